@@ -1,0 +1,1 @@
+"""123D logs to clips and back: reading, labels, datasets, writing."""

@@ -1,0 +1,1 @@
+"""Runs evaluations: predictions and truth in, one flat summary out."""

@@ -1,0 +1,83 @@
+"""Rigid motions as 4×4 matrices. `T_dst_src` maps points of frame src to frame dst."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def inverse_se3(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverse of rigid motions, by transposing the rotation."""
+    R_t = T[..., :3, :3].transpose(-1, -2)
+    out = torch.zeros_like(T)
+    out[..., :3, :3] = R_t
+    out[..., :3, 3:] = -R_t @ T[..., :3, 3:]
+    out[..., 3, 3] = 1
+    return out
+
+
+def transform_points(T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b N 3"]) -> Float[Tensor, "*b N 3"]:
+    """Map points from src to dst."""
+    return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
+
+
+def rotate_vectors(T: Float[Tensor, "*b 4 4"], vectors: Float[Tensor, "*b N 3"]) -> Float[Tensor, "*b N 3"]:
+    """Rotate free vectors (directions, velocities) from src to dst."""
+    return vectors @ T[..., :3, :3].transpose(-1, -2)
+
+
+def yaw_of(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
+    """Heading of src's x axis in dst, about dst's z axis, rad in (-π, π]."""
+    return torch.atan2(T[..., 1, 0], T[..., 0, 0])
+
+
+def hat(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Cross-product matrix: hat(v) @ u = v × u."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def exp_se3(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
+    """Exponential map of se(3), smooth at 0 in value and gradient.
+
+    Args:
+        xi: translation part (3, m) then rotation vector (3, rad).
+    """
+    rho, phi = xi[..., :3], xi[..., 3:]
+    theta2 = (phi * phi).sum(-1)[..., None, None]
+    small = theta2 < 1e-6
+    safe2 = torch.where(small, torch.ones_like(theta2), theta2)
+    theta = safe2.sqrt()
+    a = torch.where(small, 1 - theta2 / 6, theta.sin() / theta)
+    b = torch.where(small, 0.5 - theta2 / 24, (1 - theta.cos()) / safe2)
+    c = torch.where(small, 1 / 6 - theta2 / 120, (theta - theta.sin()) / (safe2 * theta))
+    W = hat(phi)
+    W2 = W @ W
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    top = torch.cat([eye + a * W + b * W2, (eye + b * W + c * W2) @ rho[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], dim=-2)
+
+
+def log_so3(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Rotation vectors, rad, of rotations by less than π."""
+    v = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1
+    )
+    sin = 0.5 * v.norm(dim=-1)
+    cos = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    angle = torch.atan2(sin, cos)
+    scale = torch.where(sin < 1e-7, torch.full_like(sin, 0.5), angle / (2 * sin.clamp_min(1e-7)))
+    return v * scale[..., None]
+
+
+def matrix_from_yaw(yaw: Float[Tensor, "*b"], xyz: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Rigid motion of a frame at `xyz` that is turned by `yaw` about z."""
+    cos, sin = yaw.cos(), yaw.sin()
+    T = torch.zeros(*yaw.shape, 4, 4, dtype=yaw.dtype, device=yaw.device)
+    T[..., 0, 0], T[..., 0, 1] = cos, -sin
+    T[..., 1, 0], T[..., 1, 1] = sin, cos
+    T[..., 2, 2] = T[..., 3, 3] = 1
+    T[..., :3, 3] = xyz
+    return T

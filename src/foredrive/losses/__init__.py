@@ -1,0 +1,1 @@
+"""Criteria: pure functions of predictions and labels."""

@@ -1,0 +1,1 @@
+"""Open-loop planning protocols, occupancy, image quality: pure functions."""

@@ -1,0 +1,1 @@
+"""Neural networks only: backbones, lifting, NeMo, planners, baselines."""

@@ -1,0 +1,1 @@
+"""Kernels, each with a plain PyTorch reference beside its fast path."""

@@ -1,0 +1,1 @@
+"""Python functions that return one frozen configuration each, and what runs them."""

@@ -1,0 +1,48 @@
+"""The types every part of Foredrive reads and writes, and the protocols it is put together from."""
+
+from foredrive.scene.boxes import Boxes, Category
+from foredrive.scene.clip import Clip, Command, Example
+from foredrive.scene.detections import Detections
+from foredrive.scene.map_patch import MapKind, MapPatch
+from foredrive.scene.protocols import (
+    Agent,
+    Belief,
+    Control,
+    Decoded,
+    Event,
+    Rendered,
+    Renderer,
+    Simulator,
+    Step,
+    WorldModel,
+)
+from foredrive.scene.rig import CameraRig
+from foredrive.scene.sweep import LidarSweep
+from foredrive.scene.trajectory import Trajectory
+from foredrive.scene.voxels import VoxelGrid, VoxelSpec
+
+__all__ = [
+    "Agent",
+    "Belief",
+    "Boxes",
+    "CameraRig",
+    "Category",
+    "Clip",
+    "Command",
+    "Control",
+    "Decoded",
+    "Detections",
+    "Event",
+    "Example",
+    "LidarSweep",
+    "MapKind",
+    "MapPatch",
+    "Rendered",
+    "Renderer",
+    "Simulator",
+    "Step",
+    "Trajectory",
+    "VoxelGrid",
+    "VoxelSpec",
+    "WorldModel",
+]

@@ -1,0 +1,34 @@
+"""What the scene types share: they are frozen dataclasses of tensors that move and slice as one."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+R = TypeVar("R", bound="Record")
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """A frozen record whose fields are tensors, other records, None, or constants shared by a batch."""
+
+    def map_tensors(self: R, fn: Callable[[Tensor], Tensor]) -> R:
+        """Apply `fn` to every tensor of this record and of the records in it."""
+
+        def apply(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return fn(value)
+            return value.map_tensors(fn) if isinstance(value, Record) else value
+
+        changed = {f.name: apply(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        return dataclasses.replace(self, **changed)
+
+    def to(self: R, device: torch.device | str) -> R:
+        """Move every tensor to `device`."""
+        return self.map_tensors(lambda tensor: tensor.to(device))
+
+    def __getitem__(self: R, index: Any) -> R:
+        """Index the leading dimension(s) of every tensor."""
+        return self.map_tensors(lambda tensor: tensor[index])

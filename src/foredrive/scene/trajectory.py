@@ -1,0 +1,25 @@
+"""Planned, predicted and driven paths."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.scene.record import Record
+
+
+@dataclass(frozen=True)
+class Trajectory(Record):
+    """M alternatives of T steps in the ego frame at now; step k lies at (k+1)·`dt_s`.
+
+    A driven future or a single plan has M = 1.
+    """
+
+    xy: Float[Tensor, "*b M T 2"]
+    """Rear-axle position, m."""
+    yaw: Float[Tensor, "*b M T"]
+    """Heading relative to the ego heading at now, rad."""
+    valid: Bool[Tensor, "*b M T"]
+    log_prob: Float[Tensor, "*b M"]
+    """Log-probability of each alternative; 0 for a single one."""
+    dt_s: float

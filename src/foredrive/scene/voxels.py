@@ -1,0 +1,45 @@
+"""Regular 3-D grids in the ego frame."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.scene.record import Record
+
+
+@dataclass(frozen=True)
+class VoxelSpec:
+    """Where a grid lies in the ego frame and how fine it is. Index order is Z, Y, X throughout."""
+
+    lower_m: tuple[float, float, float]
+    """x, y, z of the grid's lower corner."""
+    voxel_m: float
+    """Edge length of the cubic voxels."""
+    shape_zyx: tuple[int, int, int]
+
+    @property
+    def upper_m(self) -> tuple[float, float, float]:
+        """x, y, z of the grid's upper corner."""
+        nz, ny, nx = self.shape_zyx
+        x, y, z = self.lower_m
+        return (x + nx * self.voxel_m, y + ny * self.voxel_m, z + nz * self.voxel_m)
+
+    def centres_m(self, device: torch.device | str = "cpu") -> Float[Tensor, "Z Y X 3"]:
+        """Voxel centres in the ego frame, m, last dimension x y z."""
+        axes = [
+            low + (torch.arange(n, device=device, dtype=torch.float32) + 0.5) * self.voxel_m
+            for low, n in zip(self.lower_m, self.shape_zyx[::-1], strict=True)
+        ]
+        z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+        return torch.stack([x, y, z], dim=-1)
+
+
+@dataclass(frozen=True)
+class VoxelGrid(Record):
+    """Values on a grid. Unknown voxels (never seen by a beam) are not free ones: `known` tells them apart."""
+
+    spec: VoxelSpec
+    values: Float[Tensor, "*b D Z Y X"]
+    known: Bool[Tensor, "*b Z Y X"]

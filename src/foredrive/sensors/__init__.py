@@ -1,0 +1,1 @@
+"""Camera and lidar models: pixels and beams to timed rays."""

@@ -1,0 +1,1 @@
+"""The embedded world, grown on CARLA's road maps."""

@@ -1,0 +1,97 @@
+"""Imports flow one way: a folder may import from floors below its own, and from nothing beside it."""
+
+import ast
+from pathlib import Path
+
+import foredrive
+
+ROOT = Path(foredrive.__file__).parent
+
+FLOORS = [
+    {"geometry"},
+    {"scene", "ops"},
+    {"sensors"},
+    {"data", "towns", "rendering", "models", "losses", "metrics", "sets"},
+    {"search", "simulation", "training", "evaluation"},
+    {"recipes"},
+    {"view"},
+    {"cli"},
+]
+SAME_FLOOR_ALLOWED = {("towns", "data")}  # a town writes logs with data's writer
+FORBIDDEN = {
+    ("simulation", "models"),
+    ("metrics", "data"),
+    ("metrics", "models"),
+    ("sets", "data"),
+    ("sets", "models"),
+}
+THIRD_PARTY_ONLY_IN = {"py123d": {"data", "towns"}}
+
+FLOOR_OF = {folder: level for level, floor in enumerate(FLOORS) for folder in floor}
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Every module a file imports, at any depth of the file."""
+    modules: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            modules.add(node.module or "")
+    return modules
+
+
+def arrows() -> set[tuple[str, str, Path]]:
+    """(importing folder, imported folder, file) over the whole package."""
+    found = set()
+    for path in ROOT.rglob("*.py"):
+        folder = path.relative_to(ROOT).parts[0] if path.parent != ROOT else "."
+        for module in imported_modules(path):
+            parts = module.split(".")
+            if parts[0] == "foredrive" and len(parts) > 1 and parts[1] in FLOOR_OF and parts[1] != folder:
+                found.add((folder, parts[1], path))
+    return found
+
+
+def allowed(source: str, target: str) -> bool:
+    if source == ".":  # the root's own modules stand below every folder
+        return False
+    if (source, target) in SAME_FLOOR_ALLOWED:
+        return True
+    return FLOOR_OF[target] < FLOOR_OF[source] and (source, target) not in FORBIDDEN
+
+
+def test_every_folder_has_a_floor() -> None:
+    folders = {p.name for p in ROOT.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    assert folders <= set(FLOOR_OF), (
+        f"give {folders - set(FLOOR_OF)} a floor in docs/architecture.md and here"
+    )
+    assert "utils" not in folders
+
+
+def test_imports_flow_downwards() -> None:
+    wrong = [
+        f"{path}: {source} -> {target}" for source, target, path in arrows() if not allowed(source, target)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_rule_catches_an_arrow_that_runs_back_up() -> None:
+    assert allowed("models", "scene")
+    assert allowed("towns", "data")
+    assert not allowed("scene", "models")
+    assert not allowed("data", "towns")
+    assert not allowed("models", "data")
+    assert not allowed("simulation", "models")
+
+
+def test_third_party_packages_stay_where_they_belong() -> None:
+    wrong = []
+    for path in ROOT.rglob("*.py"):
+        folder = path.relative_to(ROOT).parts[0]
+        for module in imported_modules(path):
+            homes = THIRD_PARTY_ONLY_IN.get(module.split(".")[0])
+            if homes is not None and folder not in homes:
+                wrong.append(f"{path} imports {module}")
+    assert not wrong, "\n".join(wrong)
