@@ -1,0 +1,31 @@
+"""One road user at one time: what the traffic hands to the renderer and to the labels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.scene import Category
+
+
+@dataclass(frozen=True)
+class ActorState:
+    """Pose, size and motion of one road user in the world frame (right-handed, z up)."""
+
+    track_id: int
+    """The same number for the same road user throughout one drive."""
+    category: Category
+    centre_m: Float64[np.ndarray, "3"]
+    """Box centre (not the bottom)."""
+    yaw: float
+    """Heading about world z, rad, 0 along world x, counter-clockwise."""
+    pitch: float
+    """Rotation about the body's y axis (left) after the yaw, rad: positive is nose down, negative uphill."""
+    size_lwh: Float64[np.ndarray, "3"]
+    """Length along the heading, width, height, m."""
+    velocity_mps: Float64[np.ndarray, "3"]
+    """Velocity over ground along the world's axes."""
+    style: int
+    """Seed of the shape and the colour; constant over the drive."""
+    parked: bool
+    """True for a vehicle that stands for the whole drive and belongs to the place, not to the traffic."""
