@@ -1,1 +1,14 @@
 """Criteria: pure functions of predictions and labels."""
+
+from foredrive.losses.occupancy import occupancy_bce, occupancy_loss, scene_class_affinity
+from foredrive.losses.planning import waypoint_loss
+from foredrive.losses.reconstruction import l1_loss, perceptual_loss
+
+__all__ = [
+    "l1_loss",
+    "occupancy_bce",
+    "occupancy_loss",
+    "perceptual_loss",
+    "scene_class_affinity",
+    "waypoint_loss",
+]

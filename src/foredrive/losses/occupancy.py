@@ -1,0 +1,53 @@
+"""Occupancy losses on known voxels (NeMo eq. 10–11)."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+EPS = 1e-6
+
+
+def occupancy_bce(
+    logit: Float[Tensor, "*b Z Y X"], occupied: Float[Tensor, "*b Z Y X"], known: Bool[Tensor, "*b Z Y X"]
+) -> Float[Tensor, ""]:
+    """Binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known."""
+    per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none")
+    return (per_voxel * known).sum() / known.sum().clamp_min(1)
+
+
+def scene_class_affinity(
+    logit: Float[Tensor, "*b Z Y X"], occupied: Float[Tensor, "*b Z Y X"], known: Bool[Tensor, "*b Z Y X"]
+) -> Float[Tensor, ""]:
+    """Geometric scene-class affinity: −log precision − log recall − log specificity (MonoScene, eq. 4–6).
+
+    Differentiable precision P = Σp·y/Σp, recall R = Σp·y/Σy, specificity S = Σ(1−p)(1−y)/Σ(1−y) over the
+    known voxels of the batch. A term whose denominator is empty (no occupied voxel, no free one) is left
+    out, where the published code divides by zero.
+    """
+    p = logit.sigmoid()[known]
+    y = occupied[known]
+    hit = (p * y).sum()
+    terms = [(hit, p.sum()), (hit, y.sum()), (((1 - p) * (1 - y)).sum(), (1 - y).sum())]
+    has_occupied, has_free = y.sum() > 0, (1 - y).sum() > 0
+    loss = logit.new_zeros(())
+    for (numerator, denominator), present in zip(
+        terms, (has_occupied, has_occupied, has_free), strict=True
+    ):
+        ratio = (numerator + EPS) / (denominator + EPS)
+        loss = loss - torch.where(present, ratio.log(), torch.zeros_like(ratio))
+    return loss
+
+
+def occupancy_loss(
+    logit: Float[Tensor, "*b Z Y X"],
+    occupied: Float[Tensor, "*b Z Y X"],
+    known: Bool[Tensor, "*b Z Y X"],
+    *,
+    scal_weight: float,
+    bce_weight: float,
+) -> Float[Tensor, ""]:
+    """L_occ = λ_scal·L_scal + λ_BCE·L_BCE (eq. 11; the paper: 10 and 1)."""
+    return scal_weight * scene_class_affinity(logit, occupied, known) + bce_weight * occupancy_bce(
+        logit, occupied, known
+    )

@@ -1,0 +1,86 @@
+"""Image features at several resolutions: a ResNet from transformers and a feature pyramid."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+from transformers import ResNetBackbone, ResNetConfig
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+IMAGE_STRIDE = {"stage1": 4, "stage2": 8, "stage3": 16, "stage4": 32}
+
+
+def normalise_images(images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
+    """8-bit RGB to zero mean and unit variance under ImageNet's statistics."""
+    mean = torch.tensor(IMAGENET_MEAN, device=images.device).view(3, 1, 1)
+    std = torch.tensor(IMAGENET_STD, device=images.device).view(3, 1, 1)
+    return (images.float() / 255 - mean) / std
+
+
+class ImageBackbone(nn.Module):
+    """ResNet (He et al. 2016) with a feature pyramid (Lin et al. 2017) of one channel count.
+
+    Args:
+        hidden_sizes, depths, layer_type: the ResNet's stages, as in `transformers.ResNetConfig`.
+        embedding_size: channels of its stem.
+        stages: which stages feed the pyramid, e.g. ("stage2", "stage3").
+        channels: D of every pyramid level.
+        weights: a hub name or local folder of a `transformers` ResNet, whose sizes then replace the ones
+            given here; None starts from random weights.
+    """
+
+    def __init__(
+        self,
+        *,
+        embedding_size: int,
+        hidden_sizes: Sequence[int],
+        depths: Sequence[int],
+        layer_type: Literal["basic", "bottleneck"],
+        stages: Sequence[str],
+        channels: int,
+        weights: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.pretrained = False
+        self.resnet = ResNetBackbone(
+            ResNetConfig(
+                embedding_size=embedding_size,
+                hidden_sizes=list(hidden_sizes),
+                depths=list(depths),
+                layer_type=layer_type,
+                out_features=list(stages),
+            )
+        )
+        if weights is not None:
+            self._load(weights, stages)
+        widths = self.resnet.channels
+        self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
+        self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])
+
+    def _load(self, weights: str, stages: Sequence[str]) -> None:
+        try:
+            self.resnet = ResNetBackbone.from_pretrained(weights, out_features=list(stages))
+            self.pretrained = True
+        except OSError as error:
+            first_line = str(error).splitlines()[0]
+            warnings.warn(
+                f"image backbone starts from RANDOM weights: {weights!r} could not be loaded ({first_line})",
+                stacklevel=3,
+            )
+
+    def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
+        """Pyramid levels from fine to coarse, channels last."""
+        x = normalise_images(images).contiguous(memory_format=torch.channels_last)
+        maps = self.resnet(x).feature_maps
+        merged = self.lateral[-1](maps[-1])
+        levels = [merged]
+        for lateral, feature in zip(list(self.lateral)[-2::-1], maps[-2::-1], strict=True):
+            merged = lateral(feature) + F.interpolate(merged, size=feature.shape[-2:], mode="nearest")
+            levels.append(merged)
+        out = [smooth(level) for smooth, level in zip(self.smooth, levels[::-1], strict=True)]
+        return tuple(level.float().permute(0, 2, 3, 1) for level in out)

@@ -1,0 +1,171 @@
+"""From camera features to a volume: learned voxel queries refined by deformable attention (NeMo eq. 1)."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.ops.attention3d import attend_volume
+from foredrive.ops.lifting import lift
+from foredrive.scene import CameraRig, VoxelSpec
+
+
+def _directions_2d(heads: int) -> Float[Tensor, "H 2"]:
+    """Unit square directions, one a head (Zhu et al. 2021, initialisation)."""
+    angle = torch.arange(heads) * (2 * math.pi / heads)
+    grid = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    return grid / grid.abs().amax(-1, keepdim=True)
+
+
+def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
+    """Directions spread over the sphere (golden spiral), one a head, scaled to the unit cube."""
+    index = torch.arange(heads) + 0.5
+    z = 1 - 2 * index / heads
+    angle = math.pi * (1 + math.sqrt(5)) * index
+    ring = (1 - z * z).sqrt()
+    grid = torch.stack([ring * angle.cos(), ring * angle.sin(), z], dim=-1)
+    return grid / grid.abs().amax(-1, keepdim=True)
+
+
+class VolumeSelfAttention(nn.Module):
+    """Deformable self-attention in 3-D: each voxel reads P learned places around itself, in H heads."""
+
+    def __init__(self, channels: int, heads: int, points: int) -> None:
+        super().__init__()
+        self.heads, self.points = heads, points
+        self.value = nn.Linear(channels, channels)
+        self.offset = nn.Linear(channels, heads * points * 3)
+        self.weight = nn.Linear(channels, heads * points)
+        self.out = nn.Linear(channels, channels)
+        nn.init.zeros_(self.offset.weight)
+        radius = torch.arange(1, points + 1).view(1, points, 1)
+        with torch.no_grad():
+            self.offset.bias.copy_((_directions_3d(heads)[:, None] * radius).flatten())
+        nn.init.zeros_(self.weight.weight)
+        nn.init.zeros_(self.weight.bias)
+
+    def forward(
+        self, query: Float[Tensor, "b Q D"], shape_zyx: tuple[int, int, int], place: Float[Tensor, "Q 3"]
+    ) -> Float[Tensor, "b Q D"]:
+        """Args: voxel features in Z Y X order, their grid's shape, voxel centres in voxel units (x y z)."""
+        b, q, _ = query.shape
+        offset = self.offset(query).view(b, q, self.heads, self.points, 3)
+        weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
+        values = self.value(query).view(b, *shape_zyx, -1)
+        return self.out(attend_volume(values, place[:, None, None] + offset, weight))
+
+
+class CameraCrossAttention(nn.Module):
+    """Deformable cross-attention: each voxel reads P learned places around its projection, per level."""
+
+    def __init__(self, channels: int, heads: int, levels: int, points: int) -> None:
+        super().__init__()
+        self.heads, self.levels, self.points = heads, levels, points
+        self.value = nn.Linear(channels, channels)
+        self.offset = nn.Linear(channels, heads * levels * points * 2)
+        self.weight = nn.Linear(channels, heads * levels * points)
+        self.out = nn.Linear(channels, channels)
+        nn.init.zeros_(self.offset.weight)
+        radius = torch.arange(points).view(1, 1, points, 1)  # the first point starts on the projection
+        with torch.no_grad():
+            spread = _directions_2d(heads)[:, None, None] * radius
+            self.offset.bias.copy_(spread.expand(heads, levels, points, 2).flatten())
+        nn.init.zeros_(self.weight.weight)
+        nn.init.zeros_(self.weight.bias)
+
+    def forward(
+        self,
+        query: Float[Tensor, "b Q D"],
+        features: Sequence[Float[Tensor, "b C _h _w D"]],
+        uv: Float[Tensor, "b C Q 2"],
+        visible: Bool[Tensor, "b C Q"],
+    ) -> Float[Tensor, "b Q D"]:
+        """Args: voxel features; image features; projections in [0, 1]; which cameras see which voxel."""
+        b, q, _ = query.shape
+        offset = self.offset(query).view(b, q, self.heads, self.levels, self.points, 2)
+        weight = self.weight(query).view(b, q, self.heads, -1).softmax(-1)
+        weight = weight.view(b, q, self.heads, self.levels, self.points)
+        values = [self.value(level) for level in features]
+        return self.out(lift(values, uv, visible, offset, weight))
+
+
+class LiftingLayer(nn.Module):
+    """Self-attention, cross-attention, feed-forward; each residual and normalised."""
+
+    def __init__(self, channels: int, heads: int, levels: int, points: int) -> None:
+        super().__init__()
+        self.self_attention = VolumeSelfAttention(channels, heads, points)
+        self.cross_attention = CameraCrossAttention(channels, heads, levels, points)
+        self.feed_forward = nn.Sequential(
+            nn.Linear(channels, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels)
+        )
+        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(3)])
+
+    def forward(
+        self,
+        query: Float[Tensor, "b Q D"],
+        shape_zyx: tuple[int, int, int],
+        place: Float[Tensor, "Q 3"],
+        features: Sequence[Float[Tensor, "b C _h _w D"]],
+        uv: Float[Tensor, "b C Q 2"],
+        visible: Bool[Tensor, "b C Q"],
+    ) -> Float[Tensor, "b Q D"]:
+        """One round of refinement; arguments as in the two attentions."""
+        query = self.norms[0](query + self.self_attention(query, shape_zyx, place))
+        query = self.norms[1](query + self.cross_attention(query, features, uv, visible))
+        return self.norms[2](query + self.feed_forward(query))
+
+
+class LiftingEncoder(nn.Module):
+    """Learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
+
+    Args:
+        spec: the volume's grid.
+        channels: D.
+        heads, points: of the deformable attentions; `points` per head and level.
+        levels: number of image feature levels.
+        layers: rounds of refinement.
+    """
+
+    place: Tensor
+    centres_m: Tensor
+
+    def __init__(
+        self, spec: VoxelSpec, *, channels: int, heads: int, points: int, levels: int, layers: int
+    ) -> None:
+        super().__init__()
+        self.spec = spec
+        centres = spec.centres_m().flatten(0, 2)
+        self.register_buffer("centres_m", centres, persistent=False)
+        place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
+        self.register_buffer("place", place, persistent=False)
+        self.query = nn.Parameter(0.02 * torch.randn(len(centres), channels))
+        self.layers = nn.ModuleList([LiftingLayer(channels, heads, levels, points) for _ in range(layers)])
+
+    def project(
+        self, rig: CameraRig, image_valid: Bool[Tensor, "b C"]
+    ) -> tuple[Float[Tensor, "b C Q 2"], Bool[Tensor, "b C Q"]]:
+        """Where every voxel centre falls in every image, in [0, 1], and whether it is seen there."""
+        b, c = image_valid.shape
+        points = self.centres_m.expand(b, c, -1, -1)
+        in_camera = transform_points(inverse_se3(rig.T_ego_cam), points)
+        uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
+        size_wh = uv.new_tensor(rig.size_hw[::-1])
+        return uv / size_wh, inside & image_valid[..., None]
+
+    def forward(
+        self,
+        features: Sequence[Float[Tensor, "b C _h _w D"]],
+        rig: CameraRig,
+        image_valid: Bool[Tensor, "b C"],
+    ) -> Float[Tensor, "b D Z Y X"]:
+        """Lift image features; the result lies channels-last in memory."""
+        uv, visible = self.project(rig, image_valid)
+        query = self.query.expand(len(image_valid), -1, -1)
+        for layer in self.layers:
+            query = layer(query, self.spec.shape_zyx, self.place, features, uv, visible)
+        return query.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3)

@@ -1,0 +1,47 @@
+"""NeMo as something that drives: the world model and the planner on top of it."""
+
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from foredrive.models.nemo.world_model import Nemo
+from foredrive.models.planner import VolumePlanner
+from foredrive.scene import Belief, Clip, Decoded, Trajectory
+
+
+class NemoOutput(NamedTuple):
+    """Everything NeMo says about a clip."""
+
+    beliefs: list[Belief]
+    """Now, then the imagined key frames."""
+    decoded: list[Decoded]
+    plan: Trajectory
+
+
+class NemoAgent(nn.Module):
+    """An `Agent`: plans from the volume at now and the one imagined next (NeMo §3.3)."""
+
+    def __init__(self, world_model: Nemo, planner: VolumePlanner) -> None:
+        super().__init__()
+        self.world_model = world_model
+        self.planner = planner
+
+    def forward(self, clip: Clip, steps: int) -> NemoOutput:
+        """Observe, imagine `steps` ≥ 1 key frames, plan. Args as in `Nemo.forward`."""
+        beliefs, decoded = self.world_model(clip, steps)
+        now = clip.now
+        plan = self.planner(
+            beliefs[0].volume,
+            beliefs[1].volume,
+            clip.command,
+            clip.command_valid,
+            clip.ego_speed_mps[:, now],
+            clip.ego_speed_valid[:, now],
+        )
+        return NemoOutput(beliefs, decoded, plan)
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan from now on."""
+        return self(observation, 1).plan

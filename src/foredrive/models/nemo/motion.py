@@ -1,0 +1,69 @@
+"""NeMo's motion flow module: what moves, and how the ego vehicle does (§3.2, eq. 7–8)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.geometry.se3 import exp_se3
+
+XI_SCALE = 0.1
+"""Raw network outputs are scaled to metres and radians by this, so that early steps warp gently."""
+
+
+class Motion(NamedTuple):
+    """Motion over each of the next F key frames.
+
+    Both lead from the coordinates of frame t+k+1 back to those of frame t+k, because volumes are warped by
+    gathering: V̂_{t+k+1}[z] = V_{t+k}[R (z + f) + t].
+    """
+
+    flow: Float[Tensor, "b F 3 Z Y X"]
+    """f, metres along x y z."""
+    T_prev_next: Float[Tensor, "b F 4 4"]
+    """(R, t): the ego frame at t+k+1 -> the ego frame at t+k."""
+
+
+class MotionFlow(nn.Module):
+    """The 3-D ConvNets H (flow per voxel) and G (SE(3)) on the concatenated volumes of past and present.
+
+    Args:
+        channels: D of one volume.
+        frames: number of volumes put together, T_p + 1.
+        hidden: width of the ConvNets.
+        steps: T_f, the number of future key frames.
+    """
+
+    def __init__(self, *, channels: int, frames: int, hidden: int, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        wide = channels * frames
+        self.flow = nn.Sequential(
+            nn.Conv3d(wide, hidden, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv3d(hidden, hidden, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv3d(hidden, 3 * steps, 3, padding=1),
+        )
+        self.rigid = nn.Sequential(
+            nn.Conv3d(wide, hidden, 3, padding=1, stride=2),
+            nn.ReLU(),
+            nn.Conv3d(hidden, 2 * hidden, 3, padding=1, stride=2),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool3d((1, 4, 4)),  # keeps where in the plane things are: rotation needs it
+            nn.Flatten(),
+            nn.Linear(2 * hidden * 16, 4 * hidden),
+            nn.ReLU(),
+            nn.Linear(4 * hidden, 6 * steps),
+        )
+        for last in (self.flow[-1], self.rigid[-1]):
+            nn.init.zeros_(last.weight)  # start from no motion
+            nn.init.zeros_(last.bias)
+
+    def forward(self, volumes: Float[Tensor, "b T D Z Y X"]) -> Motion:
+        """Args: volumes of the past and of now (last), each in its own ego frame."""
+        stacked = volumes.flatten(1, 2).contiguous(memory_format=torch.channels_last_3d)
+        flow = self.flow(stacked).float().unflatten(1, (self.steps, 3))
+        xi = self.rigid(stacked).float().unflatten(1, (self.steps, 6))
+        return Motion(flow=flow, T_prev_next=exp_se3(XI_SCALE * xi))

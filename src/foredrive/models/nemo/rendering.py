@@ -1,0 +1,78 @@
+"""Features composited along rays, then colour (NeMo eq. 2, 5, 6)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.ops.compositing import composite, stratified_depths
+from foredrive.ops.volume import sample_volume
+from foredrive.scene import VoxelSpec
+
+
+class RenderedRays(NamedTuple):
+    """What R rays see."""
+
+    rgb: Float[Tensor, "b R 3"]
+    """0 to 1."""
+    range_m: Float[Tensor, "b R"]
+    """Expected distance of what was hit, with the far end for what was not."""
+    alpha: Float[Tensor, "b R"]
+    """Probability that the ray ends inside the volume."""
+
+
+class VolumeRenderer(nn.Module):
+    """Renders the feature of a ray with occupancy as alpha and maps it to RGB by f_recon.
+
+    Eq. 5 leaves open what a ray sees that leaves the volume. Here the transmittance that remains falls on a
+    learned background feature, which stands for the sky and for all that is too far for the grid.
+
+    Args:
+        spec: the volume's grid.
+        channels: D.
+        near_m, far_m, samples: the stratified samples of a ray.
+        hidden: width of f_recon.
+    """
+
+    lower_m: Tensor
+
+    def __init__(
+        self,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        near_m: float,
+        far_m: float,
+        samples: int,
+        hidden: int,
+    ) -> None:
+        super().__init__()
+        self.spec, self.near_m, self.far_m, self.samples = spec, near_m, far_m, samples
+        self.register_buffer("lower_m", torch.tensor(spec.lower_m), persistent=False)
+        self.background = nn.Parameter(torch.zeros(channels))
+        self.recon = nn.Sequential(
+            nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
+        )
+
+    def forward(
+        self,
+        feature: Float[Tensor, "b D Z Y X"],
+        occupancy_logit: Float[Tensor, "b Z Y X"],
+        origin: Float[Tensor, "b R 3"],
+        direction: Float[Tensor, "b R 3"],
+        generator: torch.Generator | None = None,
+    ) -> RenderedRays:
+        """Render rays given in the volume's ego frame; without a generator samples sit at bin centres."""
+        b, rays, _ = origin.shape
+        depth = stratified_depths(self.near_m, self.far_m, self.samples, (b, rays), generator)
+        depth = depth.to(origin)
+        points = origin[:, :, None] + depth[..., None] * direction[:, :, None]  # [b, R, N, 3]
+        place = ((points - self.lower_m) / self.spec.voxel_m).flatten(1, 2)
+        both = torch.cat([feature, occupancy_logit.sigmoid()[:, None]], dim=1)
+        sampled = sample_volume(both.permute(0, 2, 3, 4, 1).contiguous(), place)
+        sampled = sampled.unflatten(1, (rays, self.samples))
+        rendered, _, range_m, through = composite(sampled[..., -1], sampled[..., :-1], depth)
+        rendered = rendered + through[..., None] * self.background
+        rgb = self.recon(rendered).float().sigmoid()
+        return RenderedRays(rgb=rgb, range_m=range_m + through * self.far_m, alpha=1 - through)

@@ -1,0 +1,120 @@
+"""The temporal attention planner (NeMo §3.3, eq. 12–14)."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from foredrive.scene import Command, Trajectory
+
+SPEED_SCALE_MPS = 10.0
+
+
+class FutureAttention(nn.Module):
+    """Self-attention within the predicted future volume, multiplied onto the present one (eq. 13).
+
+    Q, K and V all come from V̂_{t+1}. Every voxel attending to every other is out of reach (640,000² pairs at
+    the paper's size, about which it is silent), so keys and values are averaged over blocks of `pool` voxels,
+    as in spatial-reduction attention (Wang et al. 2021); `pool=(1, 1, 1)` is eq. 13 to the letter.
+
+    Args:
+        channels: D.
+        pool: block of voxels (z, y, x) that share one key and value.
+    """
+
+    def __init__(self, channels: int, pool: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.pool = pool
+        self.query = nn.Linear(channels, channels)
+        self.key = nn.Linear(channels, channels)
+        self.value = nn.Linear(channels, channels)
+
+    def forward(
+        self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"]
+    ) -> Float[Tensor, "b D Z Y X"]:
+        """V_F = A ⊙ V_t."""
+        blocks = F.avg_pool3d(future, self.pool).flatten(2).transpose(1, 2)  # [b, blocks, D]
+        tokens = future.flatten(2).transpose(1, 2)  # [b, Z·Y·X, D]
+        attended = F.scaled_dot_product_attention(self.query(tokens), self.key(blocks), self.value(blocks))
+        return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
+
+
+class VolumePlanner(nn.Module):
+    """Waypoints from the present and the predicted next volume.
+
+    Height is folded into the channels, Z·D → C by an MLP; one query (command, speed and a learned planning
+    embedding, fused) attends to the plane through a transformer decoder; an MLP regresses the steps
+    between waypoints, which are summed up.
+
+    Args:
+        channels: D; height: Z; width: C (256 in the paper); layers: decoder layers (3); heads; pool: of the
+            future attention; horizon_steps, dt_s: of the plan; extent_yx: size of the plane in voxels.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: int,
+        shape_zyx: tuple[int, int, int],
+        width: int,
+        layers: int,
+        heads: int,
+        pool: tuple[int, int, int],
+        horizon_steps: int,
+        dt_s: float,
+    ) -> None:
+        super().__init__()
+        height, ny, nx = shape_zyx
+        self.horizon_steps, self.dt_s = horizon_steps, dt_s
+        self.fuse_future = FutureAttention(channels, pool)
+        self.fold = nn.Sequential(
+            nn.Linear(height * channels, width), nn.ReLU(), nn.Linear(width, width), nn.LayerNorm(width)
+        )
+        self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
+        self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
+        self.command = nn.Embedding(len(Command) + 1, width)  # the last one: not known
+        self.speed = nn.Sequential(nn.Linear(2, width), nn.ReLU(), nn.Linear(width, width))
+        self.plan = nn.Parameter(0.02 * torch.randn(width))
+        self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
+        layer = nn.TransformerDecoderLayer(width, heads, 2 * width, dropout=0.1, batch_first=True)
+        self.decoder = nn.TransformerDecoder(layer, layers)
+        self.waypoints = nn.Sequential(
+            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
+        )
+
+    def forward(
+        self,
+        now: Float[Tensor, "b D Z Y X"],
+        future: Float[Tensor, "b D Z Y X"],
+        command: Int[Tensor, "b"],
+        command_valid: Bool[Tensor, "b"],
+        speed_mps: Float[Tensor, "b"],
+        speed_valid: Bool[Tensor, "b"],
+    ) -> Trajectory:
+        """Plan in the ego frame at now."""
+        fused = self.fuse_future(now, future)
+        plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
+        memory = (plane + self.row + self.column).flatten(1, 2)
+        command = torch.where(command_valid, command, len(Command))
+        speed = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
+        query = torch.cat(
+            [self.command(command), self.speed(speed), self.plan.expand(len(command), -1)], dim=-1
+        )
+        decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
+        steps = self.waypoints(decoded).float().view(b, 1, self.horizon_steps, 2)
+        xy = steps.cumsum(dim=2)
+        return Trajectory(
+            xy=xy,
+            yaw=_headings(xy),
+            valid=torch.ones_like(xy[..., 0], dtype=torch.bool),
+            log_prob=torch.zeros_like(xy[..., 0, 0]),
+            dt_s=self.dt_s,
+        )
+
+
+def _headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:
+    """Headings along a path that starts at the origin; 0 where it hardly moves."""
+    with torch.no_grad():
+        step = torch.diff(xy, dim=2, prepend=torch.zeros_like(xy[:, :, :1]))
+        yaw = torch.atan2(step[..., 1], step[..., 0])
+        return torch.where(step.norm(dim=-1) > 0.1, yaw, torch.zeros_like(yaw))

@@ -1,0 +1,74 @@
+"""VGG-16 features for the perceptual loss."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.models.backbone import IMAGENET_MEAN, IMAGENET_STD
+
+_BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512))
+TORCHVISION_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
+
+
+class Vgg16Features(nn.Module):
+    """Activations relu1_2, relu2_2, relu3_3, relu4_3 of VGG-16 (Simonyan & Zisserman 2015), frozen.
+
+    Layer names follow torchvision's `features.N`, so its published weights load as they are.
+
+    Args:
+        weights: a .safetensors or .pth file of torchvision's VGG-16, or "download" to fetch it from
+            PyTorch's server into the torch hub cache.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, weights: str | Path) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        self.taps: list[int] = []
+        width = 3
+        for block in _BLOCKS:
+            for out in block:
+                layers += [nn.Conv2d(width, out, 3, padding=1), nn.ReLU()]
+                width = out
+            self.taps.append(len(layers) - 1)
+            layers.append(nn.MaxPool2d(2))
+        self.features = nn.Sequential(*layers[:-1])
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+        state = _read_weights(weights)
+        wanted = {key: state[key] for key in self.state_dict() if key in state}
+        missing = set(self.state_dict()) - set(wanted)
+        if missing:
+            raise InputError(f"{weights}: not VGG-16 weights, lacks {sorted(missing)[0]}")
+        self.load_state_dict(wanted)
+        self.requires_grad_(False)
+        self.eval()
+
+    def train(self, mode: bool = True) -> "Vgg16Features":
+        """Stays in evaluation mode: these features are a fixed yardstick."""
+        return super().train(False)
+
+    def forward(self, rgb: Float[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _c _h _w"], ...]:
+        """Features of RGB images in [0, 1]."""
+        x = (rgb - self.mean) / self.std
+        taps = []
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in self.taps:
+                taps.append(x)
+        return tuple(taps)
+
+
+def _read_weights(weights: str | Path) -> dict[str, Tensor]:
+    if str(weights) == "download":
+        return dict(torch.hub.load_state_dict_from_url(TORCHVISION_URL, weights_only=True))
+    path = Path(weights)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of VGG-16 weights")
+    return load_file(path) if path.suffix == ".safetensors" else torch.load(path, weights_only=True)

@@ -1,0 +1,92 @@
+"""Checkpoints as safetensors, whole or not at all."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "progress.json"
+
+
+def save_checkpoint(folder: Path, model: nn.Module, optimizer: Optimizer, step: int) -> Path:
+    """Write `folder/step_N` and remove older ones; the new one is complete before any old one goes.
+
+    The model's weights, the optimizer's tensors and the step number are all that exact resuming needs:
+    data order and random numbers follow from the seed and the step.
+    """
+    final = folder / f"step_{step:07d}"
+    with atomic_path(final) as temporary:
+        temporary.mkdir()
+        save_weights(model, temporary / MODEL)
+        tensors, scalars = _flatten_optimizer(optimizer)
+        save_file(tensors, temporary / OPTIMIZER)
+        (temporary / PROGRESS).write_text(json.dumps({"step": step, "optimizer": scalars}))
+    for old in folder.glob("step_*"):
+        if old != final:
+            shutil.rmtree(old)
+    return final
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint with the highest step, if there is one."""
+    return max(folder.glob("step_*"), default=None)
+
+
+def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
+    """Restore model and optimizer; returns the number of finished steps."""
+    load_weights(model, path / MODEL)
+    try:
+        progress = json.loads((path / PROGRESS).read_text())
+        tensors = load_file(path / OPTIMIZER)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(f"{path}: checkpoint cannot be read: {error}") from error
+    _restore_optimizer(optimizer, tensors, progress["optimizer"])
+    return int(progress["step"])
+
+
+def save_weights(model: nn.Module, path: Path) -> None:
+    """All parameters and buffers of a model, contiguous, as safetensors."""
+    save_file({name: tensor.detach().contiguous() for name, tensor in model.state_dict().items()}, path)
+
+
+def load_weights(model: nn.Module, path: Path) -> None:
+    """Load weights into a model of the same architecture."""
+    try:
+        state = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: weights cannot be read: {error}") from error
+    own = model.state_dict()
+    wrong = sorted(set(own) ^ set(state)) + [
+        name for name in sorted(set(own) & set(state)) if own[name].shape != state[name].shape
+    ]
+    if wrong:
+        raise InputError(f"{path}: weights of another architecture: {wrong[0]} ({len(wrong)} entries differ)")
+    model.load_state_dict(state)
+
+
+def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    state = optimizer.state_dict()
+    tensors = {
+        f"{index}.{name}": value.contiguous()
+        for index, entry in state["state"].items()
+        for name, value in entry.items()
+    }
+    return tensors, {"param_groups": state["param_groups"]}
+
+
+def _restore_optimizer(
+    optimizer: Optimizer, tensors: dict[str, Tensor], scalars: dict[str, Any]
+) -> None:
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({"state": state, "param_groups": scalars["param_groups"]})

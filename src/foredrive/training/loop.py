@@ -1,0 +1,230 @@
+"""The training loop: Lightning Fabric, exact resume, progress, a clean stop."""
+
+import itertools
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from foredrive.errors import InputError
+from foredrive.scene import Example
+from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long and how fast to train. AdamW, linear warm-up, then a cosine down to `final_lr_fraction`.
+
+    The length is given in steps, or in epochs over the data when `steps` is None.
+    """
+
+    batch_size: int
+    lr: float
+    steps: int | None = None
+    epochs: int | None = None
+    weight_decay: float = 1e-2
+    warmup_steps: int = 0
+    final_lr_fraction: float = 0.0
+    clip_grad_norm: float = 35.0
+    log_every: int = 10
+    checkpoint_every: int = 200
+    workers: int = 0
+    seed: int = 0
+
+    def total_steps(self, items: int) -> int:
+        """Number of steps over a data set of `items`."""
+        if (self.steps is None) == (self.epochs is None):
+            raise InputError("a schedule has either steps or epochs")
+        if self.steps is not None:
+            return self.steps
+        assert self.epochs is not None
+        return self.epochs * math.ceil(items / self.batch_size)
+
+    def lr_at(self, step: int, total: int) -> float:
+        """Learning rate of step `step` (from 0)."""
+        if step < self.warmup_steps:
+            return self.lr * (step + 1) / self.warmup_steps
+        progress = (step - self.warmup_steps) / max(total - self.warmup_steps, 1)
+        floor = self.final_lr_fraction
+        return self.lr * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))
+
+
+def batch_order(items: int, batch_size: int, seed: int) -> Iterator[list[int]]:
+    """Endless batches of indices, a fresh permutation each epoch, the same for the same seed."""
+    for epoch in itertools.count():
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
+        order = torch.randperm(items, generator=generator).tolist()
+        for start in range(0, items, batch_size):
+            yield order[start : start + batch_size]
+
+
+def train(
+    objective: nn.Module,
+    dataset: Dataset[Example],
+    collate: Callable[[list[Example]], Example],
+    schedule: Schedule,
+    folder: Path,
+    fabric: Fabric,
+) -> dict[str, float]:
+    """Train `objective` on `dataset`; continue from `folder` where a checkpoint lies there.
+
+    `objective(example, generator)` returns losses by name, of which "loss" is descended. Writes
+    `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is started again gives
+    the same losses as one that was not: the order of data and every random number follow from the seed and
+    the step. Ctrl-C saves a checkpoint of the last finished step first.
+
+    Returns the losses averaged over the last `log_every` steps.
+
+    Raises:
+        InputError: on an empty data set, or when a loss is not finite (the batch is named).
+    """
+    items = len(dataset)  # type: ignore[arg-type]
+    if items == 0:
+        raise InputError("there is nothing to train on: the data set has no clips")
+    total = schedule.total_steps(items)
+    optimizer = torch.optim.AdamW(
+        [p for p in objective.parameters() if p.requires_grad], lr=schedule.lr, weight_decay=schedule.weight_decay
+    )
+    checkpoints = folder / "checkpoints"
+    found = latest_checkpoint(checkpoints)
+    done = load_checkpoint(found, objective, optimizer) if found is not None else 0
+    log = MetricsLog(folder / "metrics.jsonl", done)
+    if done >= total:
+        return log.last
+    model, optimizer = fabric.setup(objective, optimizer)
+    loader = fabric.setup_dataloaders(
+        _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
+    )
+    model.train()
+    step = done
+    try:
+        with _progress(fabric) as progress:
+            task = progress.add_task(folder.name, total=total, completed=done, note="")
+            for example in loader:
+                losses = _one_step(model, optimizer, example, step, total, schedule, fabric)
+                step += 1
+                if log.add(step, losses, every=schedule.log_every, last=step == total):
+                    progress.update(task, note=f"loss {log.last['loss']:.3f}")
+                progress.update(task, completed=step)
+                if (step % schedule.checkpoint_every == 0 or step == total) and fabric.is_global_zero:
+                    save_checkpoint(checkpoints, objective, optimizer, step)
+    except KeyboardInterrupt:
+        if fabric.is_global_zero and step > done:
+            save_checkpoint(checkpoints, objective, optimizer, step)
+        raise
+    return log.last
+
+
+def _loader(
+    dataset: Dataset[Example],
+    collate: Callable[[list[Example]], Example],
+    schedule: Schedule,
+    done: int,
+    total: int,
+    fabric: Fabric,
+) -> DataLoader[Example]:
+    """Batches from step `done` on; each rank takes its share of every global batch."""
+    items = len(dataset)  # type: ignore[arg-type]
+    batches = itertools.islice(
+        batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed), done, total
+    )
+    mine = [_share(batch, fabric.global_rank, fabric.world_size) for batch in batches]
+    return DataLoader(
+        dataset,
+        batch_sampler=mine,
+        collate_fn=collate,
+        num_workers=schedule.workers,
+        # forked workers die when numba's threads have run in the parent
+        multiprocessing_context="forkserver" if schedule.workers else None,
+    )
+
+
+def _share(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
+    """Every rank gets something, also of a short last batch."""
+    padded = list(itertools.islice(itertools.cycle(batch), max(len(batch), world_size)))
+    return padded[rank::world_size]
+
+
+def _one_step(
+    model: nn.Module,
+    optimizer: Any,  # noqa: ANN401 - Fabric's wrapper
+    example: Example,
+    step: int,
+    total: int,
+    schedule: Schedule,
+    fabric: Fabric,
+) -> dict[str, Tensor]:
+    for group in optimizer.param_groups:
+        group["lr"] = schedule.lr_at(step, total)
+    seed = (schedule.seed * 1_000_003 + step) * 1009 + fabric.global_rank
+    torch.manual_seed(seed)  # dropout
+    losses: dict[str, Tensor] = model(example, torch.Generator().manual_seed(seed))
+    if not bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
+        bad = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
+        raise InputError(f"step {step + 1}: loss is not finite ({bad}) on the batch {', '.join(example.key)}")
+    optimizer.zero_grad(set_to_none=True)
+    fabric.backward(losses["loss"])
+    fabric.clip_gradients(model, optimizer, max_norm=schedule.clip_grad_norm, error_if_nonfinite=False)
+    optimizer.step()
+    return {name: value.detach() for name, value in losses.items()}
+
+
+def _progress(fabric: Fabric) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        disable=not fabric.is_global_zero,
+    )
+
+
+class MetricsLog:
+    """metrics.jsonl: one line every few steps, means over them; lines past a resumed step are dropped."""
+
+    def __init__(self, path: Path, done: int) -> None:
+        self.path = path
+        self.sums: dict[str, Tensor] = {}
+        self.count = 0
+        self.started = time.perf_counter()
+        self.last: dict[str, float] = {}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kept = [line for line in _read_lines(path) if line["step"] <= done]
+        path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        if kept:
+            self.last = {name: value for name, value in kept[-1].items() if name != "step"}
+
+    def add(self, step: int, losses: dict[str, Tensor], *, every: int, last: bool) -> bool:
+        """Add the losses of one finished step; True when a line was written."""
+        for name, value in losses.items():
+            self.sums[name] = self.sums.get(name, torch.zeros_like(value)) + value
+        self.count += 1
+        if step % every and not last:
+            return False
+        self.last = {name: (value / self.count).item() for name, value in self.sums.items()}
+        seconds = (time.perf_counter() - self.started) / self.count
+        with self.path.open("a") as file:
+            file.write(json.dumps({"step": step, **self.last, "s_per_step": round(seconds, 4)}) + "\n")
+        self.sums, self.count, self.started = {}, 0, time.perf_counter()
+        return True
+
+
+def _read_lines(path: Path) -> list[dict[str, float]]:
+    """Whole lines of a metrics file; a last line cut off by a crash is left out."""
+    lines = []
+    for text in path.read_text().splitlines() if path.exists() else []:
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines

@@ -1,0 +1,97 @@
+"""NeMo's two training objectives (eq. 9–11 and 15)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.losses import l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
+from foredrive.losses.reconstruction import ImageFeatures
+from foredrive.models.nemo import NemoAgent
+from foredrive.scene import Example
+from foredrive.training.rays import thinned_rays
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """The λ of NeMo. The paper: recon 0.5, occ 0.5, wpts 1 in fine-tuning; scal 10, BCE 1; perc not given.
+
+    In pre-training `wpts` is 0 and the planner is left as it is.
+    """
+
+    wpts: float
+    recon: float
+    occ: float
+    scal: float = 10.0
+    bce: float = 1.0
+    perc: float = 0.1
+
+
+class NemoObjective(nn.Module):
+    """Maps a batch to its losses; the module that is trained, so that DDP sees one forward pass.
+
+    Args:
+        agent: world model and planner.
+        weights: λ.
+        steps: T_f, number of future key frames that are imagined and supervised.
+        ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
+        image_features: VGG-16 features with real weights for the perceptual loss, or None to leave it out.
+    """
+
+    def __init__(
+        self,
+        agent: NemoAgent,
+        weights: LossWeights,
+        *,
+        steps: int,
+        ray_stride: int,
+        image_features: ImageFeatures | None = None,
+    ) -> None:
+        super().__init__()
+        self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
+        self.image_features = image_features
+
+    def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
+        """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""
+        clip = example.clip
+        now, weights = clip.now, self.weights
+        observed = clip.observed()
+        if weights.wpts > 0:
+            output = self.agent(observed, max(self.steps, 1))
+            decoded, plan = output.decoded[: self.steps + 1], output.plan
+        else:
+            _, decoded = self.agent.world_model(observed, self.steps)
+            plan = None
+
+        losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
+        for k, belief in enumerate(decoded):
+            frame = now + k
+            losses["occ"] = losses["occ"] + occupancy_loss(
+                belief.occupancy_logit,
+                example.occupancy.values[:, frame, 0],
+                example.occupancy.known[:, frame],
+                scal_weight=weights.scal,
+                bce_weight=weights.bce,
+            ) / len(decoded)
+            if weights.recon > 0:
+                rays = thinned_rays(clip, frame, self.ray_stride, generator)
+                rendered = self.agent.world_model.renderer(
+                    belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
+                )
+                b, c, _, h, w = rays.rgb.shape
+                predicted = rendered.rgb.view(b * c, h, w, 3).permute(0, 3, 1, 2)
+                truth, valid = rays.rgb.flatten(0, 1), rays.valid.flatten()
+                losses["l1"] = losses["l1"] + l1_loss(predicted, truth, valid) / len(decoded)
+                if self.image_features is not None:
+                    losses["perc"] = losses["perc"] + perceptual_loss(
+                        predicted, truth, valid, self.image_features
+                    ) / len(decoded)
+
+        losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
+            losses["l1"] + weights.perc * losses["perc"]
+        )
+        if plan is not None:
+            losses["wpts"] = waypoint_loss(plan, clip.future)
+            losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
+        return losses

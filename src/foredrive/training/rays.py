@@ -1,0 +1,51 @@
+"""Which rays of a clip are rendered, and what colour they should have."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.scene import Clip
+
+
+class ImageRays(NamedTuple):
+    """One ray per pixel of C images thinned to h×w, in the ego frame of one key frame."""
+
+    origin: Float[Tensor, "b R 3"]
+    """R = C·h·w, cameras first."""
+    direction: Float[Tensor, "b R 3"]
+    rgb: Float[Tensor, "b C 3 h w"]
+    """0 to 1."""
+    valid: Bool[Tensor, "b C"]
+
+
+def thinned_rays(clip: Clip, frame: int, stride: int, generator: torch.Generator | None = None) -> ImageRays:
+    """Rays of every stride-th pixel of all cameras of one frame.
+
+    What is left is an image again, a small one, so that losses on images (perceptual ones too) apply. The
+    phase of the grid is random with a generator, central without.
+
+    Args:
+        clip: images [b T C 3 H W].
+        frame: index into T.
+        stride: keep one pixel in `stride` along rows and columns.
+    """
+    if generator is None:
+        row, column = stride // 2, stride // 2
+    else:
+        row, column = torch.randint(stride, (2,), generator=generator).tolist()
+    images = clip.images[:, frame, :, :, row::stride, column::stride]
+    b, c = images.shape[:2]
+    uv = pixel_centres(clip.rig.size_hw)[row::stride, column::stride].reshape(-1, 2).to(images.device)
+    K, dist = clip.rig.K[:, frame], clip.rig.dist[:, frame]
+    T_ego_cam = clip.rig.T_ego_cam[:, frame]
+    direction = pixels_to_rays(uv.expand(b, c, -1, 2), K, dist) @ T_ego_cam[..., :3, :3].transpose(-1, -2)
+    origin = T_ego_cam[..., None, :3, 3].expand_as(direction)
+    return ImageRays(
+        origin=origin.flatten(1, 2),
+        direction=direction.flatten(1, 2),
+        rgb=images.float() / 255,
+        valid=clip.image_valid[:, frame],
+    )

@@ -1,0 +1,50 @@
+"""Occupancy losses."""
+
+import math
+
+import torch
+
+from foredrive.losses import occupancy_bce, occupancy_loss, scene_class_affinity
+
+
+def grid(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float32).view(1, 1, 1, -1)
+
+
+def test_bce_ignores_unknown_voxels_by_hand() -> None:
+    logit = grid(0.0, 0.0, 50.0)
+    loss = occupancy_bce(logit, grid(1, 0, 0), grid(1, 1, 0).bool())
+    torch.testing.assert_close(loss, torch.tensor(math.log(2)))
+
+
+def test_affinity_by_hand() -> None:
+    p = torch.tensor([0.8, 0.6, 0.1, 0.9])  # the last voxel is unknown
+    y = grid(1, 0, 0, 0)
+    loss = scene_class_affinity(torch.logit(p).view(1, 1, 1, -1), y, grid(1, 1, 1, 0).bool())
+    precision, recall, specificity = 0.8 / 1.5, 0.8, (0.4 + 0.9) / 2
+    expected = -math.log(precision) - math.log(recall) - math.log(specificity)
+    torch.testing.assert_close(loss, torch.tensor(expected), atol=1e-4, rtol=0)
+
+
+def test_affinity_is_finite_without_any_occupied_voxel() -> None:
+    logit = torch.zeros(1, 2, 2, 2, requires_grad=True)
+    loss = scene_class_affinity(logit, torch.zeros(1, 2, 2, 2), torch.ones(1, 2, 2, 2, dtype=torch.bool))
+    loss.backward()
+    torch.testing.assert_close(loss.detach(), torch.tensor(math.log(2)), atol=1e-4, rtol=0)  # specificity ½
+    assert logit.grad is not None
+    assert logit.grad.isfinite().all()
+
+
+def test_nothing_known_costs_nothing() -> None:
+    unknown = torch.zeros(1, 2, 2, 2, dtype=torch.bool)
+    loss = occupancy_loss(
+        torch.randn(1, 2, 2, 2), torch.zeros(1, 2, 2, 2), unknown, scal_weight=10.0, bce_weight=1.0
+    )
+    assert loss.item() == 0
+
+
+def test_a_perfect_prediction_costs_almost_nothing() -> None:
+    occupied = (torch.rand(1, 4, 4, 4, generator=torch.Generator().manual_seed(0)) > 0.7).float()
+    known = torch.ones(1, 4, 4, 4, dtype=torch.bool)
+    loss = occupancy_loss(40 * (occupied - 0.5), occupied, known, scal_weight=10.0, bce_weight=1.0)
+    assert loss.item() < 1e-3
