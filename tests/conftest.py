@@ -1,9 +1,15 @@
 """Shared by all tests: where the real logs are."""
 
+import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
+
+from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -15,3 +21,86 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real logs here: set FOREDRIVE_REAL_DATA")
     return folder
+
+
+def synthetic_example(
+    *, batch: int = 2, past: int = 1, future: int = 2, cameras: int = 2, spec: VoxelSpec, seed: int = 0
+) -> Example:
+    """A batch of well-formed but arbitrary examples: what networks and loops are tried on."""
+    rng = torch.Generator().manual_seed(seed)
+    frames, height, width, boxes, steps = past + 1 + future, 32, 64, 3, 6
+    shape = (batch, frames)
+    K = torch.tensor([[40.0, 0.0, 32.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]).expand(*shape, cameras, 3, 3)
+    yaw = torch.arange(cameras) * (2 * math.pi / cameras)
+    looking_forward = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    T_ego_cam = matrix_from_yaw(yaw, torch.tensor([0.0, 0.0, 1.6]).expand(cameras, 3))
+    T_ego_cam[:, :3, :3] = T_ego_cam[:, :3, :3] @ looking_forward
+    rig = CameraRig(
+        K=K,
+        T_ego_cam=T_ego_cam.expand(*shape, cameras, 4, 4),
+        dist=torch.zeros(*shape, cameras, 5),
+        readout_s=torch.zeros(*shape, cameras),
+        names=tuple(f"camera_{i}" for i in range(cameras)),
+        size_hw=(height, width),
+    )
+    no_beams = torch.zeros(*shape, 0)
+    sweeps = LidarSweep(
+        origin_ego=torch.zeros(*shape, 0, 3),
+        dir_ego=torch.zeros(*shape, 0, 3),
+        range_m=no_beams,
+        returned=no_beams.bool(),
+        intensity=no_beams,
+        dt_s=no_beams,
+        beam=no_beams.long(),
+        valid=no_beams.bool(),
+    )
+    yes = torch.ones(*shape, dtype=torch.bool)
+    speed_mps = torch.full(shape, 4.0)
+    t_s = ((torch.arange(frames) - past) * 0.5).expand(shape)
+    clip = Clip(
+        t_s=t_s,
+        T_world_ego=torch.eye(4, dtype=torch.float64).expand(*shape, 4, 4),
+        images=torch.randint(0, 256, (*shape, cameras, 3, height, width), generator=rng, dtype=torch.uint8),
+        image_valid=torch.ones(*shape, cameras, dtype=torch.bool),
+        rig=rig,
+        sweeps=sweeps,
+        sweep_valid=~yes,
+        misses_known=~yes,
+        boxes=Boxes(
+            centre=torch.randn(*shape, boxes, 3, generator=rng) * 5,
+            size_lwh=torch.tensor([4.0, 2.0, 1.5]).expand(*shape, boxes, 3),
+            yaw=torch.zeros(*shape, boxes),
+            velocity=torch.zeros(*shape, boxes, 2),
+            track_id=torch.arange(boxes).expand(*shape, boxes),
+            category=torch.zeros(*shape, boxes, dtype=torch.long),
+            valid=torch.ones(*shape, boxes, dtype=torch.bool),
+        ),
+        boxes_valid=yes,
+        ego_speed_mps=speed_mps,
+        ego_speed_valid=yes,
+        command=torch.full((batch,), 2),
+        command_valid=torch.ones(batch, dtype=torch.bool),
+        future=Trajectory(
+            xy=torch.stack([torch.arange(1, steps + 1) * 2.0, torch.zeros(steps)], -1).expand(
+                batch, 1, -1, -1
+            ),
+            yaw=torch.zeros(batch, 1, steps),
+            valid=torch.ones(batch, 1, steps, dtype=torch.bool),
+            log_prob=torch.zeros(batch, 1),
+            dt_s=0.5,
+        ),
+    )
+    occupied = (torch.rand(*shape, 1, *spec.shape_zyx, generator=rng) > 0.9).float()
+    known = torch.rand(*shape, *spec.shape_zyx, generator=rng) > 0.5
+    return Example(
+        clip=clip,
+        occupancy=VoxelGrid(spec, occupied, known),
+        flow=VoxelGrid(spec, torch.zeros(*shape, 3, *spec.shape_zyx), torch.zeros_like(known)),
+        key=tuple(f"log_{i}@0.0s" for i in range(batch)),
+    )
+
+
+@pytest.fixture(scope="session")
+def make_example() -> Callable[..., Example]:
+    """See `synthetic_example`."""
+    return synthetic_example

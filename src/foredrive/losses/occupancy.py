@@ -31,9 +31,7 @@ def scene_class_affinity(
     terms = [(hit, p.sum()), (hit, y.sum()), (((1 - p) * (1 - y)).sum(), (1 - y).sum())]
     has_occupied, has_free = y.sum() > 0, (1 - y).sum() > 0
     loss = logit.new_zeros(())
-    for (numerator, denominator), present in zip(
-        terms, (has_occupied, has_occupied, has_free), strict=True
-    ):
+    for (numerator, denominator), present in zip(terms, (has_occupied, has_occupied, has_free), strict=True):
         ratio = (numerator + EPS) / (denominator + EPS)
         loss = loss - torch.where(present, ratio.log(), torch.zeros_like(ratio))
     return loss

@@ -82,9 +82,7 @@ def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[st
     return tensors, {"param_groups": state["param_groups"]}
 
 
-def _restore_optimizer(
-    optimizer: Optimizer, tensors: dict[str, Tensor], scalars: dict[str, Any]
-) -> None:
+def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor], scalars: dict[str, Any]) -> None:
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)

@@ -35,7 +35,6 @@ class Schedule:
     warmup_steps: int = 0
     final_lr_fraction: float = 0.0
     clip_grad_norm: float = 35.0
-    log_every: int = 10
     checkpoint_every: int = 200
     workers: int = 0
     seed: int = 0
@@ -74,15 +73,13 @@ def train(
     schedule: Schedule,
     folder: Path,
     fabric: Fabric,
-) -> dict[str, float]:
+) -> None:
     """Train `objective` on `dataset`; continue from `folder` where a checkpoint lies there.
 
     `objective(example, generator)` returns losses by name, of which "loss" is descended. Writes
     `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is started again gives
     the same losses as one that was not: the order of data and every random number follow from the seed and
     the step. Ctrl-C saves a checkpoint of the last finished step first.
-
-    Returns the losses averaged over the last `log_every` steps.
 
     Raises:
         InputError: on an empty data set, or when a loss is not finite (the batch is named).
@@ -92,15 +89,17 @@ def train(
         raise InputError("there is nothing to train on: the data set has no clips")
     total = schedule.total_steps(items)
     optimizer = torch.optim.AdamW(
-        [p for p in objective.parameters() if p.requires_grad], lr=schedule.lr, weight_decay=schedule.weight_decay
+        [p for p in objective.parameters() if p.requires_grad],
+        lr=schedule.lr,
+        weight_decay=schedule.weight_decay,
     )
     checkpoints = folder / "checkpoints"
+    model, fabric_optimizer = fabric.setup(objective, optimizer)
     found = latest_checkpoint(checkpoints)
     done = load_checkpoint(found, objective, optimizer) if found is not None else 0
-    log = MetricsLog(folder / "metrics.jsonl", done)
     if done >= total:
-        return log.last
-    model, optimizer = fabric.setup(objective, optimizer)
+        return
+    log = MetricsLog(folder / "metrics.jsonl", done) if fabric.is_global_zero else None
     loader = fabric.setup_dataloaders(
         _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
     )
@@ -110,18 +109,17 @@ def train(
         with _progress(fabric) as progress:
             task = progress.add_task(folder.name, total=total, completed=done, note="")
             for example in loader:
-                losses = _one_step(model, optimizer, example, step, total, schedule, fabric)
+                losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
                 step += 1
-                if log.add(step, losses, every=schedule.log_every, last=step == total):
-                    progress.update(task, note=f"loss {log.last['loss']:.3f}")
-                progress.update(task, completed=step)
+                if log is not None:
+                    log.add(step, losses)
+                progress.update(task, completed=step, note=f"loss {losses['loss'].item():.3f}")
                 if (step % schedule.checkpoint_every == 0 or step == total) and fabric.is_global_zero:
                     save_checkpoint(checkpoints, objective, optimizer, step)
     except KeyboardInterrupt:
         if fabric.is_global_zero and step > done:
             save_checkpoint(checkpoints, objective, optimizer, step)
         raise
-    return log.last
 
 
 def _loader(
@@ -156,7 +154,7 @@ def _share(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
 
 def _one_step(
     model: nn.Module,
-    optimizer: Any,  # noqa: ANN401 - Fabric's wrapper
+    optimizer: Any,
     example: Example,
     step: int,
     total: int,
@@ -190,36 +188,25 @@ def _progress(fabric: Fabric) -> Progress:
 
 
 class MetricsLog:
-    """metrics.jsonl: one line every few steps, means over them; lines past a resumed step are dropped."""
+    """metrics.jsonl: one line a step; lines past the step that is resumed from are dropped."""
 
     def __init__(self, path: Path, done: int) -> None:
-        self.path = path
-        self.sums: dict[str, Tensor] = {}
-        self.count = 0
-        self.started = time.perf_counter()
-        self.last: dict[str, float] = {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        kept = [line for line in _read_lines(path) if line["step"] <= done]
+        kept = [line for line in read_metrics(path) if line["step"] <= done]
         path.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        if kept:
-            self.last = {name: value for name, value in kept[-1].items() if name != "step"}
+        self.path = path
+        self.started = time.perf_counter()
 
-    def add(self, step: int, losses: dict[str, Tensor], *, every: int, last: bool) -> bool:
-        """Add the losses of one finished step; True when a line was written."""
-        for name, value in losses.items():
-            self.sums[name] = self.sums.get(name, torch.zeros_like(value)) + value
-        self.count += 1
-        if step % every and not last:
-            return False
-        self.last = {name: (value / self.count).item() for name, value in self.sums.items()}
-        seconds = (time.perf_counter() - self.started) / self.count
+    def add(self, step: int, losses: dict[str, Tensor]) -> None:
+        """Add the losses of one finished step."""
+        now = time.perf_counter()
+        line = {"step": step, **{name: value.item() for name, value in losses.items()}}
         with self.path.open("a") as file:
-            file.write(json.dumps({"step": step, **self.last, "s_per_step": round(seconds, 4)}) + "\n")
-        self.sums, self.count, self.started = {}, 0, time.perf_counter()
-        return True
+            file.write(json.dumps({**line, "step_s": round(now - self.started, 4)}) + "\n")
+        self.started = now
 
 
-def _read_lines(path: Path) -> list[dict[str, float]]:
+def read_metrics(path: Path) -> list[dict[str, float]]:
     """Whole lines of a metrics file; a last line cut off by a crash is left out."""
     lines = []
     for text in path.read_text().splitlines() if path.exists() else []:

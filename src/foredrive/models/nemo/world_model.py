@@ -87,9 +87,7 @@ class Nemo(nn.Module):
         futures = []
         for k in range(steps):
             T_prev_next = motion.T_prev_next[:, k]
-            volume = warp_volume(
-                volume, motion.flow[:, k], T_prev_next, self.spec.lower_m, self.spec.voxel_m
-            )
+            volume = warp_volume(volume, motion.flow[:, k], T_prev_next, self.spec.lower_m, self.spec.voxel_m)
             T_now_ego = T_now_ego @ T_prev_next
             futures.append(Belief(volume=volume, T_now_ego=T_now_ego))
         return futures
@@ -104,4 +102,3 @@ class Nemo(nn.Module):
         now = self.observe(clip)
         beliefs = [now, *self.imagine(now, steps)] if steps else [now]
         return beliefs, [self.decode(belief) for belief in beliefs]
-

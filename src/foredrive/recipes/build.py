@@ -1,0 +1,85 @@
+"""From the values of a recipe to the objects they describe."""
+
+import warnings
+
+from foredrive.errors import InputError
+from foredrive.models.backbone import ImageBackbone
+from foredrive.models.lifting import LiftingEncoder
+from foredrive.models.nemo import MotionFlow, Nemo, NemoAgent, VolumeRenderer
+from foredrive.models.planner import VolumePlanner
+from foredrive.models.vgg import Vgg16Features
+from foredrive.recipes.config import Recipe, Stage
+from foredrive.training import NemoObjective
+
+
+def build_agent(recipe: Recipe) -> NemoAgent:
+    """World model and planner with fresh weights (the backbone loads the ones a recipe names)."""
+    size, clips = recipe.model, recipe.clips
+    backbone = ImageBackbone(
+        embedding_size=size.backbone.embedding_size,
+        hidden_sizes=size.backbone.hidden_sizes,
+        depths=size.backbone.depths,
+        layer_type=size.backbone.layer_type,
+        stages=size.backbone.stages,
+        channels=size.channels,
+        weights=size.backbone.weights,
+    )
+    encoder = LiftingEncoder(
+        clips.voxels,
+        channels=size.channels,
+        heads=size.heads,
+        points=size.points,
+        levels=len(size.backbone.stages),
+        layers=size.lifting_layers,
+    )
+    motion = MotionFlow(
+        channels=size.channels,
+        frames=clips.past_frames + 1,
+        hidden=size.motion_hidden,
+        steps=clips.future_frames,
+    )
+    renderer = VolumeRenderer(
+        clips.voxels,
+        channels=size.channels,
+        near_m=size.ray_near_m,
+        far_m=size.ray_far_m,
+        samples=size.ray_samples,
+        hidden=size.recon_hidden,
+    )
+    world_model = Nemo(
+        backbone=backbone,
+        encoder=encoder,
+        motion=motion,
+        renderer=renderer,
+        past_frames=clips.past_frames,
+        channels=size.channels,
+        hidden=size.occupancy_hidden,
+    )
+    planner = VolumePlanner(
+        channels=size.channels,
+        shape_zyx=clips.voxels.shape_zyx,
+        width=size.planner_width,
+        layers=size.planner_layers,
+        heads=size.planner_heads,
+        pool=size.attention_pool,
+        horizon_steps=clips.horizon_steps,
+        dt_s=clips.horizon_dt_s,
+    )
+    return NemoAgent(world_model, planner)
+
+
+def build_objective(recipe: Recipe, stage: Stage, agent: NemoAgent) -> NemoObjective:
+    """What is trained in a stage. Without real VGG-16 weights the perceptual loss has weight 0."""
+    features = None
+    if stage.vgg16 is not None:
+        try:
+            features = Vgg16Features(stage.vgg16)
+        except (OSError, InputError) as error:
+            warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=2)
+    return NemoObjective(
+        agent,
+        stage.weights,
+        steps=recipe.clips.future_frames,
+        ray_stride=stage.ray_stride,
+        image_features=features,
+    )

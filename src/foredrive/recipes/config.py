@@ -1,0 +1,93 @@
+"""What a recipe holds: values only, so that it can be read, written and compared."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from foredrive.data import ClipConfig
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.training import LossWeights, Schedule
+
+
+@dataclass(frozen=True)
+class BackboneSize:
+    """A ResNet and its pyramid; see `models.backbone.ImageBackbone`."""
+
+    embedding_size: int
+    hidden_sizes: tuple[int, ...]
+    depths: tuple[int, ...]
+    layer_type: Literal["basic", "bottleneck"]
+    stages: tuple[str, ...]
+    weights: str | None = None
+
+
+@dataclass(frozen=True)
+class NemoSize:
+    """Sizes of NeMo's parts; see the modules' own docstrings."""
+
+    backbone: BackboneSize
+    channels: int
+    heads: int
+    points: int
+    lifting_layers: int
+    occupancy_hidden: int
+    motion_hidden: int
+    ray_near_m: float
+    ray_far_m: float
+    ray_samples: int
+    recon_hidden: int
+    planner_width: int
+    planner_layers: int
+    planner_heads: int
+    attention_pool: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of training."""
+
+    schedule: Schedule
+    weights: LossWeights
+    ray_stride: int
+    vgg16: str | None = None
+    """File of VGG-16 weights for the perceptual loss, or "download"; None leaves that loss out (weight 0)."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides a run, but for where the logs are."""
+
+    name: str
+    clips: ClipConfig
+    model: NemoSize
+    pretrain: Stage
+    finetune: Stage
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
+
+
+def save_recipe(recipe: Recipe, path: Path) -> None:
+    """Write a recipe as YAML."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.safe_dump(_plain(asdict(recipe)), sort_keys=False))
+
+
+def load_recipe(path: Path) -> Recipe:
+    """Read a recipe that `save_recipe` wrote."""
+    try:
+        return TypeAdapter(Recipe).validate_python(yaml.safe_load(path.read_text()))
+    except OSError as error:
+        raise InputError(f"{path.parent}: not a run folder, {path.name} cannot be read") from error
+    except (yaml.YAMLError, ValidationError) as error:
+        first_line = str(error).splitlines()[0]
+        raise InputError(f"{path}: not a recipe: {first_line}") from error
+
+
+def _plain(value: object) -> object:
+    """Tuples as lists, as YAML has them."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value

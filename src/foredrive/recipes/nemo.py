@@ -1,0 +1,107 @@
+"""NeMo's recipes."""
+
+from foredrive.data import ClipConfig
+from foredrive.recipes.config import BackboneSize, NemoSize, Recipe, Stage
+from foredrive.scene import VoxelSpec
+from foredrive.training import LossWeights, Schedule
+
+
+def nemo_tiny() -> Recipe:
+    """NeMo small enough for two CPU cores: the demo. Every part is there, only smaller."""
+    return Recipe(
+        name="nemo_tiny",
+        clips=ClipConfig(
+            past_frames=1,
+            future_frames=2,
+            image_hw=(96, 160),
+            voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.5), voxel_m=0.75, shape_zyx=(8, 64, 64)),
+        ),
+        model=NemoSize(
+            backbone=BackboneSize(
+                embedding_size=24,
+                hidden_sizes=(24, 48, 96, 128),
+                depths=(1, 1, 1, 1),
+                layer_type="basic",
+                stages=("stage1", "stage2", "stage3"),
+            ),
+            channels=32,
+            heads=4,
+            points=4,
+            lifting_layers=2,
+            occupancy_hidden=32,
+            motion_hidden=16,
+            ray_near_m=1.0,
+            ray_far_m=34.0,
+            ray_samples=48,
+            recon_hidden=64,
+            planner_width=128,
+            planner_layers=3,
+            planner_heads=4,
+            attention_pool=(2, 4, 4),
+        ),
+        pretrain=Stage(
+            schedule=Schedule(batch_size=4, lr=2e-3, steps=240, warmup_steps=20, workers=1),
+            weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
+            ray_stride=8,
+        ),
+        finetune=Stage(
+            schedule=Schedule(batch_size=4, lr=1e-3, steps=100, warmup_steps=10, workers=1),
+            weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
+            ray_stride=16,
+        ),
+    )
+
+
+def nemo_base() -> Recipe:
+    """The paper's size: ResNet-50, 200×200×16 voxels of 0.5 m, six cameras, two stages of 10 epochs.
+
+    Constants of §4.1; what it leaves open: D = 64, three rounds of lifting with 8 heads and 8 points, four
+    pyramid levels, T_f = 3 at 0.5 s, images of 450×800, λ_perc = 0.1 (Video Autoencoder).
+    """
+    stage = {"batch_size": 1, "lr": 2e-4, "epochs": 10, "weight_decay": 1e-2, "warmup_steps": 500}
+    return Recipe(
+        name="nemo_base",
+        clips=ClipConfig(
+            past_frames=1,
+            future_frames=3,
+            image_hw=(448, 800),
+            voxels=VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200)),
+        ),
+        model=NemoSize(
+            backbone=BackboneSize(
+                embedding_size=64,
+                hidden_sizes=(256, 512, 1024, 2048),
+                depths=(3, 4, 6, 3),
+                layer_type="bottleneck",
+                stages=("stage1", "stage2", "stage3", "stage4"),
+                weights="microsoft/resnet-50",
+            ),
+            channels=64,
+            heads=8,
+            points=8,
+            lifting_layers=3,
+            occupancy_hidden=64,
+            motion_hidden=64,
+            ray_near_m=1.0,
+            ray_far_m=72.0,
+            ray_samples=96,
+            recon_hidden=128,
+            planner_width=256,
+            planner_layers=3,
+            planner_heads=8,
+            attention_pool=(4, 8, 8),
+        ),
+        pretrain=Stage(
+            schedule=Schedule(**stage, workers=4),
+            weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
+            ray_stride=8,
+            vgg16="download",
+        ),
+        finetune=Stage(
+            schedule=Schedule(**stage, workers=4),
+            weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
+            ray_stride=8,
+            vgg16="download",
+        ),
+        precision="bf16-mixed",
+    )
