@@ -1,0 +1,331 @@
+"""CARLA's towns: lanes, cross-section strips, markings, crosswalks and stop zones, with heights.
+
+The maps are the OpenDRIVE files in py123d's wheel (CARLA, CC BY 4.0), read with py123d's parser.
+"""
+
+import enum
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import py123d.parser.opendrive
+import shapely
+from jaxtyping import Float64
+from py123d.geometry.utils.rotation_utils import normalize_angle
+from py123d.parser.opendrive.utils.collection import collect_element_helpers
+from py123d.parser.opendrive.utils.stop_zone_helper import create_stop_zones_from_signals
+from py123d.parser.opendrive.xodr_parser.opendrive import XODR
+from py123d.parser.opendrive.xodr_parser.reference import XODRReferenceLine
+
+from foredrive.errors import InputError
+
+MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
+TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD")
+SAMPLE_SPACING_M = 1.0
+CONNECTION_TOLERANCE_M = 0.1
+MIN_MARKING_M = 0.1
+
+Points = Float64[np.ndarray, "N 3"]
+
+
+class StripKind(enum.StrEnum):
+    """What one strip of a road's cross-section is for (OpenDRIVE's lane types)."""
+
+    DRIVING = "driving"
+    SHOULDER = "shoulder"
+    SIDEWALK = "sidewalk"
+    PARKING = "parking"
+    MEDIAN = "median"
+    BORDER = "border"
+    BIDIRECTIONAL = "bidirectional"
+    NONE = "none"
+
+
+class MarkingKind(enum.StrEnum):
+    """How a boundary is painted or built (OpenDRIVE's road mark types)."""
+
+    NONE = "none"
+    SOLID = "solid"
+    BROKEN = "broken"
+    SOLID_SOLID = "solid solid"
+    SOLID_BROKEN = "solid broken"
+    BROKEN_SOLID = "broken solid"
+    BROKEN_BROKEN = "broken broken"
+    CURB = "curb"
+
+
+class StopZoneKind(enum.StrEnum):
+    """Why one has to stop."""
+
+    TRAFFIC_LIGHT = "traffic_light"
+    STOP_SIGN = "stop_sign"
+    YIELD_SIGN = "yield_sign"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One strip of a road's cross-section; both borders are sampled alike, in the direction of travel."""
+
+    id: str
+    kind: StripKind
+    road_id: int
+    junction_id: int | None
+    left_xyz: Points
+    right_xyz: Points
+
+    @cached_property
+    def outline_xyz(self) -> Points:
+        """The closed outline."""
+        return np.concatenate([self.left_xyz, self.right_xyz[::-1], self.left_xyz[:1]])
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """The outline seen from above, made valid."""
+        return shapely.Polygon(self.outline_xyz[:, :2]).buffer(0)
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One driving lane, in the direction of travel. Ids are py123d's."""
+
+    lane_id: str
+    group_id: str
+    """The same for the lanes side by side in one direction."""
+    junction_id: int | None
+    centreline_xyz: Points
+    left_boundary_xyz: Points
+    right_boundary_xyz: Points
+    speed_limit_mps: float | None
+    successor_ids: tuple[str, ...]
+    predecessor_ids: tuple[str, ...]
+    left_id: str | None
+    """The neighbour with the same direction of travel."""
+    right_id: str | None
+    left_marking: MarkingKind
+    """At half length: says whether the line may be crossed."""
+    right_marking: MarkingKind
+
+    @cached_property
+    def width_m(self) -> float:
+        """Median width."""
+        return float(np.median(np.linalg.norm(self.left_boundary_xyz - self.right_boundary_xyz, axis=1)))
+
+
+@dataclass(frozen=True)
+class Marking:
+    """A painted line, or a kerb without walkway behind it, along one boundary."""
+
+    kind: MarkingKind
+    colour: str
+    """white or yellow."""
+    width_m: float
+    xyz: Points
+
+
+@dataclass(frozen=True)
+class Crosswalk:
+    """A pedestrian crossing."""
+
+    id: int
+    outline_xyz: Points
+    """Closed."""
+
+
+@dataclass(frozen=True)
+class StopZone:
+    """Where lanes end at a light or a sign: the half metre behind the line."""
+
+    id: int
+    kind: StopZoneKind
+    lane_ids: tuple[str, ...]
+    """The lanes that begin at the line (inside the junction)."""
+    outline_xyz: Points
+    """Closed."""
+    post_xyz: Float64[np.ndarray, "3"]
+    """Foot of the post that holds the light or the sign."""
+    post_yaw: float
+    """Direction of travel of the traffic that has to obey, rad: the signal faces the other way."""
+
+
+@dataclass(frozen=True)
+class TownMap:
+    """A town's road network in the world frame (m, z up), the drives on the right."""
+
+    name: str
+    lanes: tuple[Lane, ...]
+    strips: tuple[Strip, ...]
+    """Every strip of every cross-section, driving lanes included."""
+    markings: tuple[Marking, ...]
+    crosswalks: tuple[Crosswalk, ...]
+    stop_zones: tuple[StopZone, ...]
+    junctions: dict[int, shapely.Polygon]
+    """Area of each junction's driving lanes, seen from above."""
+
+    def strips_of(self, *kinds: StripKind) -> tuple[Strip, ...]:
+        """The strips of some kinds: SIDEWALK for walkways, PARKING for car parks."""
+        return tuple(strip for strip in self.strips if strip.kind in kinds)
+
+    @cached_property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """Smallest x, y and largest x, y of all strips."""
+        every = np.concatenate([strip.outline_xyz for strip in self.strips])
+        (x0, y0), (x1, y1) = every[:, :2].min(0), every[:, :2].max(0)
+        return float(x0), float(y0), float(x1), float(y1)
+
+
+@lru_cache(maxsize=2)
+def load_town_map(name: str) -> TownMap:
+    """Read a town's map (.2 to 2 s).
+
+    Raises:
+        InputError: there is no such town.
+    """
+    if name not in TOWNS:
+        raise InputError(f"unknown town {name!r}: one of {', '.join(TOWNS)}")
+    xodr = XODR.parse_from_file(MAP_FOLDER / f"{name}.xodr.gz")
+    roads, _, helpers, _, objects, centre_marks, signals = collect_element_helpers(
+        xodr, SAMPLE_SPACING_M, CONNECTION_TOLERANCE_M
+    )
+    borders = {
+        lane_id: (
+            _with_road_height(helper, helper.inner_polyline_3d.array, roads),
+            _with_road_height(helper, helper.outer_polyline_3d.array, roads),
+        )
+        for lane_id, helper in helpers.items()
+    }
+    strips = tuple(_strip(helper, borders[lane_id], roads) for lane_id, helper in helpers.items())
+    lanes = tuple(_lane(s, helpers, centre_marks) for s in strips if s.kind is StripKind.DRIVING)
+    crosswalks = tuple(
+        Crosswalk(o.object_id, np.concatenate([o.outline_3d, o.outline_3d[:1]])) for o in objects.values()
+    )
+    return TownMap(
+        name=name,
+        lanes=lanes,
+        strips=strips,
+        markings=tuple(_markings(helpers, borders, centre_marks)),
+        crosswalks=crosswalks,
+        stop_zones=tuple(_stop_zones(helpers, signals, xodr)),
+        junctions=_junctions(strips),
+    )
+
+
+def _with_road_height(helper: Any, xyz: Points, roads: dict[int, Any]) -> Points:
+    """Set z from the road's elevation profile, in which py123d looks up the outer borders of later lane
+    sections at the wrong place (up to 1 m off in Town04)."""
+    profile = roads[int(helper.lane_id.split("_")[0])].elevation_profile.elevations
+    s = np.linspace(helper.s_range[0], helper.s_range[1], len(xyz))
+    starts = np.array([e.s for e in profile])
+    index = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
+    a, b, c, d = np.array([[e.a, e.b, e.c, e.d] for e in profile])[index].T
+    ds = s - starts[index]
+    z = a + ds * (b + ds * (c + ds * d))
+    return np.column_stack([xyz[:, :2], z[::-1] if helper.id > 0 else z])
+
+
+def _strip(helper: Any, border: tuple[Points, Points], roads: dict[int, Any]) -> Strip:
+    road = roads[int(helper.lane_id.split("_")[0])]
+    kind = helper.type if helper.type in set(StripKind) else StripKind.NONE
+    junction = None if road.junction is None else int(road.junction)
+    return Strip(helper.lane_id, StripKind(kind), road.id, junction, *border)
+
+
+def _lane(strip: Strip, helpers: dict[str, Any], centre_marks: dict[str, Any]) -> Lane:
+    helper = helpers[strip.id]
+    group, index = strip.id.rsplit("_", 1)
+    inward, outward = (f"{group}_{int(index) + step * (1 if helper.id > 0 else -1)}" for step in (-1, 1))
+
+    def driving(lane_ids: list[str]) -> tuple[str, ...]:
+        return tuple(sorted({i for i in lane_ids if i in helpers and helpers[i].type == "driving"}))
+
+    inner_marks = (
+        helpers[inward].open_drive_lane.road_marks
+        if inward in helpers
+        else centre_marks.get(group.rsplit("_", 1)[0], [])
+    )
+    half_s = 0.5 * (helper.s_range[1] - helper.s_range[0])
+    limit = helper.speed_limit_mps
+    return Lane(
+        lane_id=strip.id,
+        group_id=group,
+        junction_id=strip.junction_id,
+        centreline_xyz=0.5 * (strip.left_xyz + strip.right_xyz),
+        left_boundary_xyz=strip.left_xyz,
+        right_boundary_xyz=strip.right_xyz,
+        speed_limit_mps=None if limit is None else float(limit),
+        successor_ids=driving(helper.successor_lane_ids),
+        predecessor_ids=driving(helper.predecessor_lane_ids),
+        left_id=next(iter(driving([inward])), None),
+        right_id=next(iter(driving([outward])), None),
+        left_marking=_kind_at(inner_marks, half_s),
+        right_marking=_kind_at(helper.open_drive_lane.road_marks, half_s),
+    )
+
+
+def _kind(mark: Any) -> MarkingKind:
+    name = (mark.type or "none").lower()
+    return MarkingKind(name) if name in set(MarkingKind) else MarkingKind.SOLID
+
+
+def _kind_at(marks: list[Any], s_m: float) -> MarkingKind:
+    """Kind of the road mark that covers `s_m` (from the start of the lane section)."""
+    before = [mark for mark in marks if mark.s_offset <= s_m]
+    return _kind(max(before, key=lambda mark: mark.s_offset)) if before else MarkingKind.NONE
+
+
+def _markings(
+    helpers: dict[str, Any], borders: dict[str, tuple[Points, Points]], centre_marks: dict[str, Any]
+) -> list[Marking]:
+    """The marks of every strip's outer border, and those of the reference lines."""
+    lines = [(h, h.open_drive_lane.road_marks, borders[i][1]) for i, h in helpers.items()]
+    for section, marks in centre_marks.items():
+        # The reference line is the inner border of the innermost strip on either side.
+        inner = next((i for i in (f"{section}_right_-1", f"{section}_left_1") if i in helpers), None)
+        if inner is not None:
+            lines.append((helpers[inner], marks, borders[inner][0]))
+    found = []
+    for helper, marks, xyz in lines:
+        in_s = xyz[::-1] if helper.id > 0 else xyz  # road marks are given along the road's s
+        s = np.linspace(0.0, helper.s_range[1] - helper.s_range[0], len(in_s))
+        ends = [mark.s_offset for mark in marks[1:]] + [s[-1]]
+        for mark, end_s in zip(marks, ends, strict=False):
+            start_s, end_s = max(0.0, mark.s_offset), min(s[-1], end_s)
+            if _kind(mark) is MarkingKind.NONE or end_s - start_s < MIN_MARKING_M:
+                continue
+            between = s[(s > start_s) & (s < end_s)]
+            at = np.concatenate([[start_s], between, [end_s]])
+            line = np.column_stack([np.interp(at, s, in_s[:, axis]) for axis in range(3)])
+            colour = "yellow" if (mark.color or "white").lower() == "yellow" else "white"
+            found.append(Marking(_kind(mark), colour, mark.width or 0.125, line))
+    return found
+
+
+def _stop_zones(helpers: dict[str, Any], signals: dict[int, Any], xodr: XODR) -> list[StopZone]:
+    posts = {}
+    for road in xodr.roads:
+        if road.signals:
+            line = XODRReferenceLine.from_plan_view(
+                road.plan_view, road.lanes.lane_offsets, road.elevation_profile.elevations
+            )
+            for signal in road.signals:
+                s = min(signal.s, road.length)
+                yaw = line.interpolate_se2(s)[2] + (signal.h_offset or 0.0)
+                posts[signal.id] = (line.interpolate_3d(s, signal.t), normalize_angle(yaw))
+    zones = []
+    for signal_id, zone in create_stop_zones_from_signals(signals, helpers).items():
+        driving = [i for i in zone.lane_ids if helpers[i].type == "driving"]
+        kind = StopZoneKind(zone.stop_zone_type.name.lower())
+        xyz, yaw = posts[signal_id]
+        outline = zone.outline.array
+        zones.append(StopZone(signal_id, kind, tuple(sorted(driving)), outline, xyz, float(yaw)))
+    return zones
+
+
+def _junctions(strips: tuple[Strip, ...]) -> dict[int, shapely.Polygon]:
+    parts: dict[int, list[shapely.Polygon]] = {}
+    for strip in strips:
+        if strip.junction_id is not None and strip.kind is StripKind.DRIVING:
+            parts.setdefault(strip.junction_id, []).append(strip.polygon)
+    # Growing and shrinking closes the slivers between lanes that only touch.
+    return {key: shapely.union_all(p).buffer(0.25).buffer(-0.25) for key, p in sorted(parts.items())}
