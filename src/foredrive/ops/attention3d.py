@@ -1,0 +1,57 @@
+"""Multi-head deformable attention in a volume."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.ops.precision import full_precision
+
+
+def attend_volume(
+    values: Float[Tensor, "b Z Y X D"],
+    points: Float[Tensor, "b Q H P 3"],
+    weights: Float[Tensor, "b Q H P"],
+) -> Float[Tensor, "b Q D"]:
+    """Multi-head deformable attention (Zhu et al. 2021, eq. 2) in 3-D.
+
+    Head h reads channels [h·D/H, (h+1)·D/H) at its P points, trilinearly, zero outside, and takes the
+    weighted sum.
+
+    Args:
+        values: channels last.
+        points: x y z in voxel units (voxel i spans [i, i + 1)).
+        weights: attention weights, already normalised over P.
+
+    Returns:
+        float32 (float64 for float64 input), also from half precision.
+
+    Raises:
+        ValueError: if D is not a multiple of H or shapes do not agree.
+    """
+    b, queries, heads, per_head = weights.shape
+    if points.shape != (b, queries, heads, per_head, 3) or len(values) != b or values.shape[-1] % heads:
+        shapes = {
+            n: tuple(t.shape) for n, t in {"values": values, "points": points, "weights": weights}.items()
+        }
+        raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
+    return attend_volume_reference(values, points, weights)
+
+
+def attend_volume_reference(
+    values: Float[Tensor, "b Z Y X D"],
+    points: Float[Tensor, "b Q H P 3"],
+    weights: Float[Tensor, "b Q H P"],
+) -> Float[Tensor, "b Q D"]:
+    """`attend_volume` in plain PyTorch."""
+    with full_precision(values, points, weights) as (values, points, weights):
+        b, _, heads, _ = weights.shape
+        size_xyz = points.new_tensor(values.shape[1:4][::-1])
+        grid = 2 * points.clamp(-torch.ones_like(size_xyz), size_xyz + 1) / size_xyz - 1
+        maps = values.unflatten(-1, (heads, -1)).permute(0, 4, 5, 1, 2, 3)  # [b H D/H Z Y X]
+        grid = grid.transpose(1, 2).flatten(0, 1)[:, None]  # [b·H 1 Q P 3]
+        read = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)
+        read = read[:, :, 0].unflatten(0, (b, heads))  # [b H D/H Q P]
+        read = read.masked_fill(points.isnan().any(-1).transpose(1, 2)[:, :, None], torch.nan)
+        total = (read * weights.transpose(1, 2)[:, :, None]).sum(-1)  # [b H D/H Q]
+        return total.permute(0, 3, 1, 2).flatten(2)

@@ -1,0 +1,70 @@
+"""Reading volumes between their voxels, and warping them (NeMo eq. 7-8).
+
+Coordinates in volumes are in voxel units, order x y z: voxel i spans [i, i + 1), its centre lies at i + 0.5.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.geometry.se3 import transform_points
+from foredrive.ops.precision import full_precision
+
+
+def sample_volume(
+    volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
+) -> Float[Tensor, "b N D"]:
+    """Trilinear reading of a volume, zero outside.
+
+    Args:
+        volume: channels last.
+        points: x y z in voxel units. NaN reads NaN, infinity reads 0.
+
+    Returns:
+        float32 (float64 for float64 input), also from half precision.
+    """
+    return sample_volume_reference(volume, points)
+
+
+def sample_volume_reference(
+    volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
+) -> Float[Tensor, "b N D"]:
+    """`sample_volume` in plain PyTorch."""
+    with full_precision(volume, points) as (volume, points):
+        size_xyz = points.new_tensor(volume.shape[1:4][::-1])
+        grid = 2 * points.clamp(-torch.ones_like(size_xyz), size_xyz + 1) / size_xyz - 1
+        read = F.grid_sample(volume.permute(0, 4, 1, 2, 3), grid[:, None, None], align_corners=False)
+        read = read[:, :, 0, 0].transpose(1, 2)
+        return read.masked_fill(points.isnan().any(-1, keepdim=True), torch.nan)
+
+
+def warp_volume(
+    volume: Float[Tensor, "b D Z Y X"],
+    flow: Float[Tensor, "b 3 Z Y X"],
+    T_src_dst: Float[Tensor, "b 4 4"],
+    lower_m: tuple[float, float, float],
+    voxel_m: float,
+) -> Float[Tensor, "b D Z Y X"]:
+    """Move a volume by a flow and a rigid motion, by gathering (NeMo eq. 7-8).
+
+    out[z] = volume[R (z + f(z)) + t] at every voxel centre z (m, ego frame) of the result. The result lies in
+    the frame dst (the future), the given volume in src (now): flow and (R, t) = `T_src_dst` both lead from
+    the future frame's coordinates back to now's. Zero where that falls outside the volume.
+
+    Args:
+        volume: on a grid in the frame src; no copy is made if it lies channels-last in memory.
+        flow: f, metres along x y z of dst.
+        T_src_dst: points of dst -> src.
+        lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, the same in both frames.
+    """
+    with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
+        b, _, depth, height, width = volume.shape
+        axes = [torch.arange(n, dtype=flow.dtype, device=flow.device) for n in (depth, height, width)]
+        z, y, x = torch.meshgrid(*axes, indexing="ij")
+        lower = flow.new_tensor(lower_m)
+        centres_m = (torch.stack([x, y, z], dim=-1) + 0.5) * voxel_m + lower  # [Z Y X 3]
+        target_m = (centres_m + flow.permute(0, 2, 3, 4, 1)).flatten(1, 3)
+        source = (transform_points(T_src_dst, target_m) - lower) / voxel_m
+        read = sample_volume(volume.permute(0, 2, 3, 4, 1), source)
+        return read.view(b, depth, height, width, -1).permute(0, 4, 1, 2, 3)
