@@ -139,7 +139,7 @@ class LiftingEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.spec = spec
-        centres = spec.centres_m().flatten(0, 2)
+        centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
         self.register_buffer("place", place, persistent=False)

@@ -101,7 +101,7 @@ class VolumePlanner(nn.Module):
             [self.command(command), self.speed(speed), self.plan.expand(len(command), -1)], dim=-1
         )
         decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        steps = self.waypoints(decoded).float().view(b, 1, self.horizon_steps, 2)
+        steps = self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
         xy = steps.cumsum(dim=2)
         return Trajectory(
             xy=xy,

@@ -19,8 +19,8 @@ def nemo_tiny() -> Recipe:
         model=NemoSize(
             backbone=BackboneSize(
                 embedding_size=24,
-                hidden_sizes=(24, 48, 96, 128),
-                depths=(1, 1, 1, 1),
+                hidden_sizes=(24, 48, 96),
+                depths=(1, 1, 1),
                 layer_type="basic",
                 stages=("stage1", "stage2", "stage3"),
             ),
@@ -58,7 +58,15 @@ def nemo_base() -> Recipe:
     Constants of §4.1; what it leaves open: D = 64, three rounds of lifting with 8 heads and 8 points, four
     pyramid levels, T_f = 3 at 0.5 s, images of 450×800, λ_perc = 0.1 (Video Autoencoder).
     """
-    stage = {"batch_size": 1, "lr": 2e-4, "epochs": 10, "weight_decay": 1e-2, "warmup_steps": 500}
+    schedule = Schedule(
+        batch_size=1,
+        lr=2e-4,
+        epochs=10,
+        weight_decay=1e-2,
+        warmup_steps=500,
+        checkpoint_every=1000,
+        workers=4,
+    )
     return Recipe(
         name="nemo_base",
         clips=ClipConfig(
@@ -92,13 +100,13 @@ def nemo_base() -> Recipe:
             attention_pool=(4, 8, 8),
         ),
         pretrain=Stage(
-            schedule=Schedule(**stage, workers=4),
+            schedule=schedule,
             weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=8,
             vgg16="download",
         ),
         finetune=Stage(
-            schedule=Schedule(**stage, workers=4),
+            schedule=schedule,
             weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
             vgg16="download",

@@ -109,6 +109,7 @@ def train(
         with _progress(fabric) as progress:
             task = progress.add_task(folder.name, total=total, completed=done, note="")
             for example in loader:
+                assert isinstance(example, Example)
                 losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
                 step += 1
                 if log is not None:
@@ -206,7 +207,7 @@ class MetricsLog:
         self.started = now
 
 
-def read_metrics(path: Path) -> list[dict[str, float]]:
+def read_metrics(path: Path) -> list[dict[str, float | int]]:
     """Whole lines of a metrics file; a last line cut off by a crash is left out."""
     lines = []
     for text in path.read_text().splitlines() if path.exists() else []:

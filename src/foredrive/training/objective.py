@@ -51,6 +51,7 @@ class NemoObjective(nn.Module):
         super().__init__()
         self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
         self.image_features = image_features
+        agent.planner.requires_grad_(weights.wpts > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""

@@ -39,12 +39,16 @@ class MotionFlow(nn.Module):
         super().__init__()
         self.steps = steps
         wide = channels * frames
+        to_flow = nn.Conv3d(hidden, 3 * steps, 3, padding=1)
+        to_xi = nn.Linear(4 * hidden, 6 * steps)
+        for parameter in (*to_flow.parameters(), *to_xi.parameters()):
+            nn.init.zeros_(parameter)  # start from no motion
         self.flow = nn.Sequential(
             nn.Conv3d(wide, hidden, 3, padding=1),
             nn.ReLU(),
             nn.Conv3d(hidden, hidden, 3, padding=1),
             nn.ReLU(),
-            nn.Conv3d(hidden, 3 * steps, 3, padding=1),
+            to_flow,
         )
         self.rigid = nn.Sequential(
             nn.Conv3d(wide, hidden, 3, padding=1, stride=2),
@@ -55,11 +59,8 @@ class MotionFlow(nn.Module):
             nn.Flatten(),
             nn.Linear(2 * hidden * 16, 4 * hidden),
             nn.ReLU(),
-            nn.Linear(4 * hidden, 6 * steps),
+            to_xi,
         )
-        for last in (self.flow[-1], self.rigid[-1]):
-            nn.init.zeros_(last.weight)  # start from no motion
-            nn.init.zeros_(last.bias)
 
     def forward(self, volumes: Float[Tensor, "b T D Z Y X"]) -> Motion:
         """Args: volumes of the past and of now (last), each in its own ego frame."""

@@ -1,5 +1,7 @@
 """NeMo's world model: images to volume, occupancy, motion, imagined futures."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -40,8 +42,9 @@ class Nemo(nn.Module):
         super().__init__()
         self.backbone, self.encoder, self.motion, self.renderer = backbone, encoder, motion, renderer
         self.past_frames = past_frames
-        self.occupancy = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, 1))
-        nn.init.constant_(self.occupancy[-1].bias, torch.logit(torch.tensor(OCCUPIED_PRIOR)).item())
+        to_logit = nn.Linear(hidden, 1)
+        nn.init.constant_(to_logit.bias, math.log(OCCUPIED_PRIOR / (1 - OCCUPIED_PRIOR)))
+        self.occupancy = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), to_logit)
 
     @property
     def spec(self) -> VoxelSpec:

@@ -1,0 +1,75 @@
+"""Backbone and VGG features: levels, and weights that are there or are not."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from foredrive.errors import InputError
+from foredrive.models.backbone import ImageBackbone, normalise_images
+from foredrive.models.vgg import Vgg16Features
+
+SIZE = {
+    "embedding_size": 8,
+    "hidden_sizes": (8, 16, 24, 32),
+    "depths": (1, 1, 1, 1),
+    "layer_type": "basic",
+    "stages": ("stage1", "stage3"),
+    "channels": 12,
+}
+
+
+def test_levels_have_the_strides_of_their_stages() -> None:
+    levels = ImageBackbone(**SIZE)(torch.zeros(2, 3, 64, 96, dtype=torch.uint8))
+    assert [tuple(level.shape) for level in levels] == [(2, 16, 24, 12), (2, 4, 6, 12)]
+
+
+def test_white_is_normalised_as_imagenet_does() -> None:
+    white = normalise_images(torch.full((1, 3, 1, 1), 255, dtype=torch.uint8)).flatten()
+    torch.testing.assert_close(white, torch.tensor([2.2489, 2.4286, 2.6400]), atol=1e-3, rtol=0)
+
+
+def test_saved_resnet_weights_are_loaded(tmp_path: Path) -> None:
+    original = ImageBackbone(**SIZE)
+    original.resnet.save_pretrained(tmp_path)
+    loaded = ImageBackbone(**SIZE, weights=str(tmp_path))
+    assert loaded.pretrained
+    torch.testing.assert_close(loaded.resnet.state_dict(), original.resnet.state_dict())
+
+
+def test_missing_weights_are_said_loudly(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="RANDOM weights"):
+        backbone = ImageBackbone(**SIZE, weights=str(tmp_path / "nothing_here"))
+    assert not backbone.pretrained
+
+
+def vgg_state() -> dict[str, torch.Tensor]:
+    widths = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512]
+    index = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21]
+    rng = torch.Generator().manual_seed(0)
+    state = {}
+    for layer, source, target in zip(index, widths[:-1], widths[1:], strict=True):
+        state[f"features.{layer}.weight"] = torch.randn(target, source, 3, 3, generator=rng) * 0.05
+        state[f"features.{layer}.bias"] = torch.zeros(target)
+    return state | {"classifier.0.weight": torch.zeros(1)}
+
+
+def test_vgg_loads_torchvisions_names_and_taps_four_layers(tmp_path: Path) -> None:
+    save_file(vgg_state(), tmp_path / "vgg.safetensors")
+    vgg = Vgg16Features(tmp_path / "vgg.safetensors").train()
+    assert not vgg.training
+    taps = vgg(torch.rand(1, 3, 32, 48))
+    assert [tuple(tap.shape[1:]) for tap in taps] == [(64, 32, 48), (128, 16, 24), (256, 8, 12), (512, 4, 6)]
+    assert all((tap >= 0).all() for tap in taps)  # after the ReLU
+    assert not any(parameter.requires_grad for parameter in vgg.parameters())
+
+
+def test_vgg_weights_that_are_not(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        Vgg16Features(tmp_path / "vgg.safetensors")
+    state = vgg_state()
+    del state["features.21.weight"]
+    save_file(state, tmp_path / "vgg.safetensors")
+    with pytest.raises(InputError, match=r"lacks features\.21\.weight"):
+        Vgg16Features(tmp_path / "vgg.safetensors")

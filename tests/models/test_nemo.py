@@ -1,0 +1,203 @@
+"""NeMo's parts on cases whose answers are known, and the agent as a whole."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from foredrive.errors import InputError
+from foredrive.models.nemo import NemoAgent, VolumeRenderer
+from foredrive.recipes.build import build_agent, build_objective
+from foredrive.recipes.config import Recipe
+from foredrive.recipes.nemo import nemo_base, nemo_tiny
+from foredrive.scene import Command, Example, VoxelSpec
+
+SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
+
+
+def small_recipe() -> Recipe:
+    """nemo_tiny on a grid small enough for unit tests."""
+    recipe = nemo_tiny()
+    return dataclasses.replace(
+        recipe,
+        clips=dataclasses.replace(recipe.clips, voxels=SPEC),
+        model=dataclasses.replace(recipe.model, channels=16, ray_samples=16, ray_far_m=12.0),
+    )
+
+
+@pytest.fixture
+def agent() -> NemoAgent:
+    torch.manual_seed(0)
+    return build_agent(small_recipe()).eval()
+
+
+@pytest.fixture
+def example(make_example: Callable[..., Example]) -> Example:
+    return make_example(spec=SPEC, batch=2, past=1, future=2, cameras=4)
+
+
+def test_a_voxel_straight_ahead_is_seen_by_the_front_camera_alone(agent: NemoAgent, example: Example) -> None:
+    seen = example.clip.observed().frames([-1])
+    rig = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+    uv, visible = agent.world_model.encoder.project(rig, seen.image_valid.flatten(0, 1))
+    centres = agent.world_model.encoder.centres_m
+    ahead = int((centres - torch.tensor([6.5, 0.5, 1.5])).norm(dim=-1).argmin())
+    assert visible[0, :, ahead].tolist() == [True, False, False, False]
+    # Camera at 1.6 m height, focal length 40 px, principal point (32, 16), image 32×64.
+    expected = torch.tensor([(32 - 40 * 0.5 / 6.5) / 64, (16 + 40 * 0.1 / 6.5) / 32])
+    torch.testing.assert_close(uv[0, 0, ahead], expected, atol=1e-4, rtol=0)
+
+
+def test_a_missing_image_is_not_looked_at(agent: NemoAgent, example: Example) -> None:
+    clip = example.clip.observed()
+    masked = clip.image_valid.clone()
+    masked[:, :, 0] = False
+    other = clip.images.clone()
+    other[:, :, 0] = 255 - other[:, :, 0]
+    with torch.no_grad():
+        a = agent.world_model.observe(dataclasses.replace(clip, image_valid=masked)).volume
+        b = agent.world_model.observe(dataclasses.replace(clip, image_valid=masked, images=other)).volume
+        unmasked = agent.world_model.observe(dataclasses.replace(clip, images=other)).volume
+    torch.testing.assert_close(a, b)
+    assert not torch.allclose(a, unmasked)
+
+
+def test_nothing_after_now_reaches_the_plan(agent: NemoAgent, example: Example) -> None:
+    clip = example.clip
+    images = clip.images.clone()
+    images[:, clip.now + 1 :] = 0
+    pose = clip.T_world_ego.clone()
+    pose[:, clip.now + 1 :, 0, 3] += 100
+    changed = dataclasses.replace(clip, images=images, T_world_ego=pose)
+    torch.testing.assert_close(agent.act(clip.observed()).xy, agent.act(changed.observed()).xy)
+    with pytest.raises(InputError, match=r"observed\(\)"):
+        agent.world_model.observe(clip)
+
+
+def test_too_few_frames_are_refused(agent: NemoAgent, example: Example) -> None:
+    with pytest.raises(InputError, match="needs 1 frames before now"):
+        agent.world_model.observe(example.clip.observed().frames([-1]))
+
+
+def test_without_motion_the_future_is_the_present(agent: NemoAgent, example: Example) -> None:
+    """Motion starts at zero (its last layers do), so imagining must not change anything."""
+    with torch.no_grad():
+        belief = agent.world_model.observe(example.clip.observed())
+        futures = agent.world_model.imagine(belief, 2)
+    for future in futures:
+        torch.testing.assert_close(future.volume, belief.volume, atol=1e-5, rtol=0)
+        torch.testing.assert_close(future.T_now_ego, torch.eye(4).expand(2, 4, 4))
+    with pytest.raises(InputError, match="1 to 2 steps"):
+        agent.world_model.imagine(belief, 3)
+    with pytest.raises(InputError, match="takes no actions"):
+        agent.world_model.imagine(belief, 1, torch.zeros(2, 1, 2))
+
+
+def test_driving_forward_moves_the_volume_back(agent: NemoAgent, example: Example) -> None:
+    """Two metres ahead per step: what was at x + 2 is at x, and the poses chain up."""
+    motion = agent.world_model.motion
+    with torch.no_grad():
+        motion.rigid[-1].bias.view(2, 6)[:, 0] = 2.0 / 0.1
+        belief = agent.world_model.observe(example.clip.observed())
+        first, second = agent.world_model.imagine(belief, 2)
+    torch.testing.assert_close(first.volume[..., :-2], belief.volume[..., 2:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(second.volume[..., :-4], belief.volume[..., 4:], atol=1e-4, rtol=0)
+    assert second.T_now_ego is not None
+    torch.testing.assert_close(second.T_now_ego[0, :3, 3], torch.tensor([4.0, 0.0, 0.0]))
+
+
+def test_rays_stop_at_a_wall_and_pass_through_air() -> None:
+    renderer = VolumeRenderer(SPEC, channels=2, near_m=0.5, far_m=7.5, samples=28, hidden=8)
+    logit = torch.full((1, *SPEC.shape_zyx), -30.0)
+    logit[..., 12] = 30.0  # opaque from x = 4 to 5 m
+    feature = torch.zeros(1, 2, *SPEC.shape_zyx)
+    direction = torch.tensor([[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]])
+    rays = renderer(feature, logit, torch.zeros(1, 2, 3) + torch.tensor([0.0, 0.2, 0.7]), direction)
+    assert rays.alpha[0, 0] > 0.999
+    assert 3.5 < rays.range_m[0, 0] < 4.5
+    assert rays.alpha[0, 1] < 1e-3
+    assert rays.range_m[0, 1] == pytest.approx(7.5, abs=1e-2)
+
+
+def test_what_passes_through_shows_the_background() -> None:
+    renderer = VolumeRenderer(SPEC, channels=2, near_m=0.5, far_m=7.5, samples=8, hidden=8)
+    with torch.no_grad():
+        renderer.background.copy_(torch.tensor([3.0, -1.0]))
+    empty = torch.full((1, *SPEC.shape_zyx), -30.0)
+    rays = renderer(
+        torch.ones(1, 2, *SPEC.shape_zyx), empty, torch.zeros(1, 1, 3), torch.tensor([[[1.0, 0.0, 0.0]]])
+    )
+    torch.testing.assert_close(
+        rays.rgb[0, 0], renderer.recon(renderer.background).sigmoid(), atol=1e-4, rtol=0
+    )
+
+
+def test_an_unknown_command_is_not_taken_for_a_known_one(agent: NemoAgent, example: Example) -> None:
+    clip = example.clip.observed()
+    with torch.no_grad():
+        plans = {
+            command: agent.act(dataclasses.replace(clip, command=torch.full((2,), int(command)))).xy
+            for command in Command
+        }
+        unknown = [
+            agent.act(
+                dataclasses.replace(
+                    clip,
+                    command=torch.full((2,), int(command)),
+                    command_valid=torch.zeros(2, dtype=torch.bool),
+                )
+            ).xy
+            for command in Command
+        ]
+    assert not torch.allclose(plans[Command.LEFT], plans[Command.RIGHT])
+    torch.testing.assert_close(unknown[0], unknown[1])
+    assert not any(torch.allclose(unknown[0], plan) for plan in plans.values())
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_every_trained_parameter_gets_a_gradient(stage: str, example: Example) -> None:
+    recipe = small_recipe()
+    torch.manual_seed(0)
+    objective = build_objective(recipe, getattr(recipe, stage), build_agent(recipe))
+    motion = objective.agent.world_model.motion
+    for last in (motion.flow[-1], motion.rigid[-1]):  # at exactly zero they pass no gradient on
+        torch.nn.init.normal_(last.weight, std=1e-3)
+    losses = objective(example, torch.Generator().manual_seed(0))
+    losses["loss"].backward()
+    silent = [
+        name
+        for name, parameter in objective.named_parameters()
+        if parameter.requires_grad and (parameter.grad is None or not parameter.grad.isfinite().all())
+    ]
+    assert not silent
+    assert all(math.isfinite(value.item()) for value in losses.values())
+    planner_trained = objective.agent.planner.plan.requires_grad
+    assert planner_trained == (stage == "finetune") == ("wpts" in losses)
+
+
+def test_the_same_generator_gives_the_same_losses(example: Example) -> None:
+    recipe = small_recipe()
+    objective = build_objective(recipe, recipe.pretrain, build_agent(recipe)).eval()
+    a, b, c = (objective(example, torch.Generator().manual_seed(seed))["l1"].item() for seed in (1, 1, 2))
+    assert a == b != c
+
+
+def test_nemo_base_has_the_papers_size() -> None:
+    recipe = dataclasses.replace(
+        nemo_base(),
+        model=dataclasses.replace(
+            nemo_base().model, backbone=dataclasses.replace(nemo_base().model.backbone, weights=None)
+        ),
+    )
+    with torch.device("meta"):
+        agent = build_agent(recipe)
+    assert agent.world_model.encoder.query.shape == (200 * 200 * 16, 64)
+    assert agent.planner.plan.shape == (256,)
+    parameters = sum(parameter.numel() for parameter in agent.parameters())
+    assert 70e6 < parameters < 75e6
+    schedule = recipe.pretrain.schedule
+    assert (schedule.lr, schedule.weight_decay, schedule.epochs) == (2e-4, 1e-2, 10)
+    weights = recipe.finetune.weights
+    assert (weights.scal, weights.bce, weights.wpts, weights.recon, weights.occ) == (10, 1, 1, 0.5, 0.5)
