@@ -51,35 +51,37 @@ def pack_beams(sweep: LidarSweep) -> dict[str, Any]:
     which = which.reshape(-1).astype(np.uint16)
     is_return = returned[returned | missed]
     return {
-        "origin_steps": _squeeze(origins),
-        "return_origin": _squeeze(which[is_return]),
-        "miss_origin": _squeeze(which[~is_return]),
-        "miss_direction": _squeeze(
+        "origin_steps": squeeze_array(origins),
+        "return_origin": squeeze_array(which[is_return]),
+        "miss_origin": squeeze_array(which[~is_return]),
+        "miss_direction": squeeze_array(
             np.round(sweep.dir_ego.numpy()[missed] / _DIRECTION_STEP).astype(np.int16)
         ),
-        "miss_range_m": _squeeze(sweep.range_m.numpy()[missed].astype(np.float32)),
-        "miss_dt_us": _squeeze(np.round(sweep.dt_s.numpy()[missed] * 1e6).astype(np.int32)),
-        "miss_beam": _squeeze(sweep.beam.numpy()[missed].astype(np.int16)),
+        "miss_range_m": squeeze_array(sweep.range_m.numpy()[missed].astype(np.float32)),
+        "miss_dt_us": squeeze_array(np.round(sweep.dt_s.numpy()[missed] * 1e6).astype(np.int32)),
+        "miss_beam": squeeze_array(sweep.beam.numpy()[missed].astype(np.int16)),
     }
 
 
 def unpack_beams(data: dict[str, Any]) -> tuple[Float[np.ndarray, "R 3"], LidarSweep]:
     """Origins of the returns in the order of the lidar modality's points (m, ego frame), and the misses."""
-    origins = _expand(data["origin_steps"]).reshape(-1, 3).astype(np.float32) * np.float32(_ORIGIN_STEP_M)
-    direction = _expand(data["miss_direction"]).astype(np.float32)
+    origins = expand_array(data["origin_steps"]).reshape(-1, 3).astype(np.float32) * np.float32(
+        _ORIGIN_STEP_M
+    )
+    direction = expand_array(data["miss_direction"]).astype(np.float32)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True).clip(min=1)
     count = len(direction)
     misses = LidarSweep(
-        origin_ego=torch.from_numpy(origins[_expand(data["miss_origin"])]),
+        origin_ego=torch.from_numpy(origins[expand_array(data["miss_origin"])]),
         dir_ego=torch.from_numpy(direction),
-        range_m=torch.from_numpy(_expand(data["miss_range_m"]).copy()),
+        range_m=torch.from_numpy(expand_array(data["miss_range_m"]).copy()),
         returned=torch.zeros(count, dtype=torch.bool),
         intensity=torch.zeros(count),
-        dt_s=torch.from_numpy((_expand(data["miss_dt_us"]) * 1e-6).astype(np.float32)),
-        beam=torch.from_numpy(_expand(data["miss_beam"]).astype(np.int64)),
+        dt_s=torch.from_numpy((expand_array(data["miss_dt_us"]) * 1e-6).astype(np.float32)),
+        beam=torch.from_numpy(expand_array(data["miss_beam"]).astype(np.int64)),
         valid=torch.ones(count, dtype=torch.bool),
     )
-    return origins[_expand(data["return_origin"])], misses
+    return origins[expand_array(data["return_origin"])], misses
 
 
 def occupancy_metadata(spec: VoxelSpec) -> CustomModalityMetadata:
@@ -93,9 +95,9 @@ def pack_occupancy(occupancy: FullOccupancy) -> dict[str, Any]:
     flat = np.ravel_multi_index(tuple(occupancy.index_zyx.T), occupancy.spec.shape_zyx)
     order = np.argsort(flat, kind="stable")
     return {
-        "voxel_step": _squeeze(np.diff(flat[order], prepend=0).astype(np.uint32)),
-        "category": _squeeze(occupancy.category[order].astype(np.int8)),
-        "velocity_mps": _squeeze(occupancy.velocity_mps[order].astype(np.float16)),
+        "voxel_step": squeeze_array(np.diff(flat[order], prepend=0).astype(np.uint32)),
+        "category": squeeze_array(occupancy.category[order].astype(np.int8)),
+        "velocity_mps": squeeze_array(occupancy.velocity_mps[order].astype(np.float16)),
     }
 
 
@@ -103,22 +105,24 @@ def unpack_occupancy(data: dict[str, Any], metadata: CustomModalityMetadata) -> 
     """Inverse of `pack_occupancy`; voxels come in the order of their flat index."""
     grid = metadata.metadata
     spec = VoxelSpec(tuple(grid["lower_m"]), grid["voxel_m"], tuple(grid["shape_zyx"]))
-    flat = np.cumsum(_expand(data["voxel_step"]), dtype=np.int64)
+    flat = np.cumsum(expand_array(data["voxel_step"]), dtype=np.int64)
     return FullOccupancy(
         spec=spec,
         index_zyx=np.stack(np.unravel_index(flat, spec.shape_zyx), axis=-1),
-        category=_expand(data["category"]).astype(np.int64),
-        velocity_mps=_expand(data["velocity_mps"]).astype(np.float32),
+        category=expand_array(data["category"]).astype(np.int64),
+        velocity_mps=expand_array(data["velocity_mps"]).astype(np.float32),
     )
 
 
-def _squeeze(array: np.ndarray) -> dict[str, Any]:
+def squeeze_array(array: np.ndarray) -> dict[str, Any]:
+    """An array as plain values that msgpack can hold, zstd-compressed."""
     data = np.ascontiguousarray(array).tobytes()
     packed = pa.compress(data, codec="zstd", asbytes=True) if data else b""
     return {"zstd": packed, "dtype": array.dtype.str, "shape": list(array.shape)}
 
 
-def _expand(packed: dict[str, Any]) -> np.ndarray:
+def expand_array(packed: dict[str, Any]) -> np.ndarray:
+    """Inverse of `squeeze_array`; the result is read-only."""
     dtype, shape = np.dtype(packed["dtype"]), packed["shape"]
     size = dtype.itemsize * int(np.prod(shape))
     data = pa.decompress(packed["zstd"], decompressed_size=size, codec="zstd", asbytes=True) if size else b""

@@ -1,0 +1,117 @@
+"""What a sweep says about a voxel grid: walking every beam through it (numba)."""
+
+import numba
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cast_beams(
+    origin: Float64[np.ndarray, "N 3"],
+    end: Float64[np.ndarray, "N 3"],
+    free_until: Float64[np.ndarray, "N"],
+    state_zyx: UInt8[np.ndarray, "Z Y X"],
+) -> None:
+    """Mark the UNKNOWN voxels that a beam passes through FREE.
+
+    Exact traversal (Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987): every voxel
+    whose inside the beam crosses is visited once. Scalars and a flat index, because small arrays in the inner
+    loop make it seven times slower.
+
+    Args:
+        origin: where the beams start, in voxels from the grid's lower corner, x y z.
+        end: where they end, likewise.
+        free_until: fraction of the way from origin to end up to which a beam is known to be free.
+        state_zyx: contiguous; changed in place.
+    """
+    nz, ny, nx = state_zyx.shape
+    state = state_zyx.reshape(-1)
+    for beam in range(origin.shape[0]):
+        ox, oy, oz = origin[beam, 0], origin[beam, 1], origin[beam, 2]
+        dx, dy, dz = end[beam, 0] - ox, end[beam, 1] - oy, end[beam, 2] - oz
+        enter, leave = _clip(ox, dx, nx, 0.0, free_until[beam])
+        enter, leave = _clip(oy, dy, ny, enter, leave)
+        enter, leave = _clip(oz, dz, nz, enter, leave)
+        if not enter < leave:
+            continue
+        x, step_x, next_x, delta_x = _start(ox, dx, nx, enter)
+        y, step_y, next_y, delta_y = _start(oy, dy, ny, enter)
+        z, step_z, next_z, delta_z = _start(oz, dz, nz, enter)
+        at = np.uint64((z * ny + y) * nx + x)
+        while True:
+            if state[at] == UNKNOWN:
+                state[at] = FREE
+            if next_x <= next_y and next_x <= next_z:
+                x += step_x
+                if next_x >= leave or x < 0 or x >= nx:
+                    break
+                at += np.uint64(step_x)
+                next_x += delta_x
+            elif next_y <= next_z:
+                y += step_y
+                if next_y >= leave or y < 0 or y >= ny:
+                    break
+                at += np.uint64(step_y * nx)
+                next_y += delta_y
+            else:
+                z += step_z
+                if next_z >= leave or z < 0 or z >= nz:
+                    break
+                at += np.uint64(step_z * ny * nx)
+                next_z += delta_z
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _clip(o: float, d: float, size: int, enter: float, leave: float) -> tuple[float, float]:
+    """Narrow the interval of a beam o + t d to what lies between 0 and size on one axis."""
+    if d == 0.0:
+        return enter, (leave if 0.0 <= o < size else -1.0)
+    near, far = -o / d, (size - o) / d
+    return max(enter, min(near, far)), min(leave, max(near, far))
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _start(o: float, d: float, size: int, enter: float) -> tuple[int, int, float, float]:
+    """Cell at t = enter, step, t at the next border, and t from border to border, on one axis."""
+    cell = min(max(int(np.floor(o + enter * d)), 0), size - 1)
+    if d > 0.0:
+        return cell, 1, (cell + 1 - o) / d, 1.0 / d
+    if d < 0.0:
+        return cell, -1, (cell - o) / d, -1.0 / d
+    return cell, 0, np.inf, np.inf
+
+
+@numba.njit(cache=True, nogil=True)
+def box_of_points(
+    points: Float64[np.ndarray, "N 3"],
+    centre: Float64[np.ndarray, "M 3"],
+    half_lwh: Float64[np.ndarray, "M 3"],
+    yaw: Float64[np.ndarray, "M"],
+) -> np.ndarray:
+    """Index of the box each point lies in, -1 for none; where boxes overlap, the one whose centre is nearest.
+
+    Returns:
+        Int64 [N].
+    """
+    found = np.full(len(points), -1, np.int64)
+    nearest2 = np.full(len(points), np.inf)
+    for box in range(len(centre)):
+        cos, sin = np.cos(yaw[box]), np.sin(yaw[box])
+        reach2 = half_lwh[box, 0] ** 2 + half_lwh[box, 1] ** 2
+        for n in range(len(points)):
+            x, y = points[n, 0] - centre[box, 0], points[n, 1] - centre[box, 1]
+            flat2 = x * x + y * y
+            if flat2 > reach2:
+                continue
+            z = points[n, 2] - centre[box, 2]
+            if (
+                abs(cos * x + sin * y) <= half_lwh[box, 0]
+                and abs(cos * y - sin * x) <= half_lwh[box, 1]
+                and abs(z) <= half_lwh[box, 2]
+                and flat2 + z * z < nearest2[n]
+            ):
+                found[n] = box
+                nearest2[n] = flat2 + z * z
+    return found

@@ -1,0 +1,180 @@
+"""Boxes of a 123D log in the ego frame, with Foredrive's categories and with velocities from the tracks."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get_sync_table
+from py123d.datatypes import ModalityType
+from py123d.datatypes.detections.box_detection_label import BoxDetectionLabel, DefaultBoxDetectionLabel
+from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
+from py123d.datatypes.vehicle_state.ego_state import EGO_TRACK_TOKEN
+from scipy.spatial.transform import Rotation
+
+from foredrive.data.log_writer import DATASET
+from foredrive.data.logs import Log, column_array, fixed_lists, reading
+from foredrive.errors import InputError
+from foredrive.scene import Boxes, Category
+
+_KEY = ModalityType.BOX_DETECTIONS_SE3.serialize()
+_LONGEST_DIFFERENCE_S = 1.5
+"""Sightings of a track further apart give no velocity, as in the nuScenes devkit's `box_velocity`."""
+
+_DEFAULT_CATEGORY = {
+    DefaultBoxDetectionLabel.VEHICLE: Category.CAR,
+    DefaultBoxDetectionLabel.TWO_WHEELER: Category.BICYCLE,
+    DefaultBoxDetectionLabel.PERSON: Category.PEDESTRIAN,
+    DefaultBoxDetectionLabel.ANIMAL: Category.ANIMAL,
+    DefaultBoxDetectionLabel.TRAFFIC_CONE: Category.TRAFFIC_CONE,
+    DefaultBoxDetectionLabel.BARRIER: Category.BARRIER,
+}
+"""py123d's common labels; what is not here is OTHER."""
+
+_FINER_CATEGORY = {
+    Category.TRUCK: (
+        "TRUCK BOX_TRUCK TRUCK_CAB LARGE_VEHICLE MEDIUM_SIZED_TRUCK SEMI_TRUCK HEAVY_TRUCK VEHICLE_TRUCK"
+    ),
+    Category.BUS: (
+        "BUS ARTICULATED_BUS SCHOOL_BUS VEHICLE_BUS VEHICLE_BUS_BENDY VEHICLE_BUS_RIGID TROLLEY_BUS"
+    ),
+    Category.TRAILER: (
+        "TRAILER VEHICULAR_TRAILER MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER CARAVAN TOWED_OBJECT "
+        "VEHICLE_TRAILER"
+    ),
+    Category.CONSTRUCTION_VEHICLE: "OTHER_VEHICLE_CONSTRUCTION_VEHICLE VEHICLE_CONSTRUCTION",
+    Category.MOTORCYCLE: "MOTORCYCLE MOTORIZED_SCOOTER VEHICLE_MOTORCYCLE",
+    Category.OTHER: "OTHER_VEHICLE_UNCOMMON OTHER_VEHICLE",
+}
+"""Native labels whose common label says less than a category. A name means the same in every data set."""
+
+_CATEGORY_OF_NAME = {name: category for category, names in _FINER_CATEGORY.items() for name in names.split()}
+
+
+def category_of(label: BoxDetectionLabel) -> Category:
+    """Category of a data set's own label."""
+    named = _CATEGORY_OF_NAME.get(label.name)
+    return named if named is not None else _DEFAULT_CATEGORY.get(label.to_default(), Category.OTHER)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """All boxes of a log, one row a box, in the order of time; world frame."""
+
+    first_row: Int64[np.ndarray, "R_1"]
+    """Row r of 123D's box table holds the boxes first_row[r] to first_row[r + 1]."""
+    centre: Float64[np.ndarray, "N 3"]
+    R_world_box: Float64[np.ndarray, "N 3 3"]
+    size_lwh: Float64[np.ndarray, "N 3"]
+    velocity: Float64[np.ndarray, "N 3"]
+    """NaN where neither the log nor its tracks say."""
+    track_id: Int64[np.ndarray, "N"]
+    category: Int64[np.ndarray, "N"]
+    is_ego: Bool[np.ndarray, "N"]
+
+
+def read_boxes(log: Log, frame: int) -> Boxes | None:
+    """Boxes at a frame, unbatched, in its ego frame, without the ego vehicle's own.
+
+    Velocities are over ground along the ego axes: as logged, else the centred difference of the track between
+    its neighbouring sightings, else NaN.
+
+    Returns:
+        None if the frame is not annotated.
+
+    Raises:
+        InputError: on boxes that cannot be read or are not finite.
+    """
+    file = log.file(_KEY)
+    if not file.is_file():
+        return None
+    with reading(file, "the boxes"):
+        tracks = _tracks(log, file.stat().st_mtime_ns)
+        sync = get_sync_table(log.path.folder)
+        row = sync[_KEY][log.iteration(frame)].as_py() if _KEY in sync.column_names else None
+    if row is None:
+        return None
+    rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
+    rows = rows[~tracks.is_ego[rows]]
+    T_ego_world = np.linalg.inv(log.T_world_ego[frame])
+    R_ego_box = T_ego_world[:3, :3] @ tracks.R_world_box[rows]
+    centre = tracks.centre[rows] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+    velocity = tracks.velocity[rows] @ T_ego_world[:3, :3].T
+    return Boxes(
+        centre=torch.from_numpy(centre).float(),
+        size_lwh=torch.from_numpy(tracks.size_lwh[rows]).float(),
+        yaw=torch.from_numpy(np.arctan2(R_ego_box[:, 1, 0], R_ego_box[:, 0, 0])).float(),
+        velocity=torch.from_numpy(velocity[:, :2]).float(),
+        track_id=torch.from_numpy(tracks.track_id[rows]),
+        category=torch.from_numpy(tracks.category[rows]),
+        valid=torch.ones(len(rows), dtype=torch.bool),
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _tracks(log: Log, _mtime_ns: int) -> Tracks:
+    """The whole box table; a few logs' are kept, because neighbouring frames come from the same log."""
+    table = get_modality_table(log.path.folder, _KEY)
+    metadata = log.scene.get_modality_metadata(ModalityType.BOX_DETECTIONS_SE3)
+    if table is None or not isinstance(metadata, BoxDetectionsSE3Metadata):
+        raise ValueError("its label set is not known here")
+    column = {name.split(".")[-1]: column_array(table, name) for name in table.column_names}
+    lists = column["bounding_box_se3"]
+    first_row = lists.offsets.to_numpy().astype(np.int64) - lists.offsets[0].as_py()
+    box = lists.flatten().flatten().to_numpy(zero_copy_only=False).reshape(-1, 10)
+    tokens = np.array(column["track_token"].flatten().to_pylist(), dtype=object)
+    labels = column["label"].flatten().to_numpy(zero_copy_only=False)
+    label_class = metadata.box_detection_label_class
+    of_label = {int(value): label_class(int(value)) for value in np.unique(labels)}
+    bad = ~np.isfinite(box).all(-1) | (np.linalg.norm(box[:, 3:7], axis=-1) < 0.5)
+    if bad.any():
+        row = np.searchsorted(first_row, bad.argmax(), side="right") - 1
+        raise InputError(f"{log.file(_KEY)}: a box in row {row} is not finite")
+    track_id = _track_ids(tokens)
+    t_s = np.repeat(column["timestamp_us"].to_numpy() * 1e-6, np.diff(first_row))
+    logged = fixed_lists(column["velocity_3d"].flatten(), 3)
+    if log.metadata.dataset != DATASET:
+        logged[(logged == 0).all(-1)] = np.nan  # what py123d's parsers write when they do not know
+    difference = _track_velocity(track_id, t_s, box[:, :3])
+    return Tracks(
+        first_row=first_row,
+        centre=box[:, :3],
+        R_world_box=Rotation.from_quat(box[:, 3:7], scalar_first=True).as_matrix().reshape(-1, 3, 3),
+        size_lwh=box[:, 7:],
+        velocity=np.where(np.isfinite(logged), logged, difference),
+        track_id=track_id,
+        category=np.array([category_of(of_label[label]) for label in labels], dtype=np.int64),
+        is_ego=np.array(
+            [
+                token == EGO_TRACK_TOKEN or of_label[label].to_default() == DefaultBoxDetectionLabel.EGO
+                for token, label in zip(tokens, labels, strict=True)
+            ],
+            dtype=bool,
+        ),
+    )
+
+
+def _track_ids(tokens: np.ndarray) -> Int64[np.ndarray, "N"]:
+    """Tokens that are numbers stand for themselves; others are numbered in the order of their names."""
+    if all(token.isdecimal() and len(token) < 19 for token in tokens):
+        return np.array([int(token) for token in tokens], dtype=np.int64)
+    return np.unique(tokens.astype(str), return_inverse=True)[1].astype(np.int64)
+
+
+def _track_velocity(
+    track_id: Int64[np.ndarray, "N"], t_s: Float64[np.ndarray, "N"], centre: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    """Difference between the sightings of a track before and after each box; one-sided at the ends."""
+    order = np.lexsort((t_s, track_id))
+    track, at, xyz = track_id[order], t_s[order], centre[order]
+    joined = (np.diff(track) == 0) & (np.diff(at) <= _LONGEST_DIFFERENCE_S)
+    before = np.arange(len(order)) - np.concatenate([[False], joined])[: len(order)]
+    after = np.arange(len(order)) + np.concatenate([joined, [False]])[: len(order)]
+    span_s = at[after] - at[before]
+    velocity = np.full_like(xyz, np.nan)
+    known = span_s > 0
+    velocity[known] = (xyz[after] - xyz[before])[known] / span_s[known, None]
+    out = np.empty_like(velocity)
+    out[order] = velocity
+    return out

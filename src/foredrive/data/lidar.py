@@ -1,0 +1,124 @@
+"""Lidar sweeps of a 123D log, in the ego frame, with the origin of every beam."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from py123d.datatypes import Lidar, LidarMergedMetadata, LidarMetadata, ModalityType
+from py123d.datatypes.custom.custom_modality import CustomModality
+from torch import Tensor
+
+from foredrive.data.logs import Log, reading
+from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams
+from foredrive.scene import LidarSweep
+
+_LONGEST_SWEEP_US = 1_000_000
+_NEAREST_RETURN_M = 1e-3
+
+
+def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
+    """The sweep at a frame, unbatched, and whether it holds the beams that did not return.
+
+    Returns of all lidars are taken together. Where points carry times, the origin of each beam is where the
+    sensor was at its own time, in the ego frame at the frame's time, to which the points are compensated.
+
+    Returns:
+        None if the log has no lidar at this frame.
+
+    Raises:
+        InputError: on a sweep that cannot be read.
+    """
+    origins, misses = _recorded_beams(log, frame)
+    parts = []
+    for key, metadata in log.scene.get_all_modality_metadatas().items():
+        if not isinstance(metadata, LidarMetadata | LidarMergedMetadata):
+            continue
+        with reading(log.file(key), f"the sweep at frame {frame}"):
+            lidar = log.scene.get_modality_at_iteration(
+                log.iteration(frame), ModalityType.LIDAR, metadata.modality_id
+            )
+            if isinstance(lidar, Lidar):
+                parts.append(_returns(log, frame, lidar, origins))
+    if not parts:
+        return None
+    if misses is not None:
+        parts.append(misses)
+    return concatenate(parts), misses is not None
+
+
+def _recorded_beams(log: Log, frame: int) -> tuple[Float[np.ndarray, "R 3"] | None, LidarSweep | None]:
+    """Beam origins of the returns and the misses, in logs that have them."""
+    with reading(log.file(f"custom.{LIDAR_BEAMS}"), f"the beams at frame {frame}"):
+        beams = log.scene.get_custom_modality_at_iteration(log.iteration(frame), LIDAR_BEAMS)
+        return unpack_beams(beams.data) if isinstance(beams, CustomModality) else (None, None)
+
+
+def concatenate(sweeps: list[LidarSweep]) -> LidarSweep:
+    """Several unbatched sweeps as one."""
+    names = ("origin_ego", "dir_ego", "range_m", "returned", "intensity", "dt_s", "beam", "valid")
+    return LidarSweep(*(torch.cat([getattr(sweep, name) for sweep in sweeps]) for name in names))
+
+
+def empty_sweep() -> LidarSweep:
+    """A sweep of no beams."""
+    nothing = np.zeros((0, 3), dtype=np.float32)
+    return _sweep(nothing, nothing, np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3"] | None) -> LidarSweep:
+    T_ego_imu = np.linalg.inv(log.T_imu_ego)
+    points = lidar.xyz.astype(np.float64).reshape(-1, 3) @ T_ego_imu[:3, :3].T + T_ego_imu[:3, 3]
+    count = len(points)
+    dt_us = np.zeros(count)
+    if lidar.timestamps is not None:
+        since = lidar.timestamps - log.t_us[frame]
+        if (np.abs(since) <= _LONGEST_SWEEP_US).all():  # some data sets stamp points by another clock
+            dt_us = since.astype(np.float64)
+    if origins is None:
+        origins = _origins(log, frame, lidar, dt_us)
+    if len(origins) != count:
+        raise ValueError(f"{count} points, but {len(origins)} beams that returned")
+    intensity = lidar.intensity if lidar.intensity is not None else np.zeros(count)
+    beam = lidar.channel if lidar.channel is not None else np.full(count, -1)
+    sweep = _sweep(points, origins, intensity / 255.0, dt_us * 1e-6, beam)
+    return sweep[torch.isfinite(sweep.range_m) & (sweep.range_m > _NEAREST_RETURN_M)]
+
+
+def _origins(log: Log, frame: int, lidar: Lidar, dt_us: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
+    """Where each beam left its sensor, in the ego frame at the frame's time."""
+    sensors = lidar.lidar_metadatas
+    ids = lidar.ids if lidar.ids is not None else np.full(len(dt_us), int(next(iter(sensors))))
+    T_ego_imu = np.linalg.inv(log.T_imu_ego)
+    T_ego_world = np.linalg.inv(log.T_world_ego[frame])
+    origin = np.zeros((len(dt_us), 3))
+    for sensor_id, metadata in sensors.items():
+        mounted = T_ego_imu[:3, :3] @ metadata.lidar_to_imu_se3.point_3d.array + T_ego_imu[:3, 3]
+        mine = ids == int(sensor_id)
+        if not dt_us[mine].any():
+            origin[mine] = mounted
+            continue
+        world = log.path_of_point(mounted, log.t_us[frame] + dt_us[mine])
+        origin[mine] = world @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+    return origin
+
+
+def _sweep(
+    ends: np.ndarray, origins: np.ndarray, intensity: np.ndarray, dt_s: np.ndarray, beam: np.ndarray
+) -> LidarSweep:
+    """Beams from `origins` that returned at `ends`."""
+    along = ends - origins
+    range_m = np.linalg.norm(along, axis=-1)
+    direction = along / np.maximum(range_m, _NEAREST_RETURN_M)[:, None]
+    return LidarSweep(
+        origin_ego=_float_tensor(origins),
+        dir_ego=_float_tensor(direction),
+        range_m=_float_tensor(range_m),
+        returned=torch.ones(len(ends), dtype=torch.bool),
+        intensity=_float_tensor(intensity),
+        dt_s=_float_tensor(dt_s),
+        beam=torch.from_numpy(np.asarray(beam, dtype=np.int64)),
+        valid=torch.ones(len(ends), dtype=torch.bool),
+    )
+
+
+def _float_tensor(array: np.ndarray) -> Float[Tensor, "..."]:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

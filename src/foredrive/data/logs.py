@@ -1,0 +1,267 @@
+"""Finding 123D logs and opening one: its key times, ego poses and what it holds."""
+
+import contextlib
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
+from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get_sync_table
+from py123d.datatypes import EgoStateSE3Metadata, ModalityType
+from scipy.spatial.transform import Rotation, Slerp
+
+from foredrive.errors import InputError
+from foredrive.scene import Trajectory
+
+_EGO = ModalityType.EGO_STATE_SE3.serialize()
+_SEARCH_DEPTH = 3
+_LONGEST_GAP_S = 1.0
+"""Ego poses further apart than this are not interpolated between."""
+
+
+@dataclass(frozen=True)
+class LogPath:
+    """Where a log lies, and the folder of the maps that go with it (it may not exist)."""
+
+    folder: Path
+    maps_dir: Path
+
+    @property
+    def name(self) -> str:
+        """split/name: unique within a data root."""
+        return f"{self.folder.parent.name}/{self.folder.name}"
+
+
+def find_logs(path: Path) -> list[LogPath]:
+    """All 123D logs at `path`: a data root (with logs/SPLIT/NAME), a split's folder or one log's folder.
+
+    Raises:
+        InputError: if there is none.
+    """
+    path = Path(path).absolute()
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder")
+    folders = sorted(_log_folders(path, _SEARCH_DEPTH))
+    if not folders:
+        raise InputError(f"{path}: no 123D log here (a log is a folder with a sync.arrow)")
+    return [LogPath(folder, folder.parents[2] / "maps") for folder in folders]
+
+
+def _log_folders(path: Path, depth: int) -> Iterator[Path]:
+    if (path / "sync.arrow").is_file():
+        yield path
+    elif depth > 0:
+        for below in path.iterdir():
+            if below.is_dir() and not below.name.startswith("."):
+                yield from _log_folders(below, depth - 1)
+
+
+@contextlib.contextmanager
+def reading(file: Path, what: str) -> Iterator[None]:
+    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, KeyError, IndexError, TypeError, AssertionError) as error:
+        reason = str(error).strip().splitlines()
+        raise InputError(
+            f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
+        ) from error
+
+
+class Log:
+    """One opened log. Frames are the rows of its sync table that have an ego pose; picklable.
+
+    The ego frame is Foredrive's: below the rear axle on the ground. 123D's vehicle box stands on the ground,
+    which therefore lies half its height below its centre.
+
+    Raises:
+        InputError: on a file that is not whole, a pose that is not finite, time that runs backwards.
+    """
+
+    path: LogPath
+    t_us: Int64[np.ndarray, "F"]
+    """Time of each frame: that of its ego pose."""
+    T_world_ego: Float64[np.ndarray, "F 4 4"]
+    speed_mps: Float64[np.ndarray, "F"]
+    """Ego speed: as logged, else from the previous pose; NaN at a first frame without either."""
+    period_s: float
+    """Median time between frames; 0 for a single frame."""
+
+    def __init__(self, path: LogPath) -> None:
+        self.path = path
+        _check_files(path.folder)
+        self.scene = ArrowSceneAPI(path.folder, maps_root=path.maps_dir)
+        with reading(path.folder, "its metadata"):
+            self.metadata = self.scene.get_log_metadata()
+            vehicle = self.scene.get_modality_metadata(ModalityType.EGO_STATE_SE3)
+        if not isinstance(vehicle, EgoStateSE3Metadata):
+            raise InputError(f"{path.folder}: a log without ego poses (no {_EGO}.arrow)")
+        self.vehicle = vehicle
+        self.T_imu_ego = _imu_from_ego(vehicle)
+        ego_t_us, T_world_ego, speed_mps = self._read_ego()
+        self._iterations, ego_rows = self._read_sync(ego_t_us)
+        self.t_us, self.T_world_ego = ego_t_us[ego_rows], T_world_ego[ego_rows]
+        distinct = np.diff(ego_t_us, prepend=ego_t_us[0] - 1) > 0  # nanosecond stamps may share a microsecond
+        self._drive_t_us, self._drive_T = ego_t_us[distinct], T_world_ego[distinct]
+        self.period_s = float(np.median(np.diff(self.t_us))) * 1e-6 if len(self.t_us) > 1 else 0.0
+        self.speed_mps = _speed(speed_mps[ego_rows], self.t_us, self.T_world_ego)
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def iteration(self, frame: int) -> int:
+        """py123d's iteration of a frame."""
+        return int(self._iterations[frame])
+
+    def file(self, modality_key: str) -> Path:
+        """The file of a modality."""
+        return self.path.folder / f"{modality_key}.arrow"
+
+    @property
+    def ego_box(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Centre and length, width, height of the ego vehicle in the ego frame, m."""
+        T_ego_box = np.linalg.inv(self.T_imu_ego) @ self.vehicle.center_to_imu_se3.transformation_matrix
+        return T_ego_box[:3, 3], np.array([self.vehicle.length, self.vehicle.width, self.vehicle.height])
+
+    @functools.cached_property
+    def fingerprint(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, size and time of change of every file but the images: changes when the log does."""
+        files = sorted(f for f in self.path.folder.glob("*.arrow") if not f.name.startswith("camera"))
+        return tuple((str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files)
+
+    def nearest_frames(self, t_us: Float64[np.ndarray, "*n"]) -> tuple[np.ndarray, np.ndarray]:
+        """The frame nearest to each time, and whether it is off by at most half the log's period."""
+        after = np.searchsorted(self.t_us, t_us).clip(1, max(len(self) - 1, 1))
+        before = after - 1
+        after = after.clip(0, len(self) - 1)
+        frame = np.where(t_us - self.t_us[before] <= self.t_us[after] - t_us, before, after)
+        tolerance_us = max(0.5e6 * self.period_s, 1.0)
+        return frame, np.abs(self.t_us[frame] - t_us) <= tolerance_us
+
+    def driven_future(self, frame: int, steps: int, dt_s: float) -> Trajectory:
+        """Where the ego vehicle went after `frame`, M = 1; steps beyond the log or in a gap are not valid."""
+        t_us = self.t_us[frame] + np.arange(1, steps + 1) * dt_s * 1e6
+        T_world, valid = self._interpolate(t_us)
+        T = np.linalg.inv(self.T_world_ego[frame]) @ T_world
+        keep = torch.from_numpy(valid)[None]
+        return Trajectory(
+            xy=torch.from_numpy(T[:, :2, 3]).float()[None] * keep[..., None],
+            yaw=torch.from_numpy(np.arctan2(T[:, 1, 0], T[:, 0, 0])).float()[None] * keep,
+            valid=keep,
+            log_prob=torch.zeros(1),
+            dt_s=dt_s,
+        )
+
+    def path_of_point(
+        self, point_ego: Float[np.ndarray, "3"], t_us: Float64[np.ndarray, "N"]
+    ) -> Float64[np.ndarray, "N 3"]:
+        """World positions of a point fixed to the vehicle at any time; constant velocity beyond the log."""
+        at = self._drive_t_us.astype(np.float64)
+        xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
+        if len(at) > 1:
+            at = np.concatenate([[2 * at[0] - at[1]], at, [2 * at[-1] - at[-2]]])
+            xyz = np.concatenate([[2 * xyz[0] - xyz[1]], xyz, [2 * xyz[-1] - xyz[-2]]])
+        return np.stack([np.interp(t_us, at, xyz[:, axis]) for axis in range(3)], axis=-1)
+
+    def _interpolate(
+        self, t_us: Float64[np.ndarray, "N"]
+    ) -> tuple[Float64[np.ndarray, "N 4 4"], Bool[np.ndarray, "N"]]:
+        at, T = self._drive_t_us, self._drive_T
+        out = np.tile(np.eye(4), (len(t_us), 1, 1))
+        if len(at) < 2:
+            return out, np.zeros(len(t_us), dtype=bool)
+        after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
+        gap_us = at[after] - at[after - 1]
+        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (gap_us <= _LONGEST_GAP_S * 1e6)
+        inside = t_us.clip(at[0], at[-1])
+        span = slice(after.min() - 1, after.max() + 1)
+        since_s = (at[span] - at[span][0]) * 1e-6
+        turn = Slerp(since_s, Rotation.from_matrix(T[span, :3, :3]))
+        out[:, :3, :3] = turn((inside - at[span][0]) * 1e-6).as_matrix()
+        for axis in range(3):
+            out[:, axis, 3] = np.interp(inside, at[span], T[span, axis, 3])
+        return out, valid
+
+    def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN: none) of all ego states."""
+        file = self.file(_EGO)
+        with reading(file, "the ego states"):
+            table = get_modality_table(self.path.folder, _EGO)
+            t_us = table[f"{_EGO}.timestamp_us"].to_numpy()
+            pose = fixed_lists(column_array(table, f"{_EGO}.imu_se3"), 7)
+            velocity = fixed_lists(column_array(table, f"{_EGO}.dynamic_state_se3"), 9)[:, :2]
+        bad = ~np.isfinite(pose).all(-1) | (np.linalg.norm(pose[:, 3:], axis=-1) < 0.5)
+        if bad.any():
+            raise InputError(f"{file}: the ego pose of row {bad.argmax()} is not a finite pose")
+        if len(t_us) == 0:
+            raise InputError(f"{file}: no ego poses")
+        if (np.diff(t_us) < 0).any():
+            raise InputError(f"{file}: time runs backwards at row {(np.diff(t_us) < 0).argmax() + 1}")
+        T_world_imu = np.tile(np.eye(4), (len(pose), 1, 1))
+        T_world_imu[:, :3, :3] = Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix()
+        T_world_imu[:, :3, 3] = pose[:, :3]
+        return t_us, T_world_imu @ self.T_imu_ego, np.linalg.norm(velocity, axis=-1)
+
+    def _read_sync(self, ego_t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sync rows that have an ego pose, and the rows of those poses."""
+        file = self.path.folder / "sync.arrow"
+        with reading(file, "the frames"):
+            table = get_sync_table(self.path.folder)
+            ego_rows = table[_EGO].to_numpy(zero_copy_only=False).astype(np.float64)
+            t_us = table["sync.timestamp_us"].to_numpy()
+        if (np.diff(t_us) <= 0).any():
+            raise InputError(f"{file}: time runs backwards at row {(np.diff(t_us) <= 0).argmax() + 1}")
+        sync_rows = np.flatnonzero(np.isfinite(ego_rows))
+        ego_rows = ego_rows[sync_rows].astype(np.int64)
+        if len(sync_rows) == 0:
+            raise InputError(f"{file}: no frame has an ego pose")
+        if (np.diff(ego_t_us[ego_rows]) <= 0).any():
+            raise InputError(f"{file}: the ego poses of its frames are not in the order of time")
+        return sync_rows, ego_rows
+
+
+def _check_files(folder: Path) -> None:
+    """py123d passes over files it cannot open; here each must be a whole Arrow file."""
+    for file in [folder / "sync.arrow", *sorted(folder.glob("*.arrow"))]:
+        with reading(file, "it as an Arrow file"), pa.memory_map(str(file)) as source:
+            pa.ipc.open_file(source)
+
+
+def _imu_from_ego(vehicle: EgoStateSE3Metadata) -> Float64[np.ndarray, "4 4"]:
+    T_rear_ego = np.eye(4)
+    T_rear_ego[2, 3] = vehicle.rear_axle_to_center_vertical - vehicle.half_height
+    return vehicle.rear_axle_to_imu_se3.transformation_matrix @ T_rear_ego
+
+
+def column_array(table: pa.Table, name: str) -> pa.Array:
+    """A column as one array."""
+    array = table[name].combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        return array.chunk(0) if array.num_chunks else pa.array([], type=array.type)
+    return array
+
+
+def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
+    """An array of fixed-size lists as rows; NaN where the list is null."""
+    out = np.full((len(array), width), np.nan)
+    present = array.is_valid().to_numpy(zero_copy_only=False)
+    out[present] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+    return out
+
+
+def _speed(
+    logged_mps: Float64[np.ndarray, "F"],
+    t_us: Int64[np.ndarray, "F"],
+    T_world_ego: Float64[np.ndarray, "F 4 4"],
+) -> Float64[np.ndarray, "F"]:
+    """The logged speed, else the distance from the previous frame: what comes after must not leak in."""
+    step_m = np.linalg.norm(np.diff(T_world_ego[:, :3, 3], axis=0), axis=-1)
+    past_mps = np.concatenate([[np.nan], step_m / (np.diff(t_us) * 1e-6)])
+    return np.where(np.isfinite(logged_mps), logged_mps, past_mps)

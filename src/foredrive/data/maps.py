@@ -1,0 +1,107 @@
+"""123D maps: the piece around the ego vehicle as polylines, and writing a map once for many logs."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from py123d.api.map.arrow.arrow_map_writer import ArrowMapWriter
+from py123d.datatypes import (
+    BaseMapObject,
+    BaseMapSurfaceObject,
+    Lane,
+    MapLayer,
+    MapMetadata,
+    RoadEdge,
+)
+from py123d.geometry import Point2D, Polyline2D, Polyline3D
+
+from foredrive.data.log_writer import DATASET
+from foredrive.data.logs import Log, reading
+from foredrive.files import atomic_path
+from foredrive.scene import MapKind, MapPatch
+
+RADIUS_M = 60.0
+VERTICES = 32
+"""Longer polylines are cut into pieces that share an end."""
+
+_OUTLINE_KIND = {
+    MapLayer.CROSSWALK: MapKind.CROSSWALK,
+    MapLayer.WALKWAY: MapKind.WALKWAY,
+    MapLayer.STOP_ZONE: MapKind.STOP_ZONE,
+    MapLayer.INTERSECTION: MapKind.INTERSECTION,
+}
+
+
+def read_map_patch(log: Log, frame: int) -> MapPatch:
+    """The map within RADIUS_M of the ego vehicle at a frame, unbatched; no polylines where there is no map.
+
+    Raises:
+        InputError: on a map that cannot be read.
+    """
+    T_world_ego = log.T_world_ego[frame]
+    pieces: list[tuple[MapKind, np.ndarray]] = []
+    with reading(log.path.folder, "its map"):
+        api = log.scene.get_map_api()
+        if api is not None:
+            layers = [MapLayer.LANE, MapLayer.ROAD_EDGE, *_OUTLINE_KIND]
+            at = Point2D(*T_world_ego[:2, 3])
+            near = api.get_map_objects_in_radius(at, RADIUS_M, layers)
+            flat = not api.get_map_metadata().map_has_z
+            T_ego_world = np.linalg.inv(T_world_ego)
+            for kind, line in _lines(item for items in near.values() for item in items):
+                line = np.column_stack([line, np.full(len(line), T_world_ego[2, 3])]) if flat else line
+                line = line @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+                if flat:
+                    line[:, 2] = 0.0
+                pieces += [(kind, piece) for piece in _pieces(line)]
+    vertices = torch.zeros(len(pieces), VERTICES, 3)
+    valid = torch.zeros(len(pieces), VERTICES, dtype=torch.bool)
+    for row, (_, piece) in enumerate(pieces):
+        vertices[row, : len(piece)] = torch.from_numpy(piece).float()
+        valid[row, : len(piece)] = True
+    kinds = torch.tensor([int(kind) for kind, _ in pieces], dtype=torch.int64)
+    return MapPatch(vertices=vertices, valid=valid, kind=kinds)
+
+
+def write_map(objects: Iterable[BaseMapObject], location: str, root: Path) -> Path:
+    """Write a map that all logs of `location` in the data root share, once; it has heights.
+
+    Returns:
+        the folder to hand to `LogWriter` as `map_dir`.
+    """
+    maps_dir = Path(root) / "maps"
+    final = maps_dir / DATASET / f"{DATASET}_{location}.arrow"
+    if not final.is_file():
+        with atomic_path(final) as temporary:
+            scratch = temporary.parent
+            writer = ArrowMapWriter(force_map_conversion=True, maps_root=scratch, logs_root=scratch)
+            writer.reset(MapMetadata(DATASET, location, map_has_z=True, map_is_per_log=False))
+            for item in objects:
+                writer.write_map_object(item)
+            writer.close()
+            (scratch / DATASET / final.name).rename(temporary)
+    return maps_dir
+
+
+def _lines(objects: Iterable[BaseMapObject]) -> Iterator[tuple[MapKind, Float64[np.ndarray, "V D"]]]:
+    for item in objects:
+        if isinstance(item, Lane):
+            yield MapKind.LANE_CENTRE, _points(item.centerline)
+            yield MapKind.LANE_BOUNDARY, _points(item.left_boundary)
+            yield MapKind.LANE_BOUNDARY, _points(item.right_boundary)
+        elif isinstance(item, RoadEdge):
+            yield MapKind.ROAD_EDGE, _points(item.polyline)
+        elif isinstance(item, BaseMapSurfaceObject):
+            yield _OUTLINE_KIND[item.layer], _points(item.outline)
+
+
+def _points(line: Polyline2D | Polyline3D) -> Float64[np.ndarray, "V D"]:
+    return np.asarray(line.array, dtype=np.float64)
+
+
+def _pieces(line: Float64[np.ndarray, "V 3"]) -> list[Float64[np.ndarray, "v 3"]]:
+    """Cut to VERTICES, and keep what comes within RADIUS_M."""
+    cuts = [line[start : start + VERTICES] for start in range(0, max(len(line) - 1, 1), VERTICES - 1)]
+    return [piece for piece in cuts if (np.linalg.norm(piece[:, :2], axis=-1) <= RADIUS_M).any()]
