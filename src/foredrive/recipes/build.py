@@ -12,8 +12,12 @@ from foredrive.recipes.config import Recipe, Stage
 from foredrive.training import NemoObjective
 
 
-def build_agent(recipe: Recipe) -> NemoAgent:
-    """World model and planner with fresh weights (the backbone loads the ones a recipe names)."""
+def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
+    """World model and planner with fresh weights.
+
+    The backbone loads the weights the recipe names, unless `load_backbone` is False because trained ones
+    will replace them.
+    """
     size, clips = recipe.model, recipe.clips
     backbone = ImageBackbone(
         embedding_size=size.backbone.embedding_size,
@@ -22,7 +26,7 @@ def build_agent(recipe: Recipe) -> NemoAgent:
         layer_type=size.backbone.layer_type,
         stages=size.backbone.stages,
         channels=size.channels,
-        weights=size.backbone.weights,
+        weights=size.backbone.weights if load_backbone else None,
     )
     encoder = LiftingEncoder(
         clips.voxels,
