@@ -1,0 +1,170 @@
+"""Does the ego vehicle, placed along a path, touch any box? On a grid, as most protocols do, or exactly."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.metrics.protocols import ObstacleGrid, PlanningProtocol
+from foredrive.scene import Boxes
+
+
+def rectangle(
+    centre: Float[Tensor, "*b 2"], size_lw: Float[Tensor, "*b 2"], yaw: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 4 2"]:
+    """Corners of rectangles seen from above: front-left, front-right, rear-right, rear-left."""
+    signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]).to(size_lw)
+    return centre[..., None, :] + _turn(0.5 * signs * size_lw[..., None, :], yaw[..., None])
+
+
+def path_headings(path_xy: Float[Tensor, "b T 2"], rule: str) -> Float[Tensor, "b T"]:
+    """Heading of the ego box at each step of a path that starts at the origin, rad; 0 is the heading at now.
+
+    Args:
+        rule: "now": 0. "step": direction of the step that leads there, 0 for a step shorter than 1 m. "path":
+            central difference, backward at the last step; 0 where first and last step lie within 0.5 m.
+    """
+    if rule == "now":
+        return torch.zeros_like(path_xy[..., 0])
+    with_start = torch.cat([torch.zeros_like(path_xy[:, :1]), path_xy], dim=1)
+    if rule == "step":
+        delta = with_start.diff(dim=1)
+        moves = delta.norm(dim=-1) >= 1.0
+    else:
+        central = with_start[:, 2:] - with_start[:, :-2]
+        delta = torch.cat([central, with_start[:, -1:] - with_start[:, -2:-1]], dim=1)
+        moves = ((path_xy[:, -1] - path_xy[:, 0]).norm(dim=-1) >= 0.5)[:, None]
+    return torch.where(moves, torch.atan2(delta[..., 1], delta[..., 0]), torch.zeros_like(delta[..., 0]))
+
+
+def polygon_hits(
+    path_xy: Float[Tensor, "b T 2"], heading: Float[Tensor, "b T"], boxes: Boxes, protocol: PlanningProtocol
+) -> tuple[Bool[Tensor, "b T"], Bool[Tensor, "b T"]]:
+    """Whether the ego rectangle, and whether the path's point, touches any valid box; touching edges count.
+
+    Two rectangles are apart if and only if an edge direction of one of them separates them.
+    """
+    centre, size_lw, yaw = _seen_from_above(boxes)
+    direction = torch.stack([heading.cos(), heading.sin()], dim=-1)
+    ego_size = torch.tensor(protocol.ego_size_lw_m).to(path_xy).expand_as(path_xy)
+    ego = rectangle(path_xy + protocol.centre_ahead_m * direction, ego_size, heading)[:, :, None]
+    other = rectangle(centre, size_lw, yaw)  # [b, T, M, 4, 2]
+    apart = _apart_along(heading[..., None], ego, other) | _apart_along(yaw, ego, other)
+    inside = (_turn(path_xy[:, :, None] - centre, -yaw).abs() <= 0.5 * size_lw).all(dim=-1)
+    return (~apart & boxes.valid).any(dim=-1), (inside & boxes.valid).any(dim=-1)
+
+
+def grid_hits(
+    path_xy: Float[Tensor, "b T 2"],
+    heading: Float[Tensor, "b T"],
+    boxes: Boxes,
+    protocol: PlanningProtocol,
+    grid: ObstacleGrid,
+) -> tuple[Bool[Tensor, "b T"], Bool[Tensor, "b T"]]:
+    """Whether a cell of the ego vehicle, and whether the cell of the path's point, is covered by a valid box.
+
+    The cells are those that public code draws into images, with its rounding; but instead of drawing, the
+    ego vehicle's cells are tested against the boxes around them.
+    """
+    quads = _box_quads(boxes, grid)
+    path_rc = _to_row_column(path_xy, grid)
+    first_m, last = _first_centre_m(grid), _cells(grid) - 1
+
+    turn = (heading if grid.column_axis == "left" else -heading)[..., None]
+    template = _ego_template(protocol, grid).to(path_xy)
+    template = ((_turn(template, turn) - first_m) / grid.cell_m).round()  # [b, T, P, 2]
+    moved = template + path_rc[:, :, None] / grid.cell_m
+    row = moved[..., 0].ceil() if grid.row_step == "up" else moved[..., 0].floor()
+    ego = torch.stack([row, moved[..., 1].floor()], dim=-1).long().clamp(0, last)
+
+    point = ((path_rc - first_m) / grid.cell_m).floor().long()
+    on_grid = ((point >= 0) & (point <= last)).all(dim=-1)
+    box_hit = _any_covered(ego, quads, boxes.valid)
+    return box_hit, _any_covered(point[:, :, None], quads, boxes.valid) & on_grid
+
+
+def cells_in_quads(cells: Int[Tensor, "N P 2"], quads: Int[Tensor, "N 4 2"]) -> Bool[Tensor, "N P"]:
+    """Whether cells (row, column) belong to convex quadrilaterals with whole-numbered corners.
+
+    The same cells as OpenCV's `fillPoly`: the inside, and the outline by Bresenham's rule, that is, cells
+    less than half a cell off an edge, measured along the axis on which the edge advances less. Of the cells
+    exactly half a cell off, the outline has those that a walk from the edge's lower column has yet to leave.
+    """
+    following = quads.roll(-1, dims=1)
+    area = (quads[..., 1] * following[..., 0] - quads[..., 0] * following[..., 1]).sum(dim=1)
+    edge = (following - quads) * torch.where(area >= 0, 1, -1)[:, None, None]  # [N, 4, 2], inside on one side
+    row, column = edge[:, None, :, 0], edge[:, None, :, 1]
+    offset = cells[:, :, None] - quads[:, None]  # [N, P, 4, 2]
+    inward = column * offset[..., 0] - row * offset[..., 1]
+    reach = edge.abs().amax(dim=-1)[:, None]
+    tie_counts = torch.where(column.abs() > row.abs(), row > 0, row < 0)
+    drawn = (2 * inward + tie_counts > -reach) | (reach == 0)
+    low, high = quads.amin(dim=1)[:, None], quads.amax(dim=1)[:, None]
+    return drawn.all(dim=-1) & ((cells >= low) & (cells <= high)).all(dim=-1)
+
+
+def _any_covered(
+    cells: Int[Tensor, "b T P 2"], quads: Int[Tensor, "b T M 4 2"], valid: Bool[Tensor, "b T M"]
+) -> Bool[Tensor, "b T"]:
+    """Whether any of the P cells of a step is covered by any valid box.
+
+    Few boxes are near a vehicle: only pairs of ego and box whose extents overlap are looked at closely.
+    """
+    low, high = cells.amin(dim=2)[:, :, None], cells.amax(dim=2)[:, :, None]  # [b, T, 1, 2]
+    near = ((quads.amin(dim=3) <= high) & (quads.amax(dim=3) >= low)).all(dim=-1) & valid
+    item, step, box = near.nonzero(as_tuple=True)
+    covered = cells_in_quads(cells[item, step], quads[item, step, box]).any(dim=-1)
+    hit = torch.zeros(cells.shape[:2], dtype=torch.bool, device=cells.device)
+    hit[item[covered], step[covered]] = True
+    return hit
+
+
+def _box_quads(boxes: Boxes, grid: ObstacleGrid) -> Int[Tensor, "b T M 4 2"]:
+    """Corners of boxes as grid indices (row, column)."""
+    corners = _to_row_column(rectangle(*_seen_from_above(boxes)), grid)
+    if grid.corner == "nearest":
+        return ((corners + grid.reach_m) / grid.cell_m).round().long()
+    return ((corners - _first_centre_m(grid)) / grid.cell_m).floor().long()
+
+
+def _ego_template(protocol: PlanningProtocol, grid: ObstacleGrid) -> Float[Tensor, "P 2"]:
+    """Centres (forward, sideways) of the cells inside the ego vehicle when its point is at the origin."""
+    length_m, width_m = protocol.ego_size_lw_m
+    centres = _first_centre_m(grid) + grid.cell_m * torch.arange(_cells(grid), dtype=torch.float64)
+    forward = centres[(centres - protocol.centre_ahead_m).abs() < 0.5 * length_m]
+    sideways = centres[centres.abs() < 0.5 * width_m]
+    return torch.cartesian_prod(forward, sideways)
+
+
+def _seen_from_above(boxes: Boxes) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, length and width, and yaw of boxes, in double precision."""
+    return boxes.centre[..., :2].double(), boxes.size_lwh[..., :2].double(), boxes.yaw.double()
+
+
+def _apart_along(
+    yaw: Float[Tensor, "b T *M"], ego: Float[Tensor, "b T 1 4 2"], other: Float[Tensor, "b T M 4 2"]
+) -> Bool[Tensor, "b T M"]:
+    """Whether the shadows of two rectangles on either axis of a frame turned by `yaw` do not touch."""
+    ego_seen, other_seen = _turn(ego, -yaw[..., None]), _turn(other, -yaw[..., None])
+    gap = torch.maximum(
+        ego_seen.amin(dim=-2) - other_seen.amax(dim=-2), other_seen.amin(dim=-2) - ego_seen.amax(dim=-2)
+    )
+    return (gap > 0).any(dim=-1)
+
+
+def _turn(xy: Tensor, angle: Tensor) -> Tensor:
+    """Rotate vectors [..., 2] by angles [...] (broadcast)."""
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([cos * xy[..., 0] - sin * xy[..., 1], sin * xy[..., 0] + cos * xy[..., 1]], dim=-1)
+
+
+def _to_row_column(xy: Tensor, grid: ObstacleGrid) -> Tensor:
+    """Ego x, y in the axes of rows (forward) and columns, m."""
+    return xy if grid.column_axis == "left" else xy * torch.tensor([1.0, -1.0]).to(xy)
+
+
+def _first_centre_m(grid: ObstacleGrid) -> float:
+    return -grid.reach_m + 0.5 * grid.cell_m
+
+
+def _cells(grid: ObstacleGrid) -> int:
+    return round(2 * grid.reach_m / grid.cell_m)
