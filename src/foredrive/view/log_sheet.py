@@ -1,0 +1,169 @@
+"""One time of a log on one page: every camera with points and boxes, and the view from above."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from foredrive.files import atomic_path
+from foredrive.scene import CameraRig, Clip
+from foredrive.view import palette
+from foredrive.view.bev import draw_bev, legend_handles
+from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_points_on_image, resize
+
+DPI = 100
+CAMERA_WIDTH_PX = 640
+GAP_PX, HEAD_PX, FOOT_PX = 10, 64, 96
+BEV_MARGIN_PX = 56
+MIN_BEV_PX = 640
+
+
+def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -> None:
+    """Write the page as a PNG.
+
+    Args:
+        path: the picture; it appears whole or not at all.
+        clip: without leading dimensions; what is drawn is its frame at t = 0.
+        title: name and time of what is shown.
+        reach_m: how far the view from above looks in each direction.
+    """
+    figure = draw_log_sheet(clip, title, reach_m)
+    with atomic_path(path) as scratch:
+        figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
+
+
+def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
+    """The page as a figure."""
+    rig = clip.rig[clip.now]
+    rows = camera_rows(rig)
+    columns = max((len(row) for row in rows), default=0)
+    cell_h = round(CAMERA_WIDTH_PX * rig.size_hw[0] / rig.size_hw[1])
+    left_w = columns * (CAMERA_WIDTH_PX + GAP_PX)
+    body_h = max(len(rows) * (cell_h + GAP_PX) - GAP_PX, MIN_BEV_PX)
+    bev_px = body_h - BEV_MARGIN_PX // 2
+    width = GAP_PX + left_w + BEV_MARGIN_PX + bev_px + 2 * GAP_PX
+    height = HEAD_PX + body_h + FOOT_PX
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
+
+    def place(x: int, y: int, w: int, h: int) -> Axes:
+        """Axes at pixels from the upper left corner."""
+        return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
+
+    for row, cameras in enumerate(rows):
+        inset = (columns - len(cameras)) * (CAMERA_WIDTH_PX + GAP_PX) // 2
+        for column, camera in enumerate(cameras):
+            ax = place(
+                GAP_PX + inset + column * (CAMERA_WIDTH_PX + GAP_PX),
+                HEAD_PX + row * (cell_h + GAP_PX),
+                CAMERA_WIDTH_PX,
+                cell_h,
+            )
+            _show_camera(ax, clip, camera, (cell_h, CAMERA_WIDTH_PX))
+    bev = place(GAP_PX + left_w + BEV_MARGIN_PX, HEAD_PX, bev_px, bev_px)
+    draw_bev(bev, clip, reach_m)
+    figure.text(
+        2 * GAP_PX / width, 1 - HEAD_PX / 2 / height, title, color=palette.INK, fontsize=17, va="center"
+    )
+    handles = legend_handles(clip)
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(GAP_PX / width, FOOT_PX / 2 / height - 0.01),
+        ncols=min(len(handles), max(4, int((width - 420) / 165))),
+        frameon=False,
+        labelcolor=palette.INK,
+        fontsize=11,
+        handlelength=1.6,
+    )
+    if bool(clip.sweep_valid[clip.now]):
+        _range_bar(place(width - 340, HEAD_PX + body_h + 40, 300, 12))
+    return figure
+
+
+def camera_rows(rig: CameraRig) -> list[list[int]]:
+    """Camera indices laid out as around the car: those looking ahead above those looking back.
+
+    In both rows what lies to the left of the car is on the left.
+    """
+    forward = rig.T_ego_cam[..., :2, 2]  # the optical axis seen from above
+    azimuth = torch.atan2(forward[:, 1], forward[:, 0])
+    ahead_first = azimuth.abs().argsort(stable=True).tolist()
+    front = (len(ahead_first) + 1) // 2 if len(ahead_first) > 3 else len(ahead_first)
+    rows = [ahead_first[:front], ahead_first[front:]]
+    return [sorted(row, key=lambda c: -_leftness(float(azimuth[c]))) for row in rows if row]
+
+
+def _leftness(azimuth: float) -> float:
+    """Grows with how far to the left of the car's axis a camera looks, ahead or back alike."""
+    return float(np.sin(azimuth)) if abs(azimuth) > 1e-6 else 0.0
+
+
+def camera_picture(
+    clip: Clip, index: int, size_hw: tuple[int, int], with_points: bool = True
+) -> UInt8[np.ndarray, "H W 3"]:
+    """One camera's image at now in the given size, with lidar and boxes; a bare panel where there is none."""
+    now = clip.now
+    if bool(clip.image_valid[now, index]):
+        image = resize(clip.images[now, index].permute(1, 2, 0).numpy(), size_hw)
+    else:
+        image = np.full((*size_hw, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
+    camera = Camera.of(clip.rig[now], index)
+    if not bool((camera.K[0, 0] > 0) & (camera.K[1, 1] > 0)):
+        return image
+    camera = camera.resized(size_hw)
+    if with_points and bool(clip.sweep_valid[now]):
+        points, range_m = _returns(clip)
+        image = draw_points_on_image(image, points, palette.range_colours(range_m), camera)
+    if bool(clip.boxes_valid[now]):
+        image = draw_boxes_on_image(image, clip.boxes[now], camera)
+    return image
+
+
+def _returns(clip: Clip) -> tuple[Float[Tensor, "N 3"], Float[np.ndarray, " N"]]:
+    sweep = clip.sweeps[clip.now]
+    returned = sweep.returned & sweep.valid
+    return sweep.points_ego[returned], sweep.range_m[returned].numpy()
+
+
+def _show_camera(ax: Axes, clip: Clip, index: int, size_hw: tuple[int, int]) -> None:
+    ax.imshow(camera_picture(clip, index, size_hw), interpolation="none", aspect="auto")
+    ax.set_axis_off()
+    ax.text(
+        0.015,
+        0.965,
+        clip.rig.names[index],
+        transform=ax.transAxes,
+        color=palette.INK,
+        fontsize=11,
+        va="top",
+        bbox={"facecolor": palette.GROUND, "alpha": 0.65, "edgecolor": "none", "pad": 3},
+    )
+    if not bool(clip.image_valid[clip.now, index]):
+        ax.text(
+            0.5,
+            0.5,
+            "no image",
+            transform=ax.transAxes,
+            color=palette.FAINT,
+            fontsize=16,
+            ha="center",
+            va="center",
+        )
+
+
+def _range_bar(ax: Axes) -> None:
+    """Colour scale of the lidar's range."""
+    shown = LinearSegmentedColormap.from_list("range", palette.RANGE_MAP(np.linspace(0.05, 0.85, 64)))
+    scale = ScalarMappable(LogNorm(palette.NEAREST_M, palette.FARTHEST_M), shown)
+    bar = ax.figure.colorbar(scale, cax=ax, orientation="horizontal")
+    bar.set_ticks([3, 5, 10, 20, 40, 80], labels=["3", "5", "10", "20", "40", "80 m"])
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(colors=palette.FAINT, labelsize=9, length=0)
+    bar.outline.set_visible(False)
+    ax.set_title("lidar range", color=palette.INK, fontsize=10, loc="left", pad=4)

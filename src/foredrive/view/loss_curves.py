@@ -1,0 +1,80 @@
+"""Loss curves as an inline SVG that takes on the page's text colour."""
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227")
+INK_MARK = "#010203"
+"""Drawn wherever the page's own text colour shall be."""
+NOT_LOSSES = ("step", "step_s", "lr")
+SMOOTH_STEPS = 15
+NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
+
+
+def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+    """SVG with one chart a stage; raw values faint, their running mean strong, on a logarithmic scale.
+
+    Args:
+        stages: per stage the lines of its metrics file: "step" and a value per loss.
+    """
+    shown = {name: lines for name, lines in stages.items() if lines}
+    if not shown:
+        return ""
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):
+        figure = Figure(figsize=(5.2 * len(shown), 3.1), layout="constrained")
+        axes = figure.subplots(1, len(shown), squeeze=False)[0]
+        for ax, (name, lines) in zip(axes, shown.items(), strict=True):
+            _draw_stage(ax, name, lines)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
+    svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)  # the page sets the size
+    return re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg)
+
+
+def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float]]) -> None:
+    names = [key for key in lines[0] if key not in NOT_LOSSES]
+    names.sort(key=lambda key: key != "loss")  # the one that is descended comes first
+    for key, colour in zip(names, COLOURS, strict=False):
+        steps = np.array([line["step"] for line in lines if key in line], dtype=float)
+        values = np.array([line[key] for line in lines if key in line], dtype=float)
+        if not (values > 0).any():
+            continue
+        positive = np.where(values > 0, values, np.nan)
+        ax.plot(steps, positive, color=colour, linewidth=0.8, alpha=0.3)
+        ax.plot(steps, _running_mean(positive), color=colour, linewidth=1.9, label=key)
+    ax.set_yscale("log")
+    ax.set_title(name, color=INK_MARK, loc="left", fontsize=11)
+    ax.set_xlabel("step", color=INK_MARK)
+    ax.grid(color="#8888884d", linewidth=0.6)
+    ax.tick_params(which="both", colors=INK_MARK, length=0, labelsize=9)
+    ax.spines[:].set_visible(False)
+    if ax.lines:
+        ax.legend(
+            frameon=False,
+            labelcolor=INK_MARK,
+            fontsize=9,
+            loc="lower right",
+            bbox_to_anchor=(1.0, 0.98),
+            ncols=len(ax.lines),
+            handlelength=1.2,
+            columnspacing=1.2,
+        )
+
+
+def _running_mean(values: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+    """Mean of the last few values, of those that are numbers."""
+    number = np.isfinite(values)
+    total = np.cumsum(np.where(number, values, 0.0))
+    count = np.cumsum(number)
+    total[SMOOTH_STEPS:] -= total[:-SMOOTH_STEPS].copy()
+    count[SMOOTH_STEPS:] -= count[:-SMOOTH_STEPS].copy()
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,0 +1,79 @@
+"""The colours and type sizes every picture shares. All pictures are drawn on one dark ground."""
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.colors import to_rgb
+
+from foredrive.scene import Category, MapKind
+
+GROUND = "#11151c"
+"""Background of every picture."""
+PANEL = "#1a202a"
+"""Background of placeholders and empty panels."""
+INK = "#e8ecf2"
+FAINT = "#8b95a5"
+GRID = "#2b3442"
+
+EXPERT = "#3ddc84"
+"""What was driven."""
+PLAN = "#ff4d4f"
+"""What the model plans."""
+EGO = "#f5f7fa"
+
+BOX_COLOURS: dict[Category, str] = {
+    Category.CAR: "#4cc9f0",
+    Category.TRUCK: "#7b8cff",
+    Category.BUS: "#b388ff",
+    Category.TRAILER: "#9d7bd8",
+    Category.CONSTRUCTION_VEHICLE: "#e0a458",
+    Category.MOTORCYCLE: "#ff8fd2",
+    Category.BICYCLE: "#ff70a6",
+    Category.PEDESTRIAN: "#ffe14d",
+    Category.ANIMAL: "#c0f060",
+    Category.TRAFFIC_CONE: "#ff9a3c",
+    Category.BARRIER: "#ff7b54",
+    Category.OTHER: "#c8d0da",
+}
+
+MAP_COLOURS: dict[MapKind, str] = {
+    MapKind.LANE_CENTRE: "#46566b",
+    MapKind.LANE_BOUNDARY: "#77879c",
+    MapKind.ROAD_EDGE: "#c3cad4",
+    MapKind.CROSSWALK: "#d9c27a",
+    MapKind.WALKWAY: "#5d7a68",
+    MapKind.STOP_ZONE: "#c9655f",
+    MapKind.INTERSECTION: "#4a5a86",
+}
+
+TRUE_POSITIVE = "#3ddc84"
+FALSE_POSITIVE = "#ff8c42"
+FALSE_NEGATIVE = "#4d9de0"
+KNOWN_FREE = "#2a323e"
+
+RANGE_MAP = matplotlib.colormaps["plasma"].reversed()
+HEIGHT_MAP = matplotlib.colormaps["viridis"]
+NEAREST_M, FARTHEST_M = 3.0, 80.0
+"""Ends of the logarithmic range scale."""
+
+
+def label(kind: Category | MapKind) -> str:
+    """A kind's name for a legend: TRAFFIC_CONE -> traffic cone."""
+    return kind.name.lower().replace("_", " ")
+
+
+def box_colour(category: int) -> str:
+    """Colour of a `Category`; a number outside it is drawn as OTHER."""
+    return BOX_COLOURS[Category(category) if category in set(Category) else Category.OTHER]
+
+
+def rgb255(colour: str) -> tuple[int, int, int]:
+    """Red, green, blue in 0..255 of a colour given as #rrggbb."""
+    red, green, blue = (round(255 * c) for c in to_rgb(colour))
+    return red, green, blue
+
+
+def range_colours(range_m: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
+    """Bright and near to dark and far, on a logarithmic scale from 3 to 80 m."""
+    scale = np.log(np.clip(range_m, NEAREST_M, FARTHEST_M) / NEAREST_M) / np.log(FARTHEST_M / NEAREST_M)
+    return (RANGE_MAP(0.05 + 0.80 * scale)[:, :3] * 255).astype(np.uint8)

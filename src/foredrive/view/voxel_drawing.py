@@ -1,0 +1,220 @@
+"""Pictures of voxel grids: a shaded view in perspective, a comparison from above, features as colours."""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from foredrive.scene import VoxelSpec
+from foredrive.view import palette
+
+SUN = np.array([-0.35, 0.45, 0.82]) / np.linalg.norm([-0.35, 0.45, 0.82])
+AMBIENT, DIFFUSE = 0.52, 0.48
+EDGE_SHADE = 0.78  # how dark the rims of voxels are
+SUPERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A virtual camera that looks at a grid in the ego frame."""
+
+    position_m: tuple[float, float, float]
+    target_m: tuple[float, float, float]
+    focal: float
+    """Focal length in units of the picture's height."""
+
+    @classmethod
+    def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Eye":
+        """Above and behind the vehicle; the grid fills a picture of that shape, its corners just outside."""
+        reach = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
+        low, high = np.array(spec.lower_m), np.array(spec.upper_m)
+        middle = (low + high) / 2
+        position = (middle[0] - 1.75 * reach, middle[1] - 0.55 * reach, 1.35 * reach)
+        target = (middle[0] - 0.12 * reach, middle[1], 0.0)
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(8, 3)
+        off_centre = np.abs(cls(position, target, 1.0).project(corners, (1, 1)) - 0.5).max(0)  # [u v]
+        limits = np.array([0.5 * size_hw[1] / size_hw[0], 0.5]) / off_centre
+        return cls(position, target, 1.25 * float(limits.min()))
+
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: right, down, forward in the ego frame."""
+        forward = np.subtract(self.target_m, self.position_m)
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+    def project(self, points: Float[np.ndarray, "N 3"], size_hw: tuple[int, int]) -> Float[np.ndarray, "N 2"]:
+        """Pixel coordinates of points in front of the eye."""
+        local = (points - np.array(self.position_m)) @ self.axes().T
+        scale = self.focal * size_hw[0]
+        return local[:, :2] / local[:, 2:] * scale + np.array([size_hw[1] / 2, size_hw[0] / 2])
+
+
+def draw_voxels(
+    occupied: Bool[Tensor, "Z Y X"],
+    spec: VoxelSpec,
+    size_hw: tuple[int, int],
+    eye: Eye | None = None,
+    colours: UInt8[np.ndarray, "Z Y X 3"] | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Occupied voxels as lit cubes with shadows, cast ray by ray through the grid.
+
+    Args:
+        occupied: what is drawn.
+        spec: where the grid lies.
+        size_hw: size of the picture, px.
+        eye: where it is seen from; above and behind the vehicle if not given.
+        colours: RGB per voxel; by height if not given.
+    """
+    eye = eye or Eye.behind(spec, size_hw)
+    tint = height_colours(spec) if colours is None else colours
+    height, width = (SUPERSAMPLING * s for s in size_hw)
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    local = np.stack([(u - width / 2) / height, (v - height / 2) / height, np.full_like(u, eye.focal)], -1)
+    direction = local.reshape(-1, 3) @ eye.axes()
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    origin = (np.array(eye.position_m) - np.array(spec.lower_m)) / spec.voxel_m  # in voxels from here on
+    ground = np.array(palette.rgb255(palette.GROUND), dtype=float)
+    picture = _cast(occupied.numpy(), tint, origin, direction, SUN, ground, height * eye.focal)
+    canvas = Image.fromarray(picture.reshape(height, width, 3).astype(np.uint8))
+    return np.asarray(canvas.resize(size_hw[::-1], Image.Resampling.BOX))
+
+
+def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
+    """Dark and low to bright and high, the same in every picture: -0.5 m to 4 m above the ego ground."""
+    z = spec.lower_m[2] + (np.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
+    rgb = palette.HEIGHT_MAP(0.12 + 0.88 * np.clip((z + 0.5) / 4.5, 0, 1))[:, :3]
+    return np.broadcast_to((rgb * 255).astype(np.uint8)[:, None, None], (*spec.shape_zyx, 3))
+
+
+def draw_comparison(
+    predicted: Bool[Tensor, "Z Y X"],
+    label: Bool[Tensor, "Z Y X"],
+    known: Bool[Tensor, "Z Y X"],
+    spec: VoxelSpec,
+    above_m: float,
+) -> UInt8[np.ndarray, "X Y 3"]:
+    """From above, one pixel a column: hits, false alarms, misses, known free and unknown columns.
+
+    Only known voxels whose centre is higher than `above_m` in the ego frame count: the road would hide
+    everything else. Forward points up, left points left.
+    """
+    z = spec.lower_m[2] + (torch.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
+    counts = known & (z > above_m)[:, None, None]
+    truth, guess, seen = (label & counts).any(0), (predicted & counts).any(0), counts.any(0)
+    picture = torch.tensor(palette.rgb255(palette.GROUND), dtype=torch.uint8).repeat(*seen.shape, 1)
+    for where, colour in (
+        (seen, palette.KNOWN_FREE),
+        (truth & guess, palette.TRUE_POSITIVE),
+        (guess & ~truth, palette.FALSE_POSITIVE),
+        (truth & ~guess, palette.FALSE_NEGATIVE),
+    ):
+        picture[where] = torch.tensor(palette.rgb255(colour), dtype=torch.uint8)
+    return _from_above(picture)
+
+
+def draw_volume_pca(volume: Float[Tensor, "D Z Y X"]) -> UInt8[np.ndarray, "X Y 3"]:
+    """Features as colours (NeMo, Fig. 3): PCA of the D channels to three, then the mean over height.
+
+    Each channel is stretched from its 1st to its 99th percentile.
+    """
+    features = volume.float().flatten(1)
+    centred = features - features.mean(1, keepdim=True)
+    _, vectors = torch.linalg.eigh(centred @ centred.T / centred.shape[1])
+    components = vectors[:, -3:].flip(-1)  # largest variance first
+    signs = components.gather(0, components.abs().argmax(0, keepdim=True)).sign()  # fixed: colours repeat
+    colours = ((components * signs).T @ centred).unflatten(1, volume.shape[1:]).mean(1)  # [3 Y X]
+    flat = colours.flatten(1)
+    low, high = (torch.from_numpy(np.percentile(flat.numpy(), q, axis=1)).float() for q in (1, 99))
+    span = (high - low).clamp_min(1e-12)[:, None, None]
+    unit = ((colours - low[:, None, None]) / span).clamp(0, 1)
+    return _from_above((unit.permute(1, 2, 0) * 255).to(torch.uint8))
+
+
+def _from_above(rows: UInt8[Tensor, "Y X 3"]) -> UInt8[np.ndarray, "X Y 3"]:
+    """Turn [Y X] so that x (forward) points up and y (left) points left."""
+    return rows.transpose(0, 1).flip(0, 1).contiguous().numpy()
+
+
+@numba.njit(cache=True, error_model="numpy")
+@no_type_check  # numba infers the types, and wants the bare function
+def _march(occupied, origin, direction, start):
+    """First occupied voxel along a ray (Amanatides & Woo, 1987).
+
+    Returns the distance in voxels (-1: none), the voxel's z, y, x and the axis of the face that was entered
+    (-1: the ray starts inside).
+    """
+    shape = (occupied.shape[2], occupied.shape[1], occupied.shape[0])
+    near, far, axis = start, math.inf, -1
+    for i in range(3):
+        if direction[i] == 0.0:
+            if origin[i] < 0 or origin[i] > shape[i]:
+                return -1.0, 0, 0, 0, -1
+            continue
+        one, two = -origin[i] / direction[i], (shape[i] - origin[i]) / direction[i]
+        low, high = min(one, two), max(one, two)
+        if low > near:
+            near, axis = low, i
+        far = min(far, high)
+    if near >= far:
+        return -1.0, 0, 0, 0, -1
+    cell, step = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    to_next, per_cell = np.full(3, math.inf), np.full(3, math.inf)
+    for i in range(3):
+        at = origin[i] + (near + 1e-9) * direction[i]
+        cell[i] = min(max(math.floor(at), 0), shape[i] - 1)
+        if direction[i] != 0.0:
+            step[i] = 1 if direction[i] > 0 else -1
+            per_cell[i] = abs(1.0 / direction[i])
+            border = cell[i] + 1 if direction[i] > 0 else cell[i]
+            to_next[i] = (border - origin[i]) / direction[i]
+    distance = near
+    while True:
+        if occupied[cell[2], cell[1], cell[0]]:
+            return distance, cell[2], cell[1], cell[0], axis
+        axis = int(np.argmin(to_next))
+        distance = to_next[axis]
+        cell[axis] += step[axis]
+        if cell[axis] < 0 or cell[axis] >= shape[axis]:
+            return -1.0, 0, 0, 0, -1
+        to_next[axis] += per_cell[axis]
+
+
+@numba.njit(cache=True, error_model="numpy")
+@no_type_check  # numba infers the types, and wants the bare function
+def _cast(occupied, colours, origin, directions, sun, ground, px_per_unit):
+    """RGB 0..255 of every ray; lengths are in voxels."""
+    out = np.empty((len(directions), 3))
+    for ray in range(len(directions)):
+        direction = directions[ray]
+        distance, z, y, x, axis = _march(occupied, origin, direction, 0.0)
+        if distance < 0:
+            out[ray] = ground
+            continue
+        hit = origin + distance * direction
+        light = AMBIENT
+        if axis >= 0:
+            normal = np.zeros(3)
+            normal[axis] = -1.0 if direction[axis] > 0 else 1.0
+            facing = normal @ sun
+            if facing > 0:
+                shadow, _, _, _, _ = _march(occupied, hit + 1e-4 * normal, sun, 0.0)
+                if shadow < 0:
+                    light += DIFFUSE * facing
+            rim = 1.0  # distance to the face's nearest rim, in voxels
+            for i in range(3):
+                if i != axis:
+                    inside = hit[i] - math.floor(hit[i])
+                    rim = min(rim, inside, 1.0 - inside)
+            if rim * px_per_unit / distance < 1.6:
+                light *= EDGE_SHADE
+        for i in range(3):
+            out[ray, i] = light * colours[z, y, x, i]
+    return out
