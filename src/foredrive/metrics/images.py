@@ -1,0 +1,33 @@
+"""Rendered against real images, where both exist."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+
+def psnr_db(
+    rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"], known: Bool[Tensor, "n H W"]
+) -> Float[Tensor, "n"]:
+    """Peak signal-to-noise ratio of each image (RGB, 0 to 1) over its known pixels, dB; NaN without any."""
+    scores = [
+        peak_signal_noise_ratio(a[:, k], b[:, k], data_range=1.0) if k.any() else a.new_tensor(torch.nan)
+        for a, b, k in zip(rendered, real, known, strict=True)
+    ]
+    return torch.stack(scores) if scores else rendered.new_zeros(0)
+
+
+def ssim(
+    rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"], known: Bool[Tensor, "n H W"]
+) -> Float[Tensor, "n"]:
+    """Structural similarity of each image (RGB, 0 to 1; Gaussian window, σ = 1.5 px) over its known pixels.
+
+    The map is taken over whole images, with unknown pixels set to the real image's so that they add nothing
+    to their neighbours' difference, and averaged where pixels are known; NaN where there are none.
+    """
+    if not len(rendered):
+        return rendered.new_zeros(0)
+    filled = torch.where(known[:, None], rendered, real)
+    _, similarity = structural_similarity_index_measure(filled, real, data_range=1.0, return_full_image=True)
+    known_pixels = known[:, None].expand_as(similarity)
+    return torch.where(known_pixels, similarity, 0.0).sum(dim=(1, 2, 3)) / known_pixels.sum(dim=(1, 2, 3))

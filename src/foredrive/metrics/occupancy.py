@@ -1,0 +1,149 @@
+"""Voxel occupancy against labels that know where they know nothing, and the best constant prediction.
+
+Counts are summed over a data set before any ratio is taken. Voxels that no beam has seen (`known` False) are
+left out. Height is measured in the ego frame, whose origin lies on the ground under the rear axle: "above
+ground" are voxels whose centre is more than 0.4 m above its plane z = 0, which on a slope is not quite the
+road.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.scene import VoxelGrid, VoxelSpec
+from foredrive.scene.record import Record
+
+ABOVE_GROUND_M = 0.4
+MOVING_MPS = 0.5
+
+
+def above_ground(spec: VoxelSpec, height_m: float = ABOVE_GROUND_M) -> Bool[Tensor, "Z Y X"]:
+    """The voxels whose centre lies more than `height_m` above the plane z = 0 of the ego frame."""
+    return spec.centres_m()[..., 2] > height_m
+
+
+@dataclass(frozen=True)
+class OccupancyCounts(Record):
+    """Agreement of predicted with labelled occupancy, per frame."""
+
+    true_positive: Int[Tensor, "F"]
+    false_positive: Int[Tensor, "F"]
+    false_negative: Int[Tensor, "F"]
+
+    def __add__(self, other: "OccupancyCounts") -> "OccupancyCounts":
+        return OccupancyCounts(
+            self.true_positive + other.true_positive,
+            self.false_positive + other.false_positive,
+            self.false_negative + other.false_negative,
+        )
+
+    @property
+    def iou(self) -> Float[Tensor, "F"]:
+        """Intersection over union; NaN where nothing was occupied, in truth or prediction."""
+        return self.true_positive / (self.true_positive + self.false_positive + self.false_negative)
+
+    @property
+    def precision(self) -> Float[Tensor, "F"]:
+        """Share of the voxels predicted occupied that are; NaN where none was predicted."""
+        return self.true_positive / (self.true_positive + self.false_positive)
+
+    @property
+    def recall(self) -> Float[Tensor, "F"]:
+        """Share of the occupied voxels that were predicted so; NaN where none is."""
+        return self.true_positive / (self.true_positive + self.false_negative)
+
+
+def count_occupancy(
+    predicted: Bool[Tensor, "b F Z Y X"], labels: VoxelGrid, region: Bool[Tensor, "Z Y X"] | None = None
+) -> OccupancyCounts:
+    """Compare predicted occupancy with labels [b F 1 Z Y X] on known voxels, of `region` only if given."""
+    occupied = labels.values[:, :, 0] > 0.5
+    known = labels.known if region is None else labels.known & region.to(labels.known.device)
+
+    def count(where: Tensor) -> Int[Tensor, "F"]:
+        return (where & known).sum(dim=(0, 2, 3, 4)).cpu()
+
+    return OccupancyCounts(
+        count(predicted & occupied), count(predicted & ~occupied), count(~predicted & occupied)
+    )
+
+
+class VoxelPrior:
+    """How often each voxel was occupied when known, over a training set; a grid per frame (now, the future).
+
+    It stands for everything that can be predicted without looking: `best_constant` is the one fixed grid
+    that scores best on the training set, and what it scores on the test set is the number to beat.
+    """
+
+    def __init__(self, frames: int, spec: VoxelSpec) -> None:
+        self.spec = spec
+        self.occupied = torch.zeros((frames, *spec.shape_zyx), dtype=torch.int32)
+        self.known = torch.zeros_like(self.occupied)
+
+    def add(self, labels: VoxelGrid) -> None:
+        """Add training labels [b F 1 Z Y X]."""
+        if labels.spec != self.spec or labels.values.shape[1] != len(self.occupied):
+            raise InputError(
+                f"labels of {labels.values.shape[1]} frames on {labels.spec} do not fit a prior of "
+                f"{len(self.occupied)} frames on {self.spec}"
+            )
+        self.occupied += ((labels.values[:, :, 0] > 0.5) & labels.known).sum(dim=0).to(self.occupied)
+        self.known += labels.known.sum(dim=0).to(self.known)
+
+    @property
+    def probability(self) -> Float[Tensor, "F Z Y X"]:
+        """Relative frequency of occupancy; 0 for a voxel that was never known."""
+        return self.occupied / self.known.clamp_min(1)
+
+    def best_constant(
+        self, region: Bool[Tensor, "Z Y X"] | None = None
+    ) -> tuple[Bool[Tensor, "F Z Y X"], Float[Tensor, "F"]]:
+        """Per frame the grid {probability ≥ threshold} with the best IoU in training, and the threshold.
+
+        Exact: lowering the threshold adds voxels in order of probability, each with its own hits and false
+        alarms, so that all thresholds are scored by two cumulative sums. Where the training set had nothing
+        occupied the grid is empty and the threshold infinite.
+        """
+        probability = self.probability
+        where = self.known > 0 if region is None else (self.known > 0) & region
+        thresholds = torch.full((len(probability),), torch.inf)
+        for frame, (p, inside) in enumerate(zip(probability, where, strict=True)):
+            hits = self.occupied[frame][inside].double()
+            false_alarms = self.known[frame][inside].double() - hits
+            if hits.sum() == 0:
+                continue
+            p_sorted, order = p[inside].sort(descending=True)
+            iou = hits[order].cumsum(0) / (hits.sum() + false_alarms[order].cumsum(0))
+            ends_tie = torch.cat([p_sorted[1:] < p_sorted[:-1], p_sorted.new_ones(1, dtype=torch.bool)])
+            thresholds[frame] = p_sorted[torch.where(ends_tie, iou, -1.0).argmax()]
+        return where & (probability >= thresholds[:, None, None, None]), thresholds
+
+
+@dataclass(frozen=True)
+class FlowErrors(Record):
+    """Sums of end-point errors over the voxels that move, per frame."""
+
+    error_mps: Float[Tensor, "F"]
+    speed_mps: Float[Tensor, "F"]
+    """What predicting no motion at all would err by."""
+    voxels: Int[Tensor, "F"]
+
+    def __add__(self, other: "FlowErrors") -> "FlowErrors":
+        return FlowErrors(
+            self.error_mps + other.error_mps, self.speed_mps + other.speed_mps, self.voxels + other.voxels
+        )
+
+
+def flow_errors(predicted_mps: Float[Tensor, "b F 3 Z Y X"], labels: VoxelGrid) -> FlowErrors:
+    """End-point errors |predicted − true velocity| on known voxels that move at more than 0.5 m/s."""
+    speed = labels.values.norm(dim=2)
+    moving = labels.known & (speed > MOVING_MPS)
+    error = (predicted_mps - labels.values).norm(dim=2)
+
+    def total(values: Tensor) -> Float[Tensor, "F"]:
+        return torch.where(moving, values, 0.0).double().sum(dim=(0, 2, 3, 4)).cpu()
+
+    return FlowErrors(total(error), total(speed), moving.sum(dim=(0, 2, 3, 4)).cpu())
