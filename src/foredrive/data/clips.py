@@ -1,0 +1,217 @@
+"""Clips of 123D logs with their voxel labels, as a torch data set."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64, UInt8
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from foredrive.data.boxes import read_boxes
+from foredrive.data.cameras import find_camera, pinhole_cameras
+from foredrive.data.collate import stack_records
+from foredrive.data.commands import command_at
+from foredrive.data.image_store import ImageStore
+from foredrive.data.labels import LabelStore
+from foredrive.data.lidar import empty_sweep, read_sweep
+from foredrive.data.logs import Log, LogPath
+from foredrive.data.maps import read_map_patch
+from foredrive.errors import InputError
+from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, VoxelGrid, VoxelSpec
+
+
+@dataclass(frozen=True)
+class ClipConfig:
+    """Which frames of a log make a clip, and what is read of them."""
+
+    past_frames: int
+    """Key frames before now."""
+    future_frames: int
+    """Key frames after now: what training and scoring compare with."""
+    image_hw: tuple[int, int]
+    """Height and width all images are resized to, px."""
+    voxels: VoxelSpec
+    frame_dt_s: float = 0.5
+    """Time between key frames."""
+    horizon_steps: int = 6
+    horizon_dt_s: float = 0.5
+    cameras: tuple[str, ...] | None = None
+    """Cameras by their own or by 123D's names ("pcam_f0"), in this order; None takes all there are."""
+    now_stride_s: float = 0.5
+    """Time between the clips' nows."""
+    future_images: bool = True
+    lidar: bool = False
+    """Put the sweeps into the clip."""
+    map: bool = False
+
+
+class ClipDataset(Dataset[Example]):
+    """Every clip of some logs, unbatched, in the order of logs and time.
+
+    Files are opened when they are first read, in whichever process reads them; the data set can be pickled.
+    Workers need the forkserver start method: `DataLoader(..., multiprocessing_context="forkserver")`.
+
+    Args:
+        logs: at least one.
+        cache_dir: folder for voxel labels and shrunk images; None keeps nothing.
+
+    Raises:
+        InputError: on a log that cannot be read or is too short for one clip, or a camera that no log has.
+    """
+
+    command_source: dict[str, int]
+    """How many clips have their command from a provided "route", from the "driven_future", or "none"."""
+    camera_names: tuple[str, ...]
+
+    def __init__(self, logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path | None) -> None:
+        if not logs:
+            raise InputError("a data set needs at least one log")
+        self.config = config
+        self._logs = [Log(path) for path in logs]
+        self._cameras = [pinhole_cameras(log) for log in self._logs]
+        self.camera_names = self._choose_cameras()
+        self._images = ImageStore(cache_dir, config.image_hw)
+        self._labels = LabelStore(cache_dir, config.voxels)
+        self._clips: list[tuple[int, np.ndarray]] = []
+        self.command_source = {"route": 0, "driven_future": 0, "none": 0}
+        for number, log in enumerate(self._logs):
+            for frames in _clip_frames(log, config):
+                self._clips.append((number, frames))
+                self.command_source[self._command(log, frames[config.past_frames])[1]] += 1
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def __getitem__(self, index: int) -> Example:
+        """Read one clip.
+
+        Raises:
+            InputError: on data that cannot be read.
+        """
+        number, frames = self._clips[index]
+        log = self._logs[number]
+        labels = [self._labels.labels(log, frame) for frame in frames]
+        occupied = torch.stack([label.occupied for label in labels])
+        return Example(
+            clip=self._clip(number, frames),
+            occupancy=VoxelGrid(
+                spec=self.config.voxels,
+                values=occupied[:, None].float(),
+                known=torch.stack([label.known for label in labels]),
+            ),
+            flow=VoxelGrid(
+                spec=self.config.voxels,
+                values=torch.stack([label.flow_mps for label in labels]),
+                known=torch.stack([label.flow_known for label in labels]),
+            ),
+            key=(f"{log.path.name}@{log.t_us[frames[self.config.past_frames]]}",),
+        )
+
+    def _choose_cameras(self) -> tuple[str, ...]:
+        if self.config.cameras is None:
+            return tuple(dict.fromkeys(name for cameras in self._cameras for name in cameras))
+        for name in self.config.cameras:
+            if not any(find_camera(cameras, name) for cameras in self._cameras):
+                there = sorted({name for cameras in self._cameras for name in cameras})
+                raise InputError(f"no log has a camera {name!r}; there are: {', '.join(there) or 'none'}")
+        return self.config.cameras
+
+    def _command(self, log: Log, now: int) -> tuple[int | None, str]:
+        future = log.driven_future(now, self.config.horizon_steps, self.config.horizon_dt_s)
+        return command_at(log, now, future)
+
+    def _clip(self, number: int, frames: Int64[np.ndarray, "T"]) -> Clip:
+        log, config = self._logs[number], self.config
+        now = frames[config.past_frames]
+        images, image_valid, rig = self._read_cameras(number, frames)
+        sweeps = [read_sweep(log, frame) if config.lidar else None for frame in frames]
+        boxes = [read_boxes(log, frame) for frame in frames]
+        speed_mps = torch.from_numpy(log.speed_mps[frames]).float()
+        command = self._command(log, now)[0]
+        return Clip(
+            t_s=torch.from_numpy((log.t_us[frames] - log.t_us[now]) * 1e-6).float(),
+            T_world_ego=torch.from_numpy(log.T_world_ego[frames]),
+            images=images,
+            image_valid=image_valid,
+            rig=rig,
+            sweeps=_stack_sweeps([sweep[0] if sweep else None for sweep in sweeps]),
+            sweep_valid=torch.tensor([sweep is not None for sweep in sweeps]),
+            misses_known=torch.tensor([sweep is not None and sweep[1] for sweep in sweeps]),
+            boxes=stack_records([_no_boxes() if b is None else b for b in boxes]),
+            boxes_valid=torch.tensor([b is not None for b in boxes]),
+            ego_speed_mps=speed_mps.nan_to_num(),
+            ego_speed_valid=speed_mps.isfinite(),
+            command=torch.tensor(0 if command is None else int(command)),
+            command_valid=torch.tensor(command is not None),
+            future=log.driven_future(now, config.horizon_steps, config.horizon_dt_s),
+            map=read_map_patch(log, now) if config.map else None,
+        )
+
+    def _read_cameras(
+        self, number: int, frames: Int64[np.ndarray, "T"]
+    ) -> tuple[UInt8[Tensor, "T C 3 H W"], Bool[Tensor, "T C"], CameraRig]:
+        """Images, which of them are there, and the rig; a camera that the log lacks has identity matrices."""
+        names, image_hw = self.camera_names, self.config.image_hw
+        shape = (len(frames), len(names))
+        images = torch.zeros(*shape, 3, *image_hw, dtype=torch.uint8)
+        image_valid = torch.zeros(shape, dtype=torch.bool)
+        K = torch.eye(3).repeat(*shape, 1, 1)
+        T_ego_cam = torch.eye(4).repeat(*shape, 1, 1)
+        dist = torch.zeros(*shape, 5)
+        for c, name in enumerate(names):
+            metadata = find_camera(self._cameras[number], name)
+            if metadata is None:
+                continue
+            for t, frame in enumerate(frames):
+                with_image = self.config.future_images or t <= self.config.past_frames
+                camera = self._images.camera(self._logs[number], frame, metadata, with_image)
+                K[t, c], T_ego_cam[t, c], dist[t, c] = camera.K, camera.T_ego_cam, camera.dist
+                if camera.image is not None:
+                    images[t, c], image_valid[t, c] = camera.image, True
+        rig = CameraRig(
+            K=K,
+            T_ego_cam=T_ego_cam,
+            dist=dist,
+            readout_s=torch.zeros(shape),
+            names=names,
+            size_hw=image_hw,
+        )
+        return images, image_valid, rig
+
+
+def _clip_frames(log: Log, config: ClipConfig) -> list[Int64[np.ndarray, "T"]]:
+    """Frames of each clip: those nearest to the key times, none off by more than half the log's period."""
+    offset_us = np.arange(-config.past_frames, config.future_frames + 1) * config.frame_dt_s * 1e6
+    slack_us = 0.5e6 * log.period_s
+    first_us = log.t_us[0] - offset_us[0]
+    last_us = log.t_us[-1] - offset_us[-1]
+    now_us = np.arange(first_us, last_us + slack_us + 1, config.now_stride_s * 1e6)
+    now, found = log.nearest_frames(now_us)
+    now = np.unique(now[found])
+    frames, found = log.nearest_frames(log.t_us[now][:, None] + offset_us)
+    whole = found.all(-1) & (np.diff(frames, axis=-1) > 0).all(-1)
+    if not whole.any():
+        raise InputError(
+            f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
+            f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
+        )
+    return list(frames[whole].astype(np.int64))
+
+
+def _stack_sweeps(sweeps: list[LidarSweep | None]) -> LidarSweep:
+    return stack_records([empty_sweep() if sweep is None else sweep for sweep in sweeps])
+
+
+def _no_boxes() -> Boxes:
+    return Boxes(
+        centre=torch.zeros(0, 3),
+        size_lwh=torch.zeros(0, 3),
+        yaw=torch.zeros(0),
+        velocity=torch.zeros(0, 2),
+        track_id=torch.zeros(0, dtype=torch.int64),
+        category=torch.zeros(0, dtype=torch.int64),
+        valid=torch.zeros(0, dtype=torch.bool),
+    )

@@ -1,0 +1,161 @@
+"""A 123D parser for single nuScenes key frames without the data set around them.
+
+py123d's own parser needs all of nuScenes' tables and the devkit. This one reads a folder with the sensor files
+of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in an mmdetection3d info file
+(*.pkl).
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from py123d.datatypes import (
+    BoxDetectionAttributes,
+    BoxDetectionSE3,
+    BoxDetectionsSE3,
+    CameraID,
+    EgoStateSE3,
+    LidarID,
+    LidarMergedMetadata,
+    LidarMetadata,
+    LogMetadata,
+    PinholeCameraMetadata,
+    PinholeIntrinsics,
+    Timestamp,
+)
+from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
+from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
+from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync, ParsedCamera, ParsedLidar
+from py123d.parser.nuscenes.utils.nuscenes_constants import (
+    NUSCENES_BOX_DETECTIONS_SE3_METADATA,
+    NUSCENES_CAMERA_IDS,
+    NUSCENES_EGO_STATE_SE3_METADATA,
+    NUSCENES_LIDAR_SWEEP_DURATION_US,
+)
+
+from foredrive.data.log_writer import LABEL_OF_CATEGORY
+from foredrive.data.safe_pickle import load_pickle
+from foredrive.scene import Category
+
+
+class NuScenesKeyframeParser(BaseLogParser):
+    """One key frame as a log of one frame.
+
+    Args:
+        folder: holds v1.0-*/ with the tables, the info file and the sensor files by their bare names.
+        split: 123D split, e.g. nuscenes_val.
+    """
+
+    def __init__(self, folder: Path, split: str) -> None:
+        self._folder = Path(folder)
+        self._split = split
+        tables = next(self._folder.glob("v1.0-*"))
+        self._rows = {file.stem: json.loads(file.read_text()) for file in tables.glob("*.json")}
+
+    def get_log_metadata(self) -> LogMetadata:
+        """The scene's name; the location is in a table that the folder does not have."""
+        return LogMetadata("nuscenes", self._split, self._rows["scene"][0]["name"], location=None)
+
+    def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
+        """The frame: ego pose at the lidar's time, boxes, lidar and six cameras."""
+        by_channel = {self._channel(row): row for row in self._rows["sample_data"]}
+        lidar = by_channel["LIDAR_TOP"]
+        timestamp = Timestamp.from_us(lidar["timestamp"])
+        T_world_ego = self._ego_pose(lidar)
+        ego = EgoStateSE3.from_imu(_pose(T_world_ego), NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
+        T_ego_lidar = _matrix(self._calibration(lidar))
+        cameras = [
+            self._camera(camera_id, by_channel[channel])
+            for camera_id, channel in NUSCENES_CAMERA_IDS.items()
+            if channel in by_channel
+        ]
+        yield ModalitiesSync(
+            timestamp,
+            [
+                ego,
+                self._boxes(T_world_ego @ T_ego_lidar, timestamp),
+                self._lidar(lidar, T_ego_lidar),
+                *cameras,
+            ],
+        )
+
+    def _boxes(self, T_world_lidar: np.ndarray, timestamp: Timestamp) -> BoxDetectionsSE3:
+        info = load_pickle(next(self._folder.glob("*.pkl")))
+        names = {number: name for name, number in info["metainfo"]["categories"].items()}
+        detections = []
+        for track, instance in enumerate(info["data_list"][0]["instances"]):
+            *values, yaw = (float(value) for value in instance["bbox_3d"])  # lidar frame, z is the centre's
+            T = T_world_lidar @ _yaw_matrix(yaw, values[:3])
+            velocity = T_world_lidar[:3, :3] @ [*(float(v) for v in instance["velocity"]), 0.0]
+            name = names.get(instance["bbox_label_3d"], "other")
+            attributes = BoxDetectionAttributes(
+                LABEL_OF_CATEGORY[Category[name.upper()]], str(track), int(instance["num_lidar_pts"])
+            )
+            over_ground = Vector3D.from_array(velocity) if np.isfinite(velocity).all() else None
+            detections.append(
+                BoxDetectionSE3(attributes, BoundingBoxSE3(_pose(T), *values[3:6]), over_ground)
+            )
+        metadata: BoxDetectionsSE3Metadata = NUSCENES_BOX_DETECTIONS_SE3_METADATA
+        return BoxDetectionsSE3(detections, timestamp, metadata)
+
+    def _lidar(self, row: dict[str, Any], T_ego_lidar: np.ndarray) -> ParsedLidar:
+        sensor = LidarMetadata("LIDAR_TOP", LidarID.LIDAR_TOP, _pose(T_ego_lidar))
+        return ParsedLidar(
+            metadata=LidarMergedMetadata({LidarID.LIDAR_TOP: sensor}),
+            start_timestamp=Timestamp.from_us(row["timestamp"] - NUSCENES_LIDAR_SWEEP_DURATION_US),
+            end_timestamp=Timestamp.from_us(row["timestamp"]),
+            dataset_root=self._folder,
+            relative_path=Path(row["filename"]).name,
+        )
+
+    def _camera(self, camera_id: CameraID, row: dict[str, Any]) -> ParsedCamera:
+        calibration = self._calibration(row)
+        T_ego_cam = _matrix(calibration)
+        metadata = PinholeCameraMetadata(
+            camera_name=NUSCENES_CAMERA_IDS[camera_id],
+            camera_id=camera_id,
+            intrinsics=PinholeIntrinsics.from_camera_matrix(np.array(calibration["camera_intrinsic"])),
+            distortion=None,
+            width=row["width"],
+            height=row["height"],
+            camera_to_imu_se3=_pose(T_ego_cam),
+            is_undistorted=True,
+        )
+        return ParsedCamera(
+            metadata=metadata,
+            timestamp=Timestamp.from_us(row["timestamp"]),
+            camera_to_global_se3=_pose(self._ego_pose(row) @ T_ego_cam),
+            dataset_root=self._folder,
+            relative_path=Path(row["filename"]).name,
+        )
+
+    def _channel(self, row: dict[str, Any]) -> str:
+        sensor = _find(self._rows["sensor"], self._calibration(row)["sensor_token"])
+        return str(sensor["channel"])
+
+    def _calibration(self, row: dict[str, Any]) -> dict[str, Any]:
+        return _find(self._rows["calibrated_sensor"], row["calibrated_sensor_token"])
+
+    def _ego_pose(self, row: dict[str, Any]) -> np.ndarray:
+        return _matrix(_find(self._rows["ego_pose"], row["ego_pose_token"]))
+
+
+def _find(rows: list[dict[str, Any]], token: str) -> dict[str, Any]:
+    return next(row for row in rows if row["token"] == token)
+
+
+def _matrix(row: dict[str, Any]) -> np.ndarray:
+    return PoseSE3(*row["translation"], *row["rotation"]).transformation_matrix
+
+
+def _pose(T: np.ndarray) -> PoseSE3:
+    return PoseSE3.from_transformation_matrix(T)
+
+
+def _yaw_matrix(yaw: float, xyz: list[float]) -> np.ndarray:
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T[:3, 3] = xyz
+    return T
