@@ -14,7 +14,7 @@ def nemo_tiny() -> Recipe:
             past_frames=1,
             future_frames=2,
             image_hw=(96, 160),
-            voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.5), voxel_m=0.75, shape_zyx=(8, 64, 64)),
+            voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.125), voxel_m=0.75, shape_zyx=(8, 64, 64)),
         ),
         model=NemoSize(
             backbone=BackboneSize(

@@ -1,0 +1,109 @@
+"""Training runs: a folder with the recipe, two stages, their weights."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from lightning_fabric import Fabric
+
+from foredrive.data import ClipDataset, LogPath, collate, find_logs
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.models.nemo import NemoAgent
+from foredrive.recipes.build import build_agent, build_objective
+from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
+from foredrive.training import load_weights, save_weights, train
+
+CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
+STAGES = ("pretrain", "finetune")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run on disk: its recipe, the logs it was trained on, where its label cache lies."""
+
+    folder: Path
+    recipe: Recipe
+    logs: tuple[LogPath, ...]
+    cache_dir: Path
+
+    @property
+    def weights(self) -> Path:
+        """Weights of the last finished stage."""
+        for stage in reversed(STAGES):
+            if (self.folder / stage / WEIGHTS).is_file():
+                return self.folder / stage / WEIGHTS
+        raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
+
+
+def find_all_logs(paths: Sequence[Path]) -> tuple[LogPath, ...]:
+    """The logs at several places, each once."""
+    return tuple({log.folder: log for path in paths for log in find_logs(path)}.values())
+
+
+def open_run(folder: Path) -> Run:
+    """Open a run folder that `train_run` made."""
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder}: not a run folder (no {CONFIG})")
+    recipe = load_recipe(folder / CONFIG)
+    written = json.loads((folder / LOGS).read_text())
+    logs = tuple(LogPath(Path(entry["folder"]), Path(entry["maps_dir"])) for entry in written["logs"])
+    return Run(folder, recipe, logs, Path(written["cache_dir"]))
+
+
+def train_run(recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None = None) -> Run:
+    """Pre-train, then fine-tune; goes on where an earlier call with the same recipe and logs stopped.
+
+    Raises:
+        InputError: if `folder` holds a run of another recipe or other logs.
+    """
+    run = Run(folder, recipe, tuple(logs), cache_dir or folder / "cache")
+    if (folder / CONFIG).is_file():
+        _check_same(open_run(folder), run)
+    else:
+        _write(run)
+    fabric = Fabric(devices="auto" if torch.cuda.is_available() else 1, precision=recipe.precision)
+    fabric.launch()
+    dataset = ClipDataset(run.logs, recipe.clips, run.cache_dir)
+    torch.manual_seed(recipe.pretrain.schedule.seed)
+    agent = build_agent(recipe)
+    _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
+    _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
+    return run
+
+
+def _train_stage(
+    run: Run, name: str, stage: Stage, agent: NemoAgent, dataset: ClipDataset, fabric: Fabric
+) -> None:
+    weights = run.folder / name / WEIGHTS
+    if not weights.is_file():
+        objective = build_objective(run.recipe, stage, agent)
+        train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
+        if fabric.is_global_zero:
+            with atomic_path(weights) as temporary:
+                save_weights(agent, temporary)
+        fabric.barrier()
+    load_weights(agent, weights)
+
+
+def load_agent(run: Run) -> NemoAgent:
+    """The trained agent, ready to act."""
+    agent = build_agent(run.recipe, load_backbone=False)
+    load_weights(agent, run.weights)
+    return agent.eval()
+
+
+def _write(run: Run) -> None:
+    run.folder.mkdir(parents=True, exist_ok=True)
+    logs = [{"folder": str(log.folder), "maps_dir": str(log.maps_dir)} for log in run.logs]
+    with atomic_path(run.folder / LOGS) as temporary:
+        temporary.write_text(json.dumps({"logs": logs, "cache_dir": str(run.cache_dir)}, indent=1))
+    save_recipe(run.recipe, run.folder / CONFIG)
+
+
+def _check_same(there: Run, wanted: Run) -> None:
+    for what in ("recipe", "logs"):
+        if getattr(there, what) != getattr(wanted, what):
+            raise InputError(f"{there.folder}: holds a run with another {what}; choose another folder")
