@@ -1,1 +1,34 @@
 """Runs evaluations: predictions and truth in, one flat summary out."""
+
+from foredrive.evaluation.baselines import (
+    ConstantVelocity,
+    DrivenStatus,
+    StandStill,
+    fit_ego_mlp,
+    read_training_set,
+)
+from foredrive.evaluation.bench import Benchmark, run_benchmark
+from foredrive.evaluation.predictor import Prediction, Predictor
+from foredrive.evaluation.provenance import peak_rss_gib, provenance
+from foredrive.evaluation.run import EvaluationResult, Failure, evaluate
+from foredrive.evaluation.summary import print_summary, read_summary, write_summary
+
+__all__ = [
+    "Benchmark",
+    "ConstantVelocity",
+    "DrivenStatus",
+    "EvaluationResult",
+    "Failure",
+    "Prediction",
+    "Predictor",
+    "StandStill",
+    "evaluate",
+    "fit_ego_mlp",
+    "peak_rss_gib",
+    "print_summary",
+    "provenance",
+    "read_summary",
+    "read_training_set",
+    "run_benchmark",
+    "write_summary",
+]

@@ -1,0 +1,144 @@
+"""Benchmarks' common ground: arms side by side, over seeds, stored as they come in.
+
+A benchmark is run arm by arm and seed by seed, and its file is written after each. A run that was interrupted
+goes on where it stopped; figures are kept only while the code (commit and changes since), the benchmark's
+configuration and the machine are the same.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from foredrive.errors import InputError
+from foredrive.evaluation.provenance import provenance
+from foredrive.evaluation.summary import write_json
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Things to compare, all measured by this program on this machine."""
+
+    question: str
+    """What the figures answer, in one line."""
+    arms: Mapping[str, Callable[[int], Mapping[str, float]]]
+    """By name, what is compared: seed → figures by name, units in the names."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    config: Mapping[str, Any] | None = None
+    """Whatever the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
+
+
+def run_benchmark(
+    name: str,
+    benchmark: Benchmark,
+    folder: Path,
+    *,
+    arms: Sequence[str] | None = None,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Run what is still missing of a benchmark and return the path of its results, `folder`/NAME.json.
+
+    Args:
+        arms: only these; None means all.
+        say: told what happens, one line at a time.
+
+    Raises:
+        InputError: on an arm that the benchmark does not have.
+    """
+    unknown = set(arms or ()) - set(benchmark.arms)
+    if unknown:
+        raise InputError(
+            f"{name} has no arm {', '.join(sorted(unknown))}; it has {', '.join(benchmark.arms)}"
+        )
+    path = folder / f"{name}.json"
+    origin = provenance()
+    same = _identity(benchmark, origin)
+    runs = _kept_runs(path, same, benchmark, say)
+    for arm, measure in benchmark.arms.items():
+        if arms is not None and arm not in arms:
+            continue
+        for seed in benchmark.seeds:
+            if any(run["arm"] == arm and run["seed"] == seed for run in runs):
+                say(f"{name}: {arm}, seed {seed}: measured before")
+                continue
+            say(f"{name}: {arm}, seed {seed} …")
+            started = time.perf_counter()
+            figures = {key: float(value) for key, value in measure(seed).items()}
+            wall_s = time.perf_counter() - started
+            runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s})
+            write_json(path, _report(name, benchmark, origin, same, runs))
+            say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+    if not path.is_file():
+        raise InputError(f"{name} has no arms or no seeds")
+    return path
+
+
+def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Mean, standard deviation (of a sample), minimum, maximum and number per arm and figure."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for run in runs:
+        for key, value in run["figures"].items():
+            if value is not None:
+                found.setdefault(run["arm"], {}).setdefault(key, []).append(value)
+    return {
+        arm: {
+            key: {
+                "mean": mean(values),
+                "std": stdev(values) if len(values) > 1 else 0.0,
+                "min": min(values),
+                "max": max(values),
+                "n": len(values),
+            }
+            for key, values in figures.items()
+        }
+        for arm, figures in found.items()
+    }
+
+
+def _report(
+    name: str,
+    benchmark: Benchmark,
+    origin: Mapping[str, Any],
+    same: str,
+    runs: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "question": benchmark.question,
+        "figures": spread(runs),
+        "config": dict(benchmark.config or {}),
+        "identity": same,
+        **origin,
+        "runs": list(runs),
+    }
+
+
+def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
+    """A digest of all that makes two measurements comparable."""
+    parts = {key: value for key, value in origin.items() if key != "command"}
+    parts["config"] = dict(benchmark.config or {})
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _kept_runs(
+    path: Path, same: str, benchmark: Benchmark, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Earlier runs that are still good."""
+    if not path.is_file():
+        return []
+    try:
+        earlier = json.loads(path.read_text())
+        runs = [
+            run for run in earlier["runs"] if run["arm"] in benchmark.arms and run["seed"] in benchmark.seeds
+        ]
+        identity = earlier["identity"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a benchmark's results; move it away to start anew") from error
+    if identity == same:
+        return runs
+    say(f"{path.name}: measured on other code, configuration or machine; starting anew")
+    return []

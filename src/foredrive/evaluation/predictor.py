@@ -1,0 +1,36 @@
+"""What an evaluation asks of whatever it judges."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.scene import Clip, Trajectory
+from foredrive.scene.record import Record
+
+
+@dataclass(frozen=True)
+class Prediction(Record):
+    """What is said about b clips, for F frames: now, then future key frames. What is None is not judged."""
+
+    occupancy_logit: Float[Tensor, "b F Z Y X"] | None = None
+    """Each frame in its own (predicted) ego frame, on the labels' grid."""
+    plan: Trajectory | None = None
+    """[b 1 T] in the ego frame at now."""
+    flow_mps: Float[Tensor, "b F 3 Z Y X"] | None = None
+    """Velocity over ground of what is in a voxel, in the ego axes of its frame."""
+    images: Float[Tensor, "b F C 3 h w"] | None = None
+    """Rendered views of the clip's cameras, RGB from 0 to 1."""
+    image_known: Bool[Tensor, "b F C h w"] | None = None
+    """Pixels that were rendered; None: all."""
+    image_stride: int = 1
+    """Every how many-th pixel along rows and columns was rendered, the first one `image_stride // 2` in."""
+
+
+class Predictor(Protocol):
+    """A model under evaluation."""
+
+    def predict(self, observed: Clip) -> Prediction:
+        """Predict from a batch of clips that end at now; their driven future is masked."""
+        ...

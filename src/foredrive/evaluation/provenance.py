@@ -1,0 +1,91 @@
+"""Where numbers come from: machine, versions, commit, command, memory."""
+
+import hashlib
+import os
+import platform
+import resource
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import torch
+
+import foredrive
+
+GIB = 1024**3
+CODE = ("--", "src", "pyproject.toml")
+"""What figures depend on, as arguments to git."""
+
+
+def provenance() -> dict[str, float | int | str | None]:
+    """What has to be known to repeat a measurement, as flat dotted keys."""
+    commit = git_commit()
+    return {
+        "machine.cpu": _cpu_model(),
+        "machine.cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "machine.ram_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB, 1),
+        "machine.gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "version.foredrive": metadata.version("foredrive"),
+        "version.python": platform.python_version(),
+        "version.torch": torch.__version__,
+        "commit": commit,
+        "command": command_line(),
+    }
+
+
+def command_line() -> str:
+    """The command this process was started with, without the folder its program lies in."""
+    program = Path(sys.argv[0])
+    name = f"python -m {program.parent.name}" if program.name == "__main__.py" else program.name
+    return " ".join([name, *map(shlex.quote, sys.argv[1:])])
+
+
+def git_commit() -> str | None:
+    """Commit of the checkout this package runs from, None if it runs from elsewhere.
+
+    Where the code differs from the commit, "+" and a digest of the difference follow: two measurements are of
+    the same code if and only if the strings are equal.
+    """
+    folder = Path(foredrive.__file__).parents[2]
+    commit = _git(folder, "rev-parse", "--short=12", "HEAD") if (folder / ".git").exists() else None
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=all", *CODE)
+    if commit is None or not changed:
+        return commit
+    digest = hashlib.sha256((_git(folder, "diff", "HEAD", *CODE) or "").encode())
+    for line in changed.splitlines():
+        if line.startswith("?? "):
+            digest.update(line.encode() + (folder / line[3:].strip('"')).read_bytes())
+    return f"{commit}+{digest.hexdigest()[:8]}"
+
+
+def peak_rss_gib() -> float:
+    """Highest resident memory this process has had, GiB (worker processes not included)."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # getrusage would also know what the process that started this one had
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / GIB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / GIB if sys.platform == "darwin" else peak * 1024 / GIB
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git says, None if it cannot be asked."""
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=60
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip("\n")
+
+
+def _cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,148 @@
+"""Figures on disk and on the screen."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
+
+Value = float | int | str | None
+
+PROTOCOL_TITLES = {
+    "stp3": "ST-P3",
+    "uniad": "UniAD",
+    "vad": "VAD",
+    "sparsedrive": "SparseDrive",
+    "bevplanner": "BEV-Planner",
+}
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write JSON whole or not at all; NaN and infinity, which JSON does not have, become null."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def write_summary(path: Path, summary: Mapping[str, Value]) -> None:
+    """Write a flat summary (dotted keys) as JSON, keys in their given order."""
+    for key, value in summary.items():
+        if not isinstance(value, (float, int, str, type(None))):
+            raise TypeError(f"a summary is flat: {key} holds a {type(value).__name__}")
+    write_json(path, dict(summary))
+
+
+def read_summary(path: Path) -> dict[str, Value]:
+    """Read what `write_summary` wrote."""
+    try:
+        summary = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a summary that can be read") from error
+    if not isinstance(summary, dict):
+        raise InputError(f"{path}: not a summary: expected a JSON object")
+    return summary
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def planning_table(summary: Mapping[str, Value], model: str = "model") -> Table:
+    """Every protocol side by side, the model and its baselines under each."""
+    table = Table(title="Open-loop planning", title_justify="left", header_style="bold")
+    table.add_column("protocol")
+    table.add_column("planner")
+    for horizon in (*HORIZON_NAMES, "avg"):
+        table.add_column(
+            f"L2 {horizon}\n[m]" if horizon == HORIZON_NAMES[0] else f"L2 {horizon}", justify="right"
+        )
+    for horizon in (*HORIZON_NAMES, "avg"):
+        title = f"col. {horizon}"
+        table.add_column(f"{title}\n[%]" if horizon == HORIZON_NAMES[0] else title, justify="right")
+    table.add_column("frames", justify="right")
+    table.add_column("invalid", justify="right")
+    for protocol in PROTOCOLS:
+        prefixes = _planners(summary, protocol, model)
+        for i, (name, prefix) in enumerate(prefixes.items()):
+            l2 = [_show(summary.get(f"{prefix}.l2_{h}_m"), 2) for h in (*HORIZON_NAMES, "avg")]
+            collisions = [
+                _show(summary.get(f"{prefix}.collision_{h}_pct"), 2) for h in (*HORIZON_NAMES, "avg")
+            ]
+            table.add_row(
+                PROTOCOL_TITLES[protocol] if i == 0 else "",
+                name,
+                *l2,
+                *collisions,
+                _show(summary.get(f"{prefix}.frames_counted"), 0),
+                _show(summary.get(f"{prefix}.frames_invalid"), 0),
+                end_section=i == len(prefixes) - 1,
+            )
+    return table
+
+
+def _planners(summary: Mapping[str, Value], protocol: str, model: str) -> dict[str, str]:
+    """Planner names and the prefixes of their keys under a protocol, the model first."""
+    found: dict[str, str] = {}
+    ending = f".{protocol}.l2_avg_m"
+    for key in summary:
+        if key.startswith("planning.") and key.endswith(ending):
+            prefix = key.removesuffix(".l2_avg_m")
+            name = prefix.removeprefix("planning.").removesuffix(protocol).rstrip(".")
+            found[name.replace("_", " ") or model] = prefix
+    return dict(sorted(found.items(), key=lambda entry: entry[0] != model))
+
+
+def occupancy_table(summary: Mapping[str, Value]) -> Table:
+    """Occupancy now and in the future, beside the best constant where there is one."""
+    table = Table(title="Occupancy on known voxels", title_justify="left", header_style="bold")
+    table.add_column("voxels")
+    table.add_column("when")
+    for title in ("IoU", "best constant", "precision", "recall"):
+        table.add_column(title, justify="right")
+    for scope, title in (("", "all"), ("above_ground.", "above ground")):
+        prefix = f"occupancy.{scope}"
+        names = [key.removeprefix(f"{prefix}iou_") for key in summary if key.startswith(f"{prefix}iou_")]
+        for i, name in enumerate(names := [name for name in names if "." not in name]):
+            table.add_row(
+                title if i == 0 else "",
+                name.replace("future_", "in "),
+                _show(summary.get(f"{prefix}iou_{name}"), 3),
+                _show(summary.get(f"{prefix}iou_{name}.best_constant"), 3),
+                _show(summary.get(f"{prefix}precision_{name}"), 3),
+                _show(summary.get(f"{prefix}recall_{name}"), 3),
+                end_section=i == len(names) - 1,
+            )
+    return table
+
+
+def print_summary(summary: Mapping[str, Value], console: Console, model: str = "model") -> None:
+    """Print what a person wants to see of a summary."""
+    if any(key.startswith("occupancy.") for key in summary):
+        console.print(occupancy_table(summary))
+    if any(key.startswith("planning.") for key in summary):
+        console.print(planning_table(summary, model))
+    if "image.psnr_db" in summary:
+        console.print(
+            f"rendered images: PSNR {_show(summary['image.psnr_db'], 1)} dB, "
+            f"SSIM {_show(summary.get('image.ssim'), 3)}"
+        )
+    console.print(
+        f"{_show(summary.get('items'), 0)} clips, {_show(summary.get('failed'), 0)} failed; "
+        f"commands from: {summary.get('command_source', 'none')}; "
+        f"peak memory {_show(summary.get('peak_rss_gib'), 2)} GiB, {_show(summary.get('wall_s'), 0)} s"
+    )
+
+
+def _show(value: Value, digits: int) -> str:
+    if isinstance(value, str):
+        return value
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

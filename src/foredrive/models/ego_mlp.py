@@ -1,0 +1,77 @@
+"""A planner that sees nothing but the ego vehicle's own status."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3, yaw_of
+from foredrive.scene import Clip, Command, Trajectory
+
+
+def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
+    """What a vehicle knows of itself at now: where it was, how fast, and the command.
+
+    x, y, yaw of the last `past_frames` key frames in the ego frame at now; speed at those and now (m/s, 0
+    where unknown); the command as one-hot (zeros where unknown). Accelerations follow from the speeds.
+    """
+    now = clip.now
+    if now < past_frames:
+        raise InputError(f"the ego status needs {past_frames} frames before now, the clip has {now}")
+    seen = slice(now - past_frames, now + 1)
+    T_now_ego = inverse_se3(clip.T_world_ego[:, now : now + 1]) @ clip.T_world_ego[:, seen]
+    poses = torch.cat([T_now_ego[..., :2, 3], yaw_of(T_now_ego)[..., None]], dim=-1)[:, :-1]
+    speed = torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, seen]
+    command = nn.functional.one_hot(clip.command.long(), len(Command)) * clip.command_valid[:, None]
+    return torch.cat([poses.flatten(1).float(), speed, command.float()], dim=-1)
+
+
+class EgoMLP(nn.Module):
+    """An `Agent`: ego status to waypoints by a three-layer perceptron (Zhai et al. 2023, "AD-MLP").
+
+    It cannot know what is around, so what it scores is what a protocol gives away. Inputs and outputs are
+    standardised by the training set's mean and spread, which are part of the weights.
+
+    Args:
+        past_frames: key frames before now that it looks back on (4 in the paper).
+        horizon_steps, dt_s: of the plan.
+        hidden: width of both hidden layers (512 in the paper).
+    """
+
+    status_mean: Tensor
+    status_std: Tensor
+    plan_mean: Tensor
+    plan_std: Tensor
+
+    def __init__(self, *, past_frames: int, horizon_steps: int, dt_s: float, hidden: int = 512) -> None:
+        super().__init__()
+        self.past_frames, self.horizon_steps, self.dt_s = past_frames, horizon_steps, dt_s
+        inputs, outputs = 4 * past_frames + 1 + len(Command), 3 * horizon_steps
+        self.layers = nn.Sequential(
+            nn.Linear(inputs, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, outputs),
+        )
+        self.register_buffer("status_mean", torch.zeros(inputs))
+        self.register_buffer("status_std", torch.ones(inputs))
+        self.register_buffer("plan_mean", torch.zeros(outputs))
+        self.register_buffer("plan_std", torch.ones(outputs))
+
+    def forward(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 3"]:
+        """x, y (m) and yaw (rad) of each step, in the ego frame at now."""
+        plan = self.layers((status - self.status_mean) / self.status_std)
+        return (plan * self.plan_std + self.plan_mean).unflatten(1, (self.horizon_steps, 3))
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan from now on."""
+        plan = self(ego_status(observation, self.past_frames))[:, None]  # [b, 1, T, 3]
+        return Trajectory(
+            xy=plan[..., :2],
+            yaw=plan[..., 2],
+            valid=torch.ones_like(plan[..., 0], dtype=torch.bool),
+            log_prob=torch.zeros_like(plan[..., 0, 0]),
+            dt_s=self.dt_s,
+        )
