@@ -26,6 +26,7 @@ TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "
 SAMPLE_SPACING_M = 1.0
 CONNECTION_TOLERANCE_M = 0.1
 MIN_MARKING_M = 0.1
+DEFAULT_LINE_WIDTH_M = 0.125
 
 Points = Float64[np.ndarray, "N 3"]
 
@@ -65,6 +66,19 @@ class StopZoneKind(enum.StrEnum):
 
 
 @dataclass(frozen=True)
+class Marking:
+    """A painted line or a kerb along a part of a strip's border."""
+
+    start_m: float
+    """From the start of the strip, in the direction of travel."""
+    end_m: float
+    kind: MarkingKind
+    """As seen from the strip: of two lines the own one first."""
+    yellow: bool
+    width_m: float
+
+
+@dataclass(frozen=True)
 class Strip:
     """One strip of a road's cross-section; both borders are sampled alike, in the direction of travel."""
 
@@ -74,6 +88,8 @@ class Strip:
     junction_id: int | None
     left_xyz: Points
     right_xyz: Points
+    left_markings: tuple[Marking, ...]
+    right_markings: tuple[Marking, ...]
 
     @cached_property
     def outline_xyz(self) -> Points:
@@ -99,29 +115,19 @@ class Lane:
     right_boundary_xyz: Points
     speed_limit_mps: float | None
     successor_ids: tuple[str, ...]
+    """Where two lanes merge a successor may begin half a lane or more to the side (once in Town03)."""
     predecessor_ids: tuple[str, ...]
     left_id: str | None
     """The neighbour with the same direction of travel."""
     right_id: str | None
     left_marking: MarkingKind
-    """At half length: says whether the line may be crossed."""
+    """At half length, seen from the lane: says whether the line may be crossed."""
     right_marking: MarkingKind
 
     @cached_property
     def width_m(self) -> float:
         """Median width."""
         return float(np.median(np.linalg.norm(self.left_boundary_xyz - self.right_boundary_xyz, axis=1)))
-
-
-@dataclass(frozen=True)
-class Marking:
-    """A painted line, or a kerb without walkway behind it, along one boundary."""
-
-    kind: MarkingKind
-    colour: str
-    """white or yellow."""
-    width_m: float
-    xyz: Points
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,6 @@ class TownMap:
     lanes: tuple[Lane, ...]
     strips: tuple[Strip, ...]
     """Every strip of every cross-section, driving lanes included."""
-    markings: tuple[Marking, ...]
     crosswalks: tuple[Crosswalk, ...]
     stop_zones: tuple[StopZone, ...]
     junctions: dict[int, shapely.Polygon]
@@ -188,15 +193,8 @@ def load_town_map(name: str) -> TownMap:
     roads, _, helpers, _, objects, centre_marks, signals = collect_element_helpers(
         xodr, SAMPLE_SPACING_M, CONNECTION_TOLERANCE_M
     )
-    borders = {
-        lane_id: (
-            _with_road_height(helper, helper.inner_polyline_3d.array, roads),
-            _with_road_height(helper, helper.outer_polyline_3d.array, roads),
-        )
-        for lane_id, helper in helpers.items()
-    }
-    strips = tuple(_strip(helper, borders[lane_id], roads) for lane_id, helper in helpers.items())
-    lanes = tuple(_lane(s, helpers, centre_marks) for s in strips if s.kind is StripKind.DRIVING)
+    strips = tuple(_strip(helper, helpers, centre_marks, roads) for helper in helpers.values())
+    lanes = tuple(_lane(strip, helpers) for strip in strips if strip.kind is StripKind.DRIVING)
     crosswalks = tuple(
         Crosswalk(o.object_id, np.concatenate([o.outline_3d, o.outline_3d[:1]])) for o in objects.values()
     )
@@ -204,7 +202,6 @@ def load_town_map(name: str) -> TownMap:
         name=name,
         lanes=lanes,
         strips=strips,
-        markings=tuple(_markings(helpers, borders, centre_marks)),
         crosswalks=crosswalks,
         stop_zones=tuple(_stop_zones(helpers, signals, xodr)),
         junctions=_junctions(strips),
@@ -224,31 +221,80 @@ def _with_road_height(helper: Any, xyz: Points, roads: dict[int, Any]) -> Points
     return np.column_stack([xyz[:, :2], z[::-1] if helper.id > 0 else z])
 
 
-def _strip(helper: Any, border: tuple[Points, Points], roads: dict[int, Any]) -> Strip:
-    road = roads[int(helper.lane_id.split("_")[0])]
-    kind = helper.type if helper.type in set(StripKind) else StripKind.NONE
-    junction = None if road.junction is None else int(road.junction)
-    return Strip(helper.lane_id, StripKind(kind), road.id, junction, *border)
+def _strip(
+    helper: Any, helpers: dict[str, Any], centre_marks: dict[str, Any], roads: dict[int, Any]
+) -> Strip:
+    section, _, index = helper.lane_id.rsplit("_", 2)
+    road = roads[int(section.split("_")[0])]
+    inward = helpers.get(_beside(helper, -1))
+    if abs(int(index)) == 1:
+        inner_marks = centre_marks.get(section, [])
+    else:
+        inner_marks = [] if inward is None else inward.open_drive_lane.road_marks
+    # "solid broken" names the left line first on the reference line, the inner one elsewhere.
+    swap_inner = abs(int(index)) > 1 or helper.id < 0
+    return Strip(
+        id=helper.lane_id,
+        kind=StripKind(helper.type if helper.type in set(StripKind) else StripKind.NONE),
+        road_id=road.id,
+        junction_id=None if road.junction is None else int(road.junction),
+        left_xyz=_with_road_height(helper, helper.inner_polyline_3d.array, roads),
+        right_xyz=_with_road_height(helper, helper.outer_polyline_3d.array, roads),
+        left_markings=_markings(helper, inner_marks, swap_inner),
+        right_markings=_markings(helper, helper.open_drive_lane.road_marks, swap=False),
+    )
 
 
-def _lane(strip: Strip, helpers: dict[str, Any], centre_marks: dict[str, Any]) -> Lane:
+def _beside(helper: Any, step: int) -> str:
+    """Id of the strip `step` further out from the road's reference line."""
+    group, index = helper.lane_id.rsplit("_", 1)
+    return f"{group}_{int(index) + step * (1 if helper.id > 0 else -1)}"
+
+
+_SWAPPED = {
+    MarkingKind.SOLID_BROKEN: MarkingKind.BROKEN_SOLID,
+    MarkingKind.BROKEN_SOLID: MarkingKind.SOLID_BROKEN,
+}
+
+
+def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
+    """Road marks, given along the road's s, in the strip's direction of travel."""
+    length = float(helper.s_range[1] - helper.s_range[0])
+    ends = [mark.s_offset for mark in marks[1:]] + [length]
+    found = []
+    for mark, end_s in zip(marks, ends, strict=True):
+        start_m, end_m = max(0.0, mark.s_offset), min(length, end_s)
+        name = (mark.type or "none").lower()
+        kind = MarkingKind(name) if name in set(MarkingKind) else MarkingKind.SOLID
+        if end_m - start_m < MIN_MARKING_M or kind is MarkingKind.NONE:
+            continue
+        if helper.id > 0:
+            start_m, end_m = length - end_m, length - start_m
+        yellow = (mark.color or "").lower() == "yellow"
+        kind = _SWAPPED.get(kind, kind) if swap else kind
+        found.append(Marking(start_m, end_m, kind, yellow, mark.width or DEFAULT_LINE_WIDTH_M))
+    return tuple(sorted(found, key=lambda marking: marking.start_m))
+
+
+def marking_at(markings: tuple[Marking, ...], along_m: float) -> Marking | None:
+    """The marking at a distance from the start of its strip."""
+    return next((m for m in markings if m.start_m <= along_m < m.end_m), None)
+
+
+def _lane(strip: Strip, helpers: dict[str, Any]) -> Lane:
     helper = helpers[strip.id]
-    group, index = strip.id.rsplit("_", 1)
-    inward, outward = (f"{group}_{int(index) + step * (1 if helper.id > 0 else -1)}" for step in (-1, 1))
 
     def driving(lane_ids: list[str]) -> tuple[str, ...]:
         return tuple(sorted({i for i in lane_ids if i in helpers and helpers[i].type == "driving"}))
 
-    inner_marks = (
-        helpers[inward].open_drive_lane.road_marks
-        if inward in helpers
-        else centre_marks.get(group.rsplit("_", 1)[0], [])
-    )
-    half_s = 0.5 * (helper.s_range[1] - helper.s_range[0])
+    def kind_halfway(markings: tuple[Marking, ...]) -> MarkingKind:
+        marking = marking_at(markings, 0.5 * float(helper.s_range[1] - helper.s_range[0]))
+        return MarkingKind.NONE if marking is None else marking.kind
+
     limit = helper.speed_limit_mps
     return Lane(
         lane_id=strip.id,
-        group_id=group,
+        group_id=strip.id.rsplit("_", 1)[0],
         junction_id=strip.junction_id,
         centreline_xyz=0.5 * (strip.left_xyz + strip.right_xyz),
         left_boundary_xyz=strip.left_xyz,
@@ -256,49 +302,11 @@ def _lane(strip: Strip, helpers: dict[str, Any], centre_marks: dict[str, Any]) -
         speed_limit_mps=None if limit is None else float(limit),
         successor_ids=driving(helper.successor_lane_ids),
         predecessor_ids=driving(helper.predecessor_lane_ids),
-        left_id=next(iter(driving([inward])), None),
-        right_id=next(iter(driving([outward])), None),
-        left_marking=_kind_at(inner_marks, half_s),
-        right_marking=_kind_at(helper.open_drive_lane.road_marks, half_s),
+        left_id=next(iter(driving([_beside(helper, -1)])), None),
+        right_id=next(iter(driving([_beside(helper, 1)])), None),
+        left_marking=kind_halfway(strip.left_markings),
+        right_marking=kind_halfway(strip.right_markings),
     )
-
-
-def _kind(mark: Any) -> MarkingKind:
-    name = (mark.type or "none").lower()
-    return MarkingKind(name) if name in set(MarkingKind) else MarkingKind.SOLID
-
-
-def _kind_at(marks: list[Any], s_m: float) -> MarkingKind:
-    """Kind of the road mark that covers `s_m` (from the start of the lane section)."""
-    before = [mark for mark in marks if mark.s_offset <= s_m]
-    return _kind(max(before, key=lambda mark: mark.s_offset)) if before else MarkingKind.NONE
-
-
-def _markings(
-    helpers: dict[str, Any], borders: dict[str, tuple[Points, Points]], centre_marks: dict[str, Any]
-) -> list[Marking]:
-    """The marks of every strip's outer border, and those of the reference lines."""
-    lines = [(h, h.open_drive_lane.road_marks, borders[i][1]) for i, h in helpers.items()]
-    for section, marks in centre_marks.items():
-        # The reference line is the inner border of the innermost strip on either side.
-        inner = next((i for i in (f"{section}_right_-1", f"{section}_left_1") if i in helpers), None)
-        if inner is not None:
-            lines.append((helpers[inner], marks, borders[inner][0]))
-    found = []
-    for helper, marks, xyz in lines:
-        in_s = xyz[::-1] if helper.id > 0 else xyz  # road marks are given along the road's s
-        s = np.linspace(0.0, helper.s_range[1] - helper.s_range[0], len(in_s))
-        ends = [mark.s_offset for mark in marks[1:]] + [s[-1]]
-        for mark, end_s in zip(marks, ends, strict=False):
-            start_s, end_s = max(0.0, mark.s_offset), min(s[-1], end_s)
-            if _kind(mark) is MarkingKind.NONE or end_s - start_s < MIN_MARKING_M:
-                continue
-            between = s[(s > start_s) & (s < end_s)]
-            at = np.concatenate([[start_s], between, [end_s]])
-            line = np.column_stack([np.interp(at, s, in_s[:, axis]) for axis in range(3)])
-            colour = "yellow" if (mark.color or "white").lower() == "yellow" else "white"
-            found.append(Marking(_kind(mark), colour, mark.width or 0.125, line))
-    return found
 
 
 def _stop_zones(helpers: dict[str, Any], signals: dict[int, Any], xodr: XODR) -> list[StopZone]:
