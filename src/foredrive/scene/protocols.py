@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -58,6 +58,7 @@ class WorldModel(Protocol):
         ...
 
 
+@runtime_checkable
 class Agent(Protocol):
     """Something that drives."""
 
