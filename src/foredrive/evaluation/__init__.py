@@ -9,7 +9,7 @@ from foredrive.evaluation.baselines import (
 )
 from foredrive.evaluation.bench import Benchmark, run_benchmark
 from foredrive.evaluation.predictor import Prediction, Predictor
-from foredrive.evaluation.provenance import peak_rss_gib, provenance
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.run import EvaluationResult, Failure, evaluate
 from foredrive.evaluation.summary import print_summary, read_summary, write_summary
 
@@ -22,11 +22,11 @@ __all__ = [
     "Prediction",
     "Predictor",
     "StandStill",
+    "collect_provenance",
     "evaluate",
     "fit_ego_mlp",
     "peak_rss_gib",
     "print_summary",
-    "provenance",
     "read_summary",
     "read_training_set",
     "run_benchmark",

@@ -15,7 +15,7 @@ from statistics import mean, stdev
 from typing import Any
 
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import provenance
+from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 
 
@@ -55,7 +55,7 @@ def run_benchmark(
             f"{name} has no arm {', '.join(sorted(unknown))}; it has {', '.join(benchmark.arms)}"
         )
     path = folder / f"{name}.json"
-    origin = provenance()
+    origin = collect_provenance()
     same = _identity(benchmark, origin)
     runs = _kept_runs(path, same, benchmark, say)
     for arm, measure in benchmark.arms.items():

@@ -1,7 +1,7 @@
 """What an evaluation asks of whatever it judges."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -28,6 +28,7 @@ class Prediction(Record):
     """Every how many-th pixel along rows and columns was rendered, the first one `image_stride // 2` in."""
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """A model under evaluation."""
 

@@ -19,9 +19,8 @@ CODE = ("--", "src", "pyproject.toml")
 """What figures depend on, as arguments to git."""
 
 
-def provenance() -> dict[str, float | int | str | None]:
+def collect_provenance() -> dict[str, float | int | str | None]:
     """What has to be known to repeat a measurement, as flat dotted keys."""
-    commit = git_commit()
     return {
         "machine.cpu": _cpu_model(),
         "machine.cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -30,7 +29,7 @@ def provenance() -> dict[str, float | int | str | None]:
         "version.foredrive": metadata.version("foredrive"),
         "version.python": platform.python_version(),
         "version.torch": torch.__version__,
-        "commit": commit,
+        "commit": git_commit(Path(foredrive.__file__).parents[2]),
         "command": command_line(),
     }
 
@@ -42,21 +41,22 @@ def command_line() -> str:
     return " ".join([name, *map(shlex.quote, sys.argv[1:])])
 
 
-def git_commit() -> str | None:
-    """Commit of the checkout this package runs from, None if it runs from elsewhere.
+def git_commit(checkout: Path) -> str | None:
+    """Commit of a checkout, None if it is none.
 
     Where the code differs from the commit, "+" and a digest of the difference follow: two measurements are of
     the same code if and only if the strings are equal.
     """
-    folder = Path(foredrive.__file__).parents[2]
-    commit = _git(folder, "rev-parse", "--short=12", "HEAD") if (folder / ".git").exists() else None
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=all", *CODE)
+    if not (checkout / ".git").exists():
+        return None
+    commit = _git(checkout, "rev-parse", "--short=12", "HEAD")
+    changed = _git(checkout, "status", "--porcelain", "--untracked-files=all", *CODE)
     if commit is None or not changed:
         return commit
-    digest = hashlib.sha256((_git(folder, "diff", "HEAD", *CODE) or "").encode())
+    digest = hashlib.sha256((_git(checkout, "diff", "HEAD", *CODE) or "").encode())
     for line in changed.splitlines():
         if line.startswith("?? "):
-            digest.update(line.encode() + (folder / line[3:].strip('"')).read_bytes())
+            digest.update(line.encode() + (checkout / line[3:].strip('"')).read_bytes())
     return f"{commit}+{digest.hexdigest()[:8]}"
 
 

@@ -2,9 +2,10 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -13,14 +14,6 @@ from foredrive.files import atomic_path
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 
 Value = float | int | str | None
-
-PROTOCOL_TITLES = {
-    "stp3": "ST-P3",
-    "uniad": "UniAD",
-    "vad": "VAD",
-    "sparsedrive": "SparseDrive",
-    "bevplanner": "BEV-Planner",
-}
 
 
 def write_json(path: Path, content: object) -> None:
@@ -31,9 +24,6 @@ def write_json(path: Path, content: object) -> None:
 
 def write_summary(path: Path, summary: Mapping[str, Value]) -> None:
     """Write a flat summary (dotted keys) as JSON, keys in their given order."""
-    for key, value in summary.items():
-        if not isinstance(value, (float, int, str, type(None))):
-            raise TypeError(f"a summary is flat: {key} holds a {type(value).__name__}")
     write_json(path, dict(summary))
 
 
@@ -58,27 +48,22 @@ def _finite(value: object) -> object:
 
 def planning_table(summary: Mapping[str, Value], model: str = "model") -> Table:
     """Every protocol side by side, the model and its baselines under each."""
-    table = Table(title="Open-loop planning", title_justify="left", header_style="bold")
-    table.add_column("protocol")
-    table.add_column("planner")
-    for horizon in (*HORIZON_NAMES, "avg"):
-        table.add_column(
-            f"L2 {horizon}\n[m]" if horizon == HORIZON_NAMES[0] else f"L2 {horizon}", justify="right"
-        )
-    for horizon in (*HORIZON_NAMES, "avg"):
-        title = f"col. {horizon}"
-        table.add_column(f"{title}\n[%]" if horizon == HORIZON_NAMES[0] else title, justify="right")
-    table.add_column("frames", justify="right")
-    table.add_column("invalid", justify="right")
-    for protocol in PROTOCOLS:
-        prefixes = _planners(summary, protocol, model)
+    whens = (*HORIZON_NAMES, "avg")
+    table = _table("Open-loop planning", ("protocol", "planner"))
+    for title in ("L2, m", "col., %"):
+        for when in whens:
+            table.add_column(f"{title if when == whens[0] else ''}\n{when}", justify="right", no_wrap=True)
+    table.add_column("frames\ncounted", justify="right", no_wrap=True)
+    table.add_column("\ninvalid", justify="right", no_wrap=True)
+    for key, protocol in PROTOCOLS.items():
+        prefixes = _planners(summary, key, model)
         for i, (name, prefix) in enumerate(prefixes.items()):
-            l2 = [_show(summary.get(f"{prefix}.l2_{h}_m"), 2) for h in (*HORIZON_NAMES, "avg")]
+            l2 = [_show(summary.get(f"{prefix}.l2_{h}_m"), 2) for h in whens]
             collisions = [
                 _show(summary.get(f"{prefix}.collision_{h}_pct"), 2) for h in (*HORIZON_NAMES, "avg")
             ]
             table.add_row(
-                PROTOCOL_TITLES[protocol] if i == 0 else "",
+                protocol.title if i == 0 else "",
                 name,
                 *l2,
                 *collisions,
@@ -101,11 +86,17 @@ def _planners(summary: Mapping[str, Value], protocol: str, model: str) -> dict[s
     return dict(sorted(found.items(), key=lambda entry: entry[0] != model))
 
 
+def _table(title: str, words: Sequence[str]) -> Table:
+    """A table without vertical lines, and its columns of words."""
+    table = Table(title=title, title_justify="left", header_style="bold", box=box.SIMPLE_HEAD)
+    for word in words:
+        table.add_column(word, no_wrap=True, vertical="bottom")
+    return table
+
+
 def occupancy_table(summary: Mapping[str, Value]) -> Table:
     """Occupancy now and in the future, beside the best constant where there is one."""
-    table = Table(title="Occupancy on known voxels", title_justify="left", header_style="bold")
-    table.add_column("voxels")
-    table.add_column("when")
+    table = _table("Occupancy on known voxels", ("voxels", "when"))
     for title in ("IoU", "best constant", "precision", "recall"):
         table.add_column(title, justify="right")
     for scope, title in (("", "all"), ("above_ground.", "above ground")):

@@ -71,6 +71,7 @@ class ObstacleGrid:
 class PlanningProtocol:
     """Every choice that makes one open-loop protocol what it is."""
 
+    title: str
     l2: Literal["at", "mean"]
     """Distance at the horizon, or the mean over the steps up to it."""
     collision: Literal["at", "mean", "any"]
@@ -93,6 +94,7 @@ class PlanningProtocol:
 
 PROTOCOLS: dict[str, PlanningProtocol] = {
     "stp3": PlanningProtocol(
+        title="ST-P3",
         l2="mean",
         collision="mean",
         categories=VEHICLES | {Category.PEDESTRIAN},
@@ -105,6 +107,7 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         frames="complete",
     ),
     "uniad": PlanningProtocol(
+        title="UniAD",
         l2="at",
         collision="at",
         categories=VEHICLES,
@@ -117,6 +120,7 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         frames="all",
     ),
     "vad": PlanningProtocol(
+        title="VAD",
         l2="mean",
         collision="mean",
         categories=VEHICLES | {Category.PEDESTRIAN},
@@ -129,6 +133,7 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         frames="complete",
     ),
     "sparsedrive": PlanningProtocol(
+        title="SparseDrive",
         l2="mean",
         collision="mean",
         categories=frozenset(Category),
@@ -141,6 +146,7 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         frames="complete",
     ),
     "bevplanner": PlanningProtocol(
+        title="BEV-Planner",
         l2="mean",
         collision="any",
         categories=VEHICLES,

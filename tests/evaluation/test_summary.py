@@ -1,0 +1,128 @@
+"""Figures on disk and on the screen, and where they come from."""
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from foredrive.errors import InputError
+from foredrive.evaluation import (
+    ConstantVelocity,
+    StandStill,
+    evaluate,
+    print_summary,
+    read_summary,
+    write_summary,
+)
+from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.provenance import collect_provenance, command_line, git_commit, peak_rss_gib
+from foredrive.metrics import PROTOCOLS
+from foredrive.scene import Clip, Example
+
+
+def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "summary.json"
+    write_summary(path, {"b.x": math.nan, "a": math.inf, "n": 3, "s": "text", "f": 0.5, "none": None})
+    assert json.loads(path.read_text()) == {
+        "b.x": None,
+        "a": None,
+        "n": 3,
+        "s": "text",
+        "f": 0.5,
+        "none": None,
+    }
+    assert list(read_summary(path)) == ["b.x", "a", "n", "s", "f", "none"]
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_what_is_not_a_summary_is_named(tmp_path: Path) -> None:
+    (tmp_path / "half.json").write_text('{"a": 1')
+    (tmp_path / "list.json").write_text("[1]")
+    for name in ("half.json", "list.json", "missing.json"):
+        with pytest.raises(InputError, match=name):
+            read_summary(tmp_path / name)
+
+
+def test_the_printed_tables(make_example: Callable[..., Example]) -> None:
+    class Half:
+        def predict(self, observed: Clip) -> Prediction:
+            plan = ConstantVelocity(6, 0.5).act(observed)
+            occupied = make_example(0).occupancy.values[:, observed.now : observed.now + 2, 0]
+            return Prediction(occupancy_logit=occupied.expand(len(plan.xy), -1, -1, -1, -1) - 0.5, plan=plan)
+
+    baselines = {"stand_still": StandStill(6, 0.5), "constant_velocity": ConstantVelocity(6, 0.5)}
+    summary = evaluate(Half(), [make_example(0, 1)], frame_dt_s=0.5, baselines=baselines).summary
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    print_summary(summary, console, model="nemo_tiny")
+    text = console.export_text()
+    console.file.close()
+    assert max(len(line) for line in text.splitlines()) <= 120
+    assert "…" not in text  # nothing cut off
+    for protocol in PROTOCOLS.values():
+        assert len(re.findall(rf"{protocol.title}\s+nemo_tiny", text)) == 1
+    assert text.count("stand still") == text.count("constant velocity") == len(PROTOCOLS)
+    cells = next(line for line in text.splitlines() if "UniAD" in line).split()
+    expected = [summary[f"planning.uniad.l2_{h}_m"] for h in ("1s", "2s", "3s", "avg")]
+    assert cells == ["UniAD", "nemo_tiny", *(f"{value:.2f}" for value in expected), *["0.00"] * 4, "2", "0"]
+    assert "above ground" in text
+    assert "in 500ms" in text
+
+
+def test_provenance_is_complete_and_flat() -> None:
+    origin = collect_provenance()
+    assert all(isinstance(value, (str, int, float, type(None))) for value in origin.values())
+    assert origin["machine.cores"] >= 1
+    assert origin["machine.ram_gib"] > 0.5
+    assert origin["version.torch"]
+    assert origin["commit"] is None or re.fullmatch(r"[0-9a-f]{12}(\+[0-9a-f]{8})?", origin["commit"])
+
+
+def test_the_command_without_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/foredrive", "evaluate", "runs/a b"])
+    assert command_line() == "foredrive evaluate 'runs/a b'"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/foredrive/__main__.py", "demo"])
+    assert command_line() == "python -m foredrive demo"
+
+
+def test_a_commit_with_changes_says_so(tmp_path: Path) -> None:
+    package = tmp_path / "src" / "foredrive"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+
+    def git(*arguments: str) -> None:
+        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+        subprocess.run(["git", "-C", str(tmp_path), *identity, *arguments], check=True, capture_output=True)
+
+    assert git_commit(tmp_path) is None
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "first")
+    clean = git_commit(tmp_path)
+    assert clean is not None
+    assert len(clean) == 12
+    (tmp_path / "notes.txt").write_text("not code")
+    assert git_commit(tmp_path) == clean
+    (package / "new.py").write_text("a = 1")
+    one = git_commit(tmp_path)
+    assert one is not None
+    assert one.startswith(f"{clean}+")
+    (package / "new.py").write_text("a = 2")
+    two = git_commit(tmp_path)
+    assert two != one
+    (package / "__init__.py").write_text("# changed")
+    assert git_commit(tmp_path) not in (one, two)
+
+
+def test_peak_memory_is_at_least_what_is_held_now() -> None:
+    block = np.ones(2**23)  # 64 MiB, touched
+    held_gib = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**30
+    assert held_gib - 1e-3 <= peak_rss_gib() <= collect_provenance()["machine.ram_gib"]
+    assert block[-1] == 1
