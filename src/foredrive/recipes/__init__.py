@@ -1,1 +1,36 @@
-"""Python functions that return one frozen configuration each, and what runs them."""
+"""Python functions that return one frozen configuration each, and the runs put together from them."""
+
+from collections.abc import Callable
+
+from foredrive.errors import InputError
+from foredrive.recipes.config import Recipe
+from foredrive.recipes.evaluate import Inspection, evaluate_run, inspect_run
+from foredrive.recipes.nemo import nemo_base, nemo_tiny
+from foredrive.recipes.train import Run, find_all_logs, open_run, train_run
+
+RECIPES: dict[str, Callable[[], Recipe]] = {"nemo_tiny": nemo_tiny, "nemo_base": nemo_base}
+
+
+def find_recipe(name: str) -> Recipe:
+    """The recipe of a name.
+
+    Raises:
+        InputError: naming the known ones, if there is none of that name.
+    """
+    if name not in RECIPES:
+        raise InputError(f"no recipe {name!r}; there are: {', '.join(RECIPES)}")
+    return RECIPES[name]()
+
+
+__all__ = [
+    "RECIPES",
+    "Inspection",
+    "Recipe",
+    "Run",
+    "evaluate_run",
+    "find_all_logs",
+    "find_recipe",
+    "inspect_run",
+    "open_run",
+    "train_run",
+]

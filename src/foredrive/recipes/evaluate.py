@@ -1,0 +1,123 @@
+"""Evaluating a run on logs: the model, the baselines it has to beat, one summary."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from rich.progress import Progress
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.evaluation import (
+    ConstantVelocity,
+    EvaluationResult,
+    StandStill,
+    collect_provenance,
+    evaluate,
+    fit_ego_mlp,
+    read_training_set,
+    write_summary,
+)
+from foredrive.metrics import VoxelPrior
+from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.models.ego_mlp import EgoMLP
+from foredrive.recipes.predict import NemoPredictor
+from foredrive.recipes.train import Run, load_agent
+from foredrive.scene import Example, Trajectory
+
+SUMMARY = "summary.json"
+RENDER_STRIDE = 2
+"""One pixel in this many along rows and columns is rendered and compared."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """One example, unbatched, and what the model made of it: for pictures."""
+
+    example: Example
+    occupancy_prob: Float[Tensor, "F Z Y X"]
+    """Now first, then the imagined key frames."""
+    rendered: Float[Tensor, "C 3 h w"]
+    """The views at now, RGB 0 to 1."""
+    volume: Float[Tensor, "D Z Y X"]
+    plan: Trajectory
+    """[1 T]."""
+
+
+def evaluation_data(run: Run, logs: Sequence[LogPath]) -> ClipDataset:
+    """Clips of `logs` as the recipe has them, with the boxes that collisions up to 3 s need."""
+    clips = run.recipe.clips
+    frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
+    config = dataclasses.replace(clips, future_frames=frames, future_images=False)
+    return ClipDataset(logs, config, run.cache_dir)
+
+
+def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int = 4) -> EvaluationResult:
+    """Judge a trained run on logs; writes `out/summary.json`."""
+    agent = load_agent(run)
+    clips = run.recipe.clips
+    dataset = evaluation_data(run, logs)
+    prior, ego_mlp = _fit_baselines(run)
+    steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    agent.to(device)
+    with Progress() as progress:
+        task = progress.add_task("evaluate", total=len(dataset))
+        result = evaluate(
+            NemoPredictor(agent, clips.future_frames, RENDER_STRIDE),
+            DataLoader(dataset, batch_size, collate_fn=collate),
+            frame_dt_s=clips.frame_dt_s,
+            baselines={
+                "stand_still": StandStill(steps, dt_s),
+                "constant_velocity": ConstantVelocity(steps, dt_s),
+                "ego_mlp": ego_mlp.to(device),
+            },
+            prior=prior,
+            command_source=dataset.command_source,
+            device=device,
+            on_items=lambda items: progress.advance(task, items),
+        )
+    summary = result.summary | collect_provenance() | {"recipe": run.recipe.name, "run": str(run.folder)}
+    write_summary(out / SUMMARY, summary)
+    return dataclasses.replace(result, summary=summary)
+
+
+def _fit_baselines(run: Run) -> tuple[VoxelPrior, EgoMLP]:
+    """The voxel prior of the training labels and the MLP that sees ego status alone."""
+    clips = run.recipe.clips
+    blind = dataclasses.replace(clips, cameras=(), future_images=False)
+    loader = DataLoader(ClipDataset(run.logs, blind, run.cache_dir), batch_size=16, collate_fn=collate)
+    prior, status = read_training_set(loader, clips.future_frames + 1, clips.past_frames)
+    return prior, fit_ego_mlp(status, past_frames=clips.past_frames, dt_s=clips.horizon_dt_s, seed=0)
+
+
+@torch.no_grad()
+def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
+    """The model on `count` examples spread evenly over the logs."""
+    agent = load_agent(run)
+    clips = run.recipe.clips
+    config = dataclasses.replace(clips, lidar=True, map=True)
+    dataset = ClipDataset(logs, config, run.cache_dir)
+    predictor = NemoPredictor(agent, clips.future_frames, RENDER_STRIDE)
+    found = []
+    for k in range(min(count, len(dataset))):
+        item = dataset[int((k + 0.5) * len(dataset) / count)]
+        observed = collate([item]).clip.observed()
+        prediction = predictor.predict(observed)
+        assert prediction.occupancy_logit is not None
+        assert prediction.images is not None
+        assert prediction.plan is not None
+        found.append(
+            Inspection(
+                example=item,
+                occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
+                rendered=prediction.images[0, 0],
+                volume=agent.world_model.observe(observed).volume[0],
+                plan=prediction.plan[0],
+            )
+        )
+    return found
