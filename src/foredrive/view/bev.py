@@ -66,9 +66,10 @@ def draw_map(ax: Axes, patch: MapPatch) -> None:
     """Areas filled, lines drawn, in the colour of their kind."""
     for kind in AREA_KINDS:
         outlines = _polylines(patch, kind)
+        whole = [line for line in outlines if np.allclose(line[0], line[-1])]  # long outlines come in pieces
         ax.add_collection(
             PolyCollection(
-                outlines, facecolor=palette.MAP_COLOURS[kind], alpha=0.22, edgecolor="none", zorder=1.0
+                whole, facecolor=palette.MAP_COLOURS[kind], alpha=0.22, edgecolor="none", zorder=1.0
             )
         )
         ax.add_collection(

@@ -56,8 +56,8 @@ def draw_points_on_image(
     points_ego: Float[Tensor, "N 3"],
     colours: UInt8[np.ndarray, "N 3"],
     camera: Camera,
-    radius_px: float = 1.2,
-    alpha: float = 0.85,
+    radius_px: float = 0.8,
+    alpha: float = 0.6,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The image with a round dot at every point the camera sees, near dots over far ones.
 
@@ -109,13 +109,13 @@ def draw_path_on_image(
     path_ego: Float[Tensor, "T 3"],
     camera: Camera,
     colour: str,
-    width_m: float = 0.25,
+    width_m: float = 0.2,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The image with a path on the ground: a ribbon, and a disc at every point but the first."""
     if len(path_ego) < 2:
         return image
     turn = torch.linspace(0, 2 * torch.pi, 25)[:-1]
-    circle = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1) * 1.2 * width_m
+    circle = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1) * width_m
     shapes = _ribbon(path_ego, width_m) + [point + circle for point in path_ego[1:]]
     overlay = Image.new("L", (image.shape[1] * SUPERSAMPLING, image.shape[0] * SUPERSAMPLING))
     draw = ImageDraw.Draw(overlay)

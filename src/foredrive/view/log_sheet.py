@@ -105,22 +105,22 @@ def _leftness(azimuth: float) -> float:
 
 
 def camera_picture(
-    clip: Clip, index: int, size_hw: tuple[int, int], with_points: bool = True
+    clip: Clip, index: int, size_hw: tuple[int, int], with_boxes: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One camera's image at now in the given size, with lidar and boxes; a bare panel where there is none."""
+    """One camera's image at now in the given size, with lidar and boxes; a bare panel if there is none."""
     now = clip.now
     if bool(clip.image_valid[now, index]):
         image = resize(clip.images[now, index].permute(1, 2, 0).numpy(), size_hw)
     else:
         image = np.full((*size_hw, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
     camera = Camera.of(clip.rig[now], index)
-    if not bool((camera.K[0, 0] > 0) & (camera.K[1, 1] > 0)):
+    if torch.equal(camera.K, torch.eye(3)):  # a camera this log does not have
         return image
     camera = camera.resized(size_hw)
-    if with_points and bool(clip.sweep_valid[now]):
+    if bool(clip.sweep_valid[now]):
         points, range_m = _returns(clip)
         image = draw_points_on_image(image, points, palette.range_colours(range_m), camera)
-    if bool(clip.boxes_valid[now]):
+    if with_boxes and bool(clip.boxes_valid[now]):
         image = draw_boxes_on_image(image, clip.boxes[now], camera)
     return image
 
@@ -159,7 +159,9 @@ def _show_camera(ax: Axes, clip: Clip, index: int, size_hw: tuple[int, int]) -> 
 
 def _range_bar(ax: Axes) -> None:
     """Colour scale of the lidar's range."""
-    shown = LinearSegmentedColormap.from_list("range", palette.RANGE_MAP(np.linspace(0.05, 0.85, 64)))
+    shown = LinearSegmentedColormap.from_list(
+        "range", palette.RANGE_MAP(np.linspace(*palette.RANGE_SPAN, 64))
+    )
     scale = ScalarMappable(LogNorm(palette.NEAREST_M, palette.FARTHEST_M), shown)
     bar = ax.figure.colorbar(scale, cax=ax, orientation="horizontal")
     bar.set_ticks([3, 5, 10, 20, 40, 80], labels=["3", "5", "10", "20", "40", "80 m"])

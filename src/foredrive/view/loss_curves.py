@@ -18,7 +18,7 @@ SMOOTH_STEPS = 15
 NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
-def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float | int]]]) -> str:
     """SVG with one chart a stage; raw values faint, their running mean strong, on a logarithmic scale.
 
     Args:
@@ -40,7 +40,7 @@ def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float]]]) -> str
     return re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg)
 
 
-def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float]]) -> None:
+def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]]) -> None:
     names = [key for key in lines[0] if key not in NOT_LOSSES]
     names.sort(key=lambda key: key != "loss")  # the one that is descended comes first
     for key, colour in zip(names, COLOURS, strict=False):

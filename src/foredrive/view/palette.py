@@ -53,6 +53,8 @@ KNOWN_FREE = "#2a323e"
 
 RANGE_MAP = matplotlib.colormaps["plasma"].reversed()
 HEIGHT_MAP = matplotlib.colormaps["viridis"]
+RANGE_SPAN = (0.05, 0.75)
+"""The part of the map that stands out from the ground."""
 NEAREST_M, FARTHEST_M = 3.0, 80.0
 """Ends of the logarithmic range scale."""
 
@@ -76,4 +78,4 @@ def rgb255(colour: str) -> tuple[int, int, int]:
 def range_colours(range_m: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
     """Bright and near to dark and far, on a logarithmic scale from 3 to 80 m."""
     scale = np.log(np.clip(range_m, NEAREST_M, FARTHEST_M) / NEAREST_M) / np.log(FARTHEST_M / NEAREST_M)
-    return (RANGE_MAP(0.05 + 0.80 * scale)[:, :3] * 255).astype(np.uint8)
+    return (RANGE_MAP(RANGE_SPAN[0] + (RANGE_SPAN[1] - RANGE_SPAN[0]) * scale)[:, :3] * 255).astype(np.uint8)

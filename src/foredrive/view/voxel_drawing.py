@@ -16,7 +16,7 @@ from foredrive.view import palette
 
 SUN = np.array([-0.35, 0.45, 0.82]) / np.linalg.norm([-0.35, 0.45, 0.82])
 AMBIENT, DIFFUSE = 0.52, 0.48
-EDGE_SHADE = 0.78  # how dark the rims of voxels are
+RIM_SHADE, RIM_PX = 0.78, 1.6  # rims of voxels are darker
 SUPERSAMPLING = 2
 
 
@@ -40,7 +40,7 @@ class Eye:
         corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(8, 3)
         off_centre = np.abs(cls(position, target, 1.0).project(corners, (1, 1)) - 0.5).max(0)  # [u v]
         limits = np.array([0.5 * size_hw[1] / size_hw[0], 0.5]) / off_centre
-        return cls(position, target, 1.25 * float(limits.min()))
+        return cls(position, target, 1.45 * float(limits.min()))
 
     def axes(self) -> Float[np.ndarray, "3 3"]:
         """Rows: right, down, forward in the ego frame."""
@@ -75,16 +75,11 @@ def draw_voxels(
     """
     eye = eye or Eye.behind(spec, size_hw)
     tint = height_colours(spec) if colours is None else colours
-    height, width = (SUPERSAMPLING * s for s in size_hw)
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-    local = np.stack([(u - width / 2) / height, (v - height / 2) / height, np.full_like(u, eye.focal)], -1)
-    direction = local.reshape(-1, 3) @ eye.axes()
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    origin = (np.array(eye.position_m) - np.array(spec.lower_m)) / spec.voxel_m  # in voxels from here on
-    ground = np.array(palette.rgb255(palette.GROUND), dtype=float)
-    picture = _cast(occupied.numpy(), tint, origin, direction, SUN, ground, height * eye.focal)
-    canvas = Image.fromarray(picture.reshape(height, width, 3).astype(np.uint8))
-    return np.asarray(canvas.resize(size_hw[::-1], Image.Resampling.BOX))
+    large_hw = (SUPERSAMPLING * size_hw[0], SUPERSAMPLING * size_hw[1])
+    picture = np.full((*large_hw, 3), palette.rgb255(palette.GROUND), dtype=np.uint8)
+    origin = (np.array(eye.position_m) - np.array(spec.lower_m)) / spec.voxel_m
+    _cast(occupied.numpy(), tint, origin, eye.axes(), eye.focal * large_hw[0], SUN, picture)
+    return np.asarray(Image.fromarray(picture).resize(size_hw[::-1], Image.Resampling.BOX))
 
 
 def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
@@ -145,18 +140,18 @@ def _from_above(rows: UInt8[Tensor, "Y X 3"]) -> UInt8[np.ndarray, "X Y 3"]:
 
 @numba.njit(cache=True, error_model="numpy")
 @no_type_check  # numba infers the types, and wants the bare function
-def _march(occupied, origin, direction, start):
-    """First occupied voxel along a ray (Amanatides & Woo, 1987).
+def _march(occupied, origin, direction, cell, step, to_next, per_cell):
+    """First occupied voxel along a ray (Amanatides & Woo, 1987); the last four arguments are scratch.
 
-    Returns the distance in voxels (-1: none), the voxel's z, y, x and the axis of the face that was entered
-    (-1: the ray starts inside).
+    Returns the distance in voxels (-1: none) and the axis of the face that was entered (-1: the ray starts
+    inside); `cell` is left at the voxel's x, y, z.
     """
     shape = (occupied.shape[2], occupied.shape[1], occupied.shape[0])
-    near, far, axis = start, math.inf, -1
+    near, far, axis = 0.0, math.inf, -1
     for i in range(3):
         if direction[i] == 0.0:
             if origin[i] < 0 or origin[i] > shape[i]:
-                return -1.0, 0, 0, 0, -1
+                return -1.0, -1
             continue
         one, two = -origin[i] / direction[i], (shape[i] - origin[i]) / direction[i]
         low, high = min(one, two), max(one, two)
@@ -164,12 +159,11 @@ def _march(occupied, origin, direction, start):
             near, axis = low, i
         far = min(far, high)
     if near >= far:
-        return -1.0, 0, 0, 0, -1
-    cell, step = np.zeros(3, np.int64), np.zeros(3, np.int64)
-    to_next, per_cell = np.full(3, math.inf), np.full(3, math.inf)
+        return -1.0, -1
     for i in range(3):
         at = origin[i] + (near + 1e-9) * direction[i]
         cell[i] = min(max(math.floor(at), 0), shape[i] - 1)
+        step[i], per_cell[i], to_next[i] = 0, math.inf, math.inf
         if direction[i] != 0.0:
             step[i] = 1 if direction[i] > 0 else -1
             per_cell[i] = abs(1.0 / direction[i])
@@ -178,43 +172,46 @@ def _march(occupied, origin, direction, start):
     distance = near
     while True:
         if occupied[cell[2], cell[1], cell[0]]:
-            return distance, cell[2], cell[1], cell[0], axis
-        axis = int(np.argmin(to_next))
+            return distance, axis
+        axis = 0 if to_next[0] <= to_next[1] else 1
+        if to_next[2] < to_next[axis]:
+            axis = 2
         distance = to_next[axis]
         cell[axis] += step[axis]
         if cell[axis] < 0 or cell[axis] >= shape[axis]:
-            return -1.0, 0, 0, 0, -1
+            return -1.0, -1
         to_next[axis] += per_cell[axis]
 
 
 @numba.njit(cache=True, error_model="numpy")
-@no_type_check  # numba infers the types, and wants the bare function
-def _cast(occupied, colours, origin, directions, sun, ground, px_per_unit):
-    """RGB 0..255 of every ray; lengths are in voxels."""
-    out = np.empty((len(directions), 3))
-    for ray in range(len(directions)):
-        direction = directions[ray]
-        distance, z, y, x, axis = _march(occupied, origin, direction, 0.0)
-        if distance < 0:
-            out[ray] = ground
-            continue
-        hit = origin + distance * direction
-        light = AMBIENT
-        if axis >= 0:
-            normal = np.zeros(3)
-            normal[axis] = -1.0 if direction[axis] > 0 else 1.0
-            facing = normal @ sun
-            if facing > 0:
-                shadow, _, _, _, _ = _march(occupied, hit + 1e-4 * normal, sun, 0.0)
-                if shadow < 0:
-                    light += DIFFUSE * facing
-            rim = 1.0  # distance to the face's nearest rim, in voxels
+@no_type_check
+def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
+    """Paint the pixels [H W 3] behind which there is a voxel; the eye's `origin` is in voxels."""
+    height, width = picture.shape[:2]
+    direction, hit, above = np.empty(3), np.empty(3), np.empty(3)
+    cell, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    to_next, per_cell = np.empty(3), np.empty(3)
+    for row in range(height):
+        for column in range(width):
+            u, v = column + 0.5 - width / 2, row + 0.5 - height / 2
+            length = math.sqrt(u * u + v * v + focal_px * focal_px)
             for i in range(3):
-                if i != axis:
-                    inside = hit[i] - math.floor(hit[i])
-                    rim = min(rim, inside, 1.0 - inside)
-            if rim * px_per_unit / distance < 1.6:
-                light *= EDGE_SHADE
-        for i in range(3):
-            out[ray, i] = light * colours[z, y, x, i]
-    return out
+                direction[i] = (u * axes[0, i] + v * axes[1, i] + focal_px * axes[2, i]) / length
+            distance, axis = _march(occupied, origin, direction, cell, step, to_next, per_cell)
+            if distance < 0:
+                continue
+            colour = colours[cell[2], cell[1], cell[0]]
+            light, rim = AMBIENT, 1.0
+            for i in range(3):
+                hit[i] = above[i] = origin[i] + distance * direction[i]
+                if i != axis:  # how far from the face's nearest rim, in voxels
+                    rim = min(rim, hit[i] - math.floor(hit[i]), math.ceil(hit[i]) - hit[i])
+            if axis >= 0:
+                facing = -sun[axis] if direction[axis] > 0 else sun[axis]
+                above[axis] -= 1e-4 if direction[axis] > 0 else -1e-4
+                if facing > 0 and _march(occupied, above, sun, cell, step, to_next, per_cell)[0] < 0:
+                    light += DIFFUSE * facing
+            if rim * focal_px / distance < RIM_PX:
+                light *= RIM_SHADE
+            for i in range(3):
+                picture[row, column, i] = int(light * colour[i])
