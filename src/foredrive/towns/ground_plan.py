@@ -1,0 +1,230 @@
+"""The plan of a town's roads: cross-section strips cut into pieces that no longer lie across each other.
+
+In junctions the strips of connecting roads overlap. Seen from above, each spot of a level belongs to the
+piece of the highest rank: lanes before shoulders before walkways. Levels (a road over another) stay apart.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from foredrive.towns.town_map import Points, Strip, StripKind, TownMap
+
+PIECE_SAMPLES = 8
+LEVEL_GAP_M = 2.5
+"""Pieces whose heights differ by more lie on different levels."""
+OVERLAP_M2 = 0.02
+BRIDGE_REACH_M = 14.0
+BANK_SLOPE = 0.5
+"""A road beside a lower one lies on an embankment down to this slope, on a bridge where it were steeper."""
+JUNCTION_CLOSING_M = 2.0
+JUNCTION_HOLE_M2 = 150.0
+WALKWAY_RAISE_M = 0.15
+STRAIGHT_M = 1e-3
+BORDER_SPACING_M = 0.5
+
+RANK = {
+    StripKind.DRIVING: 0,
+    StripKind.BIDIRECTIONAL: 0,
+    StripKind.PARKING: 1,
+    StripKind.BORDER: 1,
+    StripKind.SHOULDER: 1,
+    StripKind.NONE: 2,
+    StripKind.MEDIAN: 3,
+    StripKind.SIDEWALK: 4,
+}
+RAISED = frozenset({StripKind.MEDIAN, StripKind.SIDEWALK})
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A few metres of a strip."""
+
+    strip: Strip
+    left_xyz: Points
+    right_xyz: Points
+    along_m: Float[np.ndarray, "N"]
+    """Distance of each sample from the start of the strip."""
+    area: shapely.Geometry
+    """What is left of it, seen from above."""
+    whole: bool
+    """Nothing was cut off."""
+    bridge: bool
+
+    @property
+    def raise_m(self) -> float:
+        """Height above the road."""
+        return WALKWAY_RAISE_M if self.strip.kind in RAISED else 0.0
+
+    def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Height of the road at points of the piece: that of the nearest point of its middle line."""
+        middle = 0.5 * (self.left_xyz + self.right_xyz)
+        start, step = middle[:-1, :2], np.diff(middle[:, :2], axis=0)
+        offset = xy[:, None] - start
+        t = (offset * step).sum(-1) / (step * step).sum(-1).clip(1e-9)
+        t = t.clip(0.0, 1.0)
+        distance = np.linalg.norm(offset - t[..., None] * step, axis=-1)
+        nearest = distance.argmin(axis=1)
+        t = t[np.arange(len(xy)), nearest]
+        return middle[nearest, 2] * (1 - t) + middle[nearest + 1, 2] * t
+
+
+@dataclass(frozen=True)
+class GroundPlan:
+    """All pieces of a town, and what they cover."""
+
+    pieces: tuple[Piece, ...]
+    fills: tuple[shapely.Polygon, ...]
+    """Asphalt between the lanes of a junction."""
+    lanes: shapely.Geometry
+    """Driving lanes of every level."""
+    ground: shapely.Geometry
+    """Everything paved that lies on the ground, walkways and fills included."""
+    bridges: shapely.Geometry
+    """Everything that is carried by bridges."""
+    borders: "BorderHeights"
+
+    @property
+    def covered(self) -> shapely.Geometry:
+        """All that is paved, of every level."""
+        return self.ground.union(self.bridges)
+
+
+@dataclass(frozen=True)
+class BorderHeights:
+    """Heights along the borders of the pieces on the ground."""
+
+    tree: cKDTree
+    z: Float[np.ndarray, "N"]
+    raised: Float[np.ndarray, "N"]
+
+    def road(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """Height of the road at its border sample nearest to each point."""
+        return self.z[self.tree.query(xy)[1]]
+
+    def top(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """The same for what lies there, walkways being higher than the road."""
+        return self.raised[self.tree.query(xy)[1]]
+
+
+def make_ground_plan(town: TownMap) -> GroundPlan:
+    """Cut a town's strips into pieces, clip them, and fill its junctions."""
+    parts = [part for strip in town.strips for part in _cut(strip)]
+    whole = np.array(
+        [shapely.Polygon(np.concatenate([left, right[::-1]])[:, :2]) for _, left, right, _ in parts]
+    )
+    whole = shapely.buffer(whole, 0.0)
+    z = np.array([left[:, 2].mean() for _, left, _, _ in parts])
+    rank = np.array([RANK[strip.kind] for strip, *_ in parts])
+    bridge = _on_bridges(whole, z)
+    area, untouched = _clip(whole, z, rank)
+    pieces = tuple(
+        Piece(*part, area=a, whole=bool(u), bridge=bool(b))
+        for part, a, u, b in zip(parts, area, untouched, bridge, strict=True)
+        if not shapely.is_empty(a)
+    )
+    fills = _fill_junctions(pieces)
+    grounded = [p.area for p in pieces if not p.bridge]
+    return GroundPlan(
+        pieces=pieces,
+        fills=fills,
+        lanes=shapely.union_all([p.area for p in pieces if RANK[p.strip.kind] == 0]),
+        ground=shapely.union_all(shapely.buffer([*grounded, *fills], 0.01)),
+        bridges=shapely.union_all([p.area for p in pieces if p.bridge]),
+        borders=_border_heights([piece for piece in pieces if not piece.bridge]),
+    )
+
+
+def _border_heights(pieces: list[Piece]) -> BorderHeights:
+    samples, raises = [], []
+    for piece in pieces:
+        at = np.arange(piece.along_m[0], piece.along_m[-1], BORDER_SPACING_M)
+        at = np.append(at, piece.along_m[-1])
+        for line in (piece.left_xyz, piece.right_xyz):
+            samples.append(np.column_stack([np.interp(at, piece.along_m, line[:, i]) for i in range(3)]))
+            raises.append(np.full(len(at), piece.raise_m))
+    xyz = np.concatenate(samples)
+    return BorderHeights(cKDTree(xyz[:, :2]), xyz[:, 2], xyz[:, 2] + np.concatenate(raises))
+
+
+def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N"]]]:
+    """Pieces of up to PIECE_SAMPLES stretches on which the markings do not change, without the samples that
+    lie on straight lines."""
+    middle = 0.5 * (strip.left_xyz + strip.right_xyz)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
+    if np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1).max() < 0.05 or along[-1] < 0.05:
+        return []
+    changes = {mark.start_m for mark in strip.left_markings + strip.right_markings}
+    changes |= {mark.end_m for mark in strip.left_markings + strip.right_markings}
+    cuts = {int(np.abs(along - change).argmin()) for change in changes} | {0, len(along) - 1}
+    cuts |= set(range(0, len(along), PIECE_SAMPLES))
+    parts = []
+    for first, last in itertools.pairwise(sorted(cuts)):
+        chosen = np.arange(first, last + 1)
+        both = np.concatenate([strip.left_xyz, strip.right_xyz], axis=1)[chosen]
+        bend = np.abs(both[:-2] - 2 * both[1:-1] + both[2:]).max(axis=1) > STRAIGHT_M
+        chosen = chosen[np.concatenate([[True], bend, [True]])]
+        parts.append((strip, strip.left_xyz[chosen], strip.right_xyz[chosen], along[chosen]))
+    return parts
+
+
+def _on_bridges(area: np.ndarray, z: Float[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
+    """Whether a piece lies above, or close beside, a piece of a lower level."""
+    tree = shapely.STRtree(area)
+    i, j = tree.query(area, predicate="dwithin", distance=BRIDGE_REACH_M)
+    above = z[i] - z[j] > LEVEL_GAP_M
+    i, j = i[above], j[above]
+    steep = z[i] - z[j] > LEVEL_GAP_M + BANK_SLOPE * shapely.distance(area[i], area[j])
+    bridge = np.zeros(len(area), dtype=bool)
+    bridge[i[steep]] = True
+    return bridge
+
+
+def _clip(
+    area: np.ndarray, z: Float[np.ndarray, "P"], rank: Int[np.ndarray, "P"]
+) -> tuple[np.ndarray, Bool[np.ndarray, "P"]]:
+    """Take from each area what overlaps an area of a higher rank on its level."""
+    i, j = shapely.STRtree(area).query(area, predicate="intersects")
+    near = (rank[j] < rank[i]) & (np.abs(z[i] - z[j]) < LEVEL_GAP_M)
+    i, j = i[near], j[near]
+    over = shapely.area(shapely.intersection(area[i], area[j])) > OVERLAP_M2
+    i, j = i[over], j[over]
+    clipped, untouched = area.copy(), np.ones(len(area), dtype=bool)
+    for k in np.unique(i):
+        clipped[k] = _polygons(shapely.difference(area[k], shapely.union_all(area[j[i == k]])))
+        untouched[k] = False
+    return clipped, untouched
+
+
+def _polygons(geometry: shapely.Geometry) -> shapely.Geometry:
+    """Only the polygons of a geometry, without slivers."""
+    opened = geometry.buffer(-0.01).buffer(0.01, join_style="mitre")
+    parts = shapely.get_parts(opened)
+    return shapely.union_all([p for p in parts if p.geom_type == "Polygon" and p.area > OVERLAP_M2])
+
+
+def _fill_junctions(pieces: tuple[Piece, ...]) -> tuple[shapely.Polygon, ...]:
+    """The spots inside a junction that no strip covers."""
+    areas = np.array([p.area for p in pieces])
+    tree = shapely.STRtree(areas)
+    by_junction: dict[int, list[shapely.Geometry]] = {}
+    for piece in pieces:
+        if piece.strip.junction_id is not None and piece.strip.kind not in RAISED and not piece.bridge:
+            by_junction.setdefault(piece.strip.junction_id, []).append(piece.area)
+    fills = []
+    for _, parts in sorted(by_junction.items()):
+        closed = shapely.union_all(parts).buffer(JUNCTION_CLOSING_M).buffer(-JUNCTION_CLOSING_M)
+        shells = [
+            shapely.Polygon(
+                p.exterior, [h for h in p.interiors if shapely.Polygon(h).area > JUNCTION_HOLE_M2]
+            )
+            for p in shapely.get_parts(closed)
+        ]
+        shell = shapely.union_all(shells)
+        rest = _polygons(shell.difference(shapely.union_all(areas[tree.query(shell)])))
+        fills += [p for p in shapely.get_parts(rest) if p.area > OVERLAP_M2]
+    return tuple(fills)

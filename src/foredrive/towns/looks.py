@@ -1,0 +1,127 @@
+"""What things look like to a camera and to a lidar: surfaces, textures and the table of looks."""
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+
+class Surface(enum.IntEnum):
+    """What a static thing is: the semantics of the town."""
+
+    ROAD = 0
+    SIDEWALK = 1
+    TERRAIN = 2
+    BUILDING = 3
+    VEGETATION = 4
+    POLE = 5
+    SIGN = 6
+    STRUCTURE = 7
+    """Bridges, walls, barriers."""
+    VEHICLE = 8
+    PEDESTRIAN = 9
+    HIDDEN = 10
+    """Under the road, where only a ray through a crack gets to."""
+
+
+class Texture(enum.IntEnum):
+    """Procedural patterns; `u, v, w` are the interpolated corner coordinates, `p` the look's parameters."""
+
+    PLAIN = 0
+    """p0: strength of the mottling."""
+    ROAD = 1
+    """Asphalt with lines. u, v: distance from the left and right border; w: along, all in m.
+    p0..p2: `LinePattern`, colour (0 white, 1 yellow), width of the left line; p3..p5: the right line."""
+    SLABS = 2
+    """p0: edge length of the slabs, m."""
+    GRASS = 3
+    FACADE = 4
+    """u: from the wall's left end; v: above the ground; w: from its right end, m.
+    p0: storey height; p1: bay width; p2: share of the bay that is window; p3: of the storey;
+    p4: height of the ground floor; p5: brick (1) or plain wall (0)."""
+    TILES = 5
+    """u: along the eaves; v: up the slope, m."""
+    FOLIAGE = 6
+    STRIPES = 7
+    """u: across the stripes, m. p0: period, p1: width of a stripe."""
+    GLASS = 8
+    GLOW = 9
+    """Shines by itself."""
+
+
+class LinePattern(enum.IntEnum):
+    """Painted along the border of a lane."""
+
+    NONE = 0
+    SOLID = 1
+    BROKEN = 2
+    DOUBLE_SOLID = 3
+    DOUBLE_BROKEN = 4
+
+
+PARAMETERS = 6
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one part of a mesh looks."""
+
+    surface: Surface
+    texture: Texture
+    rgb: tuple[float, float, float]
+    """Reflectance as sRGB would show it under white light, 0 to 1."""
+    reflectivity: float
+    """Of the lidar's infra-red light, 0 to 1."""
+    gloss: float = 0.0
+    """Share of the sky that is mirrored head-on, 0 to 1."""
+    params: tuple[float, ...] = ()
+
+
+@dataclass
+class LookTable:
+    """Looks by number; equal looks share theirs."""
+
+    looks: list[Look] = field(default_factory=list)
+    numbers: dict[Look, int] = field(default_factory=dict)
+
+    def add(self, look: Look) -> int:
+        """Number of a look."""
+        if look not in self.numbers:
+            self.numbers[look] = len(self.looks)
+            self.looks.append(look)
+        return self.numbers[look]
+
+    def arrays(self) -> "LookArrays":
+        """The table as arrays, for kernels."""
+        params = [(*look.params, *[0.0] * (PARAMETERS - len(look.params))) for look in self.looks]
+        return LookArrays(
+            surface=np.array([look.surface for look in self.looks], dtype=np.int64),
+            texture=np.array([look.texture for look in self.looks], dtype=np.int64),
+            albedo=srgb_to_linear([look.rgb for look in self.looks]),
+            reflectivity=np.array([look.reflectivity for look in self.looks], dtype=np.float32),
+            gloss=np.array([look.gloss for look in self.looks], dtype=np.float32),
+            params=np.array(params, dtype=np.float32),
+        )
+
+
+class LookArrays(NamedTuple):
+    """L looks, column by column."""
+
+    surface: Int64[np.ndarray, "L"]
+    texture: Int64[np.ndarray, "L"]
+    albedo: Float32[np.ndarray, "L 3"]
+    """Linear."""
+    reflectivity: Float32[np.ndarray, "L"]
+    gloss: Float32[np.ndarray, "L"]
+    params: Float32[np.ndarray, "L P"]
+
+
+def srgb_to_linear(rgb: Sequence[Sequence[float]]) -> Float32[np.ndarray, "n 3"]:
+    """Decode sRGB values in 0..1 (IEC 61966-2-1)."""
+    encoded = np.asarray(rgb, dtype=np.float32)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )

@@ -1,0 +1,175 @@
+"""Triangle meshes and the primitives they are put together from.
+
+Meshes are triangle soups with outward normals (counter-clockwise seen from outside); whatever is solid is
+closed, which tells its inside from its outside.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Float32, Int32
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """F triangles."""
+
+    xyz: Float32[np.ndarray, "F 3 3"]
+    """Corners, m."""
+    uvw: Float32[np.ndarray, "F 3 3"]
+    """Texture coordinates of the corners; what they mean is up to the look's texture."""
+    look: Int32[np.ndarray, "F"]
+    """Number in a `LookTable`."""
+
+    def transformed(self, T: Float[np.ndarray, "4 4"]) -> "Mesh":
+        """Mapped by an affine transform that keeps orientation."""
+        return Mesh((self.xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32), self.uvw, self.look)
+
+
+def join(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of many."""
+    if not meshes:
+        return triangles(np.zeros((0, 3, 3)), 0)
+    return Mesh(
+        np.concatenate([m.xyz for m in meshes]),
+        np.concatenate([m.uvw for m in meshes]),
+        np.concatenate([m.look for m in meshes]),
+    )
+
+
+def triangles(
+    xyz: Float[np.ndarray, "F 3 3"], look: int, uvw: Float[np.ndarray, "F 3 3"] | None = None
+) -> Mesh:
+    """Triangles of one look; texture coordinates default to the corners' positions."""
+    xyz32 = np.ascontiguousarray(xyz, dtype=np.float32)
+    uvw32 = xyz32 if uvw is None else np.ascontiguousarray(uvw, dtype=np.float32)
+    return Mesh(xyz32, uvw32, np.full(len(xyz32), look, dtype=np.int32))
+
+
+def quads(
+    corners: Float[np.ndarray, "Q 4 3"], look: int, uvw: Float[np.ndarray, "Q 4 3"] | None = None
+) -> Mesh:
+    """Quads, two triangles each, corners counter-clockwise seen from outside."""
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    xyz = np.asarray(corners)[:, halves].reshape(-1, 3, 3)
+    return triangles(xyz, look, None if uvw is None else np.asarray(uvw)[:, halves].reshape(-1, 3, 3))
+
+
+def ribbon(
+    left: Float[np.ndarray, "N 3"],
+    right: Float[np.ndarray, "N 3"],
+    look: int,
+    uvw: tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]] | None = None,
+) -> Mesh:
+    """The band between two lines; facing up when left lies to the left. `uvw` of the left and right line."""
+
+    def corners(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1)
+
+    return quads(corners(left, right), look, None if uvw is None else corners(*uvw))
+
+
+def polygon_cap(
+    polygon: shapely.Polygon, z: float, look: int, up: bool = True, origin: Sequence[float] = (0.0, 0.0)
+) -> Mesh:
+    """A level face; texture coordinates are x, y about `origin`."""
+    xy = polygon_triangles(polygon)
+    xyz = np.concatenate([xy, np.full((*xy.shape[:2], 1), z)], axis=-1)
+    uvw = xyz - np.array([*origin, 0.0])
+    return triangles(xyz if up else xyz[:, ::-1], look, uvw if up else uvw[:, ::-1])
+
+
+def polygon_triangles(polygon: shapely.Geometry) -> Float[np.ndarray, "F 3 2"]:
+    """Constrained Delaunay triangulation of a polygon or several, counter-clockwise."""
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    if len(parts) == 0:
+        return np.zeros((0, 3, 2))
+    xy = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
+    a, b = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
+    clockwise = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
+    xy[clockwise] = xy[clockwise, ::-1]
+    return xy
+
+
+def walls(
+    ring_xy: Float[np.ndarray, "N 2"],
+    z0: Float[np.ndarray, "N"] | float,
+    z1: Float[np.ndarray, "N"] | float,
+    look: int,
+) -> Mesh:
+    """Vertical faces over a line; outside is on its right, so the ring of a solid runs counter-clockwise.
+
+    Texture coordinates: from the start of each face, above its lower edge, from its end, m.
+    """
+    a, b = ring_xy[:-1], ring_xy[1:]
+    low, high = np.broadcast_to(z0, len(ring_xy)), np.broadcast_to(z1, len(ring_xy))
+    corners = np.stack(
+        [
+            np.column_stack([a, low[:-1]]),
+            np.column_stack([b, low[1:]]),
+            np.column_stack([b, high[1:]]),
+            np.column_stack([a, high[:-1]]),
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(b - a, axis=1)
+    zero, height = np.zeros_like(length), (high - low)[:-1]
+    u = np.stack([zero, length, length, zero], axis=1)
+    v = np.stack([zero, zero, height, height], axis=1)
+    return quads(corners, look, np.stack([u, v, length[:, None] - u], axis=-1))
+
+
+def prism(
+    polygon: shapely.Polygon, z0: float, z1: float, side_look: int, top_look: int, bottom: bool = True
+) -> Mesh:
+    """A polygon without holes, extruded."""
+    ring = shapely.get_coordinates(shapely.orient_polygons(polygon).exterior)
+    parts = [walls(ring, z0, z1, side_look), polygon_cap(polygon, z1, top_look)]
+    if bottom:
+        parts.append(polygon_cap(polygon, z0, side_look, up=False))
+    return join(parts)
+
+
+def box(lower: Sequence[float], upper: Sequence[float], look: int) -> Mesh:
+    """An axis-aligned box."""
+    (x0, y0, z0), (x1, y1, z1) = lower, upper
+    return hexahedron(
+        [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]],
+        [[x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]],
+        [look] * 6,
+    )
+
+
+_HEX_FACES = ((3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+
+
+def hexahedron(
+    bottom: Sequence[Sequence[float]], top: Sequence[Sequence[float]], looks: Sequence[int]
+) -> Mesh:
+    """A solid between two quads, each counter-clockwise from above.
+
+    Args:
+        looks: of the bottom, the top, then the sides from corner 0–1 on.
+    """
+    corners = np.array([*bottom, *top])
+    return join([quads(corners[list(f)][None], n) for f, n in zip(_HEX_FACES, looks, strict=True)])
+
+
+def frustum(
+    bottom: Sequence[float], top: Sequence[float], radii: tuple[float, float], sides: int, look: int
+) -> Mesh:
+    """A closed cone frustum between two points; a top radius of 0 makes a cone."""
+    base, tip = np.asarray(bottom, dtype=float), np.asarray(top, dtype=float)
+    axis = (tip - base) / np.linalg.norm(tip - base)
+    helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    across = np.cross(axis, helper)
+    across /= np.linalg.norm(across)
+    angle = np.arange(sides + 1) * (2 * np.pi / sides)
+    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+    low, high = base + radii[0] * circle, tip + radii[1] * circle
+    side = quads(np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1), look)
+    cap_low = np.stack([np.broadcast_to(base, (sides, 3)), low[1:], low[:-1]], axis=1)
+    cap_high = np.stack([np.broadcast_to(tip, (sides, 3)), high[:-1], high[1:]], axis=1)
+    return join([side, triangles(cap_low, look), triangles(cap_high, look)])

@@ -1,0 +1,66 @@
+"""The recording vehicle's sensors: six cameras like nuScenes', and a spinning lidar on the roof."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.scene import CameraRig
+from foredrive.sensors import SpinningLidar
+
+_MOUNTS = {
+    "PCAM_F0": ((1.70, 0.00, 1.60), 0.0, 70.0),
+    "PCAM_L0": ((1.52, 0.49, 1.60), 55.0, 70.0),
+    "PCAM_R0": ((1.52, -0.49, 1.60), -55.0, 70.0),
+    "PCAM_L1": ((1.03, 0.48, 1.60), 110.0, 70.0),
+    "PCAM_R1": ((1.03, -0.48, 1.60), -110.0, 70.0),
+    "PCAM_B0": ((0.03, 0.00, 1.60), 180.0, 110.0),
+}
+"""Position in the ego frame (m), heading and horizontal field of view (degrees), by 123D's camera names."""
+_EGO_FROM_CAM_AXES = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_LIDAR_XYZ_M = (0.94, 0.0, 1.84)
+
+
+def camera_rig(size_hw: tuple[int, int]) -> CameraRig:
+    """Six cameras all around, without leading dimensions; the principal point is the image's centre."""
+    height, width = size_hw
+    K, T_ego_cam = [], []
+    for xyz_m, heading_deg, fov_deg in _MOUNTS.values():
+        focal_px = 0.5 * width / math.tan(math.radians(0.5 * fov_deg))
+        K.append(torch.tensor([[focal_px, 0.0, 0.5 * width], [0.0, focal_px, 0.5 * height], [0.0, 0.0, 1.0]]))
+        T_ego_cam.append(_mount(xyz_m, math.radians(heading_deg)))
+    count = len(_MOUNTS)
+    return CameraRig(
+        K=torch.stack(K),
+        T_ego_cam=torch.stack(T_ego_cam),
+        dist=torch.zeros(count, 5),
+        readout_s=torch.zeros(count),
+        names=tuple(_MOUNTS),
+        size_hw=size_hw,
+    )
+
+
+def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:
+    """A lidar with the vertical field of view of Velodyne's HDL-32E (10.67° to -30.67°); channel 0 is lowest."""
+    T_ego_lidar = torch.eye(4)
+    T_ego_lidar[:3, 3] = torch.tensor(_LIDAR_XYZ_M)
+    elevation_deg = torch.linspace(-30.67, 10.67, channels)
+    return SpinningLidar(
+        elevation_rad=tuple(elevation_deg.deg2rad().tolist()),
+        azimuth_steps=azimuth_steps,
+        rate_hz=rate_hz,
+        min_range_m=1.0,
+        max_range_m=100.0,
+        range_noise_m=0.02,
+        T_ego_lidar=T_ego_lidar,
+    )
+
+
+def _mount(xyz_m: tuple[float, float, float], heading_rad: float) -> Float[Tensor, "4 4"]:
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    T = torch.eye(4)
+    T[:3, :3] = turn @ _EGO_FROM_CAM_AXES
+    T[:3, 3] = torch.tensor(xyz_m)
+    return T

@@ -1,0 +1,275 @@
+"""Meshes of roads: asphalt with lines, kerbs and walkways, crosswalks, stop lines, bridges."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from foredrive.towns.ground_plan import GroundPlan, Piece
+from foredrive.towns.looks import LinePattern, Look, LookTable, Surface, Texture
+from foredrive.towns.mesh import Mesh, frustum, join, polygon_triangles, quads, ribbon, triangles, walls
+from foredrive.towns.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
+
+KERB_FOOT_M = 0.3
+PAINT_M = 0.008
+"""Paint lies this much above the road."""
+STOP_LINE_M = 0.45
+STOP_LINE_GAP_M = 0.6
+STRIPE_PERIOD_M, STRIPE_M = 1.0, 0.5
+UNDERCOAT_M = 0.3
+DECK_M = 0.9
+PARAPET_M, PARAPET_WIDTH_M = 0.85, 0.25
+PILLAR_SPACING_M, PILLAR_RADIUS_M = 24.0, 0.7
+PILLAR_CLEARANCE_M = 1.0
+PATCH_M = 1.0
+
+_PATTERN = {
+    MarkingKind.SOLID: LinePattern.SOLID,
+    MarkingKind.BROKEN: LinePattern.BROKEN,
+    MarkingKind.SOLID_SOLID: LinePattern.DOUBLE_SOLID,
+    MarkingKind.SOLID_BROKEN: LinePattern.DOUBLE_SOLID,
+    MarkingKind.BROKEN_SOLID: LinePattern.DOUBLE_BROKEN,
+    MarkingKind.BROKEN_BROKEN: LinePattern.DOUBLE_BROKEN,
+}
+ASPHALT_RGB = (0.30, 0.30, 0.31)
+CONCRETE_RGB = (0.60, 0.585, 0.56)
+
+
+@dataclass(frozen=True)
+class RoadLooks:
+    """Numbers of the looks that roads are made of."""
+
+    walkway: int
+    kerb: int
+    median: int
+    hidden: int
+    stripes: int
+    line: int
+    concrete: int
+
+
+def add_road_looks(table: LookTable) -> RoadLooks:
+    """Add the looks of roads to a table."""
+    kerb = Look(Surface.SIDEWALK, Texture.PLAIN, (0.66, 0.65, 0.62), 0.4, params=(0.5,))
+    stripes = Look(
+        Surface.ROAD, Texture.STRIPES, (0.86, 0.86, 0.84), 0.75, params=(STRIPE_PERIOD_M, STRIPE_M)
+    )
+    return RoadLooks(
+        walkway=table.add(Look(Surface.SIDEWALK, Texture.SLABS, CONCRETE_RGB, 0.35, params=(1.2,))),
+        kerb=table.add(kerb),
+        median=table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.36, 0.42, 0.22), 0.45)),
+        hidden=table.add(Look(Surface.HIDDEN, Texture.PLAIN, ASPHALT_RGB, 0.15)),
+        stripes=table.add(stripes),
+        line=table.add(Look(Surface.ROAD, Texture.PLAIN, (0.86, 0.86, 0.84), 0.75, params=(0.5,))),
+        concrete=table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.61, 0.58), 0.35, params=(1.0,))),
+    )
+
+
+def build_roads(town: TownMap, plan: GroundPlan, table: LookTable) -> Mesh:
+    """Everything of a town that is paved."""
+    looks = add_road_looks(table)
+    parts = [_surface(piece, looks, table) for piece in plan.pieces]
+    parts += [_kerbs(piece, looks) for piece in plan.pieces if piece.raise_m > 0]
+    plain = table.add(_asphalt(None, None))
+    parts += [drape(fill, plan, plain, 0.0) for fill in plan.fills]
+    parts += _undercoat(plan, looks)
+    parts += _crosswalks(town, plan, looks) + _stop_lines(town, looks)
+    parts += _bridges(plan, looks)
+    return join(parts)
+
+
+def drape(area: shapely.Geometry, plan: GroundPlan, look: int, lift_m: float) -> Mesh:
+    """A polygon laid over the roads around it."""
+    xy = polygon_triangles(area)
+    z = plan.borders.road(xy) + lift_m
+    return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+
+
+def _asphalt(left: Marking | None, right: Marking | None) -> Look:
+    params: list[float] = []
+    for marking in (left, right):
+        if marking is None or marking.kind not in _PATTERN:
+            params += [LinePattern.NONE, 0.0, 0.0]
+        else:
+            params += [_PATTERN[marking.kind], float(marking.yellow), marking.width_m]
+    return Look(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15, params=tuple(params))
+
+
+def _piece_look(piece: Piece, looks: RoadLooks, table: LookTable) -> int:
+    if piece.strip.kind is StripKind.SIDEWALK:
+        return looks.walkway
+    if piece.strip.kind is StripKind.MEDIAN:
+        return looks.median
+    if piece.strip.junction_id is not None or not piece.whole:
+        return table.add(_asphalt(None, None))
+    middle_m = float(piece.along_m[[0, -1]].mean())
+    left = marking_at(piece.strip.left_markings, middle_m)
+    return table.add(_asphalt(left, marking_at(piece.strip.right_markings, middle_m)))
+
+
+def _surface(piece: Piece, looks: RoadLooks, table: LookTable) -> Mesh:
+    look = _piece_look(piece, looks, table)
+    lift = np.array([0.0, 0.0, piece.raise_m])
+    if not piece.whole:
+        xy = polygon_triangles(piece.area)
+        z = piece.height(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + piece.raise_m
+        return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+    left, right = piece.left_xyz + lift, piece.right_xyz + lift
+    if piece.raise_m > 0:
+        return ribbon(left, right, look)
+    width = np.linalg.norm(left - right, axis=1)
+    zero = np.zeros_like(width)
+    return ribbon(
+        left,
+        right,
+        look,
+        (np.column_stack([zero, width, piece.along_m]), np.column_stack([width, zero, piece.along_m])),
+    )
+
+
+def _kerbs(piece: Piece, looks: RoadLooks) -> Mesh:
+    """Vertical faces around a raised piece; those between two raised pieces are hidden."""
+    if piece.whole:
+        ring = np.concatenate([piece.right_xyz, piece.left_xyz[::-1], piece.right_xyz[:1]])
+        z = ring[:, 2]
+        return walls(ring[:, :2], z - KERB_FOOT_M, z + piece.raise_m, looks.kerb)
+    rings = [shapely.get_coordinates(r) for r in _rings(piece.area)]
+    heights = [piece.height(ring) for ring in rings]
+    return join(
+        [
+            walls(r, z - KERB_FOOT_M, z + piece.raise_m, looks.kerb)
+            for r, z in zip(rings, heights, strict=True)
+        ]
+    )
+
+
+def _rings(area: shapely.Geometry) -> list[shapely.LinearRing]:
+    """All rings, the solid on their left."""
+    oriented = shapely.get_parts(shapely.orient_polygons(area))
+    return [ring for polygon in oriented for ring in (polygon.exterior, *polygon.interiors)]
+
+
+def _undercoat(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+    """A second surface below the roads on the ground, for rays that slip through a crack between pieces."""
+    sunk = np.array([0.0, 0.0, -UNDERCOAT_M])
+    parts = [
+        ribbon(p.left_xyz + sunk, p.right_xyz + sunk, looks.hidden)
+        for p in plan.pieces
+        if p.whole and not p.bridge
+    ]
+    cut = [p.area for p in plan.pieces if not p.whole and not p.bridge]
+    return [*parts, *(drape(area, plan, looks.hidden, -UNDERCOAT_M) for area in [*cut, *plan.fills])]
+
+
+def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+    """Stripes along the lanes, cut to what is not a walkway and laid over the road metre by metre."""
+    walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0])
+    parts = []
+    for crosswalk in town.crosswalks:
+        area = shapely.Polygon(crosswalk.outline_xyz[:, :2]).buffer(0)
+        corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))[:4]
+        sides = corners[1:3] - corners[:2]
+        along = max(sides, key=lambda side: float(np.linalg.norm(side)))
+        length = float(np.linalg.norm(along))
+        along /= length
+        across = np.array([-along[1], along[0]])
+        start = corners[:4][np.argmin(corners[:4] @ along)] @ along
+        for s in np.arange(start, start + length, PATCH_M):
+            band = shapely.Polygon(
+                [
+                    along * u + across * v
+                    for u, v in ((s, -1e4), (s + PATCH_M, -1e4), (s + PATCH_M, 1e4), (s, 1e4))
+                ]
+            )
+            patch = area.intersection(band).difference(walkways)
+            mesh = drape(patch, plan, looks.stripes, PAINT_M)
+            u = mesh.xyz[..., :2] @ along - start
+            parts.append(triangles(mesh.xyz, looks.stripes, np.stack([u, 0 * u, 0 * u], axis=-1)))
+    return parts
+
+
+def _stop_lines(town: TownMap, looks: RoadLooks) -> list[Mesh]:
+    """A line across each lane before a light or a stop sign, and before the crosswalk if there is one."""
+    crosswalks = shapely.union_all([shapely.Polygon(c.outline_xyz[:, :2]) for c in town.crosswalks])
+    lanes = {lane.lane_id: lane for lane in town.lanes}
+    entries = {i for zone in town.stop_zones for lane in zone.lane_ids for i in lanes[lane].predecessor_ids}
+    parts = []
+    for name in sorted(entries):
+        lane = lanes[name]
+        for gap in np.arange(STOP_LINE_GAP_M, 8.0, 0.5):
+            left = _before_end(lane.left_boundary_xyz, gap)
+            right = _before_end(lane.right_boundary_xyz, gap)
+            corners = np.stack([right[0], right[1], left[1], left[0]])
+            if not shapely.Polygon(corners[:, :2]).buffer(STOP_LINE_GAP_M).intersects(crosswalks):
+                parts.append(quads(corners[None] + [0.0, 0.0, PAINT_M], looks.line))
+                break
+    return parts
+
+
+def _before_end(line: Float[np.ndarray, "N 3"], gap_m: float) -> Float[np.ndarray, "2 3"]:
+    """The points STOP_LINE_M + gap and gap before the end of a line."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = along[-1] - gap_m - np.array([STOP_LINE_M, 0.0])
+    return np.column_stack([np.interp(at, along, line[:, axis]) for axis in range(3)])
+
+
+def _bridges(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+    """Decks, parapets along their open sides, and pillars where there is room for them."""
+    bridge = [piece for piece in plan.pieces if piece.bridge]
+    if not bridge:
+        return []
+    top = shapely.STRtree([p.area for p in bridge])
+    parts = []
+    for piece in bridge:
+        down = np.array([0.0, 0.0, -DECK_M])
+        parts.append(ribbon(piece.right_xyz + down, piece.left_xyz + down, looks.concrete))
+    decks = shapely.union_all([p.area for p in bridge]).buffer(0.05)
+    for ring in _rings(shapely.orient_polygons(decks)):
+        parts += _edge(shapely.get_coordinates(ring), bridge, top, plan, looks)
+    parts += _pillars(bridge, plan, looks)
+    return parts
+
+
+def _edge(
+    ring: Float[np.ndarray, "N 2"],
+    bridge: list[Piece],
+    top: shapely.STRtree,
+    plan: GroundPlan,
+    looks: RoadLooks,
+) -> list[Mesh]:
+    """Fascia and parapet along one ring of the decks; none where the road goes on."""
+    nearest = top.query_nearest(shapely.points(ring), all_matches=False)[1]
+    z = np.array([bridge[n].height(xy[None])[0] for n, xy in zip(nearest, ring, strict=True)])
+    step = ring[1:] - ring[:-1]
+    length = np.linalg.norm(step, axis=1)
+    outward = np.column_stack([step[:, 1], -step[:, 0]]) / length.clip(1e-6)[:, None]
+    beyond = 0.5 * (ring[1:] + ring[:-1]) + 0.6 * outward
+    road_z = plan.borders.road(beyond)
+    goes_on = shapely.contains_xy(plan.ground, beyond[:, 0], beyond[:, 1])
+    goes_on &= np.abs(road_z - 0.5 * (z[1:] + z[:-1])) < 1.5
+    parts = [walls(ring, z - DECK_M, z, looks.concrete)]
+    for i in np.flatnonzero(~goes_on & (length > 0.05)):
+        inner = np.stack([ring[i], ring[i + 1]]) - PARAPET_WIDTH_M * outward[i]
+        foot = np.concatenate([ring[i : i + 2], inner[::-1], ring[i : i + 1]])
+        z_foot = np.concatenate([z[i : i + 2], z[i : i + 2][::-1], z[i : i + 1]])
+        parts.append(walls(foot, z_foot, z_foot + PARAPET_M, looks.concrete))
+        parts.append(quads(np.column_stack([foot[:4], z_foot[:4] + PARAPET_M])[None], looks.concrete))
+    return parts
+
+
+def _pillars(bridge: list[Piece], plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+    ground = shapely.prepared.prep(plan.ground)
+    parts, placed = [], shapely.MultiPoint()
+    for piece in bridge:
+        x, y, z = (0.5 * (piece.left_xyz + piece.right_xyz))[0]
+        spot = shapely.Point(x, y)
+        if spot.distance(placed) < PILLAR_SPACING_M * 0.5:
+            continue
+        if ground.intersects(spot.buffer(PILLAR_RADIUS_M + PILLAR_CLEARANCE_M)):
+            continue
+        placed = placed.union(spot)
+        base = float(plan.borders.road(np.array([x, y]))) - 1.0
+        radii = (PILLAR_RADIUS_M, PILLAR_RADIUS_M)
+        parts.append(frustum((x, y, base), (x, y, z - DECK_M), radii, 10, looks.concrete))
+    return parts

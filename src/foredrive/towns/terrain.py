@@ -1,0 +1,151 @@
+"""The land between and around the roads: a height field that meets every road at its edge."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from foredrive.towns.ground_plan import GroundPlan
+from foredrive.towns.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.mesh import Mesh, join, quads, triangles
+
+CELL_M = 4.0
+MARGIN_M = 90.0
+HORIZON_M = 1500.0
+EDGE_DROP_M = 0.02
+"""The land begins this much below a road's edge."""
+ROAD_REACH_M = 1.5
+DECK_CLEARANCE_M = 2.0
+SMOOTHING_ROUNDS = 200
+HILL_M, HILL_WAVE_M = 1.6, 45.0
+HILL_START_M, HILL_RAMP_M = 30.0, 60.0
+TILE_CELLS = 10
+
+Grid = Float[np.ndarray, "Y X"]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Heights of the land at the nodes of a grid."""
+
+    origin_xy: Float[np.ndarray, "2"]
+    z: Grid
+
+    def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Height of the land, bilinear between the nodes."""
+        rows_columns = ((xy - self.origin_xy) / CELL_M).T[::-1]
+        return map_coordinates(self.z, rows_columns, order=1, mode="nearest")
+
+
+def make_terrain(
+    plan: GroundPlan, bounds_m: tuple[float, float, float, float], rng: np.random.Generator
+) -> Terrain:
+    """Land that is level with the roads on the ground and rolls gently further away."""
+    origin = np.array(bounds_m[:2]) - MARGIN_M
+    columns, rows = np.ceil((np.array(bounds_m[2:]) + MARGIN_M - origin) / CELL_M).astype(int) + 1
+    y, x = np.meshgrid(np.arange(rows) * CELL_M, np.arange(columns) * CELL_M, indexing="ij")
+    xy = np.stack([x + origin[0], y + origin[1]], axis=-1)
+    near_road = _inside(plan.ground.buffer(ROAD_REACH_M), xy)
+    z = _spread(np.where(near_road, plan.borders.top(xy), 0.0), near_road)
+    away_m = distance_transform_edt(~near_road) * CELL_M
+    noise = gaussian_filter(rng.standard_normal(z.shape), HILL_WAVE_M / CELL_M / 2.5, mode="wrap")
+    hills = HILL_M * noise / noise.std()
+    z += hills * np.clip((away_m - HILL_START_M) / HILL_RAMP_M, 0.0, 1.0)
+    return Terrain(origin, _below_decks(z, xy, plan))
+
+
+def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
+    """Mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon."""
+    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.36, 0.42, 0.22), 0.45))
+    rows, columns = terrain.z.shape
+    j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
+    lower = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
+    cells = shapely.box(*np.moveaxis(lower, -1, 0), *np.moveaxis(lower + CELL_M, -1, 0))
+    shapely.prepare(plan.ground)
+    touched = shapely.intersects(plan.ground, cells)
+    cut = touched & ~shapely.contains_properly(plan.ground, cells)
+    return join(
+        [
+            quads(_cell_corners(terrain, j[~touched], i[~touched]), look),
+            _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), look),
+            _horizon(terrain, look),
+        ]
+    )
+
+
+def _inside(area: shapely.Geometry, xy: Float[np.ndarray, "Y X 2"]) -> Bool[np.ndarray, "Y X"]:
+    shapely.prepare(area)
+    return shapely.contains_xy(area, xy[..., 0], xy[..., 1])
+
+
+def _spread(z: Grid, known: Bool[np.ndarray, "Y X"]) -> Grid:
+    """Fill what is unknown smoothly (Laplace's equation), starting from the nearest known heights."""
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    filled = z[tuple(nearest)]
+    for sigma in (16.0, 8.0, 4.0, 2.0):
+        filled = np.where(known, z, gaussian_filter(filled, sigma, mode="nearest"))
+    for _ in range(SMOOTHING_ROUNDS):
+        padded = np.pad(filled, 1, mode="edge")
+        mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
+        filled = np.where(known, z, mean)
+    return filled
+
+
+def _below_decks(z: Grid, xy: Float[np.ndarray, "Y X 2"], plan: GroundPlan) -> Grid:
+    """Lower the land under bridges that it would reach."""
+    decks = [piece for piece in plan.pieces if piece.bridge]
+    if not decks:
+        return z
+    under = _inside(plan.bridges.buffer(CELL_M), xy)
+    index = shapely.STRtree([p.area for p in decks]).query_nearest(
+        shapely.points(xy[under]), all_matches=False
+    )[1]
+    ceiling = np.array([decks[i].left_xyz[:, 2].min() for i in index]) - DECK_CLEARANCE_M
+    lowered = z.copy()
+    lowered[under] = np.minimum(z[under], ceiling)
+    return lowered
+
+
+def _node_xyz(terrain: Terrain, j: np.ndarray, i: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    xy = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
+    return np.concatenate([xy, terrain.z[j, i][..., None]], axis=-1)
+
+
+def _cell_corners(terrain: Terrain, j: np.ndarray, i: np.ndarray) -> Float[np.ndarray, "n 4 3"]:
+    return np.stack(
+        [_node_xyz(terrain, j + dj, i + di) for dj, di in ((0, 0), (0, 1), (1, 1), (1, 0))], axis=1
+    )
+
+
+def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.ndarray, look: int) -> Mesh:
+    """What the roads leave of the cells on their edges: nodes keep their height, the cut has the road's."""
+    tiles, tile_of_cell = np.unique(index // TILE_CELLS, axis=0, return_inverse=True)
+    low = terrain.origin_xy + tiles[:, ::-1] * TILE_CELLS * CELL_M - 0.5
+    high = low + TILE_CELLS * CELL_M + 1.0
+    roads = np.array(
+        [shapely.clip_by_rect(plan.ground, *a, *b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    )
+    rest = shapely.difference(cells, roads[tile_of_cell.reshape(-1)])
+    parts = shapely.get_parts(shapely.get_parts(shapely.constrained_delaunay_triangles(rest)))
+    xy = shapely.get_coordinates(shapely.orient_polygons(parts)).reshape(-1, 4, 2)[:, :3]
+    at_node = np.abs((xy - terrain.origin_xy) / CELL_M % 1.0 - 0.5).min(axis=-1) > 0.5 - 1e-6
+    z = np.where(
+        at_node, terrain.height(xy.reshape(-1, 2)).reshape(at_node.shape), plan.borders.top(xy) - EDGE_DROP_M
+    )
+    return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+
+
+def _horizon(terrain: Terrain, look: int) -> Mesh:
+    """A far plain around the grid."""
+    rows, columns = terrain.z.shape
+    ring = [(0, i) for i in range(columns)] + [(j, columns - 1) for j in range(1, rows)]
+    ring += [(rows - 1, i) for i in range(columns - 2, -1, -1)] + [(j, 0) for j in range(rows - 2, -1, -1)]
+    j, i = np.array(ring).T
+    inner = _node_xyz(terrain, j, i)
+    centre = terrain.origin_xy + 0.5 * CELL_M * np.array([columns - 1, rows - 1])
+    away = inner[:, :2] - centre
+    outer_xy = inner[:, :2] + away / np.linalg.norm(away, axis=1, keepdims=True) * HORIZON_M
+    outer = np.column_stack([outer_xy, np.full(len(inner), inner[:, 2].mean())])
+    return quads(np.stack([inner[:-1], outer[:-1], outer[1:], inner[1:]], axis=1), look)
