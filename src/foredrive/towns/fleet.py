@@ -1,0 +1,136 @@
+"""Which vehicles drive: kinds with their shares, sizes and drivers, and where new ones may start."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.scene import Category
+from foredrive.towns.lane_graph import LaneGraph
+from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles, empty_slots
+
+LARGE_RADIUS_M = 9.0
+START_SPACING_M = 2.0
+CLEAR_OF_END_M = 8.0
+"""New vehicles start this far from the end of their lane, so that they can stop at its line."""
+BRAKING_MPS2 = 2.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of vehicle; sizes and top speeds are drawn evenly from their ranges."""
+
+    category: Category
+    share: float
+    smallest_lwh: tuple[float, float, float]
+    largest_lwh: tuple[float, float, float]
+    accel_mps2: float
+    decel_mps2: float
+    wheelbase: float = 0.6
+    """As a fraction of the length."""
+    top_speed_mps: tuple[float, float] = (36.0, 44.0)
+    is_large: bool = False
+    """It keeps to lanes without tight curves."""
+    aside_m: float = 0.0
+    """How far right of the centreline it keeps."""
+
+
+_HEAVY_MPS = (22.0, 24.0)
+KINDS = (
+    Kind(Category.CAR, 0.64, (3.9, 1.7, 1.4), (4.9, 1.9, 1.7), 1.6, 1.9),
+    Kind(Category.CAR, 0.12, (5.1, 1.95, 2.0), (5.9, 2.05, 2.5), 1.4, 1.8),
+    Kind(Category.TRUCK, 0.07, (6.5, 2.3, 2.8), (8.0, 2.45, 3.3), 1.0, 1.6, 0.55, _HEAVY_MPS, is_large=True),
+    Kind(Category.BUS, 0.04, (9.0, 2.4, 2.9), (10.5, 2.5, 3.2), 1.0, 1.5, 0.52, _HEAVY_MPS, is_large=True),
+    Kind(Category.MOTORCYCLE, 0.06, (2.0, 0.7, 1.4), (2.2, 0.85, 1.6), 2.0, 2.0, 0.65),
+    Kind(Category.BICYCLE, 0.07, (1.65, 0.55, 1.6), (1.85, 0.7, 1.8), 1.0, 1.8, 0.6, (4.5, 7.0), aside_m=0.9),
+)
+"""Cars, vans, trucks, buses, motorcycles and bicycles with their riders. Accelerations are those of city
+drivers (Treiber & Kesting 2013, table 11.2 gives 1.0 and 1.5 m/s²), somewhat brisker for cars."""
+
+
+def draw_fleet(
+    rng: np.random.Generator,
+    track_ids: Int[np.ndarray, "k"],
+    for_large: Bool[np.ndarray, "k"],
+    for_bicycles: Bool[np.ndarray, "k"],
+) -> Vehicles:
+    """k vehicles with their drivers, not yet placed; large ones and bicycles only where there may be any."""
+    count = len(track_ids)
+    share = np.array([kind.share for kind in KINDS])
+    large = np.array([kind.is_large for kind in KINDS])
+    bicycle = np.array([kind.category == Category.BICYCLE for kind in KINDS])
+    weight = share * (for_large[:, None] | ~large) * (for_bicycles[:, None] | ~bicycle)
+    cumulated = np.cumsum(weight, axis=1)
+    kinds = np.argmax(cumulated > rng.random((count, 1)) * cumulated[:, -1:], axis=1)
+    low = np.array([[*kind.smallest_lwh, kind.top_speed_mps[0]] for kind in KINDS])[kinds]
+    high = np.array([[*kind.largest_lwh, kind.top_speed_mps[1]] for kind in KINDS])[kinds]
+    u = np.repeat(rng.random((count, 2)), [3, 1], axis=1)  # long vehicles are wide and high
+    drawn = low + u * (high - low)
+    wheelbase = np.array([kind.wheelbase for kind in KINDS])[kinds] * drawn[:, 0]
+    aside = np.array([kind.aside_m for kind in KINDS])[kinds]
+    empty = empty_slots(count)
+    return Vehicles(
+        **{
+            **vars(empty),
+            "active": np.ones(count, dtype=np.bool_),
+            "track_id": track_ids,
+            "category": np.array([int(kind.category) for kind in KINDS])[kinds],
+            "style": rng.integers(0, 2**31, count),
+            "size_lwh": drawn[:, :3],
+            "wheelbase_m": wheelbase,
+            "axle_to_centre_m": 0.5 * wheelbase,
+            "lateral_m": np.clip(rng.normal(0.0, 0.1, count), -0.2, 0.2) - aside,
+            "top_speed_mps": drawn[:, 3],
+            "haste": rng.uniform(0.82, 1.0, count),
+            "time_gap_s": rng.uniform(1.0, 1.6, count),
+            "accel_mps2": np.array([kind.accel_mps2 for kind in KINDS])[kinds]
+            * rng.uniform(0.85, 1.15, count),
+            "decel_mps2": np.array([kind.decel_mps2 for kind in KINDS])[kinds],
+        }
+    )
+
+
+def is_large(vehicles: Vehicles) -> Bool[np.ndarray, "N"]:
+    """Vehicles that keep to lanes without curves tighter than `LARGE_RADIUS_M`."""
+    large = {kind.category for kind in KINDS if kind.is_large}
+    return np.array([Category(c) in large for c in range(len(Category))])[vehicles.category]
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Points of lanes outside junctions where a vehicle may begin."""
+
+    lane: Int[np.ndarray, "K"]
+    s_m: Float64[np.ndarray, "K"]
+    xyz: Float64[np.ndarray, "K 3"]
+    forward: Float64[np.ndarray, "K 3"]
+
+
+def find_starts(graph: LaneGraph) -> Starts:
+    """All starts of a town, `START_SPACING_M` apart."""
+    lanes, along = [], []
+    for lane in np.flatnonzero((graph.junction < 0) & ~graph.contested):
+        s = np.arange(CLEAR_OF_END_M, graph.length_m[lane] - CLEAR_OF_END_M, START_SPACING_M)
+        lanes.append(np.full(len(s), lane))
+        along.append(s)
+    lane, s_m = np.concatenate(lanes), np.concatenate(along)
+    xyz = graph.position(lane, s_m)
+    ahead = graph.position(lane, s_m + 1.0) - xyz
+    return Starts(lane, s_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+
+
+def place(
+    graph: LaneGraph, vehicles: Vehicles, lane: Int[np.ndarray, "k"], s_m: Float64[np.ndarray, "k"]
+) -> Vehicles:
+    """Put vehicles on lanes, at the speed to drive there, but able to stop at the end of the lane.
+
+    Of the path only the lanes behind and the current one are set.
+    """
+    path = np.full((len(lane), WINDOW), -1)
+    path[:, BEHIND] = lane
+    for column in range(BEHIND - 1, -1, -1):
+        path[:, column] = np.where(path[:, column + 1] >= 0, graph.predecessors[path[:, column + 1], 0], -1)
+    to_end = np.maximum(graph.length_m[lane] - s_m - 0.5 * vehicles.size_lwh[:, 0] - 2.0, 0.0)
+    speed = vehicles.haste * np.minimum(graph.speed(lane, s_m), vehicles.top_speed_mps)
+    speed = np.minimum(speed, np.sqrt(2 * BRAKING_MPS2 * to_end))
+    return Vehicles(**{**vars(vehicles), "path": path, "s_m": s_m.astype(np.float64), "speed_mps": speed})

@@ -1,0 +1,275 @@
+"""A town's lanes as flat arrays: geometry by arc length, neighbours, where paths meet, what guards them."""
+
+import dataclasses
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+from scipy.ndimage import uniform_filter1d
+
+from foredrive.scene import Command
+from foredrive.towns.meetings import Meetings, find_meetings
+from foredrive.towns.town_map import Lane, StopZoneKind, TownMap
+
+SAMPLE_M = 0.5
+TURN_RAD = np.deg2rad(30.0)
+SMOOTHED_SAMPLES = 7
+CITY_SPEED_MPS = 13.9
+"""The towns' files give most city streets the 55 mph of their OpenDRIVE road type; traffic there keeps to
+50 km/h. Lanes whose limit is above `MOTORWAY_LIMIT_MPS` are driven as posted."""
+MOTORWAY_LIMIT_MPS = 26.0
+LATERAL_MPS2 = 2.5
+"""Comfortable lateral acceleration in curves."""
+SLOWING_MPS2 = 1.5
+"""Comfortable deceleration towards a curve or a lower limit."""
+WAITING_ROOM_M = 12.0
+
+
+class Control(enum.IntEnum):
+    """What a driver meets at the start of a lane."""
+
+    NONE = 0
+    LIGHT = 1
+    STOP = 2
+    YIELD = 3
+
+
+CONTROL_OF_ZONE = {
+    StopZoneKind.TRAFFIC_LIGHT: Control.LIGHT,
+    StopZoneKind.STOP_SIGN: Control.STOP,
+    StopZoneKind.YIELD_SIGN: Control.YIELD,
+}
+
+
+@dataclass(frozen=True)
+class LaneGraph:
+    """L lanes. Centrelines are resampled evenly, at most `SAMPLE_M` apart, and laid end to end in `xyz`."""
+
+    ids: tuple[str, ...]
+    """The map's; a way through a junction that the map has in pieces is one lane here, named by its first."""
+    xyz: Float64[np.ndarray, "P 3"]
+    speed_mps: Float64[np.ndarray, "P"]
+    """Speed to drive: the limit and comfort in curves, slowing in time for what comes within the lane."""
+    first: Int[np.ndarray, "L"]
+    count: Int[np.ndarray, "L"]
+    step_m: Float64[np.ndarray, "L"]
+    length_m: Float64[np.ndarray, "L"]
+    limit_mps: Float64[np.ndarray, "L"]
+    """What traffic takes the limit to be (see `CITY_SPEED_MPS`)."""
+    width_m: Float64[np.ndarray, "L"]
+    tightest_m: Float64[np.ndarray, "L"]
+    """Smallest radius of the centreline."""
+    turn_rad: Float64[np.ndarray, "L"]
+    """How far the heading turns over the lane, positive to the left."""
+    successors: Int[np.ndarray, "L S"]
+    """Padded with -1."""
+    successor_count: Int[np.ndarray, "L"]
+    predecessors: Int[np.ndarray, "L Q"]
+    left: Int[np.ndarray, "L"]
+    """Neighbour of the same direction, -1 for none; `right` likewise."""
+    right: Int[np.ndarray, "L"]
+    junction: Int[np.ndarray, "L"]
+    """-1 outside junctions."""
+    control: Int[np.ndarray, "L"]
+    """A `Control`, met at the start of the lane."""
+    zone: Int[np.ndarray, "L"]
+    """Index of the stop zone that guards the lane, -1 for none."""
+    siblings: Meetings
+    """Lanes that part from a common start: the car ahead stays ahead until it is clear."""
+    conflicts: Meetings
+    """Lanes that cross or merge: only one at a time."""
+
+    contested: Bool[np.ndarray, "L"]
+    """Lanes that may be entered only by right of way: those that others cross, and those before them that
+    leave no room to wait."""
+
+    def position(
+        self, lane: Int[np.ndarray, "*n"], s_m: Float64[np.ndarray, "*n"]
+    ) -> Float64[np.ndarray, "*n 3"]:
+        """Points on centrelines by arc length, clamped to the lane."""
+        i, fraction = self._sample(lane, s_m)
+        a = self.xyz[i]
+        return a + fraction[..., None] * (self.xyz[i + 1] - a)
+
+    def speed(self, lane: Int[np.ndarray, "*n"], s_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+        """Speed to drive at points of lanes."""
+        i, fraction = self._sample(lane, s_m)
+        a = self.speed_mps[i]
+        return a + fraction * (self.speed_mps[i + 1] - a)
+
+    def samples(self, lane: int) -> Float64[np.ndarray, "n 3"]:
+        """The centreline of one lane."""
+        return self.xyz[self.first[lane] : self.first[lane] + self.count[lane]]
+
+    def _sample(self, lane: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        steps = np.clip(s_m / self.step_m[lane], 0, self.count[lane] - 1)
+        i = np.minimum(steps.astype(np.int64), self.count[lane] - 2)
+        return self.first[lane] + i, steps - i
+
+    def command(self, lane: int) -> Command:
+        """Which way traffic turns on a lane: by its change of heading, within junctions only."""
+        if self.junction[lane] < 0 or abs(self.turn_rad[lane]) < TURN_RAD:
+            return Command.STRAIGHT
+        return Command.LEFT if self.turn_rad[lane] > 0 else Command.RIGHT
+
+
+def build_lane_graph(town: TownMap) -> LaneGraph:
+    """Lane graph of a town."""
+    lanes, index = _whole_connectors(town.lanes)
+    lines = [_resample(lane.centreline_xyz) for lane in lanes]
+    length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
+    bends = [_bend(line) for line in lines]
+    limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
+    count = np.array([len(line) for line in lines])
+    successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
+    predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
+    junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
+    groups = [lane.group_id for lane in lanes]
+    siblings, conflicts = find_meetings(lines, length, successors, predecessors, junction, groups)
+    control, zone = _guards(town, index, len(lanes))
+    return LaneGraph(
+        ids=tuple(lane.lane_id for lane in lanes),
+        xyz=np.concatenate(lines),
+        speed_mps=np.concatenate([_speed(*of_lane) for of_lane in zip(bends, limit, length, strict=True)]),
+        first=np.cumsum(count) - count,
+        count=count,
+        step_m=length / (count - 1),
+        length_m=length,
+        limit_mps=limit,
+        width_m=np.array([lane.width_m for lane in lanes]),
+        tightest_m=np.array([1 / np.abs(bend).max().clip(1e-6) for bend in bends]),
+        turn_rad=np.array([_heading(line)[-1] - _heading(line)[0] for line in lines]),
+        successors=_padded(successors),
+        successor_count=np.array([len(row) for row in successors]),
+        predecessors=_padded(predecessors),
+        left=np.array([index.get(lane.left_id or "", -1) for lane in lanes]),
+        right=np.array([index.get(lane.right_id or "", -1) for lane in lanes]),
+        junction=junction,
+        control=control,
+        zone=zone,
+        siblings=siblings,
+        conflicts=conflicts,
+        contested=_contested(
+            (np.diff(conflicts.first) > 0) | (control != Control.NONE),
+            length,
+            successors,
+            predecessors,
+            junction,
+        ),
+    )
+
+
+def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, int]]:
+    """Lanes, with the pieces of each way through a junction put together; the index of every original lane.
+
+    Maps cut lanes where the cross-section of the road changes. What crosses a lane would be cut as well.
+    """
+    by_id = {lane.lane_id: lane for lane in lanes}
+
+    def continued_by(lane: Lane) -> Lane | None:
+        following = by_id[lane.successor_ids[0]] if len(lane.successor_ids) == 1 else None
+        if following is None or lane.junction_id is None or following.junction_id != lane.junction_id:
+            return None
+        return following if following.predecessor_ids == (lane.lane_id,) else None
+
+    absorbed = {following.lane_id for lane in lanes if (following := continued_by(lane))}
+    whole, index = [], {}
+    for lane in lanes:
+        if lane.lane_id in absorbed:
+            continue
+        pieces = [lane]
+        while following := continued_by(pieces[-1]):
+            pieces.append(following)
+        index.update({piece.lane_id: len(whole) for piece in pieces})
+        line = np.concatenate([lane.centreline_xyz] + [piece.centreline_xyz[1:] for piece in pieces[1:]])
+        whole.append(dataclasses.replace(lane, centreline_xyz=line, successor_ids=pieces[-1].successor_ids))
+    return whole, index
+
+
+def _contested(
+    crossed: Bool[np.ndarray, "L"],
+    length_m: Float64[np.ndarray, "L"],
+    successors: list[list[int]],
+    predecessors: list[list[int]],
+    junction: Int[np.ndarray, "L"],
+) -> Bool[np.ndarray, "L"]:
+    """Extend lanes that are crossed back to where a vehicle can wait with its tail out of the junction."""
+    contested = crossed.copy()
+    room_m = length_m.copy()
+    changed = True
+    while changed:
+        changed = False
+        for lane in np.flatnonzero(~contested).tolist():
+            behind = min((0.0 if contested[p] else room_m[p] for p in predecessors[lane]), default=np.inf)
+            room = min(WAITING_ROOM_M, length_m[lane] + behind)
+            before = [n for n in successors[lane] if contested[n]]
+            inside = junction[lane] >= 0 and any(junction[n] == junction[lane] for n in before)
+            if before and (inside or room < WAITING_ROOM_M):
+                contested[lane] = changed = True
+            elif room != room_m[lane]:
+                room_m[lane], changed = room, True
+    return contested
+
+
+def _resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
+    s = np.linspace(0.0, along[-1], count)
+    return np.stack([np.interp(s, along, column) for column in line.T], axis=1)
+
+
+def _heading(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n-1"]:
+    """Heading of each stretch between two samples, unwrapped."""
+    d = np.diff(line, axis=0)
+    return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+
+
+def _bend(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    """Curvature at each sample, 1/m, over some metres: the maps' polylines have corners."""
+    if len(line) < 3:
+        return np.zeros(len(line))
+    step_m = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
+    heading = uniform_filter1d(_heading(line), SMOOTHED_SAMPLES, mode="nearest")
+    at_samples = np.interp(np.arange(len(line)) - 0.5, np.arange(len(line) - 1), heading)
+    return np.gradient(at_samples) / step_m
+
+
+def _limit(posted_mps: float | None) -> float:
+    posted_mps = posted_mps or CITY_SPEED_MPS
+    return posted_mps if posted_mps > MOTORWAY_LIMIT_MPS else min(posted_mps, CITY_SPEED_MPS)
+
+
+def _speed(bend: Float64[np.ndarray, "n"], limit_mps: float, length_m: float) -> Float64[np.ndarray, "n"]:
+    """Speed to drive at each sample: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds backwards."""
+    square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(bend).clip(1e-6))
+    step_m = length_m / (len(bend) - 1)
+    to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(bend))
+    return np.sqrt(np.minimum.accumulate((square + to_end)[::-1])[::-1] - to_end)
+
+
+def _guards(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.ndarray, np.ndarray]:
+    control = np.full(lane_count, int(Control.NONE))
+    zone = np.full(lane_count, -1)
+    for i, stop in enumerate(town.stop_zones):
+        lanes = [index[name] for name in stop.lane_ids if name in index]
+        control[lanes] = CONTROL_OF_ZONE.get(stop.kind, Control.NONE)
+        zone[lanes] = i
+    return control, zone
+
+
+def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:
+    """Lanes from which one can drive on for ever without a curve tighter than this."""
+    kept = graph.tightest_m >= min_radius_m
+    while True:
+        onward = (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)
+        if not (kept & ~onward).any():
+            return kept
+        kept = kept & onward
+
+
+def _padded(rows: list[list[int]]) -> Int[np.ndarray, "L _"]:
+    out = np.full((len(rows), max(1, max(map(len, rows)))), -1)
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = values
+    return out

@@ -1,0 +1,64 @@
+"""Traffic lights with fixed cycles: what shows at a lane is a function of time alone."""
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.towns.lane_graph import Control, LaneGraph
+
+GREEN_S = 10.0
+YELLOW_S = 3.0
+ALL_RED_S = 1.5
+PHASE_S = GREEN_S + YELLOW_S + ALL_RED_S
+SAME_AXIS_COS = 0.7
+"""Approaches within 45 degrees of one axis, from either end, have green together."""
+
+
+class Light(enum.IntEnum):
+    """What a light shows."""
+
+    NONE = 0
+    RED = 1
+    YELLOW = 2
+    GREEN = 3
+
+
+@dataclass(frozen=True)
+class SignalPlan:
+    """For each lane that a light guards: when in the cycle of its junction it is green."""
+
+    guarded: Bool[np.ndarray, "L"]
+    green_from_s: Float64[np.ndarray, "L"]
+    cycle_s: Float64[np.ndarray, "L"]
+
+    def shows(self, time_s: float) -> Int[np.ndarray, "L"]:
+        """The `Light` at the start of each lane."""
+        into_s = (time_s - self.green_from_s) % self.cycle_s
+        light = np.where(
+            into_s < GREEN_S, Light.GREEN, np.where(into_s < GREEN_S + YELLOW_S, Light.YELLOW, Light.RED)
+        )
+        return np.where(self.guarded, light, Light.NONE)
+
+
+def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:
+    """One phase per axis of a junction, in turn; junctions start at random points of their cycles."""
+    guarded = graph.control == Control.LIGHT
+    green_from_s = np.zeros(len(guarded))
+    cycle_s = np.full(len(guarded), PHASE_S)
+    start = graph.xyz[graph.first + 1] - graph.xyz[graph.first]
+    heading = np.arctan2(start[:, 1], start[:, 0])
+    for junction in np.unique(graph.junction[guarded]):
+        lanes = np.flatnonzero(guarded & (graph.junction == junction))
+        axes: list[float] = []
+        phase = np.zeros(len(lanes), dtype=np.int64)
+        for k, angle in enumerate(heading[lanes]):
+            along = [i for i, axis in enumerate(axes) if abs(np.cos(angle - axis)) > SAME_AXIS_COS]
+            if not along:
+                axes.append(angle)
+            phase[k] = along[0] if along else len(axes) - 1
+        # A junction with one axis shows red for as long as a second one would have green.
+        cycle_s[lanes] = PHASE_S * max(2, len(axes))
+        green_from_s[lanes] = phase * PHASE_S + rng.uniform(0, cycle_s[lanes[0]])
+    return SignalPlan(guarded, green_from_s, cycle_s)

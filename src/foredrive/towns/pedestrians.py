@@ -1,0 +1,286 @@
+"""People on foot: they wander over walkways, wait for a gap in the traffic, and go first while crossing."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.towns.leaders import LOOK_M
+from foredrive.towns.lights import Light
+from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
+from foredrive.towns.walkways import WalkGraph
+
+CATCH_UP = 1.3
+"""Where walks meet at an angle, people cut the corner, at most this much faster than they walk."""
+ACCEPTED_BRAKING_MPS2 = 2.0
+REACTION_S = 1.0
+MARGIN_M = 1.0
+YIELD_BRAKING_MPS2 = 4.0
+"""Drivers stop for people on a crossing unless they would have to brake harder than this."""
+IN_THE_WAY_M = 0.3
+ALONG_CROSSING_M = 4.0
+SLOW_MPS = 3.0
+SPARE_S = 2.0
+"""Drivers pass before people who reach their lane this long after they have cleared the crossing."""
+AT_LANE_M = 0.5
+BEYOND_LIGHT_M = 8.0
+"""A crossing within this distance behind the line of a light goes with that light."""
+PATIENCE_S = 25.0
+"""People who found no gap for this long walk elsewhere."""
+
+
+@dataclass(frozen=True)
+class Pedestrians:
+    """N pedestrian slots. A slot that is not `active` holds nothing of meaning."""
+
+    active: Bool[np.ndarray, "N"]
+    track_id: Int[np.ndarray, "N"]
+    style: Int[np.ndarray, "N"]
+    size_lwh: Float64[np.ndarray, "N 3"]
+    pace_mps: Float64[np.ndarray, "N"]
+    aside: Float64[np.ndarray, "N"]
+    """Which part of the half width to the right of a walk's middle is kept to, 0 to 1."""
+    walk: Int[np.ndarray, "N"]
+    s_m: Float64[np.ndarray, "N"]
+    onward: Int[np.ndarray, "N"]
+    """1 along the walk, -1 against it."""
+    next_walk: Int[np.ndarray, "N"]
+    waited_s: Float64[np.ndarray, "N"]
+    xyz: Float64[np.ndarray, "N 3"]
+    """Where the feet are."""
+    velocity_mps: Float64[np.ndarray, "N 3"]
+    yaw: Float64[np.ndarray, "N"]
+
+    def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Pedestrians") -> "Pedestrians":
+        """These people with some slots taken over by the k people of `other`."""
+        changed = {}
+        for field in dataclasses.fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][rows] = getattr(other, field.name)
+        return Pedestrians(**changed)
+
+
+def empty_pavement(count: int) -> Pedestrians:
+    """Slots without people."""
+    values = {field.name: np.zeros(count) for field in dataclasses.fields(Pedestrians)}
+    values["active"] = np.zeros(count, dtype=np.bool_)
+    for name in ("track_id", "style", "walk", "onward", "next_walk"):
+        values[name] = np.zeros(count, dtype=np.int64)
+    for name in ("size_lwh", "xyz", "velocity_mps"):
+        values[name] = np.zeros((count, 3))
+    return Pedestrians(**values)
+
+
+def draw_people(
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    track_ids: Int[np.ndarray, "k"],
+    walk: Int[np.ndarray, "k"],
+    s_m: Float64[np.ndarray, "k"],
+) -> Pedestrians:
+    """k people, standing on walks."""
+    count = len(track_ids)
+    height = np.clip(rng.normal(1.7, 0.1, count), 1.3, 1.95)
+    size = np.stack([rng.uniform(0.4, 0.6, count), rng.uniform(0.45, 0.65, count), height], axis=1)
+    onward = rng.choice([-1, 1], count)
+    people = dataclasses.replace(
+        empty_pavement(count),
+        active=np.ones(count, dtype=np.bool_),
+        track_id=track_ids,
+        style=rng.integers(0, 2**31, count),
+        size_lwh=size,
+        pace_mps=np.clip(rng.normal(1.35, 0.2, count), 0.8, 1.9),
+        aside=rng.uniform(0.0, 1.0, count),
+        walk=walk,
+        s_m=s_m,
+        onward=onward,
+        next_walk=_choose_next(graph, walk, onward, rng.random(count)),
+    )
+    xyz = _way(graph, people)
+    ahead = _way(graph, dataclasses.replace(people, s_m=s_m + 0.1 * onward)) - xyz
+    return dataclasses.replace(people, xyz=xyz, yaw=np.arctan2(ahead[:, 1], ahead[:, 0]))
+
+
+def step_pedestrians(
+    graph: WalkGraph,
+    people: Pedestrians,
+    vehicles: Vehicles,
+    starts_m: Float64[np.ndarray, "N W"],
+    light: Int[np.ndarray, "L"],
+    dt_s: float,
+    rng: np.random.Generator,
+) -> Pedestrians:
+    """Where people are one time step later. They cross in front of traffic that a light (`light`) holds back."""
+    if not len(people.active) or not len(graph.length_m):
+        return people
+    s = people.s_m + people.onward * people.pace_mps * dt_s
+    s = np.where(_walks_into_vehicle(graph, people, vehicles, starts_m), people.s_m, s)
+    over = np.maximum(-s, s - graph.length_m[people.walk])
+    leaving = people.active & (over >= 0)
+    wants_to_cross = leaving & graph.is_crossing[people.next_walk]
+    blocked = wants_to_cross & ~_may_cross(graph, people.next_walk, wants_to_cross, vehicles, starts_m, light)
+    impatient = blocked & (people.waited_s > PATIENCE_S)
+    leaving &= ~blocked
+    place = graph.ends[people.walk, (people.onward > 0).astype(np.int64)]
+    entry = np.where(leaving, people.next_walk, people.walk)
+    at_start = graph.ends[entry, 0] == place
+    turned = leaving & (entry == people.walk)
+    onward = np.where(turned, -people.onward, np.where(leaving, np.where(at_start, 1, -1), people.onward))
+    begun = np.where(onward > 0, over, graph.length_m[entry] - over)
+    s = np.where(leaving, begun, np.clip(s, 0.0, graph.length_m[entry]))
+    chosen = _choose_next(graph, entry, onward, rng.random(len(s)))
+    moved = dataclasses.replace(
+        people,
+        walk=entry,
+        s_m=s,
+        onward=onward,
+        next_walk=np.where(leaving | impatient, chosen, people.next_walk),
+        waited_s=np.where(blocked & ~impatient, people.waited_s + dt_s, 0.0),
+    )
+    return _follow_way(graph, moved, dt_s)
+
+
+def _follow_way(graph: WalkGraph, people: Pedestrians, dt_s: float) -> Pedestrians:
+    to_go = _way(graph, people) - people.xyz
+    distance = np.linalg.norm(to_go[:, :2], axis=1)
+    reach = CATCH_UP * people.pace_mps * dt_s
+    step = to_go * np.minimum(1.0, reach / distance.clip(1e-9))[:, None]
+    step[~people.active] = 0.0
+    moving = np.linalg.norm(step[:, :2], axis=1) > 0.1 * dt_s
+    return dataclasses.replace(
+        people,
+        xyz=people.xyz + step,
+        velocity_mps=step / dt_s,
+        yaw=np.where(moving, np.arctan2(step[:, 1], step[:, 0]), people.yaw),
+    )
+
+
+def _way(graph: WalkGraph, people: Pedestrians) -> Float64[np.ndarray, "N 3"]:
+    """Where on the pavement people want to be: to the right of the middle, as they walk."""
+    offset = people.onward * people.aside * graph.half_width_m[people.walk]
+    middle = graph.position(people.walk, people.s_m)
+    return middle + offset[:, None] * graph.right_of(people.walk, people.s_m)
+
+
+def _choose_next(
+    graph: WalkGraph,
+    walk: Int[np.ndarray, "n"],
+    onward: Int[np.ndarray, "n"],
+    u: Float64[np.ndarray, "n"],
+) -> Int[np.ndarray, "n"]:
+    """A walk that leaves the place ahead, other than the one people come on unless there is none."""
+    options = graph.incident[graph.ends[walk, (onward > 0).astype(np.int64)]]
+    allowed = (options >= 0) & (options != walk[:, None])
+    allowed[~allowed.any(axis=1), 0] = True  # a dead end: back
+    pick = (u * allowed.sum(axis=1)).astype(np.int64)
+    column = np.argmax(np.cumsum(allowed, axis=1) > pick[:, None], axis=1)
+    return options[np.arange(len(walk)), column]
+
+
+def crossing_gap(
+    graph: WalkGraph, people: Pedestrians, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
+) -> Float64[np.ndarray, "N"]:
+    """Gap from each front bumper to the crossing at which it has to wait for people, m (infinite: none)."""
+    if not len(graph.lane) or not people.active.any():
+        return np.full(len(vehicles.active), np.inf)
+    return _crossing_gap(
+        vehicles.active,
+        vehicles.path,
+        starts_m,
+        vehicles.front_m,
+        vehicles.speed_mps,
+        graph.lane,
+        graph.crossing,
+        graph.lane_span_m,
+        graph.walk_span_m,
+        people.active,
+        people.walk,
+        people.s_m,
+        people.onward,
+        people.pace_mps,
+        vehicles.size_lwh[:, 0],
+    )
+
+
+@numba.njit(cache=True)
+def _crossing_gap(  # type: ignore[no-untyped-def]
+    active,
+    path,
+    starts,
+    front,
+    speed,
+    lanes,
+    crossings,
+    lane_span,
+    walk_span,
+    walking,
+    walk,
+    s,
+    onward,
+    pace,
+    length,
+):
+    gap = np.full(len(active), np.inf)
+    for i in range(len(active)):
+        if not active[i]:
+            continue
+        too_late = speed[i] ** 2 / (2 * YIELD_BRAKING_MPS2)
+        for k in range(BEHIND, WINDOW):
+            lane = path[i, k]
+            if lane < 0 or starts[i, k] - front[i] > LOOK_M:
+                break
+            for m in range(np.searchsorted(lanes, lane), np.searchsorted(lanes, lane + 1)):
+                to_go = starts[i, k] + lane_span[m, 0] - front[i]
+                if to_go < too_late or to_go < IN_THE_WAY_M or to_go >= gap[i]:
+                    continue
+                for p in range(len(walking)):
+                    if not walking[p] or walk[p] != crossings[m]:
+                        continue
+                    if (onward[p] > 0 and s[p] < walk_span[m, 1]) or (
+                        onward[p] < 0 and s[p] > walk_span[m, 0]
+                    ):
+                        gap[i] = to_go
+    return gap
+
+
+def _may_cross(
+    graph: WalkGraph,
+    walk: Int[np.ndarray, "n"],
+    asked: Bool[np.ndarray, "n"],
+    vehicles: Vehicles,
+    starts_m: Float64[np.ndarray, "N W"],
+    light: Int[np.ndarray, "L"],
+) -> Bool[np.ndarray, "n"]:
+    """Whether no light is green for those who would cross, and every vehicle can stop or has passed."""
+    may = np.ones(len(walk), dtype=np.bool_)
+    moving = light[graph.lane] > Light.RED
+    released = np.unique(graph.crossing[moving & (graph.lane_span_m[:, 0] < BEYOND_LIGHT_M)])
+    for i in np.flatnonzero(asked):
+        may[i] = walk[i] not in released
+        for m in np.flatnonzero((graph.crossing == walk[i]) & may[i]):
+            there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
+            to_go = starts_m + graph.lane_span_m[m, 0] - vehicles.front_m[:, None]
+            passed = starts_m + graph.lane_span_m[m, 1] < vehicles.rear_m[:, None]
+            speed = vehicles.speed_mps[:, None]
+            needed = speed**2 / (2 * ACCEPTED_BRAKING_MPS2) + REACTION_S * speed + IN_THE_WAY_M
+            may[i] &= not (there & ~passed & (to_go < needed + MARGIN_M * (speed > 0.1))).any()
+    return may
+
+
+def _walks_into_vehicle(
+    graph: WalkGraph, people: Pedestrians, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
+) -> Bool[np.ndarray, "N"]:
+    """Who is about to step in front of a vehicle that stands on the crossing or can no longer stop."""
+    blocked = np.zeros(len(people.active), dtype=np.bool_)
+    for i in np.flatnonzero(people.active & graph.is_crossing[people.walk]):
+        ahead = people.onward[i] * (graph.walk_span_m - people.s_m[i])
+        about = (graph.crossing == people.walk[i]) & (ahead.min(axis=1) > 0) & (ahead.min(axis=1) < AT_LANE_M)
+        for m in np.flatnonzero(about):
+            there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
+            to_go = starts_m + graph.lane_span_m[m, 0] - vehicles.front_m[:, None]
+            passed = starts_m + graph.lane_span_m[m, 1] < vehicles.rear_m[:, None]
+            too_late = (vehicles.speed_mps**2 / (2 * YIELD_BRAKING_MPS2))[:, None]
+            blocked[i] |= bool((there & ~passed & (to_go < np.maximum(too_late, IN_THE_WAY_M))).any())
+    return blocked

@@ -1,0 +1,338 @@
+"""Traffic on a town's lanes and walkways: one pure step from state to state."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+from foredrive.towns.car_following import (
+    EMERGENCY_MPS2,
+    HARDEST_BRAKING_MPS2,
+    JERK_DOWN_MPS3,
+    JERK_EMERGENCY_MPS3,
+    JERK_UP_MPS3,
+    follow_acceleration,
+    free_acceleration,
+)
+from foredrive.towns.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
+from foredrive.towns.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.leaders import find_leaders
+from foredrive.towns.lights import Light, SignalPlan, plan_signals
+from foredrive.towns.pedestrians import (
+    Pedestrians,
+    crossing_gap,
+    draw_people,
+    empty_pavement,
+    step_pedestrians,
+)
+from foredrive.towns.right_of_way import STANDSTILL_M, claim_junctions
+from foredrive.towns.town_map import TownMap
+from foredrive.towns.vehicles import (
+    BEHIND,
+    Poses,
+    Vehicles,
+    empty_slots,
+    path_starts,
+    speed_to_drive,
+    vehicle_poses,
+)
+from foredrive.towns.walkways import WalkGraph, build_walk_graph
+
+LINE_STANDSTILL_M = 1.0
+HALT_MPS = 0.4
+AT_LINE_M = 4.0
+BORN_BEYOND_M = 95.0
+BORN_WITHIN_M = 140.0
+GONE_BEYOND_M = 160.0
+PEOPLE_BORN_BEYOND_M = 82.0
+PEOPLE_BORN_WITHIN_M = 95.0
+PEOPLE_GONE_BEYOND_M = 110.0
+CLEAR_M = 10.0
+CLEAR_S = 3.5
+"""New vehicles keep `CLEAR_M` from all others, and `CLEAR_S` more from those ahead of and behind them."""
+TRIES = 12
+
+
+@dataclass(frozen=True)
+class TrafficState:
+    """Everything that changes from step to step."""
+
+    time_s: float
+    step_index: int
+    vehicles: Vehicles
+    people: Pedestrians
+    next_track_id: int
+    route: Int[np.ndarray, "R"]
+    """Lanes that vehicle 0 follows; empty if it wanders like the others."""
+    route_known: int
+    """How many lanes of the route are in the path of vehicle 0 by now."""
+
+
+class Traffic:
+    """The rules of traffic in one town: `step` is a pure function of the state.
+
+    Vehicle 0 is the one the world turns around: traffic appears and disappears out of its sight.
+
+    Args:
+        town: the map.
+        seed: everything random follows from it.
+        vehicle_count: vehicles on the road at one time, vehicle 0 included.
+        people_count: people on foot at one time, where the town has walkways.
+    """
+
+    def __init__(self, town: TownMap, seed: int, vehicle_count: int, people_count: int) -> None:
+        self.seed = seed
+        self.lanes: LaneGraph = build_lane_graph(town)
+        self.walks: WalkGraph = build_walk_graph(town, self.lanes)
+        self.signals: SignalPlan = plan_signals(self.lanes, np.random.default_rng((seed, 0)))
+        self._starts: Starts = find_starts(self.lanes)
+        self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
+        self._is_motorway = self.lanes.limit_mps > MOTORWAY_LIMIT_MPS
+        self._vehicle_count = vehicle_count
+        self._people_count = people_count if len(self.walks.length_m) else 0
+        walkable = np.where(self.walks.is_crossing, 0.0, self.walks.length_m)
+        self._walk_weight = walkable / max(walkable.sum(), 1e-9)
+
+    def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
+        """Vehicles and people at their start.
+
+        Args:
+            ego: a placed vehicle to be vehicle 0; without one, traffic fills the whole town.
+            route: the lanes that vehicle 0 follows, its own first; after the last it wanders.
+        """
+        rng = np.random.default_rng((self.seed, 1))
+        lanes = np.zeros(0, dtype=np.int64) if route is None else route
+        state = TrafficState(
+            time_s=0.0,
+            step_index=0,
+            vehicles=empty_slots(self._vehicle_count),
+            people=empty_pavement(self._people_count),
+            next_track_id=1,
+            route=lanes,
+            route_known=1,
+        )
+        if ego is not None:
+            vehicles = state.vehicles.replace_rows(np.array([0]), ego)
+            state = dataclasses.replace(state, vehicles=vehicles, route=lanes if len(lanes) else ego.lane)
+            state = self._know_path(state, rng)
+        state = self._put_vehicles(state, 0.0, self._vehicle_count, rng)
+        return self._put_people(state, 0.0, self._people_count, rng)
+
+    def step(self, state: TrafficState, dt_s: float) -> TrafficState:
+        """The state one time step later; equal states and steps give equal results."""
+        rng = np.random.default_rng((self.seed, 2, state.step_index))
+        v = state.vehicles
+        starts_m = path_starts(self.lanes, v.path)
+        leader, leader_gap = find_leaders(self.lanes, v, starts_m)
+        light = self.signals.shows(state.time_s)
+        green = (light == Light.NONE) | (light == Light.GREEN)
+        way = claim_junctions(self.lanes, v, starts_m, leader, leader_gap, green, state.time_s)
+        halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
+        halt_gap = np.minimum(halt_gap, way.inside_gap_m)
+        wanted = self._wanted_acceleration(v, starts_m, leader, leader_gap, halt_gap)
+        halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
+        v = dataclasses.replace(
+            v,
+            granted=way.granted,
+            asked_s=way.asked_s,
+            rank=way.rank,
+            has_stopped=v.has_stopped | halted,
+        )
+        people = step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng)
+        state = dataclasses.replace(
+            state,
+            time_s=state.time_s + dt_s,
+            step_index=state.step_index + 1,
+            vehicles=_drive(v, wanted, dt_s),
+            people=people,
+        )
+        state = self._change_lanes_at_ends(state, rng)
+        return self._turn_over(state, rng)
+
+    def poses(self, state: TrafficState) -> Poses:
+        """Poses of all vehicle slots."""
+        return vehicle_poses(self.lanes, state.vehicles)
+
+    def actors(self, state: TrafficState, skip_ego: bool = True) -> list[ActorState]:
+        """All road users; vehicle 0 is left out where it is the ego vehicle."""
+        v, poses = state.vehicles, self.poses(state)
+        ego = skip_ego and len(state.route) > 0
+        out = [
+            ActorState(
+                track_id=int(v.track_id[i]),
+                category=Category(int(v.category[i])),
+                centre_m=poses.centre_m[i],
+                yaw=float(poses.yaw[i]),
+                pitch=float(poses.pitch[i]),
+                size_lwh=v.size_lwh[i],
+                velocity_mps=v.speed_mps[i] * poses.forward[i],
+                style=int(v.style[i]),
+                parked=False,
+            )
+            for i in np.flatnonzero(v.active)
+            if i > 0 or not ego
+        ]
+        p = state.people
+        for i in np.flatnonzero(p.active):
+            out.append(
+                ActorState(
+                    track_id=int(p.track_id[i]),
+                    category=Category.PEDESTRIAN,
+                    centre_m=p.xyz[i] + [0.0, 0.0, 0.5 * p.size_lwh[i, 2]],
+                    yaw=float(p.yaw[i]),
+                    pitch=0.0,
+                    size_lwh=p.size_lwh[i],
+                    velocity_mps=p.velocity_mps[i],
+                    style=int(p.style[i]),
+                    parked=False,
+                )
+            )
+        return out
+
+    def _wanted_acceleration(
+        self,
+        v: Vehicles,
+        starts_m: np.ndarray,
+        leader: np.ndarray,
+        leader_gap: np.ndarray,
+        halt_gap: np.ndarray,
+    ) -> Float64[np.ndarray, "N"]:
+        speed = v.speed_mps
+        free = free_acceleration(speed, speed_to_drive(self.lanes, v, starts_m), v.accel_mps2, v.decel_mps2)
+        driver = (v.time_gap_s, v.accel_mps2, v.decel_mps2)
+        closing = speed - np.where(leader >= 0, speed[leader], speed)
+        standstill = np.full(len(speed), STANDSTILL_M)
+        behind = follow_acceleration(free, speed, closing, leader_gap, standstill, *driver)
+        # A line needs no time gap: nothing moves there.
+        at_line = np.full(len(speed), LINE_STANDSTILL_M)
+        halt = follow_acceleration(free, speed, speed, halt_gap, at_line, 0.3 * v.time_gap_s, *driver[1:])
+        return np.minimum(behind, halt)
+
+    def _know_path(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        """Fill in the lanes ahead that are not known yet: the route's, or a random turn."""
+        v, path, known = state.vehicles, state.vehicles.path.copy(), state.route_known
+        fits = self._for_large | ~is_large(v)[:, None]
+        for column in range(BEHIND + 1, path.shape[1]):
+            rows = np.flatnonzero(v.active & (path[:, column] < 0))
+            if not len(rows):
+                continue
+            options = self.lanes.successors[path[rows, column - 1]]
+            weight = (options >= 0) * fits[rows[:, None], options]
+            cumulated = np.cumsum(weight, axis=1)
+            u = rng.random((len(rows), 1)) * cumulated[:, -1:]
+            path[rows, column] = options[np.arange(len(rows)), np.argmax(cumulated > u, axis=1)]
+            if rows[0] == 0 and known < len(state.route):
+                path[0, column] = state.route[known]
+                known += 1
+        return dataclasses.replace(state, vehicles=dataclasses.replace(v, path=path), route_known=known)
+
+    def _change_lanes_at_ends(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        while True:
+            v = state.vehicles
+            over = v.active & (v.s_m >= self.lanes.length_m[v.lane]) & (v.path[:, BEHIND + 1] >= 0)
+            if not over.any():
+                return state
+            path = np.where(
+                over[:, None], np.pad(v.path[:, 1:], ((0, 0), (0, 1)), constant_values=-1), v.path
+            )
+            moved = dataclasses.replace(
+                v,
+                path=path,
+                s_m=np.where(over, v.s_m - self.lanes.length_m[v.lane], v.s_m),
+                granted=np.where(over, np.maximum(v.granted - 1, 0), v.granted),
+                has_stopped=v.has_stopped & ~over,
+            )
+            state = self._know_path(dataclasses.replace(state, vehicles=moved), rng)
+
+    def _turn_over(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        """Let what is far from vehicle 0 go, and let others appear out of its sight."""
+        if not len(state.route):
+            return state
+        poses = self.poses(state)
+        far = np.linalg.norm(poses.centre_m - poses.centre_m[0], axis=1) > GONE_BEYOND_M
+        far_off = np.linalg.norm(state.people.xyz - poses.centre_m[0], axis=1) > PEOPLE_GONE_BEYOND_M
+        vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
+        people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
+        state = dataclasses.replace(state, vehicles=vehicles, people=people)
+        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng)
+        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng)
+
+    def _put_vehicles(
+        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+    ) -> TrafficState:
+        """New vehicles in up to `most` free slots, at least `beyond_m` from vehicle 0 if it is the ego."""
+        rows = np.flatnonzero(~state.vehicles.active)[:most]
+        if not len(rows):
+            return state
+        places = np.arange(len(self._starts.lane))
+        if len(state.route):
+            distance = np.linalg.norm(self._starts.xyz - self.poses(state).centre_m[0], axis=1)
+            places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
+        if not len(places):
+            return state
+        vehicles = state.vehicles
+        for k, row in enumerate(rows):
+            tries = rng.choice(places, TRIES)
+            at = tries[self._is_free(vehicles, tries)][:1]
+            if len(at):
+                lane = self._starts.lane[at]
+                track_id = np.array([state.next_track_id + k])
+                one = draw_fleet(rng, track_id, self._for_large[lane], ~self._is_motorway[lane])
+                vehicles = vehicles.replace_rows(
+                    row[None], place(self.lanes, one, lane, self._starts.s_m[at])
+                )
+        state = dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
+        return self._know_path(state, rng)
+
+    def _is_free(self, vehicles: Vehicles, starts: Int[np.ndarray, "k"]) -> np.ndarray:
+        """Which starts are far from all vehicles, and in time from those ahead and behind."""
+        centres = vehicle_poses(self.lanes, vehicles).centre_m[vehicles.active]
+        offset = centres[None] - self._starts.xyz[starts][:, None]
+        forward = self._starts.forward[starts][:, None]
+        along = np.sum(offset * forward, axis=2)
+        aside = np.linalg.norm(offset - along[..., None] * forward, axis=2)
+        speed = self.lanes.speed(self._starts.lane[starts], self._starts.s_m[starts])
+        reach = CLEAR_M + CLEAR_S * speed[:, None]
+        return ~((np.hypot(along, aside) < CLEAR_M) | ((np.abs(along) < reach) & (aside < 3.0))).any(axis=1)
+
+    def _put_people(
+        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+    ) -> TrafficState:
+        """People in up to `most` free slots."""
+        rows = np.flatnonzero(~state.people.active)[:most]
+        if not len(rows):
+            return state
+        tries = rng.choice(len(self._walk_weight), size=(len(rows), TRIES), p=self._walk_weight)
+        s_m = rng.random(tries.shape) * self.walks.length_m[tries]
+        xyz = self.walks.position(tries.ravel(), s_m.ravel()).reshape(*tries.shape, 3)
+        ok = np.ones(tries.shape, dtype=np.bool_)
+        if len(state.route):
+            distance = np.linalg.norm(xyz - self.poses(state).centre_m[0], axis=2)
+            ok = (distance >= beyond_m) & (distance <= PEOPLE_BORN_WITHIN_M)
+        chosen = np.argmax(ok, axis=1)
+        found = ok.any(axis=1)
+        each = np.arange(len(rows))
+        walk, s = tries[each, chosen][found], s_m[each, chosen][found]
+        ids = state.next_track_id + np.flatnonzero(found)
+        people = state.people.replace_rows(rows[found], draw_people(self.walks, rng, ids, walk, s))
+        return dataclasses.replace(state, people=people, next_track_id=state.next_track_id + len(rows))
+
+
+def _drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> Vehicles:
+    """Change speed as wanted, within comfortable jerk unless it is an emergency; ballistic update."""
+    wanted = np.clip(wanted_mps2, -HARDEST_BRAKING_MPS2, v.accel_mps2)
+    down = np.where(wanted < -EMERGENCY_MPS2, JERK_EMERGENCY_MPS3, JERK_DOWN_MPS3)
+    a = np.clip(wanted, v.acceleration_mps2 - down * dt_s, v.acceleration_mps2 + JERK_UP_MPS3 * dt_s)
+    stops = v.speed_mps + a * dt_s <= 0
+    braking = np.minimum(a, -1e-9)
+    distance = np.where(stops, -0.5 * v.speed_mps**2 / braking, (v.speed_mps + 0.5 * a * dt_s) * dt_s)
+    speed = np.where(stops, 0.0, v.speed_mps + a * dt_s)
+    return dataclasses.replace(
+        v,
+        s_m=np.where(v.active, v.s_m + distance, v.s_m),
+        speed_mps=np.where(v.active, speed, 0.0),
+        acceleration_mps2=np.where(v.active & ~stops, a, 0.0),
+    )

@@ -1,0 +1,178 @@
+"""Vehicles on lanes: who they are, where along their paths, and the poses that follow from that."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.towns.lane_graph import SLOWING_MPS2, LaneGraph
+
+BEHIND = 4
+AHEAD = 11
+WINDOW = BEHIND + 1 + AHEAD
+"""Lanes of its path that a vehicle knows: some behind it (where its rear may still be), its own, some ahead."""
+
+
+@dataclass(frozen=True)
+class Vehicles:
+    """N vehicle slots. A slot that is not `active` holds nothing of meaning."""
+
+    active: Bool[np.ndarray, "N"]
+    track_id: Int[np.ndarray, "N"]
+    category: Int[np.ndarray, "N"]
+    style: Int[np.ndarray, "N"]
+    size_lwh: Float64[np.ndarray, "N 3"]
+    wheelbase_m: Float64[np.ndarray, "N"]
+    axle_to_centre_m: Float64[np.ndarray, "N"]
+    """From the rear axle forward to the centre of the box."""
+    lateral_m: Float64[np.ndarray, "N"]
+    """Offset of the whole path to the left of the centreline."""
+    top_speed_mps: Float64[np.ndarray, "N"]
+    haste: Float64[np.ndarray, "N"]
+    """Factor on the speed to drive."""
+    time_gap_s: Float64[np.ndarray, "N"]
+    accel_mps2: Float64[np.ndarray, "N"]
+    decel_mps2: Float64[np.ndarray, "N"]
+    path: Int[np.ndarray, "N 16"]
+    """Lanes behind, at (column `BEHIND`) and ahead; -1 where there is none."""
+    s_m: Float64[np.ndarray, "N"]
+    """Arc length of the box centre on the lane it is at."""
+    speed_mps: Float64[np.ndarray, "N"]
+    acceleration_mps2: Float64[np.ndarray, "N"]
+    granted: Int[np.ndarray, "N"]
+    """Up to how many lanes ahead right of way has been granted."""
+    asked_s: Float64[np.ndarray, "N"]
+    """Since when right of way has been asked for; infinite if it is not."""
+    rank: Float64[np.ndarray, "N"]
+    """When right of way was granted: in a junction the lower goes first."""
+    has_stopped: Bool[np.ndarray, "N"]
+    """Whether the vehicle has come to a halt at the line ahead of it."""
+
+    @property
+    def lane(self) -> Int[np.ndarray, "N"]:
+        """The lane each box centre is on."""
+        return self.path[:, BEHIND]
+
+    @property
+    def front_m(self) -> Float64[np.ndarray, "N"]:
+        """Arc length of the front bumper, counted from the start of `lane`."""
+        return self.s_m + 0.5 * self.size_lwh[:, 0]
+
+    @property
+    def rear_m(self) -> Float64[np.ndarray, "N"]:
+        """Arc length of the rear bumper, counted from the start of `lane`."""
+        return self.s_m - 0.5 * self.size_lwh[:, 0]
+
+    def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Vehicles") -> "Vehicles":
+        """These vehicles with some slots taken over by the k vehicles of `other`."""
+        changed = {}
+        for field in dataclasses.fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][rows] = getattr(other, field.name)
+        return Vehicles(**changed)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of N rigid bodies on the ground, world frame."""
+
+    axle_xyz: Float64[np.ndarray, "N 3"]
+    """The ground point below the rear axle."""
+    centre_m: Float64[np.ndarray, "N 3"]
+    """Box centre."""
+    forward: Float64[np.ndarray, "N 3"]
+    """Unit heading, along the slope of the ground."""
+
+    @property
+    def yaw(self) -> Float64[np.ndarray, "N"]:
+        """Heading about z, rad."""
+        return np.arctan2(self.forward[:, 1], self.forward[:, 0])
+
+    @property
+    def pitch(self) -> Float64[np.ndarray, "N"]:
+        """About the left axis: positive is nose down, rad."""
+        return -np.arcsin(np.clip(self.forward[:, 2], -1, 1))
+
+
+def empty_slots(count: int) -> Vehicles:
+    """Slots without vehicles."""
+    values = {
+        field.name: np.zeros((count, 3)) if field.name == "size_lwh" else np.zeros(count)
+        for field in dataclasses.fields(Vehicles)
+    }
+    for name in ("active", "has_stopped"):
+        values[name] = np.zeros(count, dtype=np.bool_)
+    for name in ("track_id", "category", "style", "granted"):
+        values[name] = np.zeros(count, dtype=np.int64)
+    for name in ("wheelbase_m", "accel_mps2", "decel_mps2", "haste"):
+        values[name] = np.ones(count)
+    values["path"] = np.full((count, WINDOW), -1)
+    values["asked_s"] = np.full(count, np.inf)
+    return Vehicles(**values)
+
+
+def path_starts(graph: LaneGraph, path: Int[np.ndarray, "N W"]) -> Float64[np.ndarray, "N W"]:
+    """Where each lane of a path starts, in arc length from the start of the current lane."""
+    length = np.where(path >= 0, graph.length_m[path], np.inf)
+    length[:, :BEHIND] = np.where(path[:, :BEHIND] >= 0, length[:, :BEHIND], 0.0)
+    start = np.zeros(path.shape)
+    start[:, BEHIND + 1 :] = np.cumsum(length[:, BEHIND:-1], axis=1)
+    start[:, :BEHIND] = -np.cumsum(length[:, BEHIND - 1 :: -1], axis=1)[:, ::-1]
+    return start
+
+
+def along_path(
+    graph: LaneGraph,
+    path: Int[np.ndarray, "N W"],
+    starts_m: Float64[np.ndarray, "N W"],
+    s_m: Float64[np.ndarray, "N"],
+) -> Float64[np.ndarray, "N 3"]:
+    """Points on paths, by arc length from the start of the current lane; beyond its ends a path is straight."""
+    column = np.where(path >= 0, starts_m <= s_m[:, None], False)
+    column = np.where(
+        column.any(1), WINDOW - 1 - np.argmax(column[:, ::-1], axis=1), np.argmax(path >= 0, axis=1)
+    )
+    rows = np.arange(len(path))
+    lane, local = path[rows, column], s_m - starts_m[rows, column]
+    inside = np.clip(local, 0, graph.length_m[lane])
+    point = graph.position(lane, inside)
+    beyond = local - inside
+    if np.abs(beyond).max(initial=0.0) > 0:
+        end = np.where(beyond > 0, graph.first[lane] + graph.count[lane] - 2, graph.first[lane])
+        ahead = graph.xyz[end + 1] - graph.xyz[end]
+        point = point + beyond[:, None] * ahead / np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+    return point
+
+
+def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
+    """Both axles on the path, so that the body turns as a vehicle does; slots that are not active are at the origin."""
+    live = np.flatnonzero(vehicles.active)
+    path = vehicles.path[live]
+    starts = path_starts(graph, path)
+    axle_s = vehicles.s_m[live] - vehicles.axle_to_centre_m[live]
+    rear = along_path(graph, path, starts, axle_s)
+    front = along_path(graph, path, starts, axle_s + vehicles.wheelbase_m[live])
+    forward = front - rear
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    left = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(live))], axis=1)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    axle = rear + vehicles.lateral_m[live, None] * left
+    centre = axle + vehicles.axle_to_centre_m[live, None] * forward
+    centre += 0.5 * vehicles.size_lwh[live, 2:] * np.cross(forward, left)
+    out = [np.zeros((len(vehicles.active), 3)) for _ in range(3)]
+    for whole, part in zip(out, (axle, centre, forward), strict=True):
+        whole[live] = part
+    return Poses(*out)
+
+
+def speed_to_drive(
+    graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
+) -> Float64[np.ndarray, "N"]:
+    """The wanted speed: the profile where the vehicle is, and slowing in time for the lanes ahead of it."""
+    here = graph.speed(vehicles.lane, vehicles.s_m)
+    ahead = vehicles.path[:, BEHIND + 1 :]
+    entry = np.where(ahead >= 0, graph.speed_mps[graph.first[ahead]], np.inf)
+    to_go = starts_m[:, BEHIND + 1 :] - vehicles.s_m[:, None]
+    in_time = np.sqrt(entry**2 + 2 * SLOWING_MPS2 * np.maximum(to_go, 0.0)).min(axis=1)
+    return np.minimum(vehicles.top_speed_mps, vehicles.haste * np.minimum(here, in_time))

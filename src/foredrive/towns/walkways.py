@@ -1,0 +1,253 @@
+"""Where people walk: walkways joined into a graph, and crossings with the lanes they cross."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float64, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from foredrive.towns.lane_graph import Control, LaneGraph
+from foredrive.towns.town_map import StripKind, TownMap
+
+JOIN_M = 1.5
+"""Ends of walkways this close are one place."""
+REACH_M = 7.0
+"""How far from a walkway a crosswalk may end."""
+MARKED_NEARBY_M = 15.0
+PAST_LINE_M = 1.5
+LONGEST_CROSSING_M = 28.0
+SHORTEST_WALK_M = 0.5
+ALONG_LANE_M = 1.7
+"""Half the stretch of a lane that people on a crossing may occupy."""
+ACROSS_LANE_M = 2.2
+"""Half the stretch of a crossing that vehicles on a lane may occupy, with room to spare."""
+
+
+@dataclass(frozen=True)
+class WalkGraph:
+    """E straight-legged walks between places. Vertices are laid end to end in `xyz`, as in a lane graph."""
+
+    xyz: Float64[np.ndarray, "P 3"]
+    along_m: Float64[np.ndarray, "P"]
+    """Arc length of each vertex on its walk."""
+    first: Int[np.ndarray, "E+1"]
+    length_m: Float64[np.ndarray, "E"]
+    ends: Int[np.ndarray, "E 2"]
+    """Places at the start and the end of each walk."""
+    is_crossing: Bool[np.ndarray, "E"]
+    half_width_m: Float64[np.ndarray, "E"]
+    """How far to either side one may walk."""
+    incident: Int[np.ndarray, "V I"]
+    """Walks that meet at each place, padded with -1."""
+    crossing: Int[np.ndarray, "K"]
+    """Where crossings and lanes meet, K times: the walk; sorted by lane."""
+    lane: Int[np.ndarray, "K"]
+    lane_span_m: Float64[np.ndarray, "K 2"]
+    """Stretch of the lane on which people cross."""
+    walk_span_m: Float64[np.ndarray, "K 2"]
+    """Stretch of the crossing on which vehicles pass."""
+
+    def position(
+        self, walk: Int[np.ndarray, "n"], s_m: Float64[np.ndarray, "n"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Points on walks by arc length."""
+        point, _ = self._locate(walk, s_m)
+        return point
+
+    def right_of(
+        self, walk: Int[np.ndarray, "n"], s_m: Float64[np.ndarray, "n"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Horizontal unit vectors to the right of the walks' direction."""
+        _, ahead = self._locate(walk, s_m)
+        right = np.stack([ahead[:, 1], -ahead[:, 0], np.zeros(len(ahead))], axis=1)
+        return right / np.linalg.norm(right, axis=1, keepdims=True).clip(1e-9)
+
+    def _locate(self, walk: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # One sorted axis for all walks: walk e covers [origin[e], origin[e] + length[e]].
+        origin = np.cumsum(self.length_m + 1.0) - self.length_m - 1.0
+        axis = self.along_m + np.repeat(origin, np.diff(self.first))
+        s = np.clip(s_m, 0.0, self.length_m[walk])
+        i = np.searchsorted(axis, origin[walk] + s, side="right") - 1
+        i = np.clip(i, self.first[walk], self.first[walk + 1] - 2)
+        leg = self.xyz[i + 1] - self.xyz[i]
+        fraction = (s - self.along_m[i]) / (self.along_m[i + 1] - self.along_m[i]).clip(1e-9)
+        return self.xyz[i] + fraction[:, None] * leg, leg
+
+
+def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
+    """Walkways, marked crosswalks, and unmarked crossings at lights that have no crosswalk."""
+    strips = [s for s in town.strips_of(StripKind.SIDEWALK) if len(s.left_xyz) > 1]
+    walks = [0.5 * (s.left_xyz + s.right_xyz) for s in strips]
+    widths = [float(np.linalg.norm(s.left_xyz - s.right_xyz, axis=1).min()) for s in strips]
+    kept = [i for i, walk in enumerate(walks) if _length(walk) > SHORTEST_WALK_M and widths[i] > 0.8]
+    walks, widths = [walks[i] for i in kept], [widths[i] for i in kept]
+    crossings = _crossings(town, lanes, walks)
+    cuts: list[list[float]] = [[] for _ in walks]
+    lines = [shapely.LineString(walk[:, :2]) for walk in walks]
+    for walk_index, point in ((i, p) for crossing in crossings for i, p in crossing.attached):
+        cuts[walk_index].append(float(lines[walk_index].project(shapely.Point(point[:2]))))
+    pieces = [(piece, w) for walk, at, w in zip(walks, cuts, widths, strict=True) for piece in _cut(walk, at)]
+    every = [piece for piece, _ in pieces] + [c.xyz for c in crossings]
+    half = np.array([max(0.1, 0.5 * w - 0.5) for _, w in pieces] + [1.0] * len(crossings))
+    is_crossing = np.arange(len(every)) >= len(pieces)
+    counts = np.array([len(line) for line in every], dtype=np.int64)
+    ends, incident = _join(every)
+    meeting = _lane_meetings(every, is_crossing, lanes)
+    return WalkGraph(
+        xyz=np.concatenate(every) if every else np.zeros((0, 3)),
+        along_m=np.concatenate([_along(line) for line in every]) if every else np.zeros(0),
+        first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        length_m=np.array([_length(line) for line in every]),
+        ends=ends,
+        is_crossing=is_crossing,
+        half_width_m=half,
+        incident=incident,
+        crossing=meeting[:, 0].astype(np.int64),
+        lane=meeting[:, 1].astype(np.int64),
+        lane_span_m=meeting[:, 2:4],
+        walk_span_m=meeting[:, 4:6],
+    )
+
+
+@dataclass(frozen=True)
+class _Crossing:
+    xyz: Float64[np.ndarray, "_ 3"]
+    attached: tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]
+    """The walkways it joins and where."""
+
+
+def _crossings(town: TownMap, lanes: LaneGraph, walks: list[np.ndarray]) -> list[_Crossing]:
+    if not walks:
+        return []
+    lines = shapely.STRtree([shapely.LineString(walk[:, :2]) for walk in walks])
+    chords = [_chord(crosswalk.outline_xyz, lines) for crosswalk in town.crosswalks]
+    marked = np.array([c.outline_xyz[:-1].mean(axis=0) for c in town.crosswalks]).reshape(-1, 3)
+    for zone in np.unique(lanes.zone[lanes.control == Control.LIGHT]):
+        start = lanes.position(np.flatnonzero(lanes.zone == zone)[:1], np.array([PAST_LINE_M]))[0]
+        if np.linalg.norm(marked - start, axis=1).min(initial=np.inf) > MARKED_NEARBY_M:
+            lane = int(np.flatnonzero(lanes.zone == zone)[0])
+            chords.append(_perpendicular(start, lanes.samples(lane)[:2], lines))
+    found = []
+    for chord in chords:
+        if chord is None:
+            continue
+        attached = [_attach(end, lines, walks) for end in chord]
+        a, b = attached
+        if a is None or b is None or a[0] == b[0]:
+            continue
+        xyz = np.stack([a[1], chord[0], chord[1], b[1]])
+        if _length(xyz) < LONGEST_CROSSING_M:
+            found.append(_Crossing(_without_repeats(xyz), (a, b)))
+    return found
+
+
+def _chord(outline: Float64[np.ndarray, "_ 3"], walkways: shapely.STRtree) -> np.ndarray | None:
+    """Middle line of a crosswalk: between the two opposite sides that lie nearer to walkways."""
+    box = shapely.minimum_rotated_rectangle(shapely.Polygon(outline[:, :2]))
+    if not isinstance(box, shapely.Polygon):
+        return None
+    corners = np.asarray(box.exterior.coords)[:4]
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    z = np.full((2, 1), outline[:, 2].mean())
+    chords = [np.hstack([middles[[i, i + 2]], z]) for i in (0, 1)]
+    return min(chords, key=lambda chord: sum(_distance(end, walkways) for end in chord))
+
+
+def _perpendicular(
+    start: Float64[np.ndarray, "3"], lane: Float64[np.ndarray, "2 3"], walkways: shapely.STRtree
+) -> np.ndarray | None:
+    """A way straight across the road, to just before the nearest walkway on either side."""
+    ahead = (lane[1] - lane[0])[:2] / np.linalg.norm((lane[1] - lane[0])[:2])
+    ends = []
+    for side in (np.array([-ahead[1], ahead[0]]), np.array([ahead[1], -ahead[0]])):
+        ray = shapely.LineString([start[:2], start[:2] + LONGEST_CROSSING_M * side])
+        hits = [ray.intersection(walkways.geometries[i]) for i in walkways.query(ray, predicate="intersects")]
+        distance = min((shapely.Point(start[:2]).distance(hit) for hit in hits), default=np.inf)
+        if not 2.0 < distance < LONGEST_CROSSING_M:
+            return None
+        ends.append(np.append(start[:2] + (distance - 1.0) * side, start[2]))
+    return np.stack(ends)
+
+
+def _distance(point: np.ndarray, walkways: shapely.STRtree) -> float:
+    where = shapely.Point(point[:2])
+    return float(where.distance(walkways.geometries[walkways.nearest(where)]))
+
+
+def _attach(
+    point: np.ndarray, walkways: shapely.STRtree, walks: list[np.ndarray]
+) -> tuple[int, np.ndarray] | None:
+    where = shapely.Point(point[:2])
+    index = int(walkways.nearest(where))
+    line = walkways.geometries[index]
+    if where.distance(line) > REACH_M:
+        return None
+    return index, _at(walks[index], line.project(where) * _length(walks[index]) / line.length)
+
+
+def _along(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def _length(line: Float64[np.ndarray, "_ 3"]) -> float:
+    return float(_along(line)[-1])
+
+
+def _at(line: Float64[np.ndarray, "_ 3"], s_m: float) -> Float64[np.ndarray, "3"]:
+    return np.array([np.interp(s_m, _along(line), column) for column in line.T])
+
+
+def _without_repeats(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
+    return line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-3])]
+
+
+def _cut(line: Float64[np.ndarray, "_ 3"], at_flat_m: list[float]) -> list[Float64[np.ndarray, "_ 3"]]:
+    """The pieces of a walk between the points (arc length seen from above) at which crossings join it."""
+    along = _along(line)
+    flat = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    stops = np.unique(np.interp([0.0, *at_flat_m, flat[-1]], flat, along))
+    pieces = []
+    for a, b in zip(stops[:-1], stops[1:], strict=True):
+        inner = line[(along > a + 1e-3) & (along < b - 1e-3)]
+        pieces.append(np.concatenate([_at(line, a)[None], inner, _at(line, b)[None]]))
+    return [piece for piece in pieces if _length(piece) > 1e-2]
+
+
+def _join(walks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Places at the ends of walks, and the walks that meet at each place."""
+    if not walks:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros((0, 1), dtype=np.int64)
+    tips = np.concatenate([line[[0, -1]] for line in walks])
+    pairs = cKDTree(tips).query_pairs(JOIN_M, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(tips), len(tips)))
+    count, place = connected_components(links, directed=False)
+    rows: list[list[int]] = [[] for _ in range(count)]
+    for tip, where in enumerate(place.tolist()):
+        rows[where].append(tip // 2)
+    incident = np.full((count, max(map(len, rows))), -1)
+    for row, values in zip(incident, rows, strict=True):
+        row[: len(values)] = values
+    return place.reshape(-1, 2).astype(np.int64), incident
+
+
+def _lane_meetings(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: LaneGraph) -> np.ndarray:
+    """Rows of crossing, lane, stretch of the lane, stretch of the crossing; sorted by lane."""
+    rows = []
+    lines = [shapely.LineString(lanes.samples(i)[:, :2]) for i in range(len(lanes.ids))]
+    tree = shapely.STRtree(lines)
+    for walk in np.flatnonzero(is_crossing):
+        way = shapely.LineString(walks[walk][:, :2])
+        for lane in tree.query(way, predicate="intersects"):
+            points = lanes.samples(lane)
+            near = shapely.distance(shapely.points(points[:, :2]), way) < ALONG_LANE_M
+            near &= np.abs(points[:, 2] - walks[walk][:, 2].mean()) < 3.0
+            if not near.any():
+                continue
+            on_lane = np.flatnonzero(near)[[0, -1]] * lanes.step_m[lane]
+            on_walk = way.project(way.intersection(lines[lane]).representative_point())
+            rows.append([walk, lane, *on_lane, on_walk - ACROSS_LANE_M, on_walk + ACROSS_LANE_M])
+    table = np.array(rows).reshape(-1, 6)
+    return table[np.lexsort((table[:, 0], table[:, 1]))]
