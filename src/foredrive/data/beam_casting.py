@@ -1,4 +1,9 @@
-"""What a sweep says about a voxel grid: walking every beam through it (numba)."""
+"""What a sweep says about a voxel grid: walking every beam through it (numba).
+
+`no_type_check` keeps the shape checks of the tests out of what numba compiles.
+"""
+
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -8,6 +13,7 @@ UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def cast_beams(
     origin: Float64[np.ndarray, "N 3"],
     end: Float64[np.ndarray, "N 3"],
@@ -64,6 +70,7 @@ def cast_beams(
 
 
 @numba.njit(inline="always", error_model="numpy")
+@no_type_check
 def _clip(o: float, d: float, size: int, enter: float, leave: float) -> tuple[float, float]:
     """Narrow the interval of a beam o + t d to what lies between 0 and size on one axis."""
     if d == 0.0:
@@ -73,6 +80,7 @@ def _clip(o: float, d: float, size: int, enter: float, leave: float) -> tuple[fl
 
 
 @numba.njit(inline="always", error_model="numpy")
+@no_type_check
 def _start(o: float, d: float, size: int, enter: float) -> tuple[int, int, float, float]:
     """Cell at t = enter, step, t at the next border, and t from border to border, on one axis."""
     cell = min(max(int(np.floor(o + enter * d)), 0), size - 1)
@@ -84,6 +92,7 @@ def _start(o: float, d: float, size: int, enter: float) -> tuple[int, int, float
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def box_of_points(
     points: Float64[np.ndarray, "N 3"],
     centre: Float64[np.ndarray, "M 3"],

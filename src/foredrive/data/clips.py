@@ -161,6 +161,7 @@ class ClipDataset(Dataset[Example]):
         K = torch.eye(3).repeat(*shape, 1, 1)
         T_ego_cam = torch.eye(4).repeat(*shape, 1, 1)
         dist = torch.zeros(*shape, 5)
+        readout_s = torch.zeros(shape)
         for c, name in enumerate(names):
             metadata = find_camera(self._cameras[number], name)
             if metadata is None:
@@ -169,13 +170,14 @@ class ClipDataset(Dataset[Example]):
                 with_image = self.config.future_images or t <= self.config.past_frames
                 camera = self._images.camera(self._logs[number], frame, metadata, with_image)
                 K[t, c], T_ego_cam[t, c], dist[t, c] = camera.K, camera.T_ego_cam, camera.dist
+                readout_s[t, c] = camera.readout_s
                 if camera.image is not None:
                     images[t, c], image_valid[t, c] = camera.image, True
         rig = CameraRig(
             K=K,
             T_ego_cam=T_ego_cam,
             dist=dist,
-            readout_s=torch.zeros(shape),
+            readout_s=readout_s,
             names=names,
             size_hw=image_hw,
         )

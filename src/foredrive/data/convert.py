@@ -24,7 +24,7 @@ LogParsers = Iterator[tuple[Path, BaseLogParser, BaseMapParser | None]]
 def convert(source: Path, dataset: str, out: Path) -> list[LogPath]:
     """Convert a raw data set into 123D logs that hold their images and sweeps themselves.
 
-    Velocities that the data set does not have are left out instead of inferred, and routes are not made up. An
+    Velocities that the data set does not have are left out, not inferred, and routes are not made up. An
     existing log of the same name is replaced.
 
     Args:

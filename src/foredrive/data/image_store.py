@@ -1,5 +1,6 @@
 """Camera images decoded and resized once, and kept in a folder."""
 
+import dataclasses
 import hashlib
 import logging
 from pathlib import Path
@@ -38,7 +39,7 @@ class ImageStore:
         image = _read_entry(file, (3, *self._image_hw))
         if image is not None:
             camera = read_camera(log, frame, metadata, self._image_hw, with_image=False)
-            return CameraFrame(torch.from_numpy(image), camera.K, camera.T_ego_cam, camera.dist)
+            return dataclasses.replace(camera, image=torch.from_numpy(image))
         camera = read_camera(log, frame, metadata, self._image_hw, with_image)
         if camera.image is not None:
             with atomic_path(file) as temporary, temporary.open("wb") as out:

@@ -170,6 +170,12 @@ class Log:
             xyz = np.concatenate([[2 * xyz[0] - xyz[1]], xyz, [2 * xyz[-1] - xyz[-2]]])
         return np.stack([np.interp(t_us, at, xyz[:, axis]) for axis in range(3)], axis=-1)
 
+    def motion(self, frame: int, from_us: float, to_us: float) -> Float64[np.ndarray, "4 4"]:
+        """The vehicle's rigid motion between two times, in the ego frame of `frame`; none beyond the log."""
+        T_world = self._interpolate(np.array([from_us, to_us]))[0]
+        T_from, T_to = np.linalg.inv(self.T_world_ego[frame]) @ T_world
+        return T_to @ np.linalg.inv(T_from)
+
     def _interpolate(
         self, t_us: Float64[np.ndarray, "N"]
     ) -> tuple[Float64[np.ndarray, "N 4 4"], Bool[np.ndarray, "N"]]:

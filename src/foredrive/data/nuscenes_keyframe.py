@@ -1,8 +1,8 @@
 """A 123D parser for single nuScenes key frames without the data set around them.
 
-py123d's own parser needs all of nuScenes' tables and the devkit. This one reads a folder with the sensor files
-of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in an mmdetection3d info file
-(*.pkl).
+py123d's own parser needs all of nuScenes' tables and the devkit. This one reads a folder with the sensor
+files of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in a file of infos as
+mmdetection3d writes it (*.pkl).
 """
 
 import json

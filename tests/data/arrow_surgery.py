@@ -1,0 +1,17 @@
+"""Damage a log's files on purpose."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+
+
+def rewrite_column(file: Path, column: str, change: Callable[[list], list]) -> None:
+    """Replace the values of one column of an Arrow file, keeping its schema."""
+    with pa.OSFile(str(file)) as source:
+        table = pa.ipc.open_file(source).read_all()
+    values = pa.array(change(table[column].to_pylist()), type=table.schema.field(column).type)
+    index = table.schema.get_field_index(column)
+    table = table.set_column(index, table.schema.field(column), values)
+    with pa.OSFile(str(file), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
