@@ -150,7 +150,7 @@ def test_a_batch_that_cannot_be_loaded_is_counted_and_the_rest_goes_on(make_exam
 def test_when_nothing_succeeds_there_is_no_result(make_example: MakeExample) -> None:
     oracle = Oracle()
     oracle.breaks_on = {float(make_example(0).clip.ego_speed_mps[0, 0])}
-    with pytest.raises(InputError, match="all 1 items failed, the first: RuntimeError: out of luck"):
+    with pytest.raises(InputError, match="all 1 items failed, RuntimeError: out of luck"):
         evaluate(oracle, [make_example(0)], **ABOUT)
     with pytest.raises(InputError, match="no items"):
         evaluate(oracle, [], **ABOUT)

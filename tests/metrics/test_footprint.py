@@ -165,3 +165,9 @@ def test_a_finer_grid_comes_closer_to_the_polygons(
     assert hits(exact, (0.0, 0.0), grown)[0] or not hits(drawn, (0.0, 0.0), boxes)[0]
     if bool((boxes.size_lwh[..., :2] > margin).all()):
         assert hits(drawn, (0.0, 0.0), boxes)[0] or not hits(exact, (0.0, 0.0), shrunk)[0]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=PROTOCOLS)
+def test_an_empty_street(protocol: PlanningProtocol) -> None:
+    nothing = some_boxes([(0.0, 0.0, 4.0, 2.0, 0.0)])[:, :, :0]
+    assert hits(protocol, (0.0, 0.0), nothing) == (False, False)

@@ -56,7 +56,7 @@ def evaluate(
         predictor: sees `clip.observed()` only. What it leaves None is not judged.
         loader: batches. For collisions up to 3 s their clips need boxes of the six key frames after now.
         frame_dt_s: time between key frames; names the figures of future frames.
-        baselines: planners by name, judged on the same frames under `planning.NAME.PROTOCOL`.
+        baselines: planners by name, judged on every item they manage, under `planning.NAME.PROTOCOL`.
         prior: of the training set, on the model's frames; adds `best_constant` beside every occupancy figure.
         command_source: how many commands came from a route, the driven future, nowhere.
         on_items: told the number of items after each batch.
@@ -83,9 +83,7 @@ def evaluate(
                 rival.add(example, obstacles)
             on_items(len(example.key))
     if judged == 0:
-        first = (
-            f"all {len(failures)} items failed, the first: {failures[0].reason}" if failures else "no items"
-        )
+        first = f"all {len(failures)} items failed, {failures[0].reason}" if failures else "no items"
         raise InputError(f"there is nothing to evaluate: {first}")
     summary = totals.figures()
     for name, rival in rivals.items():
