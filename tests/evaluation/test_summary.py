@@ -60,7 +60,7 @@ def test_the_printed_tables(make_example: Callable[..., Example]) -> None:
 
     baselines = {"stand_still": StandStill(6, 0.5), "constant_velocity": ConstantVelocity(6, 0.5)}
     summary = evaluate(Half(), [make_example(0, 1)], frame_dt_s=0.5, baselines=baselines).summary
-    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     print_summary(summary, console, model="nemo_tiny")
     text = console.export_text()
     console.file.close()

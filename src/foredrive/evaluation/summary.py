@@ -14,6 +14,7 @@ from foredrive.files import atomic_path
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 
 Value = float | int | str | None
+TABLE_COLUMNS = 120
 
 
 def write_json(path: Path, content: object) -> None:
@@ -116,7 +117,8 @@ def occupancy_table(summary: Mapping[str, Value]) -> Table:
 
 
 def print_summary(summary: Mapping[str, Value], console: Console, model: str = "model") -> None:
-    """Print what a person wants to see of a summary."""
+    """Print what a person wants to see of a summary. A console below 120 columns (a pipe has 80) is widened."""
+    console.width = max(console.width, TABLE_COLUMNS)
     if any(key.startswith("occupancy.") for key in summary):
         console.print(occupancy_table(summary))
     if any(key.startswith("planning.") for key in summary):
