@@ -117,7 +117,7 @@ def occupancy_table(summary: Mapping[str, Value]) -> Table:
 
 
 def print_summary(summary: Mapping[str, Value], console: Console, model: str = "model") -> None:
-    """Print what a person wants to see of a summary. A console below 120 columns (a pipe has 80) is widened."""
+    """Print what a person wants to see of a summary. A console of less than 120 columns is widened."""
     console.width = max(console.width, TABLE_COLUMNS)
     if any(key.startswith("occupancy.") for key in summary):
         console.print(occupancy_table(summary))
