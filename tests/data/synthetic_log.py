@@ -4,6 +4,7 @@ The ego vehicle drives along world x at a constant speed. Everything a test comp
 exact ray casting, independently of the package's own code.
 """
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -141,10 +142,15 @@ def write(
     name: str = "flat",
     specs: list[CameraSpec] | None = None,
     route_xyz: np.ndarray | None = None,
+    empty_sweeps: bool = False,
 ) -> Path:
     """Write the log and return its folder."""
     specs = cameras() if specs is None else specs
     with LogWriter(root, "flat_train", name, specs, None, None, route_xyz) as writer:
         for index in range(frames):
-            writer.write(frame(index, specs))
+            item = frame(index, specs)
+            if empty_sweeps:
+                nothing = item.sweep[torch.zeros_like(item.sweep.valid)]
+                item = dataclasses.replace(item, sweep=nothing)
+            writer.write(item)
     return root / "logs" / "flat_train" / name

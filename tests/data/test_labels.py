@@ -9,6 +9,7 @@ import torch
 from arrow_surgery import rewrite_column
 
 from foredrive.data.labels import BOX_MARGIN_M, LabelStore, VoxelLabels, make_labels, voxel_labels
+from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log, find_logs
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
@@ -140,12 +141,12 @@ def test_labels_of_a_log_agree_with_its_geometry(flat_log: Path) -> None:
 
 
 def test_misses_make_more_known(flat_log: Path) -> None:
-    log = Log(find_logs(flat_log)[0])
-    with_misses = make_labels(log, 0, SPEC)
-    sweep = world.sweep(0.0)
-    without = voxel_labels(sweep[sweep.returned], SPEC, None, log.ego_box)
-    assert torch.equal(with_misses.occupied, without.occupied)
-    assert with_misses.known.sum() > 1.2 * without.known.sum()
+    sweep, misses_known = read_sweep(Log(find_logs(flat_log)[0]), 0)
+    assert misses_known
+    whole = voxel_labels(sweep, SPEC, None, None)
+    returns = voxel_labels(sweep[sweep.returned], SPEC, None, None)
+    assert torch.equal(whole.occupied, returns.occupied)
+    assert whole.known.sum() > 1.2 * returns.known.sum()
 
 
 def entries(folder: Path) -> list[Path]:

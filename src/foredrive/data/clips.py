@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -75,7 +75,7 @@ class ClipDataset(Dataset[Example]):
         self.camera_names = self._choose_cameras()
         self._images = ImageStore(cache_dir, config.image_hw)
         self._labels = LabelStore(cache_dir, config.voxels)
-        self._clips: list[tuple[int, np.ndarray]] = []
+        self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}
         for number, log in enumerate(self._logs):
             for frames in _clip_frames(log, config):
@@ -123,7 +123,7 @@ class ClipDataset(Dataset[Example]):
         future = log.driven_future(now, self.config.horizon_steps, self.config.horizon_dt_s)
         return command_at(log, now, future)
 
-    def _clip(self, number: int, frames: Int64[np.ndarray, "T"]) -> Clip:
+    def _clip(self, number: int, frames: list[int]) -> Clip:
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
         images, image_valid, rig = self._read_cameras(number, frames)
@@ -151,7 +151,7 @@ class ClipDataset(Dataset[Example]):
         )
 
     def _read_cameras(
-        self, number: int, frames: Int64[np.ndarray, "T"]
+        self, number: int, frames: list[int]
     ) -> tuple[UInt8[Tensor, "T C 3 H W"], Bool[Tensor, "T C"], CameraRig]:
         """Images, which of them are there, and the rig; a camera that the log lacks has identity matrices."""
         names, image_hw = self.camera_names, self.config.image_hw
@@ -184,7 +184,7 @@ class ClipDataset(Dataset[Example]):
         return images, image_valid, rig
 
 
-def _clip_frames(log: Log, config: ClipConfig) -> list[Int64[np.ndarray, "T"]]:
+def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
     """Frames of each clip: those nearest to the key times, none off by more than half the log's period."""
     offset_us = np.arange(-config.past_frames, config.future_frames + 1) * config.frame_dt_s * 1e6
     slack_us = 0.5e6 * log.period_s
@@ -200,7 +200,8 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[Int64[np.ndarray, "T"]]:
             f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
         )
-    return list(frames[whole].astype(np.int64))
+    clips: list[list[int]] = frames[whole].tolist()
+    return clips
 
 
 def _stack_sweeps(sweeps: list[LidarSweep | None]) -> LidarSweep:
