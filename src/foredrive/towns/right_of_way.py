@@ -4,8 +4,8 @@ A vehicle may enter lanes that others cross only once it has been granted its wh
 Requests are served in the order of arrival. A grant needs a green light (or a stop made at a stop sign), room
 beyond the junction, and that vehicles granted before will be out of the way when this one gets there. Should one
 of them be held up after all, the later one waits inside the junction, before their paths meet. The one granted
-first is thus never held up by others in the junction, which rules out deadlock; a request that has to wait holds
-back later ones that conflict with it, which rules out starvation.
+first is thus never held up by others in the junction, which rules out deadlock. A request that has to wait holds
+back later ones that conflict with it, but not for long: where junctions touch, those may be what it waits for.
 """
 
 from dataclasses import dataclass
@@ -29,10 +29,13 @@ RIGHT_WAITS_S = 0.5
 """Turning vehicles are served as if they had arrived this much later."""
 MOVING_ON_S = 1.5
 """Room beyond a junction is judged by where the vehicles in it will be after this time."""
+ENOUGH_ROOM_M = 60.0
 BRISK_MPS2 = 2.0
 SLOW_MPS = 2.0
 """When others are out of the way is judged from at least this speed, when one gets there from `BRISK_MPS2`."""
 INSIDE_M = 0.2
+PATIENCE_S = 15.0
+"""After this time a request no longer stands back for older ones."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,9 @@ def claim_junctions(
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
     queued = (leader >= 0) & (leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
-    may_ask = (green[lane] & stop_made & ~queued & ~inside) | goes_on
-    asks = vehicles.active & (line_gap < reach) & may_ask
-    asked_s = np.where(asks, np.minimum(vehicles.asked_s, time_s), np.inf)
+    near = vehicles.active & (line_gap < reach) & ((~queued & ~inside) | goes_on)
+    asks = near & ((green[lane] & stop_made) | goes_on)
+    asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
     turn = graph.turn_rad[lane]
     waits = np.where(turn > TURN_RAD, LEFT_WAITS_S, np.where(turn < -TURN_RAD, RIGHT_WAITS_S, 0.0))
     order = np.argsort(np.where(goes_on, -np.inf, asked_s + waits), kind="stable")
@@ -87,6 +90,7 @@ def claim_junctions(
         motion,
         kept,
         goes_on,
+        asks & (time_s - asked_s > PATIENCE_S),
         graph.length_m,
         graph.contested,
         (conflicts.first, conflicts.other, conflicts.enter_m, conflicts.other_clear_m),
@@ -137,8 +141,8 @@ def _withdraw(
 
 
 @numba.njit(cache=True)
-def _serve(order, line_column, motion, granted, goes_on, length, contested, conflicts):  # type: ignore[no-untyped-def]
-    active, path, starts, front, rear, speed = motion
+def _serve(order, line_column, motion, granted, goes_on, impatient, length, contested, conflicts):  # type: ignore[no-untyped-def]
+    active, path, starts, front, rear, _ = motion
     count = len(active)
     granted = granted.copy()
     head = np.full(len(length), -1)
@@ -157,12 +161,12 @@ def _serve(order, line_column, motion, granted, goes_on, length, contested, conf
             end += 1
         exit_lane = path[i, end] if end < WINDOW else -1
         if not goes_on[i]:
+            entries = (head, following, who, where)
             if exit_lane >= 0:
-                room = _room(i, exit_lane, head, following, who, where, starts, front, rear, speed, length)
+                room = _room(i, end, motion, contested, length, entries)
                 if room - promised[exit_lane] < need:
                     continue
-            entries = (head, following, who, where)
-            if not _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for):
+            if not _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for & ~impatient[i]):
                 for k in range(begin, end):
                     waited_for[path[i, k]] = True
                 continue
@@ -177,15 +181,25 @@ def _serve(order, line_column, motion, granted, goes_on, length, contested, conf
 
 
 @numba.njit(cache=True)
-def _room(i, lane, head, following, who, where, starts, front, rear, speed, length):  # type: ignore[no-untyped-def]
-    """Free length at the start of the lane beyond a junction, in a moment."""
-    room = length[lane]
-    entry = head[lane]
-    while entry >= 0:
-        j, k = who[entry], where[entry]
-        if j != i and front[j] > starts[j, k]:
-            room = min(room, rear[j] - starts[j, k] + MOVING_ON_S * speed[j])
-        entry = following[entry]
+def _room(i, begin, motion, contested, length, entries):  # type: ignore[no-untyped-def]
+    """Free length beyond a junction in a moment, up to the next vehicle or junction."""
+    _, path, starts, front, rear, speed = motion
+    head, following, who, where = entries
+    room = 0.0
+    for k in range(begin, WINDOW):
+        lane = path[i, k]
+        if lane < 0 or contested[lane]:
+            return room
+        ahead = length[lane]
+        entry = head[lane]
+        while entry >= 0:
+            j, at = who[entry], where[entry]
+            if j != i and front[j] > starts[j, at]:
+                ahead = min(ahead, rear[j] - starts[j, at] + MOVING_ON_S * speed[j])
+            entry = following[entry]
+        room += ahead
+        if ahead < length[lane] or room > ENOUGH_ROOM_M:
+            return room
     return room
 
 
