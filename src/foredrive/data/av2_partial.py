@@ -64,7 +64,7 @@ class Av2PartialParser(BaseLogParser):
         poses = feather.read_table(self._folder / "city_SE3_egovehicle.feather")
         row_at = {t_ns: row for row, t_ns in enumerate(poses["timestamp_ns"].to_pylist())}
         pose_rows = _columns(poses, _POSE)
-        lidar_metadata = self._lidar_metadata()
+        lidars = self._lidars()
         annotated_ns = annotations["timestamp_ns"].to_numpy()
         for timestamp_ns in np.unique(annotated_ns).tolist():
             timestamp = Timestamp.from_ns(timestamp_ns)
@@ -73,10 +73,10 @@ class Av2PartialParser(BaseLogParser):
             boxes = _boxes(annotations.filter(pa.array(annotated_ns == timestamp_ns)), pose, timestamp)
             modalities: list[BaseModality] = [ego, boxes]
             sweep = self._folder / "sensors" / "lidar" / f"{timestamp_ns}.feather"
-            if lidar_metadata is not None and sweep.is_file():
+            if lidars and sweep.is_file():
                 modalities.append(
                     ParsedLidar(
-                        metadata=lidar_metadata,
+                        metadata=LidarMergedMetadata(lidars),
                         start_timestamp=timestamp,
                         end_timestamp=Timestamp.from_ns(timestamp_ns + _SWEEP_NS),
                         dataset_root=self._folder,
@@ -85,18 +85,15 @@ class Av2PartialParser(BaseLogParser):
                 )
             yield ModalitiesSync(timestamp, modalities)
 
-    def _lidar_metadata(self) -> LidarMergedMetadata | None:
+    def _lidars(self) -> dict[LidarID, LidarMetadata]:
         file = self._folder / "calibration" / "egovehicle_SE3_sensor.feather"
         if not file.is_file():
-            return None
+            return {}
         sensors = feather.read_table(file)
         mounted = dict(zip(sensors["sensor_name"].to_pylist(), _columns(sensors, _POSE), strict=True))
-        return LidarMergedMetadata(
-            {
-                id_: LidarMetadata(name, id_, PoseSE3.from_array(mounted[name]))
-                for id_, name in _LIDARS.items()
-            }
-        )
+        return {
+            id_: LidarMetadata(name, id_, PoseSE3.from_array(mounted[name])) for id_, name in _LIDARS.items()
+        }
 
 
 def _boxes(rows: pa.Table, ego: PoseSE3, timestamp: Timestamp) -> BoxDetectionsSE3:

@@ -77,7 +77,7 @@ def read_camera(
         if pose is not None:
             T_ego_cam = np.linalg.inv(log.T_world_ego[frame]) @ pose.transformation_matrix
         if pose is not None and first_s != -last_s:
-            stamp_us = _column(log, *at, "timestamp_us")
+            stamp_us = float(_column(log, *at, "timestamp_us"))
             T_ego_cam = log.motion(frame, stamp_us, stamp_us + 0.5e6 * (first_s + last_s)) @ T_ego_cam
         if with_image:
             data = _column(log, *at, "data")

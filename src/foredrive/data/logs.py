@@ -68,7 +68,7 @@ def reading(file: Path, what: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (pa.ArrowException, OSError, ValueError, KeyError, IndexError, TypeError, AssertionError) as error:
+    except (pa.ArrowException, OSError, ValueError, LookupError, AssertionError) as error:
         reason = str(error).strip().splitlines()
         raise InputError(
             f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"

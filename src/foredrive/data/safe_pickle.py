@@ -12,6 +12,7 @@ _ALLOWED = {
     ("numpy", "ndarray"),
     ("numpy._core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
     ("_codecs", "encode"),
 }
 """What arrays and numbers are made of; plain containers need nothing."""
