@@ -42,7 +42,7 @@ def camera_rig(size_hw: tuple[int, int]) -> CameraRig:
 
 
 def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:
-    """A lidar with the vertical field of view of Velodyne's HDL-32E (10.67° to -30.67°); channel 0 is lowest."""
+    """A lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°); channel 0 looks lowest."""
     T_ego_lidar = torch.eye(4)
     T_ego_lidar[:3, 3] = torch.tensor(_LIDAR_XYZ_M)
     elevation_deg = torch.linspace(-30.67, 10.67, channels)

@@ -294,7 +294,8 @@ def lidar_returns(scene, hits, origin, direction, beam_rad, max_range_m, chance)
         chance: [N 2] uniform random numbers: for the loss, and for the depth within foliage.
 
     Returns:
-        range [N] m, returned [N], intensity [N] in 0..1 (range-compensated).
+        range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1
+        (range-compensated).
     """
     count = len(hits.t)
     range_m = np.empty(count, np.float32)
@@ -310,6 +311,7 @@ def lidar_returns(scene, hits, origin, direction, beam_rad, max_range_m, chance)
         glass, paint = work.colour[3], work.colour[4]
         reflectivity = scene.looks.reflectivity[look] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
         reflectivity *= 1.0 - GLASS_LOSS * glass
+        range_m[i] = t
         echo = reflectivity * cosine * (LIDAR_REFERENCE_M / max(t, 1.0)) ** 2
         if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
             returned[i] = True

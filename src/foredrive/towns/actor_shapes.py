@@ -1,0 +1,175 @@
+"""Shapes of road users, each in the unit box about the origin, x ahead: stretched to size when placed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from foredrive.scene import Category
+from foredrive.towns.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
+from foredrive.towns.actors import ActorState
+from foredrive.towns.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.mesh import Mesh, join
+from foredrive.towns.raycast import TriangleScene
+
+SLOTS = 3
+VAN_LENGTH_M, VAN_HEIGHT_M = 5.0, 1.9
+STRIDE_M = 1.4
+WALKING_MPS = 0.3
+WALK_POSES = 4
+
+Palette = tuple[tuple[float, float, float], ...]
+_CAR_PAINTS: Palette = (
+    (0.93, 0.93, 0.93),
+    (0.08, 0.08, 0.09),
+    (0.45, 0.46, 0.48),
+    (0.72, 0.73, 0.75),
+    (0.60, 0.08, 0.08),
+    (0.10, 0.20, 0.45),
+    (0.20, 0.23, 0.26),
+    (0.85, 0.84, 0.80),
+    (0.12, 0.28, 0.20),
+    (0.40, 0.30, 0.22),
+    (0.82, 0.55, 0.10),
+    (0.30, 0.45, 0.62),
+)
+_CARGO_PAINTS: Palette = (
+    (0.90, 0.90, 0.88),
+    (0.75, 0.76, 0.74),
+    (0.20, 0.35, 0.60),
+    (0.80, 0.72, 0.30),
+    (0.62, 0.20, 0.16),
+)
+_BUS_PAINTS: Palette = (
+    (0.80, 0.15, 0.12),
+    (0.92, 0.92, 0.90),
+    (0.15, 0.35, 0.60),
+    (0.85, 0.70, 0.15),
+    (0.20, 0.50, 0.35),
+)
+_CLOTHES: Palette = (
+    (0.15, 0.16, 0.20),
+    (0.55, 0.12, 0.14),
+    (0.18, 0.30, 0.52),
+    (0.85, 0.83, 0.78),
+    (0.30, 0.42, 0.28),
+    (0.62, 0.52, 0.36),
+    (0.35, 0.36, 0.38),
+    (0.80, 0.62, 0.20),
+    (0.50, 0.32, 0.48),
+    (0.12, 0.12, 0.13),
+)
+_SKINS: Palette = ((0.90, 0.72, 0.60), (0.78, 0.57, 0.44), (0.55, 0.38, 0.28), (0.40, 0.27, 0.20))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One shape and the part of the library's soup that it is."""
+
+    scene: TriangleScene
+    mesh: Mesh
+    first: int
+    """First triangle in the soup."""
+
+
+@dataclass(frozen=True)
+class ShapeLibrary:
+    """All shapes of road users."""
+
+    shapes: dict[str, Shape]
+    soup: Mesh
+    paints: dict[str, Int32[np.ndarray, "_"]]
+    """Looks to paint with, by palette."""
+
+    def shape_of(self, actor: ActorState) -> Shape:
+        """The shape of a road user; one who walks is in one of a few poses."""
+        return self.shapes[shape_name(actor)]
+
+    def paint_of(self, actor: ActorState) -> Int32[np.ndarray, "3"]:
+        """Looks for the three paint slots."""
+        if actor.category is Category.PEDESTRIAN or actor.category in (Category.BICYCLE, Category.MOTORCYCLE):
+            palettes = ("clothes", "clothes", "skin")
+        elif actor.category is Category.BUS:
+            palettes = ("bus", "bus", "bus")
+        else:
+            palettes = ("car", "cargo", "car")
+        mixed = np.random.default_rng(actor.style).random(SLOTS)
+        chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in zip(palettes, mixed, strict=True)]
+        return np.array(chosen, dtype=np.int32)
+
+
+def make_shape_library(table: LookTable) -> ShapeLibrary:
+    """Build every shape once."""
+    looks = MeshLooks(table)
+    shapes, first = {}, 0
+    for name, build in BUILDERS.items():
+        mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name.startswith("pedestrian") else None)
+        shapes[name] = Shape(TriangleScene(mesh), mesh, first)
+        first += len(mesh.look)
+
+    def paints(colours: Palette, gloss: float) -> Int32[np.ndarray, "_"]:
+        surface = Surface.VEHICLE if gloss > 0.0 else Surface.PEDESTRIAN
+        numbers = [
+            table.add(Look(surface, Texture.PLAIN, c, 0.15 + 0.5 * float(np.mean(c)), gloss)) for c in colours
+        ]
+        return np.array(numbers, dtype=np.int32)
+
+    return ShapeLibrary(
+        shapes=shapes,
+        soup=join([shape.mesh for shape in shapes.values()]),
+        paints={
+            "car": paints(_CAR_PAINTS, 0.07),
+            "cargo": paints(_CARGO_PAINTS, 0.02),
+            "bus": paints(_BUS_PAINTS, 0.05),
+            "clothes": paints(_CLOTHES, 0.0),
+            "skin": paints(_SKINS, 0.0),
+        },
+    )
+
+
+def shape_name(actor: ActorState) -> str:
+    """Which shape fits a road user."""
+    if actor.category is Category.PEDESTRIAN:
+        if np.linalg.norm(actor.velocity_mps) < WALKING_MPS:
+            return "pedestrian_standing"
+        along = actor.centre_m[0] * np.cos(actor.yaw) + actor.centre_m[1] * np.sin(actor.yaw)
+        return f"pedestrian_{int(along / STRIDE_M * WALK_POSES) % WALK_POSES}"
+    if actor.category is Category.CAR:
+        length, _, height = actor.size_lwh
+        if length > VAN_LENGTH_M and height > VAN_HEIGHT_M:
+            return "van"
+        if height > 1.58:
+            return "suv"
+        return "hatchback" if actor.style % 3 == 0 else "sedan"
+    return _NAME_OF_CATEGORY.get(actor.category, "block")
+
+
+_NAME_OF_CATEGORY = {
+    Category.TRUCK: "truck",
+    Category.BUS: "bus",
+    Category.MOTORCYCLE: "motorcycle",
+    Category.BICYCLE: "bicycle",
+    Category.TRAFFIC_CONE: "cone",
+}
+
+
+def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
+    """The affine map from the unit box to an actor's box."""
+    cos, sin = np.cos(actor.yaw), np.sin(actor.yaw)
+    up, ahead = np.sin(actor.pitch), np.cos(actor.pitch)
+    yaw = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    pitch = np.array([[ahead, 0.0, up], [0.0, 1.0, 0.0], [-up, 0.0, ahead]])
+    T = np.eye(4)
+    T[:3, :3] = yaw @ pitch * actor.size_lwh
+    T[:3, 3] = actor.centre_m
+    return T
+
+
+def _into_unit_box(
+    mesh: Mesh, bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None
+) -> Mesh:
+    """Map `bounds`, by default those of the mesh, to the unit box about the origin."""
+    corners = mesh.xyz.reshape(-1, 3)
+    low, high = np.array(bounds) if bounds else (corners.min(0), corners.max(0))
+    xyz = ((mesh.xyz - 0.5 * (low + high)) / (high - low)).clip(-0.5, 0.5)
+    return Mesh(np.ascontiguousarray(xyz, dtype=np.float32), np.zeros_like(mesh.uvw), mesh.look)

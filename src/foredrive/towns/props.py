@@ -1,0 +1,292 @@
+"""Street furniture and vegetation: traffic lights, signs, lamps, trees, bushes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import trimesh
+from jaxtyping import Float
+
+from foredrive.towns.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.mesh import Mesh, box, frustum, join, triangles
+from foredrive.towns.site import Site, frontages
+from foredrive.towns.town_map import StopZone, StopZoneKind, TownMap
+
+LAMP_SPACING_M, LAMP_HEIGHT_M, LAMP_ARM_M = 30.0, 7.5, 1.6
+LAMP_SETBACK_M, TREE_SETBACK_M = 0.5, 1.5
+TREE_SPACING_M = (7.0, 15.0)
+STREET_TREES, OPEN_TREES_PER_M2 = 0.6, 1 / 260.0
+FIRST_TREE_M, LAST_TREE_M = 5.0, 80.0
+MAST_HEIGHT_M, HEAD_GAP_M = 5.6, 3.0
+LONGEST_ARM_M = 9.0
+SIGN_HEIGHT_M = 2.3
+POST_CLEARANCE_M = 0.3
+POLE_SAMPLE_M = 0.2
+CROWN_SPREAD = 1.35
+LARGEST_FOOT_M2 = 2.0
+"""What stands on more ground than this is not just a post or a trunk."""
+
+_LEAVES = ((0.27, 0.38, 0.14), (0.33, 0.42, 0.17), (0.22, 0.33, 0.15), (0.40, 0.44, 0.18), (0.25, 0.36, 0.20))
+_NEEDLES = ((0.17, 0.28, 0.17), (0.20, 0.31, 0.18))
+
+
+@dataclass(frozen=True)
+class SignalHead:
+    """Where the lamps of one traffic light are in the look table: red, yellow, green."""
+
+    zone: int
+    """Index into the town's stop zones."""
+    lamps: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Props:
+    """All props of a town."""
+
+    mesh: Mesh
+    heads: tuple[SignalHead, ...]
+    poles_xyz: Float[np.ndarray, "N 3"]
+    """Points along thin vertical things, which a grid of vertical rays would miss."""
+
+
+@dataclass
+class _Looks:
+    table: LookTable
+
+    def __post_init__(self) -> None:
+        add = self.table.add
+        self.metal = add(Look(Surface.POLE, Texture.PLAIN, (0.42, 0.43, 0.44), 0.45, gloss=0.03))
+        self.dark = add(Look(Surface.POLE, Texture.PLAIN, (0.16, 0.17, 0.17), 0.25))
+        self.bark = add(Look(Surface.VEGETATION, Texture.PLAIN, (0.36, 0.29, 0.23), 0.35, params=(2.0,)))
+        self.lamp = add(Look(Surface.POLE, Texture.PLAIN, (0.90, 0.90, 0.86), 0.6))
+        self.red_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.75, 0.09, 0.09), 1.0))
+        self.white_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.92, 0.92, 0.92), 1.0))
+        self.leaves = [add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, 0.5)) for rgb in _LEAVES]
+        self.needles = [add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, 0.45)) for rgb in _NEEDLES]
+
+
+def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
+    """Traffic lights and signs where the map has them, if that is not on a lane; they come first."""
+    looks = _Looks(table)
+    parts, heads, poles = [], [], []
+    lanes = site.plan.lanes
+    shapely.prepare(lanes)
+    for index, zone in enumerate(town.stop_zones):
+        foot = _off_lanes(zone, lanes)
+        if foot is None:
+            continue
+        site.take(shapely.Point(foot[:2]).buffer(0.4))
+        z = float(site.height(foot[None, :2])[0])
+        if zone.kind is StopZoneKind.TRAFFIC_LIGHT:
+            lamps = _lamp_looks(table, index)
+            parts.append(_traffic_light(town, zone, np.array([*foot[:2], z]), lamps, looks))
+            heads.append(SignalHead(index, lamps))
+            poles.append(_along_pole(foot, z, MAST_HEIGHT_M))
+        else:
+            parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
+            poles.append(_along_pole(foot, z, SIGN_HEIGHT_M))
+    return Props(join(parts), tuple(heads), _joined(poles))
+
+
+def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
+    """Lamps along the roads, then trees along walkways and in the open."""
+    looks = _Looks(table)
+    parts, poles = [], []
+    for frontage in frontages(site.plan, LAMP_SETBACK_M):
+        for s in np.arange(rng.uniform(0.0, LAMP_SPACING_M), frontage.line.length, LAMP_SPACING_M):
+            foot = frontage.at(s)
+            if site.is_free(shapely.Point(foot).buffer(0.25)):
+                site.take(shapely.Point(foot).buffer(0.4))
+                ahead = frontage.at(min(s + 0.5, frontage.line.length)) - foot
+                z = float(site.height(foot[None])[0])
+                parts.append(_lamp(foot, z, ahead, looks))
+                poles.append(_along_pole(foot, z, LAMP_HEIGHT_M))
+    spots = _street_tree_spots(site, rng) + _open_tree_spots(site, rng)
+    for xy in spots:
+        mesh = _plant(site, xy, looks, rng)
+        if mesh is not None:
+            parts.append(mesh)
+    return Props(join(parts), (), _joined(poles))
+
+
+def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
+    """The post's foot, moved to the right of the traffic until it is off the lanes; None if that is far."""
+    right = np.array([np.sin(zone.post_yaw), -np.cos(zone.post_yaw), 0.0])
+    for step in np.arange(0.0, 4.0, 0.25):
+        foot = zone.post_xyz + step * right
+        if not lanes.intersects(shapely.Point(foot[:2]).buffer(POST_CLEARANCE_M)):
+            return foot
+    return None
+
+
+def _lamp_looks(table: LookTable, zone: int) -> tuple[int, int, int]:
+    """Looks of a light's own three lamps, unlit; the zone keeps them apart from those of other lights."""
+    off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
+    red, yellow, green = (
+        table.add(Look(Surface.SIGN, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
+    )
+    return red, yellow, green
+
+
+def _turned(mesh: Mesh, xyz: Float[np.ndarray, "3"], yaw: float) -> Mesh:
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T[:3, 3] = xyz
+    return mesh.transformed(T)
+
+
+def _traffic_light(
+    town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks
+) -> Mesh:
+    """A post with a head at eye level and, over several lanes, an arm with one head for each."""
+    # In the post's frame x points along the traffic, which sees the lights against that direction.
+    parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, looks.metal)]
+    parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, looks))
+    lanes = {lane.lane_id: lane for lane in town.lanes}
+    left = np.array([-np.sin(zone.post_yaw), np.cos(zone.post_yaw)])
+    starts = np.array([lanes[i].centreline_xyz[0, :2] for i in zone.lane_ids])
+    across = np.unique(((starts - foot[:2]) @ left).round(1))
+    reach = across[(np.abs(across) > 2.0) & (np.abs(across) < LONGEST_ARM_M)]
+    if len(reach):
+        tip = reach[np.abs(reach).argmax()]
+        end = (0.0, float(tip), MAST_HEIGHT_M - 0.1)
+        parts.append(frustum((0.0, 0.0, MAST_HEIGHT_M - 0.15), end, (0.07, 0.05), 6, looks.metal))
+        last = None
+        for y in sorted(reach, key=abs):
+            if last is None or abs(y - last) >= HEAD_GAP_M:
+                parts.append(_head(np.array([-0.2, y, MAST_HEIGHT_M - 0.75]), lamps, looks))
+                last = y
+    return _turned(join(parts), foot, zone.post_yaw)
+
+
+def _head(centre: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks) -> Mesh:
+    x, y, z = centre
+    parts = [box((x - 0.1, y - 0.17, z - 0.5), (x + 0.1, y + 0.17, z + 0.5), looks.dark)]
+    for lamp, dz in zip(lamps, (0.3, 0.0, -0.3), strict=True):
+        disc = frustum((x - 0.1, y, z + dz), (x - 0.13, y, z + dz), (0.12, 0.12), 8, lamp)
+        parts.append(disc)
+    return join(parts)
+
+
+def _stop_or_yield(zone: StopZone, foot: Float[np.ndarray, "3"], looks: _Looks) -> Mesh:
+    sides = 8 if zone.kind is StopZoneKind.STOP_SIGN else 3
+    pole = frustum((0, 0, -0.3), (0, 0, SIGN_HEIGHT_M), (0.035, 0.035), 6, looks.metal)
+    rim = frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.42, 0.42), sides, looks.white_sign)
+    inner = looks.red_sign if sides == 8 else looks.white_sign
+    outer = (
+        rim
+        if sides == 8
+        else frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.45, 0.45), 3, looks.red_sign)
+    )
+    face_m = 0.37 if sides == 8 else 0.28
+    face = frustum((-0.08, 0, SIGN_HEIGHT_M), (-0.09, 0, SIGN_HEIGHT_M), (face_m, face_m), sides, inner)
+    return _turned(join([pole, outer, face]), foot, zone.post_yaw)
+
+
+def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"], looks: _Looks) -> Mesh:
+    """A street lamp whose arm reaches over the road, on the left of `ahead`."""
+    top = LAMP_HEIGHT_M
+    parts = [
+        frustum((0, 0, -0.5), (0, 0, top), (0.09, 0.05), 6, looks.metal),
+        frustum((0, 0, top - 0.05), (0, LAMP_ARM_M, top + 0.25), (0.04, 0.03), 5, looks.metal),
+        box((-0.12, LAMP_ARM_M - 0.1, top + 0.14), (0.12, LAMP_ARM_M + 0.5, top + 0.26), looks.lamp),
+    ]
+    return _turned(join(parts), np.array([*foot, z]), float(np.arctan2(ahead[1], ahead[0])))
+
+
+def _street_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
+    spots = []
+    for frontage in frontages(site.plan, TREE_SETBACK_M):
+        s = rng.uniform(*TREE_SPACING_M)
+        while s < frontage.line.length:
+            if rng.random() < STREET_TREES:
+                spots.append(frontage.at(s) + rng.normal(0.0, 0.2, 2))
+            s += rng.uniform(*TREE_SPACING_M)
+    return spots
+
+
+def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
+    """Trees in clumps on the land that is left."""
+    terrain = site.terrain
+    extent = np.array(terrain.z.shape[::-1]) * 4.0
+    count = int(extent.prod() * OPEN_TREES_PER_M2)
+    xy = terrain.origin_xy + rng.random((count, 2)) * extent
+    away = site.distance_to_road(xy)
+    clump = np.sin(xy[:, 0] / 17.0 + 1.3 * np.sin(xy[:, 1] / 23.0)) + np.sin(xy[:, 1] / 19.0)
+    wanted = (away > FIRST_TREE_M) & (away < LAST_TREE_M) & (clump > rng.uniform(-0.6, 1.6, count))
+    return list(xy[wanted])
+
+
+def _plant(site: Site, xy: Float[np.ndarray, "2"], looks: _Looks, rng: np.random.Generator) -> Mesh | None:
+    """A tree if its crown has room, a bush if only that fits, else nothing."""
+    kind = rng.choice(["round", "tall", "conifer", "bush"], p=[0.45, 0.25, 0.18, 0.12])
+    radius = {"round": rng.uniform(1.6, 2.8), "tall": rng.uniform(1.0, 1.6)}.get(kind, rng.uniform(0.8, 1.5))
+    if not site.is_free(shapely.Point(xy).buffer(0.35)):
+        return None
+    spread = shapely.Point(xy).buffer(CROWN_SPREAD * radius, quad_segs=2)
+    if kind == "bush":
+        has_room = site.is_free(spread)
+    else:  # over a walkway, above a lamp's foot, but clear of lanes and walls
+        has_room = not site.plan.lanes.intersects(spread) and not site.plan.bridges.intersects(spread)
+        has_room &= not any(a.area > LARGEST_FOOT_M2 and a.intersects(spread) for a in site.near(spread))
+    if not has_room:
+        return None
+    site.take(shapely.Point(xy).buffer(0.6))
+    foot = np.array([*xy, float(site.height(xy[None])[0])])
+    leaves = looks.needles if kind == "conifer" else looks.leaves
+    return _tree(kind, foot, radius, looks.bark, leaves[int(rng.integers(len(leaves)))], rng)
+
+
+def _tree(
+    kind: str,
+    foot: Float[np.ndarray, "3"],
+    radius: float,
+    bark: int,
+    leaves: int,
+    rng: np.random.Generator,
+) -> Mesh:
+    x, y, z = foot
+    if kind == "bush":
+        return _crown(foot + np.array([0, 0, 0.45 * radius]), (radius, radius, 0.7 * radius), leaves, rng)
+    if kind == "conifer":
+        height = rng.uniform(5.0, 9.0)
+        parts = [frustum((x, y, z - 0.3), (x, y, z + 1.6), (0.16, 0.13), 5, bark)]
+        for k in range(3):
+            low = z + 1.0 + 0.26 * k * height
+            top = min(low + 0.48 * height, z + height)
+            parts.append(frustum((x, y, low), (x, y, top), (radius * (1.25 - 0.3 * k), 0.0), 8, leaves))
+        return join(parts)
+    trunk_m = rng.uniform(2.4, 3.2)
+    stretch = rng.uniform(1.7, 2.3) if kind == "tall" else rng.uniform(0.85, 1.15)
+    middle = foot + np.array([0.0, 0.0, trunk_m + 0.95 * radius * stretch])
+    parts = [
+        frustum((x, y, z - 0.3), tuple(middle), (0.09 + 0.05 * radius, 0.05), 6, bark),
+        _crown(middle, (radius, radius, radius * stretch), leaves, rng),
+    ]
+    if kind == "round":
+        for _ in range(2):
+            angle, r = rng.uniform(0.0, 2.0 * np.pi), radius * rng.uniform(0.55, 0.75)
+            offset = 0.6 * radius * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.2, 0.5)])
+            parts.append(_crown(middle + offset, (r, r, 0.9 * r), leaves, rng))
+    return join(parts)
+
+
+_SPHERE = trimesh.creation.icosphere(subdivisions=1)
+
+
+def _crown(
+    centre: Float[np.ndarray, "3"], radii: tuple[float, float, float], look: int, rng: np.random.Generator
+) -> Mesh:
+    """A lumpy ball of leaves."""
+    lumps = rng.uniform(0.8, 1.15, (len(_SPHERE.vertices), 1))
+    vertices = centre + _SPHERE.vertices * lumps * radii
+    return triangles(vertices[_SPHERE.faces], look)
+
+
+def _along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
+    up = np.arange(0.0, height, POLE_SAMPLE_M)
+    return np.column_stack([np.full_like(up, foot[0]), np.full_like(up, foot[1]), z + up])
+
+
+def _joined(points: list[np.ndarray]) -> Float[np.ndarray, "N 3"]:
+    return np.concatenate(points) if points else np.zeros((0, 3))

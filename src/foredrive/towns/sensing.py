@@ -1,0 +1,146 @@
+"""What cameras and a lidar sense of a town at one moment."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
+
+from foredrive.ops.threads import in_parallel
+from foredrive.scene import CameraRig, LidarSweep
+from foredrive.sensors import SpinningLidar, camera_rays
+from foredrive.towns import raycast, shading
+from foredrive.towns.light import LightArrays
+
+PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
+
+Rays = Float32[np.ndarray, "N 3"]
+
+
+@dataclass(frozen=True)
+class SensorSuite:
+    """The sensors of the recording vehicle."""
+
+    rig: CameraRig
+    """Without leading dimensions."""
+    lidar: SpinningLidar
+    samples_per_pixel: int = 1
+    """A square number. Textures are filtered anyway; more samples smooth the outlines of things."""
+
+    @cached_property
+    def pixel_rays(self) -> tuple[Rays, Rays]:
+        """Origins and directions in the ego frame: cameras, rows, columns, samples."""
+        rays = camera_rays(self.rig, self.samples_per_pixel)
+        return rays.origin_ego.reshape(-1, 3).numpy(), rays.dir_ego.reshape(-1, 3).numpy()
+
+    @cached_property
+    def ray_rad(self) -> Float32[np.ndarray, "R"]:
+        """Angle between neighbouring rays."""
+        height, width = self.rig.size_hw
+        angle = 1.0 / (self.rig.K[:, 0, 0] * self.samples_per_pixel**0.5)
+        return angle.repeat_interleave(height * width * self.samples_per_pixel).numpy()
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A town with its road users where they are at one time."""
+
+    scene: shading.Scene
+    static: raycast.TriangleScene
+    placed: raycast.PlacedShapes
+    light: LightArrays
+
+    def cast(self, origin: Rays, direction: Rays) -> shading.Hits:
+        """Nearest hits."""
+        return raycast.cast(self.static, self.placed, origin, direction)
+
+    def sunlit(self, hits: shading.Hits, origin: Rays, direction: Rays) -> Bool[np.ndarray, "N"]:
+        """Which hits the sun shines on."""
+        start = np.empty_like(origin)
+        lit = shading.sun_rays(self.scene, hits, origin, direction, self.light, start)
+        facing = np.flatnonzero(lit)
+        to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
+        lit[facing] = ~raycast.occluded(self.static, self.placed, start[facing], to_sun)
+        return lit
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What rays met: which triangle of which actor, as in `shading.Hits`."""
+
+    triangle: Int32[np.ndarray, "N"]
+    actor: Int32[np.ndarray, "N"]
+
+
+def see(
+    moment: Moment, sensors: SensorSuite, T_world_ego: Float64[np.ndarray, "4 4"]
+) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
+    """Images of all cameras, and what the first sample of each pixel met [C·H·W]."""
+    samples, rays_ego = sensors.samples_per_pixel, sensors.pixel_rays
+    count = len(rays_ego[0]) // samples
+    rgb = np.empty((count, 3), np.uint8)
+    seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
+
+    def job(start: int, stop: int) -> None:
+        part = slice(start * samples, stop * samples)
+        origin, direction = _to_world(T_world_ego, rays_ego[0][part], rays_ego[1][part])
+        hits = moment.cast(origin, direction)
+        lit = moment.sunlit(hits, origin, direction)
+        rgb[start:stop] = shading.shade_pixels(
+            moment.scene, hits, origin, direction, sensors.ray_rad[part], lit, moment.light, samples
+        )
+        seen.triangle[start:stop], seen.actor[start:stop] = hits.triangle[::samples], hits.actor[::samples]
+
+    in_parallel(job, count, PIXEL_GRAIN)
+    return rgb.reshape(len(sensors.rig.names), *sensors.rig.size_hw, 3), seen
+
+
+def sweep(
+    moment: Moment,
+    lidar: SpinningLidar,
+    T_world_ego: Float64[np.ndarray, "4 4"],
+    twist_ego: Float[np.ndarray, "6"],
+    rng: np.random.Generator,
+) -> tuple[LidarSweep, Seen]:
+    """One revolution, and what its beams met.
+
+    A beam that is not returned although it met something is free up to there.
+    """
+    beams = lidar.beams(torch.from_numpy(np.asarray(twist_ego, dtype=np.float32)))
+    origin_ego, dir_ego = beams.origin_ego.numpy(), beams.dir_ego.numpy()
+    count = len(dir_ego)
+    chance = rng.random((count, 2), dtype=np.float32)
+    noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
+    range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
+    returned = np.empty(count, np.bool_)
+    seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
+    beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps)
+
+    def job(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        origin, direction = _to_world(T_world_ego, origin_ego[part], dir_ego[part])
+        hits = moment.cast(origin, direction)
+        range_m[part], returned[part], intensity[part] = shading.lidar_returns(
+            moment.scene, hits, origin, direction, beam_rad, np.float32(lidar.max_range_m), chance[part]
+        )
+        seen.triangle[part], seen.actor[part] = hits.triangle, hits.actor
+
+    in_parallel(job, count, BEAM_GRAIN)
+    returned &= range_m >= lidar.min_range_m
+    range_m = np.where(returned, (range_m + noise_m).clip(min=0.0), range_m)
+    return LidarSweep(
+        origin_ego=beams.origin_ego.contiguous(),
+        dir_ego=beams.dir_ego,
+        range_m=torch.from_numpy(range_m),
+        returned=torch.from_numpy(returned),
+        intensity=torch.from_numpy(np.where(returned, intensity, np.float32(0.0))),
+        dt_s=beams.dt_s,
+        beam=lidar.channel,
+        valid=torch.ones(count, dtype=torch.bool),
+    ), seen
+
+
+def _to_world(T_world_ego: Float64[np.ndarray, "4 4"], origin: Rays, direction: Rays) -> tuple[Rays, Rays]:
+    R = np.ascontiguousarray(T_world_ego[:3, :3].T, dtype=np.float32)
+    return origin @ R + T_world_ego[:3, 3].astype(np.float32), direction @ R

@@ -1,0 +1,88 @@
+"""Where things may stand: off the roads and clear of each other."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+
+from foredrive.towns.ground_plan import GroundPlan
+from foredrive.towns.terrain import Terrain
+
+GRID_M = 20.0
+
+
+@dataclass
+class Site:
+    """A town's free land and what has been put there."""
+
+    plan: GroundPlan
+    terrain: Terrain
+    taken: list[shapely.Geometry] = field(default_factory=list)
+    _cells: dict[tuple[int, int], list[int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._paved = self.plan.covered
+        shapely.prepare(self._paved)
+
+    def is_free(self, area: shapely.Geometry) -> bool:
+        """Whether an area touches neither road, walkway or bridge nor anything standing."""
+        if self._paved.intersects(area):
+            return False
+        return not any(other.intersects(area) for other in self.near(area))
+
+    def near(self, area: shapely.Geometry) -> list[shapely.Geometry]:
+        """What has been put near an area."""
+        indices = {i for cell in self._cells_of(area) for i in self._cells.get(cell, ())}
+        return [self.taken[i] for i in sorted(indices)]
+
+    def take(self, area: shapely.Geometry) -> None:
+        """Mark an area as built on."""
+        for cell in self._cells_of(area):
+            self._cells.setdefault(cell, []).append(len(self.taken))
+        self.taken.append(area)
+
+    def distance_to_road(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Distance of points to what is paved, m."""
+        return shapely.distance(self._paved, shapely.points(xy))
+
+    def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Height of the land: the terrain, or the walkway where there is one."""
+        return np.where(self._on_ground(xy), self.plan.borders.top(xy), self.terrain.height(xy))
+
+    def _on_ground(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        return shapely.contains_xy(self.plan.ground, xy[:, 0], xy[:, 1])
+
+    @staticmethod
+    def _cells_of(area: shapely.Geometry) -> Iterator[tuple[int, int]]:
+        x0, y0, x1, y1 = (int(c // GRID_M) for c in area.bounds)
+        return ((x, y) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1))
+
+
+@dataclass(frozen=True)
+class Frontage:
+    """A line along the roads at some distance, with the road on its left."""
+
+    line: shapely.LineString
+    walkway: bool
+    """Whether a walkway runs along it."""
+
+    def at(self, along_m: float) -> Float[np.ndarray, "2"]:
+        """Point by arc length."""
+        return shapely.get_coordinates(shapely.line_interpolate_point(self.line, along_m))[0]
+
+
+def frontages(plan: GroundPlan, setback_m: float) -> list[Frontage]:
+    """Lines that keep a distance from all that is paved on the ground, in a fixed order."""
+    walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0]).buffer(setback_m + 1.0)
+    shapely.prepare(walkways)
+    rings = []
+    for polygon in shapely.get_parts(shapely.orient_polygons(plan.ground.buffer(setback_m).simplify(0.1))):
+        rings += [polygon.exterior, *polygon.interiors]
+    lines = []
+    for ring in rings:
+        segments = shapely.segmentize(ring, 5.0)
+        beside = shapely.contains_xy(walkways, shapely.get_coordinates(segments))
+        lines.append(Frontage(shapely.LineString(segments.coords), bool(beside.mean() > 0.5)))
+    return sorted(lines, key=lambda f: f.line.bounds)

@@ -1,0 +1,189 @@
+"""A town to be seen: all that stands in it, and what the recording vehicle senses there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, Int32, UInt8
+
+from foredrive.scene import LidarSweep
+from foredrive.towns import raycast, sensing, shading
+from foredrive.towns.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
+from foredrive.towns.actors import ActorState
+from foredrive.towns.buildings import build_buildings
+from foredrive.towns.ground_plan import make_ground_plan
+from foredrive.towns.light import daylight
+from foredrive.towns.lights import Light
+from foredrive.towns.looks import LookArrays, LookTable, Texture, srgb_to_linear
+from foredrive.towns.mesh import Mesh, join
+from foredrive.towns.parking import build_car_parks, numbered, park_on_strips
+from foredrive.towns.props import SignalHead, build_furniture, build_posts
+from foredrive.towns.road_mesh import build_roads
+from foredrive.towns.sensing import SensorSuite
+from foredrive.towns.site import Site
+from foredrive.towns.terrain import build_terrain, make_terrain
+from foredrive.towns.town_map import TownMap
+
+NOBODY = -1
+ACTOR_REACH_M = 200.0
+"""Road users further from the vehicle are not drawn."""
+LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
+LAMP_LIT_RGB = ((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45))
+
+
+@dataclass(frozen=True)
+class SensorFrame:
+    """What the sensors saw at one time. Ids are track ids, NOBODY for what is no road user."""
+
+    images: dict[str, UInt8[np.ndarray, "H W 3"]]
+    pixel_ids: dict[str, Int[np.ndarray, "H W"]]
+    """Of a pixel's first sample."""
+    sweep: LidarSweep
+    """Unbatched, in the ego frame at the frame's time; a beam that got lost is free up to where it hit."""
+    beam_ids: Int[np.ndarray, "N"]
+    """Of all beams, also of those that did not return."""
+
+
+@dataclass(frozen=True)
+class StaticWorld:
+    """What does not move in a town."""
+
+    mesh: Mesh
+    track: Int32[np.ndarray, "F"]
+    """Track id of the parked car that a triangle belongs to, NOBODY for all others."""
+    parked: tuple[ActorState, ...]
+    heads: tuple[SignalHead, ...]
+    poles_xyz: Float[np.ndarray, "N 3"]
+
+
+class World:
+    """A town grown from a seed: the same map and the same seed give the same world."""
+
+    def __init__(self, town: TownMap, seed: int) -> None:
+        rng = np.random.default_rng([seed, *town.name.encode()])
+        table = LookTable()
+        self.town = town
+        self.light = daylight(rng)
+        self._shapes = make_shape_library(table)
+        self.static = build_static(town, table, self._shapes, rng)
+        self._looks = table.arrays()
+        self._scene = raycast.TriangleScene(self.static.mesh)
+
+    @property
+    def parked(self) -> tuple[ActorState, ...]:
+        """Parked cars: a part of the world that `render` and `occupancy` know of already."""
+        return self.static.parked
+
+    def render(
+        self,
+        actors: Sequence[ActorState],
+        sensors: SensorSuite,
+        T_world_ego: Float64[np.ndarray, "4 4"],
+        twist_ego: Float[np.ndarray, "6"],
+        noise_seed: int,
+        lights: Int[np.ndarray, "Z"] | None = None,
+    ) -> SensorFrame:
+        """What the sensors see at one time.
+
+        All rows of an image are exposed at that time. Road users stand still during a sweep, while the
+        vehicle moves.
+
+        Args:
+            actors: road users without the ego vehicle; those that are parked are passed over.
+            twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
+            noise_seed: of range noise and lost beams.
+            lights: a `Light` for each of the town's stop zones; None leaves their lamps dark.
+        """
+        near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
+        moment = self._moment(near, lights)
+        images, seen = sensing.see(moment, sensors, T_world_ego)
+        noise = np.random.default_rng(noise_seed)
+        sweep, met = sensing.sweep(moment, sensors.lidar, T_world_ego, twist_ego, noise)
+        names = sensors.rig.names
+        pixel_ids = self._track_ids(seen, near).reshape(len(names), *sensors.rig.size_hw)
+        return SensorFrame(
+            images=dict(zip(names, images, strict=True)),
+            pixel_ids=dict(zip(names, pixel_ids, strict=True)),
+            sweep=sweep,
+            beam_ids=self._track_ids(met, near),
+        )
+
+    def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> sensing.Moment:
+        shapes = [self._shapes.shape_of(actor) for actor in actors]
+        T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
+        placed = raycast.place(tuple(shape.scene for shape in shapes), T)
+        paint = np.array([self._shapes.paint_of(a) for a in actors], dtype=np.int32).reshape(-1, SLOTS)
+        first = np.array([shape.first for shape in shapes], dtype=np.int32)
+        scene = shading.Scene(
+            static=_soup(self.static.mesh),
+            shapes=_soup(self._shapes.soup),
+            actors=shading.ActorArrays(placed.T_world_unit, first, paint),
+            looks=self._lit_looks(lights),
+        )
+        return sensing.Moment(scene, self._scene, placed, self.light)
+
+    def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
+        if lights is None:
+            return self._looks
+        texture, albedo = self._looks.texture.copy(), self._looks.albedo.copy()
+        lit = srgb_to_linear(LAMP_LIT_RGB)
+        for head in self.static.heads:
+            for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, lit, strict=True):
+                if lights[head.zone] == shown:
+                    texture[lamp], albedo[lamp] = Texture.GLOW, rgb
+        return self._looks._replace(texture=texture, albedo=albedo)
+
+    def _track_ids(self, seen: sensing.Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
+        track = np.array([*(actor.track_id for actor in actors), NOBODY], dtype=np.int64)
+        static = self.static.track[np.maximum(seen.triangle, 0)]
+        owner = np.where(seen.actor >= 0, track[seen.actor], static)
+        return np.where(seen.triangle == shading.MISS, NOBODY, owner)
+
+
+def build_static(
+    town: TownMap, table: LookTable, shapes: ShapeLibrary, rng: np.random.Generator
+) -> StaticWorld:
+    """Grow a town. What the map says comes first, then what needs most room."""
+    plan = make_ground_plan(town)
+    terrain = make_terrain(plan, town.bounds_m, rng)
+    site = Site(plan, terrain)
+    posts = build_posts(town, site, table)
+    lots, cars = build_car_parks(site, table, rng)
+    parked = numbered(park_on_strips(town, site, rng) + cars)
+    place = join(
+        [
+            build_roads(town, plan, table),
+            build_terrain(terrain, plan, table),
+            posts.mesh,
+            lots,
+            build_buildings(site, town.name, table, rng),
+        ]
+    )
+    furniture = build_furniture(site, table, rng)
+    vehicles = [_standing(car, shapes) for car in parked]
+    track = [np.full(len(place.look) + len(furniture.mesh.look), NOBODY, dtype=np.int32)]
+    track += [np.full(len(v.look), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)]
+    return StaticWorld(
+        mesh=join([place, furniture.mesh, *vehicles]),
+        track=np.concatenate(track),
+        parked=parked,
+        heads=posts.heads,
+        poles_xyz=np.concatenate([posts.poles_xyz, furniture.poles_xyz]),
+    )
+
+
+def _standing(car: ActorState, shapes: ShapeLibrary) -> Mesh:
+    """A parked car as a part of the town."""
+    shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car)
+    moved = shape.transformed(unit_to_world(car))
+    slot = np.clip(-1 - moved.look, 0, SLOTS - 1)
+    look = np.where(moved.look < 0, paint[slot], moved.look)
+    return Mesh(moved.xyz, moved.uvw, look.astype(np.int32))
+
+
+def _soup(mesh: Mesh) -> shading.Soup:
+    return shading.Soup(mesh.xyz, mesh.uvw, mesh.look)
+
+
+def _distance(actor: ActorState, T_world_ego: Float64[np.ndarray, "4 4"]) -> float:
+    return float(np.linalg.norm(actor.centre_m - T_world_ego[:3, 3]))
