@@ -5,7 +5,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.ops.precision import full_precision
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can
+from foredrive.ops.volume_kernels import BLOCK, Reader
+from foredrive.ops.volume_reading import ReadVolume
 
 
 def attend_volume(
@@ -30,12 +32,24 @@ def attend_volume(
         ValueError: if D is not a multiple of H or shapes do not agree.
     """
     b, queries, heads, per_head = weights.shape
-    if points.shape != (b, queries, heads, per_head, 3) or len(values) != b or values.shape[-1] % heads:
-        shapes = {
-            n: tuple(t.shape) for n, t in {"values": values, "points": points, "weights": weights}.items()
-        }
+    fits = (
+        points.shape == (b, queries, heads, per_head, 3)
+        and len(values) == b
+        and heads * per_head > 0
+        and min(values.shape[1:]) > 0
+        and values.shape[-1] % heads == 0
+    )
+    if not fits:
+        shapes = f"values {(*values.shape,)}, points {(*points.shape,)}, weights {(*weights.shape,)}"
         raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
-    return attend_volume_reference(values, points, weights)
+    small = values[:1].numel() < MAX_ITEM_SIZE and per_head <= BLOCK
+    if not (small and numba_can(values, points, weights)):
+        return attend_volume_reference(values, points, weights)
+    width = values.shape[-1] // heads
+    readers = tuple(Reader(head, head * width, (head + 1) * width, head) for head in range(heads))
+    with full_precision(values, points, weights) as (values, points, weights):
+        out: Tensor = ReadVolume.apply(values, points, weights, readers)
+        return out
 
 
 def attend_volume_reference(

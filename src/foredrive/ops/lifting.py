@@ -1,13 +1,23 @@
 """Multi-camera deformable attention: what 3-D queries read from image features (NeMo eq. 1)."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from foredrive.ops.precision import full_precision
+from foredrive.ops.lifting_kernels import BLOCK, Gradients, Inputs, lift_pairs, lift_pairs_backward
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can
+from foredrive.ops.threads import in_parallel
+
+MIN_QUERIES = 64
+"""Fewer are not worth a thread of their own."""
+CACHE_LINE = 16
+"""Floats in a cache line: threads that write to the same line slow each other down."""
 
 
 def lift(
@@ -39,7 +49,20 @@ def lift(
         ValueError: if D is not a multiple of H or shapes do not agree.
     """
     _check(values, uv, visible, offsets, weights)
-    return lift_reference(values, uv, visible, offsets, weights)
+    image_size = sum(v.shape[2] * v.shape[3] for v in values) * values[0].shape[4]
+    points = weights.shape[3] * weights.shape[4]
+    small = image_size < MAX_ITEM_SIZE and points <= BLOCK
+    if not (small and numba_can(*values, uv, offsets, weights)):
+        return lift_reference(values, uv, visible, offsets, weights)
+    with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
+        sizes, start = [], 0
+        for value in values:
+            sizes.append((value.shape[2], value.shape[3], start))
+            start += value.shape[2] * value.shape[3]
+        joined = torch.cat([value.flatten(2, 3) for value in values], dim=2)
+        pairs = _visible_pairs(uv, visible)
+        out: Tensor = _Lift.apply(joined, offsets, weights, np.array(sizes, np.int32), pairs)
+        return out
 
 
 def lift_reference(
@@ -70,6 +93,106 @@ def lift_reference(
         return mean.permute(0, 3, 1, 2).flatten(2)
 
 
+class _Pairs(NamedTuple):
+    """Queries and cameras that see them, sorted by query; `Inputs` says what the fields are."""
+
+    query: np.ndarray
+    image: np.ndarray
+    uv: np.ndarray
+    share: np.ndarray
+    first: np.ndarray
+    """Int64[b·Q + 1], where the pairs of each query begin."""
+
+
+def _visible_pairs(uv: Float[Tensor, "b C Q 2"], visible: Bool[Tensor, "b C Q"]) -> _Pairs:
+    b, cameras, queries = visible.shape
+    by_query = visible.transpose(1, 2)  # [b Q C]
+    item, query, camera = by_query.nonzero(as_tuple=True)
+    count = by_query.sum(-1).flatten()
+    row = item * queries + query
+    first = torch.zeros(b * queries + 1, dtype=torch.int64)
+    torch.cumsum(count, 0, out=first[1:])
+    return _Pairs(
+        query=row.numpy(),
+        image=(item * cameras + camera).numpy(),
+        uv=uv.detach()[item, camera, query].numpy(),
+        share=(1 / count.float())[row].numpy(),
+        first=first.numpy(),
+    )
+
+
+class _Lift(torch.autograd.Function):
+    """The numba path of `lift`, for float32 on the CPU."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Float[Tensor, "b C S D"],
+        offsets: Float[Tensor, "b Q H L P 2"],
+        weights: Float[Tensor, "b Q H L P"],
+        sizes: np.ndarray,
+        pairs: _Pairs,
+    ) -> Float[Tensor, "b Q D"]:
+        values, offsets, weights = values.contiguous(), offsets.contiguous(), weights.contiguous()
+        ctx.save_for_backward(values, offsets, weights)
+        ctx.sizes, ctx.pairs = sizes, pairs
+        b, queries = weights.shape[:2]
+        inputs = _inputs(values, offsets, weights, sizes, pairs)
+        out = values.new_zeros(b * queries, values.shape[-1])
+        rows = out.numpy()
+
+        def job(start: int, stop: int) -> None:
+            lift_pairs(inputs, pairs.first[start], pairs.first[stop], rows)
+
+        in_parallel(job, b * queries, grain=MIN_QUERIES)
+        return out.unflatten(0, (b, queries))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
+        values, offsets, weights = ctx.saved_tensors
+        wants_values, wants_offsets, wants_weights = ctx.needs_input_grad[:3]
+        wants_points = wants_offsets or wants_weights
+        grad_values = torch.zeros_like(values) if wants_values else values[:0]
+        grad_offsets = torch.zeros_like(offsets) if wants_points else offsets[:0]
+        grad_weights = torch.zeros_like(weights) if wants_points else weights[:0]
+        inputs = _inputs(values, offsets, weights, ctx.sizes, ctx.pairs)
+        grads = Gradients(
+            out=grad_out.contiguous().flatten(0, 1).numpy(),
+            values=grad_values.flatten(0, 1).numpy(),
+            offsets=grad_offsets.flatten(0, 1).numpy(),
+            weights=grad_weights.flatten(0, 1).numpy(),
+        )
+        b, queries, heads = weights.shape[:3]
+        first = ctx.pairs.first
+
+        def job(start: int, stop: int) -> None:
+            for item, head in (divmod(i, heads) for i in range(start, stop)):
+                lift_pairs_backward(inputs, first[item * queries], first[(item + 1) * queries], head, grads)
+
+        in_parallel(job, b * heads, grain=-(-CACHE_LINE // (values.shape[-1] // heads)))
+        return (
+            grad_values if wants_values else None,
+            grad_offsets if wants_offsets else None,
+            grad_weights if wants_weights else None,
+            None,
+            None,
+        )
+
+
+def _inputs(values: Tensor, offsets: Tensor, weights: Tensor, sizes: np.ndarray, pairs: _Pairs) -> Inputs:
+    return Inputs(
+        values=values.detach().flatten(0, 1).numpy(),
+        sizes=sizes,
+        offsets=offsets.detach().flatten(0, 1).numpy(),
+        weights=weights.detach().flatten(0, 1).numpy(),
+        query=pairs.query,
+        image=pairs.image,
+        uv=pairs.uv,
+        share=pairs.share,
+    )
+
+
 def _check(values: Sequence[Tensor], uv: Tensor, visible: Tensor, offsets: Tensor, weights: Tensor) -> None:
     """Refuse shapes that do not fit together: the kernels index by them."""
     b, cameras, queries = visible.shape
@@ -77,7 +200,8 @@ def _check(values: Sequence[Tensor], uv: Tensor, visible: Tensor, offsets: Tenso
     channels = values[0].shape[-1] if values else 0
     fits = (
         len(values) == levels > 0
-        and all(v.shape[:2] == (b, cameras) and v.shape[4:] == (channels,) for v in values)
+        and heads * points > 0
+        and all(v.shape == (b, cameras, *v.shape[2:4], channels) and min(v.shape[2:]) > 0 for v in values)
         and uv.shape == (b, cameras, queries, 2)
         and offsets.shape == (b, queries, heads, levels, points, 2)
         and weights.shape == (b, queries, heads, levels, points)

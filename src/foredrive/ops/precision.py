@@ -1,4 +1,4 @@
-"""Sampling and compositing run in full precision, whatever autocast says around them."""
+"""Which numbers the ops compute in, and whether the numba kernels can."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,10 +6,22 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+MAX_ITEM_SIZE = 2**31
+"""Kernels count floats within one image or volume in 32 bits."""
+
 
 @contextmanager
 def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Autocast off, and the tensors in float32, or in float64 if any of them is."""
+    """Autocast off, and the tensors in float32, or in float64 if any of them is.
+
+    Sampling and compositing gain nothing from half precision, and lose places and depths.
+    """
     dtype = torch.float64 if any(t.dtype == torch.float64 for t in tensors) else torch.float32
     with torch.autocast(tensors[0].device.type, enabled=False):
         yield tuple(t.to(dtype) for t in tensors)
+
+
+def numba_can(*tensors: Tensor) -> bool:
+    """Whether CPU kernels can take these: on the CPU, not in float64, and nobody traces the call."""
+    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return not traced and all(t.device.type == "cpu" and t.dtype != torch.float64 for t in tensors)

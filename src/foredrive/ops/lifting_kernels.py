@@ -1,0 +1,260 @@
+"""Numba kernels of `foredrive.ops.lifting`: what visible pairs read from all levels, and its gradients.
+
+A pair is a query and a camera that sees it. Pairs go through in blocks of some hundred points, head by head:
+the points' coordinates are collected, then turned into corners and weights by loops that LLVM vectorises over
+points, then the corners are read eight channels at a time.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+
+from foredrive.ops.lanes import (
+    HALF,
+    ONE,
+    WIDTH,
+    ZERO,
+    add_dots,
+    kernel,
+    load,
+    mul_add,
+    neighbours,
+    store,
+    zeros8,
+)
+
+BLOCK = 256
+"""Most points prepared at once: their buffers stay in the first-level cache. Buffers are flat, with rows of
+constant length, which lets LLVM see that rows do not overlap."""
+
+
+class Inputs(NamedTuple):
+    """What is read. Pairs are sorted by query."""
+
+    values: np.ndarray
+    """Float[b·C S D], the levels' pixels one after the other."""
+    sizes: np.ndarray
+    """Int32[L 3], height, width and first pixel of each level."""
+    offsets: np.ndarray
+    """Float[b·Q H L P 2]."""
+    weights: np.ndarray
+    """Float[b·Q H L P]."""
+    query: np.ndarray
+    """Int64[pairs], index into b·Q."""
+    image: np.ndarray
+    """Int64[pairs], index into b·C."""
+    uv: np.ndarray
+    """Float[pairs 2]."""
+    share: np.ndarray
+    """Float[pairs], one over the number of cameras that see the query."""
+
+
+class Gradients(NamedTuple):
+    """Gradients with respect to the result and to the inputs of the same names."""
+
+    out: np.ndarray
+    values: np.ndarray
+    offsets: np.ndarray
+    weights: np.ndarray
+
+
+class _Block(NamedTuple):
+    """The points of a block of pairs, of one head, level by level; row k of a buffer begins at k · BLOCK."""
+
+    x: np.ndarray
+    """Float, integers are pixel centres."""
+    y: np.ndarray
+    weight: np.ndarray
+    """Float, attention weight times the camera's share."""
+    corner: np.ndarray
+    """Int32, four rows: where the pixels around a point lie in its image's memory."""
+    part: np.ndarray
+    """Float, four rows: their parts of the weight."""
+    dots: np.ndarray
+    """Float, four in a row for each point: what the pixels hold, times the gradient of the result."""
+
+
+@kernel
+@no_type_check
+def _new_block():
+    x, y, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    part, dots = np.empty(4 * BLOCK, np.float32), np.empty(4 * BLOCK, np.float32)
+    return _Block(x, y, weight, np.empty(4 * BLOCK, np.int32), part, dots)
+
+
+@kernel
+@no_type_check
+def _level(block, start):
+    """The buffers from a level's first point on."""
+    x, y, weight = block.x[start:], block.y[start:], block.weight[start:]
+    return _Block(x, y, weight, block.corner[start:], block.part[start:], block.dots[4 * start :])
+
+
+@kernel
+@no_type_check
+def _collect(inputs, block, first, last, head):
+    """Fill `block` with the points of the pairs first … last."""
+    levels, points = inputs.weights.shape[2:]
+    count = (last - first) * points
+    for pair in range(first, last):
+        q, share = inputs.query[pair], inputs.share[pair]
+        for level in range(levels):
+            u = inputs.uv[pair, 0] * np.float32(inputs.sizes[level, 1]) - HALF
+            v = inputs.uv[pair, 1] * np.float32(inputs.sizes[level, 0]) - HALF
+            i = level * count + (pair - first) * points
+            for p in range(points):
+                block.x[i + p] = u + inputs.offsets[q, head, level, p, 0]
+                block.y[i + p] = v + inputs.offsets[q, head, level, p, 1]
+                block.weight[i + p] = inputs.weights[q, head, level, p] * share
+    for level in range(levels):
+        _corners(_level(block, level * count), count, inputs.sizes[level], np.int32(inputs.values.shape[2]))
+
+
+@kernel
+@no_type_check
+def _corners(block, count, size, channels):
+    """Fill corner and part of one level."""
+    height, width, start = size
+    corner, part = block.corner, block.part
+    for i in range(count):
+        x, y = block.x[i], block.y[i]
+        x0, x1, wx0, wx1, _, _ = neighbours(x, width)
+        y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+        w = block.weight[i] if (x == x) & (y == y) else np.float32(np.nan)
+        corner[i] = (start + y0 * width + x0) * channels
+        corner[BLOCK + i] = (start + y0 * width + x1) * channels
+        corner[2 * BLOCK + i] = (start + y1 * width + x0) * channels
+        corner[3 * BLOCK + i] = (start + y1 * width + x1) * channels
+        part[i] = w * wy0 * wx0
+        part[BLOCK + i] = w * wy0 * wx1
+        part[2 * BLOCK + i] = w * wy1 * wx0
+        part[3 * BLOCK + i] = w * wy1 * wx1
+
+
+@kernel
+@no_type_check
+def _read(inputs, block, first, last, channel, zero, out):
+    """Add what each pair of a block reads from its image, in the channels from `channel` on."""
+    levels, points = inputs.weights.shape[2:]
+    pixels, channels = inputs.values.shape[1:]
+    for pair in range(first, last):
+        base = inputs.image[pair] * pixels * channels + channel
+        at = inputs.query[pair] * channels + channel
+        total = load(out, at, zero)
+        for level in range(levels):
+            i = (level * (last - first) + pair - first) * points
+            for p in range(i, i + points):
+                point = zero
+                for k in range(4):
+                    value = load(inputs.values, base + block.corner[k * BLOCK + p], zero)
+                    point = mul_add(block.part[k * BLOCK + p], value, point)
+                total = mul_add(ONE, point, total)
+        store(out, at, total)
+
+
+@kernel
+@no_type_check
+def lift_pairs(inputs, first_pair, last_pair, out):
+    """Add what the pairs first_pair … last_pair read to `out`, Float[b·Q D]. L·P ≤ BLOCK."""
+    heads, width = inputs.weights.shape[1], inputs.values.shape[2] // inputs.weights.shape[1]
+    whole = width - width % WIDTH
+    block, step = _new_block(), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
+    for first in range(first_pair, last_pair, step):
+        last = min(first + step, last_pair)
+        for head in range(heads):
+            _collect(inputs, block, first, last, head)
+            start = head * width
+            for c in range(start, start + whole, WIDTH):
+                _read(inputs, block, first, last, c, zeros8(), out)
+            for c in range(start + whole, start + width):
+                _read(inputs, block, first, last, c, ZERO, out)
+
+
+@kernel
+@no_type_check
+def _read_back(inputs, block, first, last, channel, zero, grads):
+    """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
+    levels, points = inputs.weights.shape[2:]
+    pixels, channels = inputs.values.shape[1:]
+    corner = block.corner
+    to_values, to_points = grads.values.size > 0, grads.weights.size > 0
+    for pair in range(first, last):
+        base = inputs.image[pair] * pixels * channels + channel
+        grad = load(grads.out, inputs.query[pair] * channels + channel, zero)
+        for level in range(levels):
+            i = (level * (last - first) + pair - first) * points
+            for p in range(i, i + points):
+                if to_points:
+                    add_dots(
+                        block.dots,
+                        4 * p,
+                        load(inputs.values, base + corner[p], zero),
+                        load(inputs.values, base + corner[BLOCK + p], zero),
+                        load(inputs.values, base + corner[2 * BLOCK + p], zero),
+                        load(inputs.values, base + corner[3 * BLOCK + p], zero),
+                        grad,
+                    )
+                if to_values:
+                    for k in range(4):
+                        at = base + corner[k * BLOCK + p]
+                        total = load(grads.values, at, zero)
+                        store(grads.values, at, mul_add(block.part[k * BLOCK + p], grad, total))
+
+
+@kernel
+@no_type_check
+def _slopes(block, count, size):
+    """Turn `dots` into gradients with respect to x, y and weight, which go to the first rows of `part`."""
+    height, width, _ = size
+    dots, slope = block.dots, block.part
+    for i in range(count):
+        _, _, wx0, wx1, dx0, dx1 = neighbours(block.x[i], width)
+        _, _, wy0, wy1, dy0, dy1 = neighbours(block.y[i], height)
+        d00, d01, d10, d11 = dots[4 * i], dots[4 * i + 1], dots[4 * i + 2], dots[4 * i + 3]
+        w = block.weight[i]
+        slope[i] = w * (wy0 * (dx0 * d00 + dx1 * d01) + wy1 * (dx0 * d10 + dx1 * d11))
+        slope[BLOCK + i] = w * (wx0 * (dy0 * d00 + dy1 * d10) + wx1 * (dy0 * d01 + dy1 * d11))
+        slope[2 * BLOCK + i] = wy0 * (wx0 * d00 + wx1 * d01) + wy1 * (wx0 * d10 + wx1 * d11)
+
+
+@kernel
+@no_type_check
+def _hand_out(inputs, block, first, last, head, grads):
+    """Add the gradients of a block's points to those of their queries. Overwrites `block.part`."""
+    levels, points = inputs.weights.shape[2:]
+    count = (last - first) * points
+    for level in range(levels):
+        _slopes(_level(block, level * count), count, inputs.sizes[level])
+    for pair in range(first, last):
+        q, share = inputs.query[pair], inputs.share[pair]
+        for level in range(levels):
+            i = level * count + (pair - first) * points
+            for p in range(points):
+                grads.offsets[q, head, level, p, 0] += block.part[i + p]
+                grads.offsets[q, head, level, p, 1] += block.part[BLOCK + i + p]
+                grads.weights[q, head, level, p] += block.part[2 * BLOCK + i + p] * share
+
+
+@kernel
+@no_type_check
+def lift_pairs_backward(inputs, first_pair, last_pair, head, grads):
+    """Add the gradients that one head's reading for the pairs first_pair … last_pair brings.
+
+    Heads touch disjoint channels of the values and disjoint offsets and weights, batch items disjoint images:
+    calls that differ in either can run at the same time. Gradients that are not wanted have size 0 (offsets
+    and weights: both or none).
+    """
+    width = inputs.values.shape[2] // inputs.weights.shape[1]
+    start = head * width
+    whole = width - width % WIDTH
+    block, step = _new_block(), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
+    for first in range(first_pair, last_pair, step):
+        last = min(first + step, last_pair)
+        _collect(inputs, block, first, last, head)
+        block.dots[:] = 0
+        for c in range(start, start + whole, WIDTH):
+            _read_back(inputs, block, first, last, c, zeros8(), grads)
+        for c in range(start + whole, start + width):
+            _read_back(inputs, block, first, last, c, ZERO, grads)
+        if grads.weights.size > 0:
+            _hand_out(inputs, block, first, last, head, grads)

@@ -1,0 +1,268 @@
+"""Numba kernels behind `sample_volume` and `attend_volume`: weighted sums of trilinear readings.
+
+Queries go through in blocks of some hundred points: the points' coordinates are collected, then turned into
+corners and weights by loops that LLVM vectorises over points, then the corners are read eight channels at a
+time.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+
+from foredrive.ops.lanes import (
+    HALF,
+    ONE,
+    WIDTH,
+    ZERO,
+    add_dots,
+    kernel,
+    load,
+    mul_add,
+    neighbours,
+    store,
+    zeros8,
+)
+
+BLOCK = 256
+"""Most points prepared at once: their buffers stay in the first-level cache. Buffers are flat, with rows of
+constant length, which lets LLVM see that rows do not overlap."""
+
+
+class Inputs(NamedTuple):
+    """What is read."""
+
+    values: np.ndarray
+    """Float[b Z Y X D]."""
+    points: np.ndarray
+    """Float[b Q H P 3], x y z in voxel units."""
+    weights: np.ndarray
+    """Float[b Q H P]."""
+
+
+class Gradients(NamedTuple):
+    """Gradients with respect to the result and to the inputs of the same names."""
+
+    out: np.ndarray
+    values: np.ndarray
+    points: np.ndarray
+    """Float[b Q slots P 3]."""
+    weights: np.ndarray
+    """Float[b Q slots P]."""
+
+
+class Reader(NamedTuple):
+    """Which channels of a query are read at the points of which head, and where their gradients go."""
+
+    head: int
+    first_channel: int
+    last_channel: int
+    slot: int
+
+
+class _Block(NamedTuple):
+    """The points of a block of queries, of one head; row k of a buffer begins at k · BLOCK."""
+
+    place: np.ndarray
+    """Float, rows x y z; integers are voxel centres."""
+    weight: np.ndarray
+    """Float, one row."""
+    corner: np.ndarray
+    """Int32, eight rows: where the voxels around a point lie in its volume's memory."""
+    part: np.ndarray
+    """Float, eight rows: their parts of the weight."""
+    dots: np.ndarray
+    """Float, eight in a row for each point: what the voxels hold, times the gradient of the result."""
+
+
+@kernel
+@no_type_check
+def _new_block():
+    corner = np.empty(8 * BLOCK, np.int32)
+    part, dots = np.empty(8 * BLOCK, np.float32), np.empty(8 * BLOCK, np.float32)
+    return _Block(np.empty(3 * BLOCK, np.float32), np.empty(BLOCK, np.float32), corner, part, dots)
+
+
+@kernel
+@no_type_check
+def _collect(inputs, block, item, first, last, head):
+    """Fill `block` with the points of the queries first … last of a batch item."""
+    points = inputs.weights.shape[3]
+    for q in range(first, last):
+        i = (q - first) * points
+        for p in range(points):
+            for axis in range(3):
+                block.place[axis * BLOCK + i + p] = inputs.points[item, q, head, p, axis] - HALF
+            block.weight[i + p] = inputs.weights[item, q, head, p]
+    _corners(block, (last - first) * points, inputs.values.shape)
+
+
+@kernel
+@no_type_check
+def _corners(block, count, shape):
+    """Fill corner and part."""
+    place, corner, part = block.place, block.corner, block.part
+    depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
+    channels = np.int32(shape[4])
+    for i in range(count):
+        x, y, z = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+        x0, x1, wx0, wx1, _, _ = neighbours(x, width)
+        y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+        z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
+        w = block.weight[i] if (x == x) & (y == y) & (z == z) else np.float32(np.nan)
+        row00, row01 = (z0 * height + y0) * width, (z0 * height + y1) * width
+        row10, row11 = (z1 * height + y0) * width, (z1 * height + y1) * width
+        corner[i] = (row00 + x0) * channels
+        corner[BLOCK + i] = (row00 + x1) * channels
+        corner[2 * BLOCK + i] = (row01 + x0) * channels
+        corner[3 * BLOCK + i] = (row01 + x1) * channels
+        corner[4 * BLOCK + i] = (row10 + x0) * channels
+        corner[5 * BLOCK + i] = (row10 + x1) * channels
+        corner[6 * BLOCK + i] = (row11 + x0) * channels
+        corner[7 * BLOCK + i] = (row11 + x1) * channels
+        part[i] = w * wz0 * wy0 * wx0
+        part[BLOCK + i] = w * wz0 * wy0 * wx1
+        part[2 * BLOCK + i] = w * wz0 * wy1 * wx0
+        part[3 * BLOCK + i] = w * wz0 * wy1 * wx1
+        part[4 * BLOCK + i] = w * wz1 * wy0 * wx0
+        part[5 * BLOCK + i] = w * wz1 * wy0 * wx1
+        part[6 * BLOCK + i] = w * wz1 * wy1 * wx0
+        part[7 * BLOCK + i] = w * wz1 * wy1 * wx1
+
+
+@kernel
+@no_type_check
+def _read(inputs, block, item, first, last, channel, zero, out):
+    """Write what each query of a block reads, in the channels from `channel` on."""
+    points, channels = inputs.weights.shape[3], inputs.values.shape[4]
+    queries = out.shape[1]
+    base = item * inputs.values[0].size + channel
+    for q in range(first, last):
+        total = zero
+        i = (q - first) * points
+        for p in range(i, i + points):
+            point = zero
+            for k in range(8):
+                value = load(inputs.values, base + block.corner[k * BLOCK + p], zero)
+                point = mul_add(block.part[k * BLOCK + p], value, point)
+            total = mul_add(ONE, point, total)
+        store(out, (item * queries + q) * channels + channel, total)
+
+
+@kernel
+@no_type_check
+def read_queries(inputs, item, first_query, last_query, out):
+    """Write what the queries first_query … last_query of an item read to `out`, Float[b Q D]. P ≤ BLOCK."""
+    heads = inputs.weights.shape[2]
+    width = inputs.values.shape[4] // heads
+    whole = width - width % WIDTH
+    block, step = _new_block(), BLOCK // inputs.weights.shape[3]
+    for first in range(first_query, last_query, step):
+        last = min(first + step, last_query)
+        for head in range(heads):
+            _collect(inputs, block, item, first, last, head)
+            start = head * width
+            for c in range(start, start + whole, WIDTH):
+                _read(inputs, block, item, first, last, c, zeros8(), out)
+            for c in range(start + whole, start + width):
+                _read(inputs, block, item, first, last, c, ZERO, out)
+
+
+@kernel
+@no_type_check
+def _read_back(inputs, block, item, first, last, channel, zero, grads):
+    """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
+    points, channels = inputs.weights.shape[3], inputs.values.shape[4]
+    queries = grads.out.shape[1]
+    base = item * inputs.values[0].size + channel
+    to_values, to_points = grads.values.size > 0, grads.weights.size > 0
+    for q in range(first, last):
+        grad = load(grads.out, (item * queries + q) * channels + channel, zero)
+        i = (q - first) * points
+        for p in range(i, i + points):
+            if to_points:
+                for k in range(0, 8, 4):
+                    add_dots(
+                        block.dots,
+                        8 * p + k,
+                        load(inputs.values, base + block.corner[k * BLOCK + p], zero),
+                        load(inputs.values, base + block.corner[(k + 1) * BLOCK + p], zero),
+                        load(inputs.values, base + block.corner[(k + 2) * BLOCK + p], zero),
+                        load(inputs.values, base + block.corner[(k + 3) * BLOCK + p], zero),
+                        grad,
+                    )
+            if to_values:
+                for k in range(8):
+                    at = base + block.corner[k * BLOCK + p]
+                    store(
+                        grads.values,
+                        at,
+                        mul_add(block.part[k * BLOCK + p], grad, load(grads.values, at, zero)),
+                    )
+
+
+@kernel
+@no_type_check
+def _slopes(block, count, shape):
+    """Turn `dots` into gradients with respect to x, y, z and weight, which go to the first rows of `part`."""
+    place, slope = block.place, block.part
+    depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
+    for i in range(count):
+        _, _, wx0, wx1, dx0, dx1 = neighbours(place[i], width)
+        _, _, wy0, wy1, dy0, dy1 = neighbours(place[BLOCK + i], height)
+        _, _, wz0, wz1, dz0, dz1 = neighbours(place[2 * BLOCK + i], depth)
+        j = 8 * i
+        d000, d001, d010, d011 = block.dots[j], block.dots[j + 1], block.dots[j + 2], block.dots[j + 3]
+        d100, d101, d110, d111 = block.dots[j + 4], block.dots[j + 5], block.dots[j + 6], block.dots[j + 7]
+        d00, d01, d10, d11 = (
+            wx0 * d000 + wx1 * d001,
+            wx0 * d010 + wx1 * d011,
+            wx0 * d100 + wx1 * d101,
+            wx0 * d110 + wx1 * d111,
+        )
+        d0, d1 = wy0 * d00 + wy1 * d01, wy0 * d10 + wy1 * d11
+        along_x0 = wy0 * (dx0 * d000 + dx1 * d001) + wy1 * (dx0 * d010 + dx1 * d011)
+        along_x1 = wy0 * (dx0 * d100 + dx1 * d101) + wy1 * (dx0 * d110 + dx1 * d111)
+        w = block.weight[i]
+        slope[i] = w * (wz0 * along_x0 + wz1 * along_x1)
+        slope[BLOCK + i] = w * (wz0 * (dy0 * d00 + dy1 * d01) + wz1 * (dy0 * d10 + dy1 * d11))
+        slope[2 * BLOCK + i] = w * (dz0 * d0 + dz1 * d1)
+        slope[3 * BLOCK + i] = wz0 * d0 + wz1 * d1
+
+
+@kernel
+@no_type_check
+def _hand_out(inputs, block, item, first, last, slot, grads):
+    """Write the gradients of a block's points. Overwrites `block.part`."""
+    points = inputs.weights.shape[3]
+    slope = block.part
+    _slopes(block, (last - first) * points, inputs.values.shape)
+    for q in range(first, last):
+        i = (q - first) * points
+        for p in range(points):
+            for axis in range(3):
+                grads.points[item, q, slot, p, axis] = slope[axis * BLOCK + i + p]
+            grads.weights[item, q, slot, p] = slope[3 * BLOCK + i + p]
+
+
+@kernel
+@no_type_check
+def read_back(inputs, item, reader, grads):
+    """Add the values' gradients that one reader of a batch item brings, and write those of its points.
+
+    Readers touch disjoint channels and slots, batch items disjoint volumes: calls that differ in either can
+    run at the same time. Gradients that are not wanted have size 0 (points and weights: both or none).
+    """
+    width = reader.last_channel - reader.first_channel
+    whole = reader.first_channel + width - width % WIDTH
+    block, step = _new_block(), BLOCK // inputs.weights.shape[3]
+    queries = inputs.weights.shape[1]
+    for first in range(0, queries, step):
+        last = min(first + step, queries)
+        _collect(inputs, block, item, first, last, reader.head)
+        block.dots[:] = 0
+        for c in range(reader.first_channel, whole, WIDTH):
+            _read_back(inputs, block, item, first, last, c, zeros8(), grads)
+        for c in range(whole, reader.last_channel):
+            _read_back(inputs, block, item, first, last, c, ZERO, grads)
+        if grads.weights.size > 0:
+            _hand_out(inputs, block, item, first, last, reader.slot, grads)

@@ -1,0 +1,79 @@
+"""The numba path of `sample_volume` and `attend_volume` as a function that autograd knows."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from foredrive.ops.threads import in_parallel
+from foredrive.ops.volume_kernels import Gradients, Inputs, Reader, read_back, read_queries
+
+MIN_QUERIES = 256
+"""Fewer are not worth a thread of their own."""
+
+
+class ReadVolume(torch.autograd.Function):
+    """Weighted sums of trilinear readings, for float32 on the CPU; `attend_volume` says what they are.
+
+    The backward pass runs reader by reader. There may be several to a head, each with some of its channels;
+    each has its own slot for the gradients of the points, and the slots of a head are added up at the end.
+    The result does not depend on the number of threads.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Float[Tensor, "b Z Y X D"],
+        points: Float[Tensor, "b Q H P 3"],
+        weights: Float[Tensor, "b Q H P"],
+        readers: tuple[Reader, ...],
+    ) -> Float[Tensor, "b Q D"]:
+        """Read; the last argument says which channels the backward pass takes together."""
+        values, points, weights = values.contiguous(), points.contiguous(), weights.contiguous()
+        ctx.save_for_backward(values, points, weights)
+        ctx.readers = readers
+        inputs = Inputs(*(tensor.detach().numpy() for tensor in (values, points, weights)))
+        b, queries = weights.shape[:2]
+        out = values.new_empty(b, queries, values.shape[-1])
+        rows = out.numpy()
+
+        def job(start: int, stop: int) -> None:
+            for item in range(start // queries, -(-stop // queries)):
+                before = item * queries
+                read_queries(inputs, item, max(start - before, 0), min(stop - before, queries), rows)
+
+        in_parallel(job, b * queries, grain=MIN_QUERIES)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of values, points and weights, where they are wanted."""
+        values, points, weights = ctx.saved_tensors
+        wants_values, wants_points, wants_weights, _ = ctx.needs_input_grad
+        readers: tuple[Reader, ...] = ctx.readers
+        b, queries, heads, per_head = weights.shape
+        grad_values = torch.zeros_like(values) if wants_values else values[:0]
+        slots = len(readers) if wants_points or wants_weights else 0
+        grad_points = points.new_empty(b, queries, slots, per_head, 3)
+        grad_weights = weights.new_empty(b, queries, slots, per_head)
+        inputs = Inputs(*(tensor.numpy() for tensor in (values, points, weights)))
+        found = (grad_out.contiguous(), grad_values, grad_points, grad_weights)
+        grads = Gradients(*(tensor.numpy() for tensor in found))
+
+        def job(start: int, stop: int) -> None:
+            for item, reader in (divmod(i, len(readers)) for i in range(start, stop)):
+                read_back(inputs, item, readers[reader], grads)
+
+        in_parallel(job, b * len(readers))
+        if slots > heads:
+            grad_points = grad_points.unflatten(2, (heads, -1)).sum(3)
+            grad_weights = grad_weights.unflatten(2, (heads, -1)).sum(3)
+        return (
+            grad_values if wants_values else None,
+            grad_points if wants_points else None,
+            grad_weights if wants_weights else None,
+            None,
+        )
