@@ -13,7 +13,7 @@ Summary = Mapping[str, Figure]
 
 MISSING = "&ndash;"
 MODEL = ""
-AGENT_TITLES = {MODEL: "this model"}
+AGENT_TITLES = {MODEL: "this model", "ego_mlp": "MLP of ego status alone"}
 PROTOCOL_TITLES = {
     "stp3": "ST-P3",
     "uniad": "UniAD",
@@ -145,7 +145,8 @@ def _planning_rows(summary: Summary, agents: Sequence[str], columns: Sequence[tu
     best = {}
     for column in columns:
         values = [v for agent in agents if isinstance(v := table[agent, column], float) and not math.isnan(v)]
-        best[column] = min(values) if len(values) > 1 and not column[1].startswith("frames") else None
+        differ = len(set(values)) > 1 and not column[1].startswith("frames")
+        best[column] = min(values) if differ else None
     rows = []
     for agent in agents:
         cells = [

@@ -1,0 +1,7 @@
+"""`python -m foredrive`."""
+
+import sys
+
+from foredrive.cli.main import main
+
+sys.exit(main())

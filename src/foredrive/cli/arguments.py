@@ -1,0 +1,9 @@
+"""Kinds of arguments that several verbs take."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+SomePaths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]")]

@@ -1,0 +1,24 @@
+"""`foredrive convert`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def convert(
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")],
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
+    out: Path,
+) -> None:
+    """Convert a raw data set into 123D logs.
+
+    Args:
+        dataset: pandaset, av2 or nuscenes-keyframe; for others use py123d's own py123d-conversion.
+        source: Folder of one raw log, or of many.
+        out: 123D data root to write to.
+    """
+    from foredrive.data.convert import convert as convert_logs
+
+    for log in convert_logs(source, dataset, out):
+        print(f"wrote {log.folder}")

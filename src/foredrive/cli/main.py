@@ -1,0 +1,91 @@
+"""The program `foredrive`: its verbs, and what a user sees when one of them cannot go on."""
+
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import tyro
+
+from foredrive.cli.convert import convert
+from foredrive.cli.evaluate import evaluate
+from foredrive.cli.train import train
+from foredrive.cli.view import view
+from foredrive.errors import InputError
+
+VERBS: dict[str, Callable[..., Any]] = {
+    "convert": convert,
+    "train": train,
+    "evaluate": evaluate,
+    "view": view,
+}
+DESCRIPTION = (
+    "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly."
+)
+EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
+DISK_ERRORS = {
+    errno.ENOSPC: "no space left on the disk",
+    errno.EDQUOT: "disk quota exceeded",
+    errno.EROFS: "the disk is read-only",
+    errno.EACCES: "permission denied",
+}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one verb; returns the exit code.
+
+    Bad input and full disks are one line on stderr and 2, Ctrl-C one line and 130; on any other error the
+    traceback is shown, because it is a mistake in the program. What the command line itself gets wrong ends
+    in SystemExit(2), `--help` in SystemExit(0).
+    """
+    try:
+        tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
+    except InputError as error:
+        return _give_up(_last_words(error))
+    except BrokenPipeError:  # whoever reads our output has seen enough, such as `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_PIPE
+    except KeyboardInterrupt:
+        _give_up("interrupted")
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        reason = _disk_reason(error)
+        if reason is None:
+            raise
+        return _give_up(reason)
+    return 0
+
+
+def _give_up(reason: str) -> int:
+    print(f"foredrive: {' '.join(reason.split())}", file=sys.stderr)
+    return EXIT_INPUT
+
+
+def _last_words(error: BaseException) -> str:
+    """An error's message; of one from a worker process, which carries a traceback as text, the last line."""
+    lines = str(error).strip().splitlines()
+    if lines and lines[0].startswith("Caught "):
+        return lines[-1].partition(": ")[2]
+    return str(error)
+
+
+def _disk_reason(error: BaseException) -> str | None:
+    """What the disk refused and where; None if the disk is not to blame.
+
+    Libraries wrap the operating system's error in their own, some keep only its text.
+    """
+    for cause in _causes(error):
+        if isinstance(cause, OSError) and cause.errno in DISK_ERRORS:
+            where = cause.filename2 or cause.filename
+            return f"{where}: {DISK_ERRORS[cause.errno]}" if where else DISK_ERRORS[cause.errno]
+        if "No space left on device" in str(cause):
+            return f"{DISK_ERRORS[errno.ENOSPC]}: {_last_words(cause)}"
+    return None
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or cause.__context__

@@ -1,0 +1,29 @@
+"""`foredrive train`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath, SomePaths
+
+
+def train(
+    recipe: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECIPE")],
+    logs: SomePaths,
+    out: Path,
+    cache: OptionalPath = None,
+) -> None:
+    """Train a recipe on logs, or go on with a run that was interrupted.
+
+    Args:
+        recipe: Name of the recipe, such as nemo_tiny; an unknown name lists the known ones.
+        logs: 123D logs, splits or data roots to train on.
+        out: Folder of the run. Where it holds this run already, training goes on from the last checkpoint.
+        cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
+    """
+    from foredrive.recipes import find_all_logs, find_recipe, train_run
+
+    run = train_run(find_recipe(recipe), find_all_logs(logs), out, cache)
+    print(f"trained {run.recipe.name}: {run.weights}")
+    print(f"next: foredrive evaluate {out} --logs ...")

@@ -1,0 +1,85 @@
+"""The report of a run that was evaluated."""
+
+import datetime
+from collections.abc import Sequence
+
+from foredrive.data import LogPath
+from foredrive.evaluation import EvaluationResult
+from foredrive.recipes import Inspection, Run
+from foredrive.recipes.train import STAGES
+from foredrive.training import read_metrics
+from foredrive.view.example_panel import ExamplePanel
+from foredrive.view.report import ReportData
+from foredrive.view.summary_tables import Summary
+
+OCCUPIED_ABOVE = 0.5
+FAILURES_NAMED = 5
+
+
+def report_on_run(
+    run: Run, logs: Sequence[LogPath], result: EvaluationResult, inspections: Sequence[Inspection]
+) -> ReportData:
+    """Put together what the report of a run on some logs shows."""
+    losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
+    summary = result.summary
+    return ReportData(
+        title=f"{run.recipe.name} on {_names(logs)}",
+        command=str(summary.get("command")),
+        commit=str(summary.get("commit") or "not a git checkout"),
+        machine=machine_line(summary),
+        date=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        summary=summary,
+        losses=losses,
+        panels=[inspection_panel(inspection) for inspection in inspections],
+        notes=_notes(run, logs, result, losses),
+    )
+
+
+def inspection_panel(inspection: Inspection) -> ExamplePanel:
+    """One example as the report shows it."""
+    log, _, t_us = inspection.example.key[0].rpartition("@")
+    return ExamplePanel(
+        title=f"{log} at {int(t_us) * 1e-6:.2f} s",
+        example=inspection.example,
+        occupied=inspection.occupancy_prob > OCCUPIED_ABOVE,
+        rendered=inspection.rendered,
+        volume=inspection.volume,
+        plan=inspection.plan,
+    )
+
+
+def machine_line(summary: Summary) -> str:
+    """The machine of a summary in one line."""
+    parts = [
+        f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
+        f"{summary.get('machine.ram_gib')} GiB",
+        summary.get("machine.gpu"),
+        f"Python {summary.get('version.python')}",
+        f"torch {summary.get('version.torch')}",
+    ]
+    return ", ".join(str(part) for part in parts if part)
+
+
+def _names(logs: Sequence[LogPath]) -> str:
+    names = [log.name for log in logs]
+    return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more logs"
+
+
+def _notes(
+    run: Run,
+    logs: Sequence[LogPath],
+    result: EvaluationResult,
+    losses: dict[str, list[dict[str, float]]],
+) -> list[str]:
+    """What keeps the figures from meaning what they seem to mean."""
+    notes = []
+    seen = {log.folder for log in run.logs} & {log.folder for log in logs}
+    if seen:
+        notes.append(
+            f"{len(seen)} of the {len(logs)} evaluated logs were trained on: these figures show that "
+            "the model fits, not that it generalises."
+        )
+    if any(lines and not any(line.get("perc") for line in lines) for lines in losses.values()):
+        notes.append("The perceptual loss was off in training (no VGG-16 weights, or weight 0).")
+    notes += [f"Failed: {failure.key}: {failure.reason}" for failure in result.failures[:FAILURES_NAMED]]
+    return notes
