@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from foredrive.scene import Command, Trajectory
 
 SPEED_SCALE_MPS = 10.0
+MOVES_M = 0.1
 
 
 class FutureAttention(nn.Module):
@@ -113,8 +114,11 @@ class VolumePlanner(nn.Module):
 
 
 def _headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:
-    """Headings along a path that starts at the origin; 0 where it hardly moves."""
+    """Headings along a path from the origin; where it hardly moves, the heading it had before."""
     with torch.no_grad():
         step = torch.diff(xy, dim=2, prepend=torch.zeros_like(xy[:, :, :1]))
-        yaw = torch.atan2(step[..., 1], step[..., 0])
-        return torch.where(step.norm(dim=-1) > 0.1, yaw, torch.zeros_like(yaw))
+        along = torch.atan2(step[..., 1], step[..., 0])
+        moves = step.norm(dim=-1) > MOVES_M
+        count = torch.arange(1, xy.shape[2] + 1, device=xy.device)
+        last_move = torch.where(moves, count, 0).cummax(dim=2).values  # 0: has not moved yet
+        return torch.cat([torch.zeros_like(along[..., :1]), along], dim=2).gather(2, last_move)

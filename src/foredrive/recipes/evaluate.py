@@ -81,9 +81,9 @@ def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int =
             device=device,
             on_items=lambda items: progress.advance(task, items),
         )
-    summary = result.summary | collect_provenance() | {"recipe": run.recipe.name, "run": str(run.folder)}
-    write_summary(out / SUMMARY, summary)
-    return dataclasses.replace(result, summary=summary)
+    origin = {"recipe": run.recipe.name, "run": str(run.folder)}
+    write_summary(out / SUMMARY, result.summary | collect_provenance() | origin)
+    return result
 
 
 def _fit_baselines(run: Run) -> tuple[VoxelPrior, EgoMLP]:

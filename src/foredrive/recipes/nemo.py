@@ -14,7 +14,7 @@ def nemo_tiny() -> Recipe:
             past_frames=1,
             future_frames=2,
             image_hw=(96, 160),
-            voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.125), voxel_m=0.75, shape_zyx=(8, 64, 64)),
+            voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 48)),
         ),
         model=NemoSize(
             backbone=BackboneSize(
@@ -22,7 +22,7 @@ def nemo_tiny() -> Recipe:
                 hidden_sizes=(24, 48, 96),
                 depths=(1, 1, 1),
                 layer_type="basic",
-                stages=("stage1", "stage2", "stage3"),
+                stages=("stage2", "stage3"),
             ),
             channels=32,
             heads=4,
@@ -32,7 +32,7 @@ def nemo_tiny() -> Recipe:
             motion_hidden=16,
             ray_near_m=1.0,
             ray_far_m=34.0,
-            ray_samples=48,
+            ray_samples=32,
             recon_hidden=64,
             planner_width=128,
             planner_layers=3,

@@ -1,0 +1,25 @@
+"""The planner's geometry."""
+
+import math
+
+import torch
+
+from foredrive.models.planner import FutureAttention, _headings
+
+
+def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
+    xy = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [2.0, 2.01], [2.0, 2.0], [1.0, 2.0]])
+    yaw = _headings(xy[None, None])[0, 0]
+    torch.testing.assert_close(yaw, torch.tensor([0, 0, math.pi / 2, math.pi / 2, math.pi / 2, math.pi]))
+
+
+def test_attention_over_single_voxels_is_equation_13() -> None:
+    """With blocks of one voxel the pooled form must be softmax(QKᵀ/√d)V ⊙ V_t exactly."""
+    torch.manual_seed(0)
+    attention = FutureAttention(4, (1, 1, 1))
+    now, future = torch.randn(2, 1, 4, 2, 3, 3)
+    tokens = future.flatten(2).transpose(1, 2)[0]
+    q, k, v = attention.query(tokens), attention.key(tokens), attention.value(tokens)
+    expected = (q @ k.T / math.sqrt(4)).softmax(-1) @ v
+    expected = expected.T.view(1, 4, 2, 3, 3) * now
+    torch.testing.assert_close(attention(now, future), expected)
