@@ -4,10 +4,14 @@ import numpy as np
 from jaxtyping import Float64
 
 EXPONENT = 4.0
+SLOWING_TIME_S = 0.5
 HARDEST_BRAKING_MPS2 = 8.0
 JERK_UP_MPS3 = 3.0
 JERK_DOWN_MPS3 = 5.0
 JERK_EMERGENCY_MPS3 = 40.0
+SOFT_STOP_S = 0.35
+CRAWL_MPS = 0.02
+"""Braking fades with the speed in `SOFT_STOP_S`; what is slower than this stands."""
 EMERGENCY_MPS2 = 3.5
 """A wish to brake harder than this is followed at once, without regard to comfort."""
 
@@ -18,15 +22,15 @@ def free_acceleration(
     accel_mps2: Float64[np.ndarray, "*n"],
     decel_mps2: Float64[np.ndarray, "*n"],
 ) -> Float64[np.ndarray, "*n"]:
-    """Acceleration on an open road, m/s² (Treiber & Kesting, Traffic Flow Dynamics, 2013, eq. 11.23).
+    """Acceleration on an open road, m/s².
 
-    Below the wanted speed that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4); above it, braking
-    that tends to the comfortable deceleration instead of growing without bound.
+    Up to the wanted speed that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4). Above it, where their
+    model brakes without bound, the excess is taken off within `SLOWING_TIME_S`, no harder than twice the
+    comfortable deceleration: the wanted speed falls before curves and has to be kept up with.
     """
     wanted = np.maximum(wanted_mps, 0.1)
     below = accel_mps2 * (1 - (np.minimum(speed_mps, wanted) / wanted) ** EXPONENT)
-    ratio = wanted / np.maximum(speed_mps, wanted)
-    above = -decel_mps2 * (1 - ratio ** (accel_mps2 * EXPONENT / decel_mps2))
+    above = -np.minimum((speed_mps - wanted) / SLOWING_TIME_S, 2 * decel_mps2)
     return np.where(speed_mps <= wanted, below, above)
 
 

@@ -113,10 +113,10 @@ def find_starts(graph: LaneGraph) -> Starts:
         s = np.arange(CLEAR_OF_END_M, graph.length_m[lane] - CLEAR_OF_END_M, START_SPACING_M)
         lanes.append(np.full(len(s), lane))
         along.append(s)
-    lane, s_m = np.concatenate(lanes), np.concatenate(along)
-    xyz = graph.position(lane, s_m)
-    ahead = graph.position(lane, s_m + 1.0) - xyz
-    return Starts(lane, s_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+    at_lane, at_m = np.concatenate(lanes), np.concatenate(along)
+    xyz = graph.position(at_lane, at_m)
+    ahead = graph.position(at_lane, at_m + 1.0) - xyz
+    return Starts(at_lane, at_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
 
 
 def place(

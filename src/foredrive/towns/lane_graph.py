@@ -19,7 +19,7 @@ CITY_SPEED_MPS = 13.9
 """The towns' files give most city streets the 55 mph of their OpenDRIVE road type; traffic there keeps to
 50 km/h. Lanes whose limit is above `MOTORWAY_LIMIT_MPS` are driven as posted."""
 MOTORWAY_LIMIT_MPS = 26.0
-LATERAL_MPS2 = 2.5
+LATERAL_MPS2 = 2.0
 """Comfortable lateral acceleration in curves."""
 SLOWING_MPS2 = 1.5
 """Comfortable deceleration towards a curve or a lower limit."""
@@ -174,7 +174,8 @@ def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
         return following if following.predecessor_ids == (lane.lane_id,) else None
 
     absorbed = {following.lane_id for lane in lanes if (following := continued_by(lane))}
-    whole, index = [], {}
+    whole: list[Lane] = []
+    index: dict[str, int] = {}
     for lane in lanes:
         if lane.lane_id in absorbed:
             continue

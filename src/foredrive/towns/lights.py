@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.lane_graph import Control, LaneGraph
 
-GREEN_S = 10.0
+GREEN_S = 8.0
 YELLOW_S = 3.0
-ALL_RED_S = 1.5
+ALL_RED_S = 1.0
 PHASE_S = GREEN_S + YELLOW_S + ALL_RED_S
 SAME_AXIS_COS = 0.7
 """Approaches within 45 degrees of one axis, from either end, have green together."""

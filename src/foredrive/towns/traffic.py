@@ -9,11 +9,13 @@ from jaxtyping import Float64, Int
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.car_following import (
+    CRAWL_MPS,
     EMERGENCY_MPS2,
     HARDEST_BRAKING_MPS2,
     JERK_DOWN_MPS3,
     JERK_EMERGENCY_MPS3,
     JERK_UP_MPS3,
+    SOFT_STOP_S,
     follow_acceleration,
     free_acceleration,
 )
@@ -69,6 +71,8 @@ class TrafficState:
     """Lanes that vehicle 0 follows; empty if it wanders like the others."""
     route_known: int
     """How many lanes of the route are in the path of vehicle 0 by now."""
+    route_passed: int
+    """How many it has left behind."""
 
 
 class Traffic:
@@ -113,6 +117,7 @@ class Traffic:
             next_track_id=1,
             route=lanes,
             route_known=1,
+            route_passed=0,
         )
         if ego is not None:
             vehicles = state.vehicles.replace_rows(np.array([0]), ego)
@@ -245,7 +250,9 @@ class Traffic:
                 granted=np.where(over, np.maximum(v.granted - 1, 0), v.granted),
                 has_stopped=v.has_stopped & ~over,
             )
-            state = self._know_path(dataclasses.replace(state, vehicles=moved), rng)
+            passed = state.route_passed + bool(over[0])
+            state = dataclasses.replace(state, vehicles=moved, route_passed=passed)
+            state = self._know_path(state, rng)
 
     def _turn_over(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Let what is far from vehicle 0 go, and let others appear out of its sight."""
@@ -324,9 +331,11 @@ class Traffic:
 def _drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> Vehicles:
     """Change speed as wanted, within comfortable jerk unless it is an emergency; ballistic update."""
     wanted = np.clip(wanted_mps2, -HARDEST_BRAKING_MPS2, v.accel_mps2)
+    gentle = np.maximum(wanted, -v.speed_mps / SOFT_STOP_S)  # no jolt at the end
+    wanted = np.where(wanted < -EMERGENCY_MPS2, wanted, gentle)
     down = np.where(wanted < -EMERGENCY_MPS2, JERK_EMERGENCY_MPS3, JERK_DOWN_MPS3)
     a = np.clip(wanted, v.acceleration_mps2 - down * dt_s, v.acceleration_mps2 + JERK_UP_MPS3 * dt_s)
-    stops = v.speed_mps + a * dt_s <= 0
+    stops = (v.speed_mps + a * dt_s <= CRAWL_MPS) & (a <= 0)
     braking = np.minimum(a, -1e-9)
     distance = np.where(stops, -0.5 * v.speed_mps**2 / braking, (v.speed_mps + 0.5 * a * dt_s) * dt_s)
     speed = np.where(stops, 0.0, v.speed_mps + a * dt_s)

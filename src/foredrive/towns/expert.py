@@ -1,0 +1,130 @@
+"""The privileged driver: it follows a route as vehicle 0 of the traffic, and everybody reacts to it.
+
+It plans its speed as all drivers do, from the exact state of the others, the lights and the curves ahead
+(car_following, right_of_way), and steers so that the rear axle stays on the lane's centreline.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.data.log_writer import EGO_VEHICLE
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+from foredrive.towns.fleet import find_starts, place
+from foredrive.towns.routes import Route, draw_route
+from foredrive.towns.traffic import Traffic, TrafficState
+from foredrive.towns.vehicles import Vehicles, empty_slots, vehicle_poses
+
+LONGEST_STEP_S = 0.1
+SETTLE_S = 6.0
+LONGEST_SETTLE_S = 30.0
+MOVING_MPS = 3.0
+"""A drive begins once traffic has left its first, unlikely state and the ego vehicle moves."""
+AVERAGE_MPS = 7.0
+BEYOND_M = 60.0
+TURN_RATE_STEP_S = 0.05
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The world at one time of a drive."""
+
+    t_s: float
+    T_world_ego: Float64[np.ndarray, "4 4"]
+    velocity_ego_mps: Float64[np.ndarray, "3"]
+    acceleration_ego_mps2: Float64[np.ndarray, "3"]
+    """Along the road by the engine and the brakes, to the side by the curve; gravity is not in it."""
+    actors: list[ActorState]
+    """All road users but the ego vehicle."""
+
+
+class Drive:
+    """One drive of the expert in one town: a route and the moments along it.
+
+    Args:
+        traffic: the town's traffic; its seed decides the route, too.
+        seconds: how long the drive will be, so that the route is long enough and turns within it.
+    """
+
+    def __init__(self, traffic: Traffic, seconds: float) -> None:
+        rng = np.random.default_rng((traffic.seed, 3))
+        lanes = traffic.lanes
+        fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
+        driven_m = AVERAGE_MPS * (seconds + SETTLE_S)
+        self._traffic = traffic
+        self._planned = draw_route(lanes, find_starts(lanes), rng, fastest_m, driven_m)
+        self._state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
+        while not self._is_settled():
+            self._state = traffic.step(self._state, LONGEST_STEP_S)
+        self.route = self._remaining()
+
+    def moments(self, count: int, dt_s: float) -> Iterator[Moment]:
+        """`count` moments of the drive, `dt_s` apart."""
+        steps = max(1, int(np.ceil(dt_s / LONGEST_STEP_S - 1e-9)))
+        for index in range(count):
+            if index:
+                for _ in range(steps):
+                    self._state = self._traffic.step(self._state, dt_s / steps)
+            yield self._moment(index * dt_s)
+
+    def _is_settled(self) -> bool:
+        moving = self._state.vehicles.speed_mps[0] > MOVING_MPS
+        return self._state.time_s > (SETTLE_S if moving else LONGEST_SETTLE_S)
+
+    def _remaining(self) -> Route:
+        """The route from where the ego vehicle is now."""
+        axle_m = float(self._state.vehicles.s_m[0] - self._state.vehicles.axle_to_centre_m[0])
+        return Route(self._planned.lanes[self._state.route_passed :], max(0.0, axle_m))
+
+    def _moment(self, t_s: float) -> Moment:
+        ego = _only_ego(self._state)
+        T_world_ego = _axle_pose(self._traffic, ego)
+        speed = float(ego.speed_mps[0])
+        soon = dataclasses.replace(ego, s_m=ego.s_m + speed * TURN_RATE_STEP_S)
+        turned = np.linalg.inv(T_world_ego) @ _axle_pose(self._traffic, soon)
+        turn_rate = float(np.arctan2(turned[1, 0], turned[0, 0])) / TURN_RATE_STEP_S
+        return Moment(
+            t_s=t_s,
+            T_world_ego=T_world_ego,
+            velocity_ego_mps=np.array([speed, 0.0, 0.0]),
+            acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), speed * turn_rate, 0.0]),
+            actors=self._traffic.actors(self._state),
+        )
+
+
+def _ego_vehicle(traffic: Traffic, route: Route) -> Vehicles:
+    """The recording vehicle with a calm driver, at the start of its route."""
+    one = {name: value[:1] for name, value in vars(empty_slots(1)).items()}
+    driver = dataclasses.replace(
+        Vehicles(**one),
+        active=np.array([True]),
+        category=np.array([int(Category.CAR)]),
+        size_lwh=np.array([[EGO_VEHICLE.length, EGO_VEHICLE.width, EGO_VEHICLE.height]]),
+        wheelbase_m=np.array([EGO_VEHICLE.wheel_base]),
+        axle_to_centre_m=np.array([EGO_VEHICLE.rear_axle_to_center_longitudinal]),
+        top_speed_mps=np.array([30.0]),
+        haste=np.array([0.97]),
+        time_gap_s=np.array([1.4]),
+        accel_mps2=np.array([1.5]),
+        decel_mps2=np.array([1.8]),
+    )
+    return place(traffic.lanes, driver, route.lanes[:1], np.array([route.start_m]))
+
+
+def _only_ego(state: TrafficState) -> Vehicles:
+    return Vehicles(**{name: value[:1] for name, value in vars(state.vehicles).items()})
+
+
+def _axle_pose(traffic: Traffic, ego: Vehicles) -> Float64[np.ndarray, "4 4"]:
+    """The ego frame: on the road below the rear axle, x forward along the slope."""
+    poses = vehicle_poses(traffic.lanes, ego)
+    forward = poses.forward[0]
+    left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
+    T[:3, 3] = poses.axle_xyz[0]
+    return T
