@@ -7,6 +7,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+WHILE_WRITING = "while writing "
+"""Starts the note that `atomic_path` adds to an error; the final path follows."""
+
 
 @contextlib.contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
@@ -25,5 +28,8 @@ def atomic_path(final: Path) -> Iterator[Path]:
         if temporary.is_dir() and final.is_dir():
             final.rename(scratch / "replaced")
         os.replace(temporary, final)
+    except Exception as error:  # a full disk is reported by what was to be written, not by a scratch name
+        error.add_note(f"{WHILE_WRITING}{final}")
+        raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

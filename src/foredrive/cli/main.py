@@ -13,6 +13,7 @@ from foredrive.cli.evaluate import evaluate
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
+from foredrive.files import WHILE_WRITING
 
 VERBS: dict[str, Callable[..., Any]] = {
     "convert": convert,
@@ -23,6 +24,7 @@ VERBS: dict[str, Callable[..., Any]] = {
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly."
 )
+DISK_FULL_TEXT = "No space left on device"
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
 DISK_ERRORS = {
     errno.ENOSPC: "no space left on the disk",
@@ -77,11 +79,20 @@ def _disk_reason(error: BaseException) -> str | None:
     """
     for cause in _causes(error):
         if isinstance(cause, OSError) and cause.errno in DISK_ERRORS:
-            where = cause.filename2 or cause.filename
-            return f"{where}: {DISK_ERRORS[cause.errno]}" if where else DISK_ERRORS[cause.errno]
-        if "No space left on device" in str(cause):
-            return f"{DISK_ERRORS[errno.ENOSPC]}: {_last_words(cause)}"
+            reason, where = DISK_ERRORS[cause.errno], _written(error) or cause.filename2 or cause.filename
+        elif DISK_FULL_TEXT in str(cause):
+            reason, where = DISK_ERRORS[errno.ENOSPC], _written(error)
+        else:
+            continue
+        return f"{where}: {reason}" if where else reason
     return None
+
+
+def _written(error: BaseException) -> str | None:
+    """The final path of what was being written, which `atomic_path` notes."""
+    notes = [note for cause in _causes(error) for note in getattr(cause, "__notes__", ())]
+    paths = [note.removeprefix(WHILE_WRITING) for note in notes if note.startswith(WHILE_WRITING)]
+    return paths[0] if paths else None
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:

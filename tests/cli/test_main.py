@@ -1,0 +1,214 @@
+"""What a user sees when a verb cannot go on: one line and an exit code."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from torch._utils import ExceptionWrapper
+
+from foredrive.cli import main as program
+from foredrive.cli.main import main
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+FULL = Path("/dev/full")  # every write to it fails with ENOSPC
+needs_full_device = pytest.mark.skipif(not FULL.is_char_device(), reason="this system has no /dev/full")
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], None]], tuple[int, str]]:
+    """Run a function as the only verb; exit code and what stood on stderr."""
+
+    def run_verb(verb: Callable[[], None]) -> tuple[int, str]:
+        monkeypatch.setattr(program, "VERBS", {"try": verb, "other": lambda: None})
+        code = main(["try"])
+        return code, capsys.readouterr().err
+
+    return run_verb
+
+
+def test_a_verb_that_ends_well_is_silent(run: Callable) -> None:
+    assert run(lambda: None) == (0, "")
+
+
+def test_bad_input_is_one_line_and_2(run: Callable) -> None:
+    def verb() -> None:
+        raise InputError("runs/a: not a run folder\n  (no config.yaml)")
+
+    assert run(verb) == (2, "foredrive: runs/a: not a run folder (no config.yaml)\n")
+
+
+def test_bad_input_met_by_a_worker_process_is_the_same_line(run: Callable) -> None:
+    def verb() -> None:
+        try:
+            raise InputError("log/camera.arrow: cannot read frame 3")
+        except InputError:  # how torch's DataLoader carries an error over from a worker
+            ExceptionWrapper(where="in DataLoader worker process 0").reraise()
+
+    assert run(verb) == (2, "foredrive: log/camera.arrow: cannot read frame 3\n")
+
+
+def test_an_interrupt_is_one_line_and_130(run: Callable) -> None:
+    def verb() -> None:
+        raise KeyboardInterrupt
+
+    assert run(verb) == (130, "foredrive: interrupted\n")
+
+
+@needs_full_device
+def test_a_full_disk_is_one_line_that_names_the_file(run: Callable, tmp_path: Path) -> None:
+    def verb() -> None:
+        with atomic_path(tmp_path / "summary.json") as scratch:
+            scratch.symlink_to(FULL)
+            scratch.write_text("{}")
+
+    code, err = run(verb)
+    assert code == 2
+    assert err == f"foredrive: {tmp_path / 'summary.json'}: no space left on the disk\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_full_device
+def test_a_full_disk_behind_another_error_is_found(run: Callable, tmp_path: Path) -> None:
+    def verb() -> None:
+        with atomic_path(tmp_path / "grid.npy") as scratch:
+            try:
+                with FULL.open("wb") as file:
+                    np.save(file, np.zeros(100_000))
+            except OSError as error:
+                raise RuntimeError(f"could not save {scratch}") from error
+
+    assert run(verb) == (2, f"foredrive: {tmp_path / 'grid.npy'}: no space left on the disk\n")
+
+
+def test_a_library_that_keeps_only_the_text_is_understood(run: Callable, tmp_path: Path) -> None:
+    def verb() -> None:
+        with atomic_path(tmp_path / "model.safetensors"):
+            raise RuntimeError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    assert run(verb) == (2, f"foredrive: {tmp_path / 'model.safetensors'}: no space left on the disk\n")
+
+
+def test_a_folder_that_must_not_be_written_to_is_one_line(run: Callable, tmp_path: Path) -> None:
+    def verb() -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path / "out"))
+
+    assert run(verb) == (2, f"foredrive: {tmp_path / 'out'}: permission denied\n")
+
+
+def test_mistakes_in_the_program_keep_their_traceback(run: Callable) -> None:
+    def verb() -> None:
+        raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        run(verb)
+
+
+def test_a_missing_file_is_a_mistake_unless_a_verb_says_otherwise(run: Callable) -> None:
+    with pytest.raises(FileNotFoundError):
+        run(lambda: Path("/nowhere/at/all").read_text())
+
+
+@pytest.mark.parametrize("args", [["vew"], ["view"], ["train", "nemo_tiny"], []])
+def test_what_the_command_line_gets_wrong_ends_in_2(
+    args: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(args)
+    assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_an_unknown_verb_is_told_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["vew"])
+    assert "view" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", list(program.VERBS))
+def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    function = program.VERBS[verb]
+    assert (function.__doc__ or "").split("\n")[0] in " ".join(said.split())
+    for name in function.__annotations__:
+        if name != "return":
+            sentence = function.__doc__.partition(f"        {name}: ")[2].split()[:3]
+            assert len(sentence) == 3, f"{verb}: no sentence about {name}"
+            assert " ".join(sentence) in " ".join(said.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["view", "{tmp}/none", "--save", "{tmp}/x.png"], "{tmp}/none: no such folder"),
+        (["view", "{tmp}", "--save", "{tmp}/x.png"], "{tmp}: no 123D log here"),
+        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, nemo_base"),
+        (["train", "nemo_tiny", "--logs", "{tmp}/none", "--out", "{tmp}/run"], "{tmp}/none: no such folder"),
+        (["evaluate", "{tmp}"], "{tmp}: not a run folder"),
+        (["convert", "pandaset", "{tmp}/none", "--out", "{tmp}/out"], "{tmp}/none: no such folder"),
+        (["convert", "kitti", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
+    ],
+)
+def test_each_verb_names_what_it_cannot_use(
+    args: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([a.format(tmp=tmp_path) for a in args]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("foredrive: ")
+    assert err.count("\n") == 1
+    assert said.format(tmp=tmp_path) in err
+    assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """Help must come at once, so it may not wait for torch."""
+    code = (
+        "import sys\n"
+        "from foredrive.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print({'torch', 'py123d', 'matplotlib', 'numba'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("set()\n")
+
+
+def test_it_runs_as_a_module_and_passes_its_exit_code_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "foredrive", "view", str(tmp_path), "--save", str(tmp_path / "x.png")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"foredrive: {tmp_path}: no 123D log here (a log is a folder with a sync.arrow)\n"
+
+
+def test_a_real_interrupt_reaches_the_verb() -> None:
+    """Ctrl-C, as the terminal sends it, to a process in the middle of a verb."""
+    code = (
+        "import sys, time\n"
+        "from foredrive.cli import main as program\n"
+        "def wait():\n    print('waiting', flush=True)\n    time.sleep(60)\n"
+        "program.VERBS = {'wait': wait, 'other': wait}\n"
+        "sys.exit(program.main(['wait']))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=-1, stderr=-1, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "waiting\n"
+    time.sleep(0.05)
+    process.send_signal(2)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err == "foredrive: interrupted\n"
+
+
+def test_a_reader_that_leaves_early_is_no_error() -> None:
+    command = f"{sys.executable} -m foredrive view --help | head -1"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: foredrive view")
+    assert done.stderr == ""
