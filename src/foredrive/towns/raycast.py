@@ -65,7 +65,7 @@ def place(scenes: tuple[TriangleScene, ...], T_world_unit: Float[np.ndarray, "A 
 def cast(static: TriangleScene, placed: PlacedShapes, origin: Rays, direction: Rays) -> Hits:
     """Nearest hits of unit rays with the static world and the actors."""
     hits = static.cast(origin, direction)
-    passing = _passing(placed.T_world_unit, placed.radius_m, origin, direction, hits.t)
+    passing = _passing(placed, origin, direction, hits.t)
     for a, scene in enumerate(placed.scenes):
         rays = np.flatnonzero(passing[a])
         if len(rays) == 0:
@@ -84,7 +84,7 @@ def occluded(
     """Whether unit rays hit the static world or an actor."""
     blocked = static.occluded(origin, direction)
     far = np.where(blocked, 0.0, np.inf).astype(np.float32)
-    passing = _passing(placed.T_world_unit, placed.radius_m, origin, direction, far)
+    passing = _passing(placed, origin, direction, far)
     for a, scene in enumerate(placed.scenes):
         rays = np.flatnonzero(passing[a])
         if len(rays):
@@ -98,17 +98,25 @@ def _to_unit(T: Float32[np.ndarray, "3 4"], origin: Rays, direction: Rays) -> tu
     return origin @ rotation + T[:, 3], direction @ rotation
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def _passing(T_world_unit, radius_m, origin, direction, far):
-    """Which rays pass the sphere of each actor [A N] before they end."""
-    actors, rays = len(radius_m), len(origin)
-    out = np.empty((actors, rays), np.bool_)
-    for a in range(actors):
-        x, y, z, r = T_world_unit[a, 0, 3], T_world_unit[a, 1, 3], T_world_unit[a, 2, 3], radius_m[a]
-        for i in range(rays):
-            ox, oy, oz = x - origin[i, 0], y - origin[i, 1], z - origin[i, 2]
-            along = ox * direction[i, 0] + oy * direction[i, 1] + oz * direction[i, 2]
-            aside = ox * ox + oy * oy + oz * oz - along * along
-            out[a, i] = (aside < r * r) & (along > -r) & (along - r < far[i])
+def _passing(
+    placed: PlacedShapes, origin: Rays, direction: Rays, far: Float32[np.ndarray, "N"]
+) -> Bool[np.ndarray, "A N"]:
+    """Which rays pass the bounding sphere of each actor before they end."""
+    out = np.empty((len(placed.scenes), len(origin)), np.bool_)
+    rows = np.ascontiguousarray(np.concatenate([origin, direction], axis=1).T)  # rays side by side, for SIMD
+    _pass_spheres(placed.T_world_unit, placed.radius_m, rows, far, out)
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@no_type_check
+def _pass_spheres(T_world_unit, radius_m, rows, far, out):
+    ox, oy, oz, dx, dy, dz = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    for a in range(len(radius_m)):
+        x, y, z, r = T_world_unit[a, 0, 3], T_world_unit[a, 1, 3], T_world_unit[a, 2, 3], radius_m[a]
+        passes = out[a]
+        for i in range(len(far)):
+            cx, cy, cz = x - ox[i], y - oy[i], z - oz[i]
+            along = cx * dx[i] + cy * dy[i] + cz * dz[i]
+            aside = cx * cx + cy * cy + cz * cz - along * along
+            passes[i] = (aside < r * r) & (along > -r) & (along - r < far[i])

@@ -55,13 +55,13 @@ class Moment:
         """Nearest hits."""
         return raycast.cast(self.static, self.placed, origin, direction)
 
-    def sunlit(self, hits: shading.Hits, origin: Rays, direction: Rays) -> Bool[np.ndarray, "N"]:
+    def sunlit(self, found: shading.Surfaces, hits: shading.Hits) -> Bool[np.ndarray, "N"]:
         """Which hits the sun shines on."""
-        start = np.empty_like(origin)
-        lit = shading.sun_rays(self.scene, hits, origin, direction, self.light, start)
-        facing = np.flatnonzero(lit)
+        start = np.empty_like(found.xyz)
+        facing = shading.sun_rays(found, hits.t, self.light.sun, start)
         to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
-        lit[facing] = ~raycast.occluded(self.static, self.placed, start[facing], to_sun)
+        lit = np.zeros(len(hits.t), dtype=np.bool_)
+        lit[facing] = ~raycast.occluded(self.static, self.placed, start[: len(facing)], to_sun)
         return lit
 
 
@@ -86,10 +86,10 @@ def see(
         part = slice(start * samples, stop * samples)
         origin, direction = _to_world(T_world_ego, rays_ego[0][part], rays_ego[1][part])
         hits = moment.cast(origin, direction)
-        lit = moment.sunlit(hits, origin, direction)
-        rgb[start:stop] = shading.shade_pixels(
-            moment.scene, hits, origin, direction, sensors.ray_rad[part], lit, moment.light, samples
-        )
+        found = shading.surfaces(moment.scene, hits, origin, direction, sensors.ray_rad[part])
+        lit = moment.sunlit(found, hits)
+        radiance = shading.shade(moment.scene.looks, found, hits.t, direction, lit, moment.light)
+        rgb[start:stop] = shading.develop(radiance, moment.light.exposure, samples)
         seen.triangle[start:stop], seen.actor[start:stop] = hits.triangle[::samples], hits.actor[::samples]
 
     in_parallel(job, count, PIXEL_GRAIN)
@@ -115,14 +115,15 @@ def sweep(
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
     seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
-    beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps)
+    beam_rad = np.full(count, 2 * np.pi / lidar.azimuth_steps, dtype=np.float32)
 
     def job(start: int, stop: int) -> None:
         part = slice(start, stop)
         origin, direction = _to_world(T_world_ego, origin_ego[part], dir_ego[part])
         hits = moment.cast(origin, direction)
+        found = shading.surfaces(moment.scene, hits, origin, direction, beam_rad[part])
         range_m[part], returned[part], intensity[part] = shading.lidar_returns(
-            moment.scene, hits, origin, direction, beam_rad, np.float32(lidar.max_range_m), chance[part]
+            moment.scene.looks, found, hits.t, np.float32(lidar.max_range_m), chance[part]
         )
         seen.triangle[part], seen.actor[part] = hits.triangle, hits.actor
 

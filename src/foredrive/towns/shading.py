@@ -20,6 +20,8 @@ LIDAR_THRESHOLD = 0.02
 FOLIAGE_DEPTH_M = 0.25
 
 _FOLIAGE, _GLOW = int(Texture.FOLIAGE), int(Texture.GLOW)
+_ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
+"""8-bit values of display brightness by its 12-bit linear value."""
 
 
 class Soup(NamedTuple):
@@ -63,83 +65,128 @@ class Scene(NamedTuple):
     looks: LookArrays
 
 
-class _Work(NamedTuple):
-    """Room for what is known of one hit."""
+class Surfaces(NamedTuple):
+    """What N rays found where they ended; meaningless for a ray that missed."""
 
-    corners: Float32[np.ndarray, "3 3"]
-    uvw: Float32[np.ndarray, "3 3"]
-    normal: Float32[np.ndarray, "3"]
-    xyz: Float32[np.ndarray, "3"]
-    at: Float32[np.ndarray, "3"]
-    duvw: Float32[np.ndarray, "3"]
-    colour: Float32[np.ndarray, "5"]
-    mirror: Float32[np.ndarray, "5"]
+    look: Int32[np.ndarray, "N"]
+    """MISS for a ray that missed."""
+    xyz: Float32[np.ndarray, "N 3"]
+    normal: Float32[np.ndarray, "N 3"]
+    """Unit, against the ray."""
+    cosine: Float32[np.ndarray, "N"]
+    """Of the angle at which the surface is met."""
+    uvw: Float32[np.ndarray, "N 3"]
+    """Texture coordinates."""
+    extent: Float32[np.ndarray, "N 4"]
+    """Of the ray's footprint: in the three texture coordinates, and on the surface, m."""
 
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 
+def surfaces(
+    scene: Scene,
+    hits: Hits,
+    origin: Float32[np.ndarray, "N 3"],
+    direction: Float32[np.ndarray, "N 3"],
+    ray_rad: Float32[np.ndarray, "N"],
+) -> Surfaces:
+    """Look up what rays met. `ray_rad` is the angle between a ray and its neighbours."""
+    count = len(hits.t)
+    out = Surfaces(
+        np.full(count, MISS, np.int32),
+        np.empty((count, 3), np.float32),
+        np.empty((count, 3), np.float32),
+        np.empty(count, np.float32),
+        np.empty((count, 3), np.float32),
+        np.empty((count, 4), np.float32),
+    )
+    _find_surfaces(scene.static, scene.shapes, scene.actors, hits, origin, direction, ray_rad, out)
+    return out
+
+
 @_kernel
 @no_type_check
-def _look_up(scene, hits, i, corners, uvw):
-    """Fill the corners (world, 3×3) and texture coordinates (3×3) of a hit triangle; return its look."""
-    actor, triangle = hits.actor[i], hits.triangle[i]
-    if actor < 0:
+def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out):
+    corner = np.empty((3, 3), np.float32)
+    coordinate = np.empty((3, 3), np.float32)
+    for i in range(len(hits.t)):
+        triangle, actor = hits.triangle[i], hits.actor[i]
+        if triangle == MISS:
+            continue
+        if actor < 0:
+            look = static.look[triangle]
+            for k in range(3):
+                for a in range(3):
+                    corner[k, a] = static.xyz[triangle, k, a]
+                    coordinate[k, a] = static.uvw[triangle, k, a]
+        else:
+            row = actors.first[actor] + triangle
+            look = shapes.look[row]
+            if look < 0:
+                look = actors.paint[actor, -1 - look]
+            for k in range(3):
+                x, y, z = shapes.xyz[row, k, 0], shapes.xyz[row, k, 1], shapes.xyz[row, k, 2]
+                for a in range(3):
+                    corner[k, a] = (
+                        actors.T_world_unit[actor, a, 0] * x
+                        + actors.T_world_unit[actor, a, 1] * y
+                        + actors.T_world_unit[actor, a, 2] * z
+                        + actors.T_world_unit[actor, a, 3]
+                    )
+                    coordinate[k, a] = shapes.uvw[row, k, a]
+        out.look[i] = look
+        t, u, v = hits.t[i], hits.u[i], hits.v[i]
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        px, py, pz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+        qx, qy, qz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        scale = 1.0 / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-20)
+        cosine = (nx * dx + ny * dy + nz * dz) * scale
+        if cosine > 0.0:
+            scale = -scale
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        cosine = max(abs(cosine), 1e-3)
+        out.normal[i, 0], out.normal[i, 1], out.normal[i, 2] = nx, ny, nz
+        out.cosine[i] = cosine
+        out.xyz[i, 0] = origin[i, 0] + t * dx
+        out.xyz[i, 1] = origin[i, 1] + t * dy
+        out.xyz[i, 2] = origin[i, 2] + t * dz
+        # With g the gradient of a coordinate within the triangle's plane, a ray that moves sideways by δ ⟂ d
+        # shifts the hit by δ - d (n·δ)/(n·d), hence the coordinate by h·δ, h = g - n (g·d)/(n·d).
+        pp, pq, qq = px * px + py * py + pz * pz, px * qx + py * qy + pz * qz, qx * qx + qy * qy + qz * qz
+        inverse = 1.0 / max(pp * qq - pq * pq, 1e-20)
+        pd, qd = px * dx + py * dy + pz * dz, qx * dx + qy * dy + qz * dz
+        width = t * ray_rad[i]
         for k in range(3):
-            for a in range(3):
-                corners[k, a] = scene.static.xyz[triangle, k, a]
-                uvw[k, a] = scene.static.uvw[triangle, k, a]
-        return scene.static.look[triangle]
-    row = scene.actors.first[actor] + triangle
-    T = scene.actors.T_world_unit[actor]
-    for k in range(3):
-        p = scene.shapes.xyz[row, k]
-        for a in range(3):
-            corners[k, a] = T[a, 0] * p[0] + T[a, 1] * p[1] + T[a, 2] * p[2] + T[a, 3]
-            uvw[k, a] = scene.shapes.uvw[row, k, a]
-    look = scene.shapes.look[row]
-    return look if look >= 0 else scene.actors.paint[actor, -1 - look]
+            base = coordinate[0, k]
+            dp, dq = coordinate[1, k] - base, coordinate[2, k] - base
+            out.uvw[i, k] = base + u * dp + v * dq
+            r, s = (qq * dp - pq * dq) * inverse, (pp * dq - pq * dp) * inverse
+            tilt = (r * pd + s * qd) / cosine
+            hx, hy, hz = r * px + s * qx + nx * tilt, r * py + s * qy + ny * tilt, r * pz + s * qz + nz * tilt
+            out.extent[i, k] = width * math.sqrt(hx * hx + hy * hy + hz * hz)
+        out.extent[i, 3] = width / math.sqrt(cosine)
 
 
 @_kernel
 @no_type_check
-def _normal(corners, dx, dy, dz, normal):
-    """Unit normal of a triangle, turned against the ray; return the ray's cosine with it."""
-    ax, ay, az = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1], corners[1, 2] - corners[0, 2]
-    bx, by, bz = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1], corners[2, 2] - corners[0, 2]
-    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    scale = 1.0 / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-20)
-    cosine = (nx * dx + ny * dy + nz * dz) * scale
-    if cosine > 0.0:
-        scale = -scale
-    normal[0], normal[1], normal[2] = nx * scale, ny * scale, nz * scale
-    return max(abs(cosine), 1e-3)
-
-
-@_kernel
-@no_type_check
-def _footprint(corners, uvw, normal, direction, cosine, width, duvw):
-    """Extent of a pixel's footprint in the texture coordinates.
-
-    With g the gradient of a coordinate within the triangle's plane, a ray that moves sideways by δ ⟂ d shifts
-    the hit by δ - d (n·δ)/(n·d), hence the coordinate by h·δ, h = g - n (g·d)/(n·d).
-    """
-    e1, e2 = corners[1] - corners[0], corners[2] - corners[0]
-    a = e1[0] * e1[0] + e1[1] * e1[1] + e1[2] * e1[2]
-    b = e1[0] * e2[0] + e1[1] * e2[1] + e1[2] * e2[2]
-    c = e2[0] * e2[0] + e2[1] * e2[1] + e2[2] * e2[2]
-    inverse = 1.0 / max(a * c - b * b, 1e-20)
-    for k in range(3):
-        d1, d2 = uvw[1, k] - uvw[0, k], uvw[2, k] - uvw[0, k]
-        s, r = (c * d1 - b * d2) * inverse, (a * d2 - b * d1) * inverse
-        along = 0.0
-        for x in range(3):
-            along += (s * e1[x] + r * e2[x]) * direction[x]
-        total = 0.0
-        for x in range(3):
-            h = s * e1[x] + r * e2[x] + normal[x] * along / cosine
-            total += h * h
-        duvw[k] = width * math.sqrt(total)
+def sun_rays(found, t, sun, out_origin):
+    """Indices of the hits that face the sun; out_origin is filled with where rays towards it start."""
+    index = np.empty(len(t), np.int64)
+    count = 0
+    for i in range(len(t)):
+        if found.look[i] == MISS:
+            continue
+        nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
+        if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
+            offset = SHADOW_OFFSET_M + 2e-5 * t[i]
+            out_origin[count, 0] = found.xyz[i, 0] + offset * nx
+            out_origin[count, 1] = found.xyz[i, 1] + offset * ny
+            out_origin[count, 2] = found.xyz[i, 2] + offset * nz
+            index[count] = i
+            count += 1
+    return index[:count]
 
 
 @_kernel
@@ -150,15 +197,12 @@ def _sky(light, dx, dy, dz, out):
     blend = 1.0 - (1.0 - up) ** 5
     glow = max(dx * light.sun[0] + dy * light.sun[1] + dz * light.sun[2], 0.0)
     halo = 0.25 * glow**6 + 0.6 * glow**64
-    disc = 8.0 if glow > 0.9995 else 0.0
+    disc = 8.0 if glow > 0.9999 else 0.0
     cloud = 0.0
-    if dz > 0.02 and light.clouds > 0.0:
+    if dz > 0.02:
         x, y = dx / (dz + 0.12) * 1.3, dy / (dz + 0.12) * 1.3
-        n = (
-            noise(x, y, 0.0, 81)
-            + 0.5 * noise(2.1 * x, 2.1 * y, 0.0, 82)
-            + 0.25 * noise(4.3 * x, 4.3 * y, 0.0, 83)
-        )
+        n = noise(x, y, 0.0, 81)
+        n += 0.5 * noise(2.1 * x, 2.1 * y, 0.0, 82) + 0.25 * noise(4.3 * x, 4.3 * y, 0.0, 83)
         cloud = min(max(1.1 * n + 1.6 * light.clouds - 0.8, 0.0), 1.0) * min(1.0, 6.0 * dz)
     for c in range(3):
         clear = light.horizon[c] * (1.0 - blend) + light.zenith[c] * blend
@@ -168,123 +212,61 @@ def _sky(light, dx, dy, dz, out):
 
 @_kernel
 @no_type_check
-def _make_work():
-    three = np.empty((4, 3), np.float32)
-    square = np.empty((2, 3, 3), np.float32)
-    five = np.empty((2, 5), np.float32)
-    return _Work(square[0], square[1], three[0], three[1], three[2], three[3], five[0], five[1])
-
-
-@_kernel
-@no_type_check
-def sun_rays(scene, hits, origin, direction, light, out_origin):
-    """Where rays towards the sun start, for hits that face it; return which ones do."""
-    count = len(hits.t)
-    wanted = np.zeros(count, dtype=np.bool_)
-    work = _make_work()
-    normal = work.normal
-    for i in range(count):
-        if hits.triangle[i] == MISS:
+def shade(looks, found, t, direction, lit, light):
+    """Radiance [N 3] along rays; `lit` says which hits the sun shines on."""
+    out = np.empty((len(t), 3), np.float32)
+    colour, mirror = np.empty(5, np.float32), np.empty(3, np.float32)
+    for i in range(len(t)):
+        look = found.look[i]
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        if look == MISS:
+            _sky(light, dx, dy, dz, colour)
+            out[i, 0], out[i, 1], out[i, 2] = colour[0], colour[1], colour[2]
             continue
-        d = direction[i]
-        _look_up(scene, hits, i, work.corners, work.uvw)
-        _normal(work.corners, d[0], d[1], d[2], normal)
-        facing = normal[0] * light.sun[0] + normal[1] * light.sun[1] + normal[2] * light.sun[2]
-        if facing > 0.0:
-            wanted[i] = True
-            offset = SHADOW_OFFSET_M + 2e-5 * hits.t[i]
-            for a in range(3):
-                out_origin[i, a] = origin[i, a] + hits.t[i] * d[a] + offset * normal[a]
-    return wanted
-
-
-@_kernel
-@no_type_check
-def _meet(scene, hits, i, origin, d, ray_rad, work):
-    """Work out one hit: normal, position, texture. Return its look and the ray's cosine with the normal."""
-    look = _look_up(scene, hits, i, work.corners, work.uvw)
-    cosine = _normal(work.corners, d[0], d[1], d[2], work.normal)
-    t, u, v = hits.t[i], hits.u[i], hits.v[i]
-    for a in range(3):
-        work.xyz[a] = origin[a] + t * d[a]
-        work.at[a] = (1.0 - u - v) * work.uvw[0, a] + u * work.uvw[1, a] + v * work.uvw[2, a]
-    width = t * ray_rad
-    _footprint(work.corners, work.uvw, work.normal, d, cosine, width, work.duvw)
-    looks = scene.looks
-    texture(
-        looks.texture[look],
-        looks.params[look],
-        looks.albedo[look],
-        work.xyz,
-        work.at,
-        width / math.sqrt(cosine),
-        work.duvw,
-        look,
-        work.colour,
-    )
-    return look, cosine
-
-
-@_kernel
-@no_type_check
-def _shade(scene, hits, i, origin, d, ray_rad, lit, light, work):
-    """Radiance along one ray, into work.colour[0:3]."""
-    colour, normal = work.colour, work.normal
-    if hits.triangle[i] == MISS:
-        _sky(light, d[0], d[1], d[2], colour)
-        return
-    look, cosine = _meet(scene, hits, i, origin, d, ray_rad, work)
-    kind, glass = scene.looks.texture[look], colour[3]
-    facing = max(normal[0] * light.sun[0] + normal[1] * light.sun[1] + normal[2] * light.sun[2], 0.0)
-    direct = facing if lit else 0.0
-    if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
-        direct = (0.35 + 0.65 * facing) if lit else 0.12
-    up = 0.5 + 0.5 * normal[2]
-    gloss = min(1.0, scene.looks.gloss[look] + 0.35 * glass)
-    if gloss > 0.0:
-        gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
-        k = 2.0 * cosine
-        rise = max(d[2] + k * normal[2], 0.05)
-        _sky(light, d[0] + k * normal[0], d[1] + k * normal[1], rise, work.mirror)
-    haze = 1.0 - math.exp(-hits.t[i] / light.visibility_m)
-    for c in range(3):
-        ambient = light.sky_rgb[c] * up + light.bounce_rgb[c] * (1.0 - up)
-        radiance = colour[c] * (light.sun_rgb[c] * direct + ambient)
-        if kind == _GLOW:
-            radiance = 2.5 * colour[c]
+        texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
+        kind, glass, cosine = looks.texture[look], colour[3], found.cosine[i]
+        nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
+        facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
+        direct = facing if lit[i] else 0.0
+        if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
+            direct = (0.35 + 0.65 * facing) if lit[i] else 0.12
+        gloss = min(1.0, looks.gloss[look] + 0.35 * glass)
         if gloss > 0.0:
-            radiance = radiance * (1.0 - gloss) + gloss * min(work.mirror[c], 3.0)
-        colour[c] = radiance * (1.0 - haze) + haze * light.haze_rgb[c]
-
-
-@_kernel
-@no_type_check
-def shade_pixels(scene, hits, origin, direction, ray_rad, lit, light, samples):
-    """8-bit sRGB colours [pixels 3] of rays of which `samples` in a row belong to one pixel.
-
-    ray_rad is the angle between neighbouring rays, one for each ray.
-    """
-    count = len(hits.t) // samples
-    out = np.empty((count, 3), np.uint8)
-    work = _make_work()
-    total = np.empty(3, np.float32)
-    for pixel in range(count):
-        total[:] = 0.0
-        for i in range(pixel * samples, (pixel + 1) * samples):
-            _shade(scene, hits, i, origin[i], direction[i], ray_rad[i], lit[i], light, work)
-            for c in range(3):
-                x = work.colour[c] * light.exposure
-                # Narkowicz, ACES filmic tone mapping curve, 2015
-                total[c] += min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
+            gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
+            _sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(dz + 2 * cosine * nz, 0.05), mirror)
+        up = 0.5 + 0.5 * nz
+        haze = 1.0 - math.exp(-t[i] / light.visibility_m)
         for c in range(3):
-            encoded = (total[c] / samples) ** (1.0 / 2.2)
-            out[pixel, c] = np.uint8(min(encoded, 1.0) * 255.0 + 0.5)
+            ambient = light.sky_rgb[c] * up + light.bounce_rgb[c] * (1.0 - up)
+            radiance = colour[c] * (light.sun_rgb[c] * direct + ambient)
+            if kind == _GLOW:
+                radiance = 2.5 * colour[c]
+            if gloss > 0.0:
+                radiance = radiance * (1.0 - gloss) + gloss * min(mirror[c], 3.0)
+            out[i, c] = radiance * (1.0 - haze) + haze * light.haze_rgb[c]
     return out
 
 
 @_kernel
 @no_type_check
-def lidar_returns(scene, hits, origin, direction, beam_rad, max_range_m, chance):
+def develop(radiance, exposure, samples):
+    """8-bit sRGB [pixels 3] of radiances of which `samples` in a row belong to one pixel."""
+    count = len(radiance) // samples
+    out = np.empty((count, 3), np.uint8)
+    for pixel in range(count):
+        for c in range(3):
+            total = 0.0
+            for i in range(pixel * samples, (pixel + 1) * samples):
+                x = radiance[i, c] * exposure
+                # Narkowicz, ACES filmic tone mapping curve, 2015
+                total += min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
+            out[pixel, c] = _ENCODED[int(total / samples * 4095.0)]
+    return out
+
+
+@_kernel
+@no_type_check
+def lidar_returns(looks, found, t, max_range_m, chance):
     """Which beams return, how strongly and from where.
 
     The echo of a surface of reflectivity ρ met at an angle θ falls with ρ cos θ / r²; it is lost with a
@@ -297,25 +279,25 @@ def lidar_returns(scene, hits, origin, direction, beam_rad, max_range_m, chance)
         range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1
         (range-compensated).
     """
-    count = len(hits.t)
+    count = len(t)
     range_m = np.empty(count, np.float32)
     returned = np.zeros(count, np.bool_)
     intensity = np.zeros(count, np.float32)
-    work = _make_work()
+    colour = np.empty(5, np.float32)
     for i in range(count):
-        t = hits.t[i]
+        look = found.look[i]
         range_m[i] = max_range_m
-        if hits.triangle[i] == MISS or t > max_range_m:
+        if look == MISS or t[i] > max_range_m:
             continue
-        look, cosine = _meet(scene, hits, i, origin[i], direction[i], beam_rad, work)
-        glass, paint = work.colour[3], work.colour[4]
-        reflectivity = scene.looks.reflectivity[look] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
+        texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
+        glass, paint, cosine = colour[3], colour[4], found.cosine[i]
+        reflectivity = looks.reflectivity[look] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
         reflectivity *= 1.0 - GLASS_LOSS * glass
-        range_m[i] = t
-        echo = reflectivity * cosine * (LIDAR_REFERENCE_M / max(t, 1.0)) ** 2
+        range_m[i] = t[i]
+        echo = reflectivity * cosine * (LIDAR_REFERENCE_M / max(t[i], 1.0)) ** 2
         if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
             returned[i] = True
             intensity[i] = min(reflectivity * (0.35 + 0.65 * cosine), 1.0)
-            leafy = scene.looks.texture[look] == _FOLIAGE
-            range_m[i] = t + (FOLIAGE_DEPTH_M * chance[i, 1] if leafy else 0.0)
+            if looks.texture[look] == _FOLIAGE:
+                range_m[i] += FOLIAGE_DEPTH_M * chance[i, 1]
     return range_m, returned, intensity
