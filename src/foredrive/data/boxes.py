@@ -6,15 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
-from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get_sync_table
+from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.datatypes import ModalityType
 from py123d.datatypes.detections.box_detection_label import BoxDetectionLabel, DefaultBoxDetectionLabel
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.vehicle_state.ego_state import EGO_TRACK_TOKEN
 from scipy.spatial.transform import Rotation
 
+from foredrive.data.arrow_files import column_array, fixed_lists, reading
 from foredrive.data.log_writer import DATASET
-from foredrive.data.logs import Log, column_array, fixed_lists, reading
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category
 
@@ -91,10 +92,11 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
         return None
     with reading(file, "the boxes"):
         tracks = _tracks(log, file.stat().st_mtime_ns)
-        sync = get_sync_table(log.path.folder)
-        row = sync[_KEY][log.iteration(frame)].as_py() if _KEY in sync.column_names else None
-    if row is None:
+        frames, table_rows = log.rows(_KEY)
+        at = np.searchsorted(frames, frame)
+    if at == len(frames) or frames[at] != frame:
         return None
+    row = table_rows[at]
     rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
     rows = rows[~tracks.is_ego[rows]]
     T_ego_world = np.linalg.inv(log.T_world_ego[frame])

@@ -1,20 +1,22 @@
 """Cameras of a 123D log: images of one size, intrinsics to match, motion-compensated extrinsics."""
 
+import functools
 import io
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 from PIL import Image
+from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.common.runtime import get_dataset_paths
-from py123d.datatypes import CameraID, ModalityType, PinholeCameraMetadata
+from py123d.datatypes import ModalityType, PinholeCameraMetadata
 from torch import Tensor
 
-from foredrive.data.logs import Log, reading
+from foredrive.data.arrow_files import column_array, fixed_lists, pose_matrices, reading
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 
 _log = logging.getLogger(__name__)
@@ -62,33 +64,25 @@ def read_camera(
 ) -> CameraFrame:
     """Read one camera at one frame, resized to `image_hw`.
 
-    `T_ego_cam` takes the camera at its own exposure (of the middle row) to the ego frame at the frame's time.
-
     Raises:
         InputError: on an image that cannot be decoded or a pose that is not finite.
     """
     file = log.file(metadata.modality_key)
-    T_ego_cam = np.linalg.inv(log.T_imu_ego) @ metadata.camera_to_imu_se3.transformation_matrix
-    first_s, last_s = _ROWS_EXPOSED_S.get(log.metadata.dataset, (0.0, 0.0))
-    at = (log.iteration(frame), ModalityType.CAMERA, metadata.camera_id)
-    data = None
-    with reading(file, f"frame {frame}"):
-        pose = _column(log, *at, "camera_to_global_se3", deserialize=True)
-        if pose is not None:
-            T_ego_cam = np.linalg.inv(log.T_world_ego[frame]) @ pose.transformation_matrix
-        if pose is not None and first_s != -last_s:
-            stamp_us = float(_column(log, *at, "timestamp_us"))
-            T_ego_cam = log.motion(frame, stamp_us, stamp_us + 0.5e6 * (first_s + last_s)) @ T_ego_cam
-        if with_image:
-            data = _column(log, *at, "data")
-    if not np.isfinite(T_ego_cam).all():
+    with reading(file, "the camera's poses"):
+        T_ego_cam = _extrinsics(log, metadata.modality_key)[frame]
+    if np.isnan(T_ego_cam).any():
         raise InputError(f"{file}: the camera pose at frame {frame} is not finite")
     image = None
-    if data is not None:
+    if with_image:
         with reading(file, f"the image at frame {frame}"):
-            image = _resize(_open_image(log, frame, metadata, data), image_hw)
+            data = log.scene.get_modality_column_at_iteration(
+                log.iteration(frame), "data", ModalityType.CAMERA, metadata.camera_id
+            )
+            if data is not None:
+                image = _resize(_open_image(log, frame, metadata, data), image_hw)
     dist = metadata.distortion
     ideal = metadata.is_undistorted or dist is None
+    first_s, last_s = _rows_exposed_s(log)
     return CameraFrame(
         image=image,
         K=_scaled_intrinsics(metadata, image_hw),
@@ -98,10 +92,34 @@ def read_camera(
     )
 
 
-def _column(
-    log: Log, iteration: int, kind: ModalityType, camera_id: CameraID, name: str, deserialize: bool = False
-) -> Any:
-    return log.scene.get_modality_column_at_iteration(iteration, name, kind, camera_id, deserialize)
+def _rows_exposed_s(log: Log) -> tuple[float, float]:
+    return _ROWS_EXPOSED_S.get(log.metadata.dataset, (0.0, 0.0))
+
+
+@functools.lru_cache(maxsize=64)
+def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
+    """`T_ego_cam` at every frame, from the camera at the exposure of its middle row to the ego frame at the
+    frame's time: by the camera's logged pose, else by the vehicle's; the static one where there is no image.
+    """
+    metadata = log.scene.get_all_modality_metadatas()[modality_key]
+    assert isinstance(metadata, PinholeCameraMetadata)
+    mounted = np.linalg.inv(log.T_imu_ego) @ metadata.camera_to_imu_se3.transformation_matrix
+    T_ego_cam = np.tile(mounted, (len(log), 1, 1))
+    frames, rows = log.rows(modality_key)
+    table = get_modality_table(log.path.folder, modality_key)
+    if table is None or len(rows) == 0:
+        return T_ego_cam
+    stamp_us = table[f"{modality_key}.timestamp_us"].to_numpy()[rows].astype(np.float64)
+    logged = column_array(table, f"{modality_key}.camera_to_global_se3")
+    T_world_cam = pose_matrices(fixed_lists(logged, 7)[rows])
+    T_stamped = log.poses_at(stamp_us)[0]
+    T_exposed = log.poses_at(stamp_us + 0.5e6 * sum(_rows_exposed_s(log)))[0]
+    unlogged = logged.is_null().to_numpy(zero_copy_only=False)[rows]
+    T_world_cam[unlogged] = T_stamped[unlogged] @ mounted
+    T_ego_cam[frames] = (
+        np.linalg.inv(log.T_world_ego[frames]) @ T_exposed @ np.linalg.inv(T_stamped) @ T_world_cam
+    )
+    return T_ego_cam
 
 
 def _scaled_intrinsics(metadata: PinholeCameraMetadata, image_hw: tuple[int, int]) -> Float[Tensor, "3 3"]:

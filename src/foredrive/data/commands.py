@@ -3,7 +3,8 @@
 import numpy as np
 from py123d.datatypes import ModalityType, RouteMetadata
 
-from foredrive.data.logs import Log, reading
+from foredrive.data.arrow_files import reading
+from foredrive.data.logs import Log
 from foredrive.scene import Command, Trajectory
 
 LATERAL_M = 2.0

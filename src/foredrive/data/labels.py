@@ -63,7 +63,7 @@ def voxel_labels(
         boxes: unbatched, ego frame; None if the frame is not annotated, which leaves the flow unknown.
         ego_box: centre and size (length, width, height) of the ego vehicle in its frame, m.
     """
-    beams = sweep[sweep.valid]
+    beams = sweep if bool(sweep.valid.all()) else sweep[sweep.valid]
     origin = beams.origin_ego.numpy().astype(np.float64)
     direction = beams.dir_ego.numpy().astype(np.float64)
     range_m = beams.range_m.numpy().astype(np.float64)

@@ -7,7 +7,8 @@ from py123d.datatypes import Lidar, LidarMergedMetadata, LidarMetadata, Modality
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor
 
-from foredrive.data.logs import Log, reading
+from foredrive.data.arrow_files import reading
+from foredrive.data.logs import Log
 from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams
 from foredrive.scene import LidarSweep
 
@@ -80,7 +81,8 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
     intensity = lidar.intensity if lidar.intensity is not None else np.zeros(count)
     beam = lidar.channel if lidar.channel is not None else np.full(count, -1)
     sweep = _sweep(points, origins, intensity / 255.0, dt_us * 1e-6, beam)
-    return sweep[torch.isfinite(sweep.range_m) & (sweep.range_m > _NEAREST_RETURN_M)]
+    real = torch.isfinite(sweep.range_m) & (sweep.range_m > _NEAREST_RETURN_M)
+    return sweep if bool(real.all()) else sweep[real]
 
 
 def _origins(log: Log, frame: int, lidar: Lidar, dt_us: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:

@@ -12,7 +12,7 @@ from types import TracebackType
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
 from py123d.api.scene.arrow.arrow_log_writer import ArrowLogWriter
 from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.api.scene.arrow.utils.route_utils import ROUTE_POSITION_KEY
@@ -120,6 +120,8 @@ class Frame:
     boxes: Boxes
     """Unbatched, in the ego frame at `t_us`."""
     occupancy: FullOccupancy | None = None
+    lidar_points: Int[np.ndarray, "M"] | None = None
+    """Returns from each of `boxes`: 0 where it is hidden; None if they were not counted."""
 
 
 class LogWriter:
@@ -273,20 +275,24 @@ class LogWriter:
 def _boxes(frame: Frame) -> BoxDetectionsSE3:
     metadata = BoxDetectionsSE3Metadata(Label)
     R_world_ego = frame.T_world_ego[:3, :3]
-    boxes = frame.boxes[frame.boxes.valid]
+    valid = frame.boxes.valid
+    boxes = frame.boxes[valid]
+    counted = frame.lidar_points
+    points = [None] * len(boxes.yaw) if counted is None else counted[valid.numpy()].tolist()
     T_ego_box = matrix_from_yaw(boxes.yaw.double(), boxes.centre.double()).numpy()
     detections = []
-    for T, size, velocity, track, category in zip(
+    for T, size, velocity, track, category, hits in zip(
         frame.T_world_ego @ T_ego_box,
         boxes.size_lwh.tolist(),
         boxes.velocity.double().numpy(),
         boxes.track_id.tolist(),
         boxes.category.tolist(),
+        points,
         strict=True,
     ):
         known = np.isfinite(velocity).all()
         over_ground = Vector3D.from_array(R_world_ego @ [*velocity, 0.0]) if known else None
-        attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[Category(category)], str(track))
+        attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[Category(category)], str(track), hits)
         detections.append(BoxDetectionSE3(attributes, BoundingBoxSE3(_pose(T), *size), over_ground))
     return BoxDetectionsSE3(detections, Timestamp.from_us(frame.t_us), metadata)
 

@@ -1,13 +1,11 @@
 """Finding 123D logs and opening one: its key times, ego poses and what it holds."""
 
-import contextlib
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
@@ -15,6 +13,7 @@ from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get
 from py123d.datatypes import EgoStateSE3Metadata, ModalityType
 from scipy.spatial.transform import Rotation, Slerp
 
+from foredrive.data.arrow_files import check_whole, column_array, fixed_lists, pose_matrices, reading
 from foredrive.errors import InputError
 from foredrive.scene import Trajectory
 
@@ -61,20 +60,6 @@ def _log_folders(path: Path, depth: int) -> Iterator[Path]:
                 yield from _log_folders(below, depth - 1)
 
 
-@contextlib.contextmanager
-def reading(file: Path, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (pa.ArrowException, OSError, ValueError, LookupError, AssertionError) as error:
-        reason = str(error).strip().splitlines()
-        raise InputError(
-            f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
-        ) from error
-
-
 class Log:
     """One opened log. Frames are the rows of its sync table that have an ego pose; picklable.
 
@@ -96,7 +81,7 @@ class Log:
 
     def __init__(self, path: LogPath) -> None:
         self.path = path
-        _check_files(path.folder)
+        check_whole(path.folder)
         self.scene = ArrowSceneAPI(path.folder, maps_root=path.maps_dir)
         with reading(path.folder, "its metadata"):
             self.metadata = self.scene.get_log_metadata()
@@ -119,6 +104,15 @@ class Log:
     def iteration(self, frame: int) -> int:
         """py123d's iteration of a frame."""
         return int(self._iterations[frame])
+
+    def rows(self, modality_key: str) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
+        """The frames at which the log has a modality, and the rows of its table that hold it."""
+        table = get_sync_table(self.path.folder)
+        if modality_key not in table.column_names:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        row = table[modality_key].to_numpy(zero_copy_only=False).astype(np.float64)[self._iterations]
+        frames = np.flatnonzero(np.isfinite(row))
+        return frames, row[frames].astype(np.int64)
 
     def file(self, modality_key: str) -> Path:
         """The file of a modality."""
@@ -148,7 +142,7 @@ class Log:
     def driven_future(self, frame: int, steps: int, dt_s: float) -> Trajectory:
         """Where the ego vehicle went after `frame`, M = 1; steps beyond the log or in a gap are not valid."""
         t_us = self.t_us[frame] + np.arange(1, steps + 1) * dt_s * 1e6
-        T_world, valid = self._interpolate(t_us)
+        T_world, valid = self.poses_at(t_us)
         T = np.linalg.inv(self.T_world_ego[frame]) @ T_world
         keep = torch.from_numpy(valid)[None]
         return Trajectory(
@@ -170,19 +164,17 @@ class Log:
             xyz = np.concatenate([[2 * xyz[0] - xyz[1]], xyz, [2 * xyz[-1] - xyz[-2]]])
         return np.stack([np.interp(t_us, at, xyz[:, axis]) for axis in range(3)], axis=-1)
 
-    def motion(self, frame: int, from_us: float, to_us: float) -> Float64[np.ndarray, "4 4"]:
-        """The vehicle's rigid motion between two times, in the ego frame of `frame`; none beyond the log."""
-        T_world = self._interpolate(np.array([from_us, to_us]))[0]
-        T_from, T_to = np.linalg.inv(self.T_world_ego[frame]) @ T_world
-        return T_to @ np.linalg.inv(T_from)
-
-    def _interpolate(
+    def poses_at(
         self, t_us: Float64[np.ndarray, "N"]
     ) -> tuple[Float64[np.ndarray, "N 4 4"], Bool[np.ndarray, "N"]]:
+        """`T_world_ego` at any times, interpolated, and whether the log has poses close before and after.
+
+        Before and after the log the vehicle stands still.
+        """
         at, T = self._drive_t_us, self._drive_T
+        if len(at) < 2 or len(t_us) == 0:
+            return np.repeat(T[:1], len(t_us), axis=0), np.zeros(len(t_us), dtype=bool)
         out = np.tile(np.eye(4), (len(t_us), 1, 1))
-        if len(at) < 2:
-            return out, np.zeros(len(t_us), dtype=bool)
         after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
         gap_us = at[after] - at[after - 1]
         valid = (t_us >= at[0]) & (t_us <= at[-1]) & (gap_us <= _LONGEST_GAP_S * 1e6)
@@ -203,16 +195,14 @@ class Log:
             t_us = table[f"{_EGO}.timestamp_us"].to_numpy()
             pose = fixed_lists(column_array(table, f"{_EGO}.imu_se3"), 7)
             velocity = fixed_lists(column_array(table, f"{_EGO}.dynamic_state_se3"), 9)[:, :2]
-        bad = ~np.isfinite(pose).all(-1) | (np.linalg.norm(pose[:, 3:], axis=-1) < 0.5)
+        T_world_imu = pose_matrices(pose)
+        bad = np.isnan(T_world_imu).any((-1, -2))
         if bad.any():
             raise InputError(f"{file}: the ego pose of row {bad.argmax()} is not a finite pose")
         if len(t_us) == 0:
             raise InputError(f"{file}: no ego poses")
         if (np.diff(t_us) < 0).any():
             raise InputError(f"{file}: time runs backwards at row {(np.diff(t_us) < 0).argmax() + 1}")
-        T_world_imu = np.tile(np.eye(4), (len(pose), 1, 1))
-        T_world_imu[:, :3, :3] = Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix()
-        T_world_imu[:, :3, 3] = pose[:, :3]
         return t_us, T_world_imu @ self.T_imu_ego, np.linalg.norm(velocity, axis=-1)
 
     def _read_sync(self, ego_t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -233,33 +223,10 @@ class Log:
         return sync_rows, ego_rows
 
 
-def _check_files(folder: Path) -> None:
-    """py123d passes over files it cannot open; here each must be a whole Arrow file."""
-    for file in [folder / "sync.arrow", *sorted(folder.glob("*.arrow"))]:
-        with reading(file, "it as an Arrow file"), pa.memory_map(str(file)) as source:
-            pa.ipc.open_file(source)
-
-
 def _imu_from_ego(vehicle: EgoStateSE3Metadata) -> Float64[np.ndarray, "4 4"]:
     T_rear_ego = np.eye(4)
     T_rear_ego[2, 3] = vehicle.rear_axle_to_center_vertical - vehicle.half_height
     return vehicle.rear_axle_to_imu_se3.transformation_matrix @ T_rear_ego
-
-
-def column_array(table: pa.Table, name: str) -> pa.Array:
-    """A column as one array."""
-    array = table[name].combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        return array.chunk(0) if array.num_chunks else pa.array([], type=array.type)
-    return array
-
-
-def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
-    """An array of fixed-size lists as rows; NaN where the list is null."""
-    out = np.full((len(array), width), np.nan)
-    present = array.is_valid().to_numpy(zero_copy_only=False)
-    out[present] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
-    return out
 
 
 def _speed(

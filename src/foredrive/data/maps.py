@@ -17,8 +17,9 @@ from py123d.datatypes import (
 )
 from py123d.geometry import Point2D, Polyline2D, Polyline3D
 
+from foredrive.data.arrow_files import reading
 from foredrive.data.log_writer import DATASET
-from foredrive.data.logs import Log, reading
+from foredrive.data.logs import Log
 from foredrive.files import atomic_path
 from foredrive.scene import MapKind, MapPatch
 

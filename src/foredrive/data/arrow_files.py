@@ -1,0 +1,63 @@
+"""Reading Arrow files of a 123D log as arrays, with errors that name the file."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from foredrive.errors import InputError
+
+
+@contextlib.contextmanager
+def reading(file: Path, what: str) -> Iterator[None]:
+    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, LookupError, AssertionError) as error:
+        reason = str(error).strip().splitlines()
+        raise InputError(
+            f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
+        ) from error
+
+
+def check_whole(folder: Path) -> None:
+    """Each of a log's files must be a whole Arrow file; py123d passes over those it cannot open.
+
+    Raises:
+        InputError: naming the first one that is not.
+    """
+    for file in [folder / "sync.arrow", *sorted(folder.glob("*.arrow"))]:
+        with reading(file, "it as an Arrow file"), pa.memory_map(str(file)) as source:
+            pa.ipc.open_file(source)
+
+
+def column_array(table: pa.Table, name: str) -> pa.Array:
+    """A column as one array."""
+    array = table[name].combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        return array.chunk(0) if array.num_chunks else pa.array([], type=array.type)
+    return array
+
+
+def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
+    """An array of fixed-size lists as rows; NaN where the list is null."""
+    out = np.full((len(array), width), np.nan)
+    present = array.is_valid().to_numpy(zero_copy_only=False)
+    out[present] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+    return out
+
+
+def pose_matrices(pose: Float64[np.ndarray, "N 7"]) -> Float64[np.ndarray, "N 4 4"]:
+    """Rigid motions of x y z qw qx qy qz; NaN where they are not finite or the quaternion is none."""
+    whole = np.isfinite(pose).all(-1) & (np.linalg.norm(pose[:, 3:], axis=-1) > 0.5)
+    T = np.full((len(pose), 4, 4), np.nan)
+    T[whole] = np.eye(4)
+    T[whole, :3, :3] = Rotation.from_quat(pose[whole, 3:], scalar_first=True).as_matrix().reshape(-1, 3, 3)
+    T[whole, :3, 3] = pose[whole, :3]
+    return T
