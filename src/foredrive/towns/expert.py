@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
@@ -35,11 +35,14 @@ class Moment:
 
     t_s: float
     T_world_ego: Float64[np.ndarray, "4 4"]
-    velocity_ego_mps: Float64[np.ndarray, "3"]
+    twist_ego: Float64[np.ndarray, "6"]
+    """Velocity (m/s), then turn rate (rad/s), in the ego axes."""
     acceleration_ego_mps2: Float64[np.ndarray, "3"]
     """Along the road by the engine and the brakes, to the side by the curve; gravity is not in it."""
     actors: list[ActorState]
-    """All road users but the ego vehicle."""
+    """All road users that move or could, but the ego vehicle."""
+    lights: Int[np.ndarray, "Z"]
+    """A `Light` for each of the town's stop zones."""
 
 
 class Drive:
@@ -90,9 +93,10 @@ class Drive:
         return Moment(
             t_s=t_s,
             T_world_ego=T_world_ego,
-            velocity_ego_mps=np.array([speed, 0.0, 0.0]),
+            twist_ego=np.array([speed, 0.0, 0.0, 0.0, 0.0, turn_rate]),
             acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), speed * turn_rate, 0.0]),
             actors=self._traffic.actors(self._state),
+            lights=self._traffic.zone_lights(self._state.time_s),
         )
 
 

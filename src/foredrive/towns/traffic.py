@@ -93,6 +93,7 @@ class Traffic:
         self.walks: WalkGraph = build_walk_graph(town, self.lanes)
         self.signals: SignalPlan = plan_signals(self.lanes, np.random.default_rng((seed, 0)))
         self._starts: Starts = find_starts(self.lanes)
+        self._zone_count = len(town.stop_zones)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
         self._is_motorway = self.lanes.limit_mps > MOTORWAY_LIMIT_MPS
         self._vehicle_count = vehicle_count
@@ -156,6 +157,13 @@ class Traffic:
         )
         state = self._change_lanes_at_ends(state, rng)
         return self._turn_over(state, rng)
+
+    def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
+        """The `Light` of each of the town's stop zones."""
+        guarded = np.flatnonzero(self.signals.guarded)
+        lights = np.full(self._zone_count, int(Light.NONE))
+        lights[self.lanes.zone[guarded]] = self.signals.shows(time_s)[guarded]
+        return lights
 
     def poses(self, state: TrafficState) -> Poses:
         """Poses of all vehicle slots."""

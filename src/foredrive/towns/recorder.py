@@ -1,0 +1,161 @@
+"""Recording what the expert drives and senses in a town as a 123D log with exact labels."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
+from rich.progress import track
+
+from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
+from foredrive.data.logs import LogPath
+from foredrive.data.maps import write_map
+from foredrive.errors import InputError
+from foredrive.scene import Boxes, CameraRig, VoxelSpec
+from foredrive.towns.actors import ActorState
+from foredrive.towns.expert import Drive, Moment
+from foredrive.towns.rig import camera_rig, roof_lidar
+from foredrive.towns.sensing import SensorSuite
+from foredrive.towns.town_map import MAP_FOLDER, load_town_map
+from foredrive.towns.traffic import Traffic
+from foredrive.towns.world import World
+
+TEST_TOWNS = ("Town05",)
+"""Held out, as in the papers; all others are for training."""
+FIRST_TIME_US = 1_577_836_800_000_000
+"""Midnight of 1 January 2020 UTC: a log's time must not depend on when it was made."""
+BOXES_WITHIN_M = 80.0
+OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
+"""NeMo's grid."""
+FASTEST_HZ = 100.0
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """How many share the road with the ego vehicle, within some 140 m of it."""
+
+    vehicles: int = 30
+    people: int = 20
+    """Where the town has walkways."""
+
+
+def split_of(town: str) -> str:
+    """The 123D split that recordings of a town belong to."""
+    return "town_test" if town in TEST_TOWNS else "town_train"
+
+
+def record(
+    town: str,
+    seconds: float,
+    seed: int,
+    out: Path,
+    rate_hz: float = 10.0,
+    sensors: SensorSuite | None = None,
+    crowd: Crowd | None = None,
+) -> LogPath:
+    """Record one drive; the same arguments give the same bytes.
+
+    The log lies at out/logs/SPLIT/TOWN_seedN and replaces one of that name; the map, once for all logs of the
+    town, at out/maps. Boxes are those of all road users within `BOXES_WITHIN_M`, parked cars included; the
+    number of lidar returns from each tells hidden ones from visible ones.
+
+    Args:
+        town: one of `TOWNS`.
+        seconds: length of the drive.
+        seed: decides the place's buildings, the route, the traffic and all noise.
+        out: 123D data root.
+        rate_hz: frames per second.
+        sensors: six cameras of 144 × 256 px and 32 × 720 beams by default.
+        crowd: `Crowd()` by default.
+
+    Raises:
+        InputError: there is no such town, or no frame to record.
+        OSError: the disk is full; what was written of the log is gone then.
+    """
+    if not seconds > 0:
+        raise InputError(f"a recording takes more than 0 s, got {seconds:g}")
+    if not 0 < rate_hz <= FASTEST_HZ:
+        raise InputError(f"the frame rate lies above 0 and up to {FASTEST_HZ:g} Hz, got {rate_hz:g}")
+    if seed < 0:
+        raise InputError(f"a seed is 0 or more, got {seed}")
+    town_map = load_town_map(town)
+    sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
+    crowd = crowd or Crowd()
+    world = World(town_map, seed)
+    traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
+    drive = Drive(traffic, seconds)
+    maps = write_map(OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects(), town, out)
+    name, count = f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
+    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, seed)
+    route = drive.route.polyline(traffic.lanes)
+    with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
+        for frame in track(frames, description=f"recording {name}", total=count):
+            writer.write(frame)
+    return LogPath(writer.folder, maps)
+
+
+def _frames(world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int) -> Iterator[Frame]:
+    for index, moment in enumerate(moments):
+        actors = [*moment.actors, *world.parked]
+        seen = world.render(
+            moment.actors,
+            sensors,
+            moment.T_world_ego,
+            moment.twist_ego,
+            noise_seed=np.random.SeedSequence((seed, index)).generate_state(1)[0].item(),
+            lights=moment.lights,
+        )
+        near = [a for a in actors if _distance_m(a, moment) < BOXES_WITHIN_M]
+        returned = seen.beam_ids[seen.sweep.returned.numpy()]
+        yield Frame(
+            t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
+            T_world_ego=moment.T_world_ego,
+            velocity_ego_mps=moment.twist_ego[:3],
+            acceleration_ego_mps2=moment.acceleration_ego_mps2,
+            images=seen.images,
+            sweep=seen.sweep,
+            boxes=boxes_of(near, moment.T_world_ego),
+            occupancy=world.occupancy(moment.actors, OCCUPANCY, moment.T_world_ego),
+            lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
+        )
+
+
+def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:
+    """Boxes of road users in the ego frame, unbatched."""
+    T_ego_world = np.linalg.inv(T_world_ego)
+    centre = (
+        np.array([a.centre_m for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+    )
+    yaw = np.array([a.yaw for a in actors])
+    heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1) @ T_ego_world[:3, :3].T
+    velocity = np.array([a.velocity_mps for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T
+    return Boxes(
+        centre=torch.from_numpy(centre).float(),
+        size_lwh=torch.from_numpy(np.array([a.size_lwh for a in actors]).reshape(-1, 3)).float(),
+        yaw=torch.from_numpy(np.arctan2(heading[:, 1], heading[:, 0])).float(),
+        velocity=torch.from_numpy(velocity[:, :2]).float(),
+        track_id=torch.tensor([a.track_id for a in actors], dtype=torch.int64),
+        category=torch.tensor([int(a.category) for a in actors], dtype=torch.int64),
+        valid=torch.ones(len(actors), dtype=torch.bool),
+    )
+
+
+def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
+    """How often each track was hit."""
+    hit, count = np.unique(hit_ids, return_counts=True)
+    counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
+    return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
+
+
+def _distance_m(actor: ActorState, moment: Moment) -> float:
+    return float(np.linalg.norm(actor.centre_m - moment.T_world_ego[:3, 3]))
+
+
+def _specs(rig: CameraRig) -> list[CameraSpec]:
+    return [
+        CameraSpec(name, rig.K[i].numpy(), rig.T_ego_cam[i].numpy(), rig.size_hw)
+        for i, name in enumerate(rig.names)
+    ]
