@@ -8,7 +8,7 @@ import py123d.parser.registry as registry
 import pytest
 import synthetic_log as world
 import torch
-from arrow_surgery import rewrite_column
+from arrow_surgery import rewrite_column, rewrite_metadata
 from py123d.datatypes.detections.box_detection_label import BOX_DETECTION_LABEL_REGISTRY
 
 from foredrive.data.boxes import category_of, read_boxes
@@ -24,20 +24,6 @@ def copy_of(folder: Path, tmp_path: Path) -> LogPath:
     target = tmp_path / "logs" / "flat_train" / "copy"
     shutil.copytree(folder, target)
     return LogPath(target, tmp_path / "maps")
-
-
-def as_from_elsewhere(path: LogPath) -> None:
-    """Give the log another data set's name: its zeros are then what py123d writes for want of a velocity."""
-    import msgpack
-    import pyarrow as pa
-
-    file = path.folder / "sync.arrow"
-    with pa.OSFile(str(file)) as source:
-        table = pa.ipc.open_file(source).read_all()
-    metadata = msgpack.unpackb(table.schema.metadata[b"metadata"])
-    schema = table.schema.with_metadata({b"metadata": msgpack.packb(metadata | {"dataset": "other"})})
-    with pa.OSFile(str(file), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
-        writer.write_table(table.cast(schema))
 
 
 def test_boxes_are_in_the_ego_frame_of_their_frame(flat_log: Path) -> None:
@@ -71,7 +57,8 @@ def test_velocity_comes_from_the_track_where_it_is_not_logged(
     rewrite_column(file, f"{BOXES}.velocity_3d", lambda rows: [[logged, logged] for _ in rows])
     once = lambda rows: [["7", "only-here" if i == 30 else "11"] for i in range(len(rows))]  # noqa: E731
     rewrite_column(file, f"{BOXES}.track_token", once)
-    as_from_elsewhere(path)
+    # another data set's zeros are what py123d writes for want of a velocity
+    rewrite_metadata(path.folder / "sync.arrow", lambda metadata: metadata | {"dataset": "other"})
     log = Log(path)
     for frame in (0, 20, 50):
         torch.testing.assert_close(

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import synthetic_log as world
 import torch
-from arrow_surgery import rewrite_column
+from arrow_surgery import rewrite_column, rewrite_metadata
+from py123d.datatypes import CameraID, FisheyeMEICameraMetadata
+from py123d.geometry import PoseSE3
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
@@ -290,3 +292,44 @@ def test_a_corrupt_sweep_is_named(flat_log: Path, tmp_path: Path) -> None:
     rewrite_column(file, "lidar.lidar_top.data", lambda rows: [row[:60] for row in rows])
     with pytest.raises(InputError, match=r"lidar\.lidar_top\.arrow: cannot read the sweep at frame 0"):
         ClipDataset([path], config(), None)[0]
+
+
+def test_a_camera_pose_that_is_not_finite_is_named(flat_log: Path, tmp_path: Path) -> None:
+    path = copy_of(flat_log, tmp_path)
+    file = path.folder / "camera.pcam_l0.arrow"
+    spoil = lambda rows: [[np.nan] * 7 if i == 10 else row for i, row in enumerate(rows)]  # noqa: E731
+    rewrite_column(file, "camera.pcam_l0.camera_to_global_se3", spoil)
+    with pytest.raises(InputError, match=r"camera\.pcam_l0\.arrow: the camera pose at frame 10"):
+        ClipDataset([path], config(), None)[0]
+
+
+def test_a_camera_without_logged_poses_follows_the_vehicle(flat_log: Path, tmp_path: Path) -> None:
+    path = copy_of(flat_log, tmp_path)
+    file = path.folder / "camera.pcam_f0.arrow"
+    rewrite_column(file, "camera.pcam_f0.camera_to_global_se3", lambda rows: [None] * len(rows))
+    late_us = 40_000
+    rewrite_column(file, "camera.pcam_f0.timestamp_us", lambda rows: [row + late_us for row in rows])
+    rig = ClipDataset([path], config(), None)[0].clip.rig
+    static = torch.from_numpy(world.cameras()[0].T_ego_cam).float()
+    moved = static[:3, 3] + torch.tensor([world.EGO_SPEED_MPS * late_us * 1e-6, 0, 0])
+    torch.testing.assert_close(rig.T_ego_cam[2, 0, :3, :3], static[:3, :3], atol=1e-6, rtol=0)
+    torch.testing.assert_close(rig.T_ego_cam[2, 0, :3, 3], moved, atol=1e-5, rtol=0)
+
+
+def test_a_fisheye_camera_is_left_out_with_a_note(
+    flat_log: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = copy_of(flat_log, tmp_path)
+    fisheye = FisheyeMEICameraMetadata(
+        camera_name="left",
+        camera_id=CameraID.FMCAM_L,
+        mirror_parameter=1.0,
+        distortion=None,
+        projection=None,
+        width=96,
+        height=48,
+        camera_to_imu_se3=PoseSE3.identity(),
+    )
+    rewrite_metadata(path.folder / "camera.pcam_l0.arrow", lambda _: fisheye.to_dict())
+    assert ClipDataset([path], config(), None).camera_names == ("ahead",)
+    assert "camera.pcam_l0 is not a pinhole camera and is left out" in caplog.text

@@ -133,7 +133,7 @@ class LogWriter:
         root: 123D data root.
         split: ends in _train, _val or _test, which py123d goes by.
         cameras: specs of every camera that may appear in a frame, at most 11.
-        map_dir: root/maps when `maps.write_map` has put the map of `location` there; None: the log has no map.
+        map_dir: root/maps with the map of `location` in it (`maps.write_map`); None: the log has no map.
         location: town name, None if there is none.
         route_xyz: the route to follow, world frame, m; None if there is none.
 
