@@ -59,7 +59,8 @@ def lift(
         for value in values:
             sizes.append((value.shape[2], value.shape[3], start))
             start += value.shape[2] * value.shape[3]
-        joined = torch.cat([value.flatten(2, 3) for value in values], dim=2)
+        levels = [value.flatten(2, 3) for value in values]
+        joined = torch.cat(levels, dim=2) if len(levels) > 1 else levels[0]
         pairs = _visible_pairs(uv, visible)
         out: Tensor = _Lift.apply(joined, offsets, weights, np.array(sizes, np.int32), pairs)
         return out
