@@ -8,11 +8,15 @@ from jaxtyping import Float, Int32
 from foredrive.scene import Category
 from foredrive.towns.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
 from foredrive.towns.actors import ActorState
+from foredrive.towns.columns import Intervals, columns, faces_of
 from foredrive.towns.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.mesh import Mesh, join
 from foredrive.towns.raycast import TriangleScene
 
 SLOTS = 3
+SOLID_CELL_M = 0.15
+"""Shapes are sampled about this finely for occupancy."""
+_USUAL_SIZE_M = {"bus": (11.0, 2.6), "truck": (8.5, 2.6), "van": (6.0, 2.1)}
 VAN_LENGTH_M, VAN_HEIGHT_M = 5.0, 1.9
 STRIDE_M = 1.4
 WALKING_MPS = 0.3
@@ -70,6 +74,8 @@ class Shape:
     mesh: Mesh
     first: int
     """First triangle in the soup."""
+    solid: Intervals
+    """Matter in the unit box."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,10 @@ def make_shape_library(table: LookTable) -> ShapeLibrary:
     shapes, first = {}, 0
     for name, build in BUILDERS.items():
         mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name.startswith("pedestrian") else None)
-        shapes[name] = Shape(TriangleScene(mesh), mesh, first)
+        scene = TriangleScene(mesh)
+        shapes[name] = Shape(
+            scene, mesh, first, _solid(scene, mesh, table, _USUAL_SIZE_M.get(name, (5.0, 2.0)))
+        )
         first += len(mesh.look)
 
     def paints(colours: Palette, gloss: float) -> Int32[np.ndarray, "_"]:
@@ -163,6 +172,15 @@ def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
     T[:3, :3] = yaw @ pitch * actor.size_lwh
     T[:3, 3] = actor.centre_m
     return T
+
+
+def _solid(scene: TriangleScene, mesh: Mesh, table: LookTable, size_m: tuple[float, float]) -> Intervals:
+    """Vertical intervals of matter in the unit box, sampled finely for something of about this size."""
+    counts = [int(np.ceil(edge / SOLID_CELL_M)) for edge in size_m]
+    x, y = ((np.arange(n) + 0.5) / n - 0.5 for n in counts)
+    at_x, at_y = np.meshgrid(x, y, indexing="ij")
+    faces = faces_of(mesh, table.arrays().surface)
+    return columns(scene, faces, at_x.ravel(), at_y.ravel(), top_m=0.6, step_m=1e-4)
 
 
 def _into_unit_box(

@@ -1,11 +1,12 @@
 """Street furniture and vegetation: traffic lights, signs, lamps, trees, bushes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from foredrive.towns.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.mesh import Mesh, box, frustum, join, triangles
@@ -22,6 +23,7 @@ LONGEST_ARM_M = 9.0
 SIGN_HEIGHT_M = 2.3
 POST_CLEARANCE_M = 0.3
 POLE_SAMPLE_M = 0.2
+TRUNK_M = 2.0
 CROWN_SPREAD = 1.35
 LARGEST_FOOT_M2 = 2.0
 """What stands on more ground than this is not just a post or a trunk."""
@@ -45,8 +47,15 @@ class Props:
 
     mesh: Mesh
     heads: tuple[SignalHead, ...]
-    poles_xyz: Float[np.ndarray, "N 3"]
-    """Points along thin vertical things, which a grid of vertical rays would miss."""
+    thin: "ThinThings"
+
+
+@dataclass(frozen=True)
+class ThinThings:
+    """Points along posts and trunks, which a grid of vertical rays would miss."""
+
+    xyz: Float[np.ndarray, "N 3"]
+    surface: Int[np.ndarray, "N"]
 
 
 @dataclass
@@ -85,7 +94,7 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
         else:
             parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
             poles.append(_along_pole(foot, z, SIGN_HEIGHT_M))
-    return Props(join(parts), tuple(heads), _joined(poles))
+    return Props(join(parts), tuple(heads), join_thin([_thin(poles, Surface.POLE)]))
 
 
 def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
@@ -101,12 +110,13 @@ def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> P
                 z = float(site.height(foot[None])[0])
                 parts.append(_lamp(foot, z, ahead, looks))
                 poles.append(_along_pole(foot, z, LAMP_HEIGHT_M))
-    spots = _street_tree_spots(site, rng) + _open_tree_spots(site, rng)
-    for xy in spots:
+    trunks = []
+    for xy in _street_tree_spots(site, rng) + _open_tree_spots(site, rng):
         mesh = _plant(site, xy, looks, rng)
         if mesh is not None:
             parts.append(mesh)
-    return Props(join(parts), (), _joined(poles))
+            trunks.append(_along_pole(xy, float(site.height(xy[None])[0]), TRUNK_M))
+    return Props(join(parts), (), join_thin([_thin(poles, Surface.POLE), _thin(trunks, Surface.VEGETATION)]))
 
 
 def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
@@ -288,5 +298,11 @@ def _along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[
     return np.column_stack([np.full_like(up, foot[0]), np.full_like(up, foot[1]), z + up])
 
 
-def _joined(points: list[np.ndarray]) -> Float[np.ndarray, "N 3"]:
-    return np.concatenate(points) if points else np.zeros((0, 3))
+def _thin(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinThings:
+    xyz = np.concatenate([np.zeros((0, 3)), *lines])
+    return ThinThings(xyz, np.full(len(xyz), int(surface)))
+
+
+def join_thin(parts: Sequence[ThinThings]) -> ThinThings:
+    """All points together."""
+    return ThinThings(np.concatenate([p.xyz for p in parts]), np.concatenate([p.surface for p in parts]))

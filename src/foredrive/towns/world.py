@@ -6,18 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int32, UInt8
 
-from foredrive.scene import LidarSweep
+from foredrive.data.modalities import FullOccupancy
+from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.towns import raycast, sensing, shading
 from foredrive.towns.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.actors import ActorState
 from foredrive.towns.buildings import build_buildings
+from foredrive.towns.columns import TownColumns, faces_of
 from foredrive.towns.ground_plan import make_ground_plan
 from foredrive.towns.light import daylight
 from foredrive.towns.lights import Light
 from foredrive.towns.looks import LookArrays, LookTable, Texture, srgb_to_linear
 from foredrive.towns.mesh import Mesh, join
+from foredrive.towns.occupancy import full_occupancy
 from foredrive.towns.parking import build_car_parks, numbered, park_on_strips
-from foredrive.towns.props import SignalHead, build_furniture, build_posts
+from foredrive.towns.props import SignalHead, ThinThings, build_furniture, build_posts, join_thin
 from foredrive.towns.road_mesh import build_roads
 from foredrive.towns.sensing import SensorSuite
 from foredrive.towns.site import Site
@@ -27,6 +30,7 @@ from foredrive.towns.town_map import TownMap
 NOBODY = -1
 ACTOR_REACH_M = 200.0
 """Road users further from the vehicle are not drawn."""
+ACTOR_RADIUS_M = 8.0
 LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
 LAMP_LIT_RGB = ((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45))
 
@@ -53,7 +57,7 @@ class StaticWorld:
     """Track id of the parked car that a triangle belongs to, NOBODY for all others."""
     parked: tuple[ActorState, ...]
     heads: tuple[SignalHead, ...]
-    poles_xyz: Float[np.ndarray, "N 3"]
+    thin: ThinThings
 
 
 class World:
@@ -68,6 +72,8 @@ class World:
         self.static = build_static(town, table, self._shapes, rng)
         self._looks = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
+        faces = faces_of(self.static.mesh, self._looks.surface)
+        self._columns = TownColumns(self._scene, faces, float(self.static.mesh.xyz[..., 2].max()) + 1.0)
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
@@ -107,6 +113,22 @@ class World:
             sweep=sweep,
             beam_ids=self._track_ids(met, near),
         )
+
+    def occupancy(
+        self, actors: Sequence[ActorState], T_world_ego: Float64[np.ndarray, "4 4"], spec: VoxelSpec
+    ) -> FullOccupancy:
+        """Exact occupancy of a grid in the ego frame, the insides of solid things included.
+
+        `category` is that of the road user, or -1 minus the `Surface` of what is static; velocities are those
+        of the road users, in the ego axes. Takes .2 s where the vehicle has not been, then milliseconds.
+
+        Raises:
+            InputError: voxels finer than `occupancy.FINEST_VOXEL_M`.
+        """
+        reach_m = float(np.linalg.norm([*spec.lower_m, *spec.upper_m]))
+        near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
+        shaped = [(actor, self._shapes.shape_of(actor)) for actor in near]
+        return full_occupancy(self._columns, self.static.thin, shaped, T_world_ego, spec)
 
     def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> sensing.Moment:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
@@ -168,7 +190,7 @@ def build_static(
         track=np.concatenate(track),
         parked=parked,
         heads=posts.heads,
-        poles_xyz=np.concatenate([posts.poles_xyz, furniture.poles_xyz]),
+        thin=join_thin([posts.thin, furniture.thin]),
     )
 
 

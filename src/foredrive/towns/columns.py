@@ -1,0 +1,123 @@
+"""Solid matter above each spot of a town, as vertical intervals: what exact occupancy is made from."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from foredrive.towns.looks import Surface
+from foredrive.towns.mesh import Mesh
+from foredrive.towns.raycast import TriangleScene
+from foredrive.towns.shading import MISS
+
+TILE_M = 32.0
+COLUMN_M = 0.25
+MOST_LAYERS = 40
+STEP_M = 2e-3
+DECK_DEPTH_M = 1.5
+"""An underside this far below a road is that of the road's deck."""
+
+_GROUND = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN)
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """N vertical stretches of matter; those of surfaces without depth have low = high."""
+
+    x: Float32[np.ndarray, "N"]
+    y: Float32[np.ndarray, "N"]
+    low: Float32[np.ndarray, "N"]
+    high: Float32[np.ndarray, "N"]
+    surface: Int[np.ndarray, "N"]
+
+
+@dataclass
+class TownColumns:
+    """Columns of a town in square tiles, worked out when first asked for and kept."""
+
+    scene: TriangleScene
+    faces: "Faces"
+    top_m: float
+    """Above everything."""
+    _tiles: dict[tuple[int, int], Intervals] = field(default_factory=dict)
+
+    def around(self, centre_xy: Float[np.ndarray, "2"], radius_m: float) -> list[Intervals]:
+        """All tiles within a distance."""
+        (i0, j0), (i1, j1) = (np.floor((centre_xy + r) / TILE_M).astype(int) for r in (-radius_m, radius_m))
+        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+        for key in keys:
+            if key not in self._tiles:
+                self._tiles[key] = self._tile(*key)
+        return [self._tiles[key] for key in keys]
+
+    def _tile(self, i: int, j: int) -> Intervals:
+        offsets = (np.arange(round(TILE_M / COLUMN_M)) + 0.5) * COLUMN_M
+        y, x = np.meshgrid(j * TILE_M + offsets, i * TILE_M + offsets, indexing="ij")
+        return columns(self.scene, self.faces, x.ravel(), y.ravel(), self.top_m)
+
+
+@dataclass(frozen=True)
+class Faces:
+    """What columns need to know of the triangles of a mesh."""
+
+    upward: Bool[np.ndarray, "F"]
+    surface: Int[np.ndarray, "F"]
+
+
+def faces_of(mesh: Mesh, surface_of_look: Int[np.ndarray, "L"]) -> Faces:
+    """Orientation and surface of each triangle; negative look numbers (paint) count as a vehicle's."""
+    a, b = mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]
+    upward = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+    surface = np.where(mesh.look < 0, int(Surface.VEHICLE), surface_of_look[np.maximum(mesh.look, 0)])
+    return Faces(upward, surface)
+
+
+def columns(
+    scene: TriangleScene,
+    faces: Faces,
+    x: Float[np.ndarray, "C"],
+    y: Float[np.ndarray, "C"],
+    top_m: float,
+    step_m: float = STEP_M,
+) -> Intervals:
+    """Matter below `top_m` at each x, y.
+
+    A ray straight down enters a closed mesh through a face that looks up and leaves it through one that
+    looks down. The ground is a surface without depth; it also ends what reaches into it.
+    """
+    count = len(x)
+    origin = np.column_stack([x, y, np.full(count, top_m)]).astype(np.float32)
+    ray = np.arange(count)
+    depth, opened, opened_as = np.zeros(count, int), np.zeros(count, np.float32), np.zeros(count, int)
+    last_ground = np.full(count, np.inf, np.float32)
+    found: list[tuple[np.ndarray, ...]] = []
+
+    def emit(rays: np.ndarray, low: np.ndarray, high: np.ndarray, surface: np.ndarray) -> None:
+        found.append((rays, low, high, surface))
+
+    for _ in range(MOST_LAYERS):
+        down = np.broadcast_to(np.array([0, 0, -1], np.float32), (len(ray), 3))
+        hits = scene.cast(origin[ray], np.ascontiguousarray(down))
+        on = hits.triangle != MISS
+        ended = ray[~on]
+        emit(ended[depth[ended] > 0], *(a[ended[depth[ended] > 0]] for a in (opened, opened, opened_as)))
+        ray, triangle, z = ray[on], hits.triangle[on], origin[ray[on], 2] - hits.t[on]
+        if len(ray) == 0:
+            break
+        surface, upward = faces.surface[triangle], faces.upward[triangle]
+        ground = np.isin(surface, _GROUND)
+        enters, leaves = ~ground & upward, ~ground & ~upward & (surface != Surface.HIDDEN)
+        enters &= surface != Surface.HIDDEN
+        closing = (ground & (depth[ray] > 0)) | (leaves & (depth[ray] == 1))
+        emit(ray[closing], z[closing], opened[ray[closing]], opened_as[ray[closing]])
+        emit(ray[ground], z[ground], z[ground], surface[ground])
+        below = leaves & (depth[ray] == 0)
+        deck = np.where(last_ground[ray] - z < DECK_DEPTH_M, last_ground[ray], z)
+        emit(ray[below], z[below], deck[below], surface[below])
+        opening = enters & (depth[ray] == 0)
+        opened[ray[opening]], opened_as[ray[opening]] = z[opening], surface[opening]
+        depth[ray] = np.where(ground, 0, depth[ray] + enters - (leaves & (depth[ray] > 0)))
+        last_ground[ray] = np.where(ground, z, last_ground[ray])
+        origin[ray, 2] = z - step_m
+    rays, low, high, surface = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Intervals(origin[rays, 0], origin[rays, 1], low, high, surface)
