@@ -52,7 +52,7 @@ def _clip_at(path: "LogPath", t_s: float | None) -> tuple["Clip", float]:
         raise InputError(f"{path.folder}: no time {wanted_s:g} s in this log of {duration_s:.2f} s")
     camera = next(iter(pinhole_cameras(log).values()), None)
     aspect = 9 / 16 if camera is None else camera.height / camera.width
-    at_start = wanted_s < log.period_s / 2
+    at_start = wanted_s <= log.period_s / 2
     config = ClipConfig(
         past_frames=0,
         future_frames=0,

@@ -19,8 +19,7 @@ from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_point
 
 DPI = 100
 CAMERA_WIDTH_PX = 640
-GAP_PX, HEAD_PX, FOOT_PX = 10, 64, 96
-BEV_MARGIN_PX = 56
+GAP_PX, HEAD_PX, AXIS_PX, LEGEND_PX = 10, 64, 60, 230
 MIN_BEV_PX = 640
 
 
@@ -46,9 +45,8 @@ def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
     cell_h = round(CAMERA_WIDTH_PX * rig.size_hw[0] / rig.size_hw[1])
     left_w = columns * (CAMERA_WIDTH_PX + GAP_PX)
     body_h = max(len(rows) * (cell_h + GAP_PX) - GAP_PX, MIN_BEV_PX)
-    bev_px = body_h - BEV_MARGIN_PX // 2
-    width = GAP_PX + left_w + BEV_MARGIN_PX + bev_px + 2 * GAP_PX
-    height = HEAD_PX + body_h + FOOT_PX
+    bev_left = GAP_PX + left_w + AXIS_PX
+    width, height = bev_left + body_h + LEGEND_PX, HEAD_PX + body_h + AXIS_PX
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
 
     def place(x: int, y: int, w: int, h: int) -> Axes:
@@ -65,24 +63,28 @@ def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
                 cell_h,
             )
             _show_camera(ax, clip, camera, (cell_h, CAMERA_WIDTH_PX))
-    bev = place(GAP_PX + left_w + BEV_MARGIN_PX, HEAD_PX, bev_px, bev_px)
-    draw_bev(bev, clip, reach_m)
+    draw_bev(place(bev_left, HEAD_PX, body_h, body_h), clip, reach_m)
     figure.text(
-        2 * GAP_PX / width, 1 - HEAD_PX / 2 / height, title, color=palette.INK, fontsize=17, va="center"
+        2 * GAP_PX / width,
+        1 - HEAD_PX / 2 / height,
+        title,
+        color=palette.INK,
+        fontsize=min(17.0, 1.15 * width / max(len(title), 1)),  # long names shrink to fit
+        va="center",
     )
-    handles = legend_handles(clip)
     figure.legend(
-        handles=handles,
-        loc="center left",
-        bbox_to_anchor=(GAP_PX / width, FOOT_PX / 2 / height - 0.01),
-        ncols=min(len(handles), max(4, int((width - 420) / 165))),
+        handles=legend_handles(clip),
+        loc="upper left",
+        bbox_to_anchor=((bev_left + body_h + GAP_PX) / width, 1 - HEAD_PX / height),
+        borderaxespad=0,
         frameon=False,
         labelcolor=palette.INK,
         fontsize=11,
         handlelength=1.6,
     )
     if bool(clip.sweep_valid[clip.now]):
-        _range_bar(place(width - 340, HEAD_PX + body_h + 40, 300, 12))
+        bar_w = LEGEND_PX - 5 * GAP_PX
+        _range_bar(place(bev_left + body_h + 2 * GAP_PX, HEAD_PX + body_h - 24, bar_w, 12))
     return figure
 
 
@@ -164,7 +166,7 @@ def _range_bar(ax: Axes) -> None:
     )
     scale = ScalarMappable(LogNorm(palette.NEAREST_M, palette.FARTHEST_M), shown)
     bar = ax.figure.colorbar(scale, cax=ax, orientation="horizontal")
-    bar.set_ticks([3, 5, 10, 20, 40, 80], labels=["3", "5", "10", "20", "40", "80 m"])
+    bar.set_ticks([3, 10, 30, 80], labels=["3", "10", "30", "80 m"])
     bar.ax.minorticks_off()
     bar.ax.tick_params(colors=palette.FAINT, labelsize=9, length=0)
     bar.outline.set_visible(False)
