@@ -10,12 +10,14 @@ import tyro
 
 from foredrive.cli.convert import convert
 from foredrive.cli.evaluate import evaluate
+from foredrive.cli.record import record
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
 
 VERBS: dict[str, Callable[..., Any]] = {
+    "record": record,
     "convert": convert,
     "train": train,
     "evaluate": evaluate,
