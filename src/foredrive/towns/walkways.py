@@ -1,5 +1,6 @@
 """Where people walk: walkways joined into a graph, and crossings with the lanes they cross."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from foredrive.towns.ground_plan import WALKWAY_RAISE_M
 from foredrive.towns.lane_graph import Control, LaneGraph
 from foredrive.towns.town_map import StripKind, TownMap
 
@@ -19,6 +21,7 @@ REACH_M = 7.0
 MARKED_NEARBY_M = 15.0
 PAST_LINE_M = 1.5
 LONGEST_CROSSING_M = 28.0
+NEAREST_KERB_M = 1.0
 SHORTEST_WALK_M = 0.5
 ALONG_LANE_M = 1.7
 """Half the stretch of a lane that people on a crossing may occupy."""
@@ -80,11 +83,11 @@ class WalkGraph:
 def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
     """Walkways, marked crosswalks, and unmarked crossings at lights that have no crosswalk."""
     strips = [s for s in town.strips_of(StripKind.SIDEWALK) if len(s.left_xyz) > 1]
-    walks = [0.5 * (s.left_xyz + s.right_xyz) for s in strips]
+    walks = [0.5 * (s.left_xyz + s.right_xyz) + [0.0, 0.0, WALKWAY_RAISE_M] for s in strips]
     widths = [float(np.linalg.norm(s.left_xyz - s.right_xyz, axis=1).min()) for s in strips]
     kept = [i for i, walk in enumerate(walks) if _length(walk) > SHORTEST_WALK_M and widths[i] > 0.8]
     walks, widths = [walks[i] for i in kept], [widths[i] for i in kept]
-    crossings = _crossings(town, lanes, walks)
+    crossings = _crossings(town, lanes, walks, widths)
     cuts: list[list[float]] = [[] for _ in walks]
     lines = [shapely.LineString(walk[:, :2]) for walk in walks]
     for walk_index, point in ((i, p) for crossing in crossings for i, p in crossing.attached):
@@ -119,7 +122,9 @@ class _Crossing:
     """The walkways it joins and where."""
 
 
-def _crossings(town: TownMap, lanes: LaneGraph, walks: list[np.ndarray]) -> list[_Crossing]:
+def _crossings(
+    town: TownMap, lanes: LaneGraph, walks: list[np.ndarray], widths_m: list[float]
+) -> list[_Crossing]:
     if not walks:
         return []
     lines = shapely.STRtree([shapely.LineString(walk[:, :2]) for walk in walks])
@@ -129,7 +134,7 @@ def _crossings(town: TownMap, lanes: LaneGraph, walks: list[np.ndarray]) -> list
         start = lanes.position(np.flatnonzero(lanes.zone == zone)[:1], np.array([PAST_LINE_M]))[0]
         if np.linalg.norm(marked - start, axis=1).min(initial=np.inf) > MARKED_NEARBY_M:
             lane = int(np.flatnonzero(lanes.zone == zone)[0])
-            chords.append(_perpendicular(start, lanes.samples(lane)[:2], lines))
+            chords.append(_perpendicular(start, lanes.samples(lane)[:2], lines, widths_m))
     found = []
     for chord in chords:
         if chord is None:
@@ -157,18 +162,23 @@ def _chord(outline: Float64[np.ndarray, "_ 3"], walkways: shapely.STRtree) -> np
 
 
 def _perpendicular(
-    start: Float64[np.ndarray, "3"], lane: Float64[np.ndarray, "2 3"], walkways: shapely.STRtree
+    start: Float64[np.ndarray, "3"],
+    lane: Float64[np.ndarray, "2 3"],
+    walkways: shapely.STRtree,
+    widths_m: list[float],
 ) -> np.ndarray | None:
-    """A way straight across the road, to just before the nearest walkway on either side."""
+    """A way straight across the road, from kerb to kerb."""
     ahead = (lane[1] - lane[0])[:2] / np.linalg.norm((lane[1] - lane[0])[:2])
-    ends = []
+    here, ends = shapely.Point(start[:2]), []
     for side in (np.array([-ahead[1], ahead[0]]), np.array([ahead[1], -ahead[0]])):
         ray = shapely.LineString([start[:2], start[:2] + LONGEST_CROSSING_M * side])
-        hits = [ray.intersection(walkways.geometries[i]) for i in walkways.query(ray, predicate="intersects")]
-        distance = min((shapely.Point(start[:2]).distance(hit) for hit in hits), default=np.inf)
-        if not 2.0 < distance < LONGEST_CROSSING_M:
+        to_kerb = [
+            here.distance(ray.intersection(walkways.geometries[i])) - 0.5 * widths_m[i]
+            for i in walkways.query(ray, predicate="intersects")
+        ]
+        if min(to_kerb, default=0.0) < NEAREST_KERB_M:
             return None
-        ends.append(np.append(start[:2] + (distance - 1.0) * side, start[2]))
+        ends.append(np.append(start[:2] + min(to_kerb) * side, start[2]))
     return np.stack(ends)
 
 
@@ -210,7 +220,7 @@ def _cut(line: Float64[np.ndarray, "_ 3"], at_flat_m: list[float]) -> list[Float
     flat = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
     stops = np.unique(np.interp([0.0, *at_flat_m, flat[-1]], flat, along))
     pieces = []
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in itertools.pairwise(stops.tolist()):
         inner = line[(along > a + 1e-3) & (along < b - 1e-3)]
         pieces.append(np.concatenate([_at(line, a)[None], inner, _at(line, b)[None]]))
     return [piece for piece in pieces if _length(piece) > 1e-2]
