@@ -8,10 +8,11 @@ from jaxtyping import Float, Int32
 from foredrive.scene import Category
 from foredrive.towns.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
 from foredrive.towns.actors import ActorState
-from foredrive.towns.columns import Intervals, columns, faces_of
+from foredrive.towns.columns import Intervals
 from foredrive.towns.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.mesh import Mesh, join
 from foredrive.towns.raycast import TriangleScene
+from foredrive.towns.shading import MISS
 
 SLOTS = 3
 SOLID_CELL_M = 0.15
@@ -111,9 +112,7 @@ def make_shape_library(table: LookTable) -> ShapeLibrary:
     for name, build in BUILDERS.items():
         mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name.startswith("pedestrian") else None)
         scene = TriangleScene(mesh)
-        shapes[name] = Shape(
-            scene, mesh, first, _solid(scene, mesh, table, _USUAL_SIZE_M.get(name, (5.0, 2.0)))
-        )
+        shapes[name] = Shape(scene, mesh, first, _solid(scene, _USUAL_SIZE_M.get(name, (5.0, 2.0))))
         first += len(mesh.look)
 
     def paints(colours: Palette, gloss: float) -> Int32[np.ndarray, "_"]:
@@ -174,13 +173,19 @@ def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def _solid(scene: TriangleScene, mesh: Mesh, table: LookTable, size_m: tuple[float, float]) -> Intervals:
-    """Vertical intervals of matter in the unit box, sampled finely for something of about this size."""
+def _solid(scene: TriangleScene, size_m: tuple[float, float]) -> Intervals:
+    """Matter in the unit box, from the lowest to the highest face, for something of about this size."""
     counts = [int(np.ceil(edge / SOLID_CELL_M)) for edge in size_m]
-    x, y = ((np.arange(n) + 0.5) / n - 0.5 for n in counts)
-    at_x, at_y = np.meshgrid(x, y, indexing="ij")
-    faces = faces_of(mesh, table.arrays().surface)
-    return columns(scene, faces, at_x.ravel(), at_y.ravel(), top_m=0.6, step_m=1e-4)
+    x, y = (a.ravel() for a in np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in counts)))
+    ends = []
+    for side in (1.0, -1.0):
+        origin = np.column_stack([x, y, np.full_like(x, side)]).astype(np.float32)
+        direction = np.tile(np.array([0.0, 0.0, -side], np.float32), (len(x), 1))
+        hits = scene.cast(origin, direction)
+        ends.append(side - side * hits.t)
+    met = hits.triangle != MISS
+    x, y, high, low = (a[met].astype(np.float32) for a in (x, y, *ends))
+    return Intervals(x, y, low, high, np.full(len(x), int(Surface.VEHICLE)))
 
 
 def _into_unit_box(

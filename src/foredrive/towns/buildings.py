@@ -250,7 +250,9 @@ class _Builder:
             size = rng.uniform(1.5, 4.0, 2)
             centre = (rng.uniform(0.2, 0.8) * w, rng.uniform(0.15, 0.35) * d)
             rise = rng.uniform(1.0, 2.6)
-            parts.append(self._local_box(plot, centre, tuple(size), (top - PARAPET_M, top + rise), roof))
+            parts.append(
+                self._local_box(plot, centre, tuple(size), (top - PARAPET_M - 0.2, top + rise), roof)
+            )
         if not tower and rng.random() < 0.45:
             parts.append(self._awning(plot, base + ground_m - 0.55))
         return join(parts)

@@ -1,6 +1,7 @@
 """Solid matter above each spot of a town, as vertical intervals: what exact occupancy is made from."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -12,16 +13,20 @@ from foredrive.towns.shading import MISS
 
 TILE_M = 32.0
 COLUMN_M = 0.25
+EDGE_SPLIT = 4
+"""Columns on the edge of something solid are split into this many along x and y."""
+EDGE_M = 0.4
 MOST_LAYERS = 40
 STEP_M = 2e-3
 DECK_DEPTH_M = 1.5
 """An underside this far below a road is that of the road's deck."""
 
 _GROUND = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN)
+_PASSED = (Surface.HIDDEN, Surface.VEHICLE, Surface.PEDESTRIAN)
+"""Parked cars are looked after as road users are."""
 
 
-@dataclass(frozen=True)
-class Intervals:
+class Intervals(NamedTuple):
     """N vertical stretches of matter; those of surfaces without depth have low = high."""
 
     x: Float32[np.ndarray, "N"]
@@ -51,9 +56,19 @@ class TownColumns:
         return [self._tiles[key] for key in keys]
 
     def _tile(self, i: int, j: int) -> Intervals:
-        offsets = (np.arange(round(TILE_M / COLUMN_M)) + 0.5) * COLUMN_M
-        y, x = np.meshgrid(j * TILE_M + offsets, i * TILE_M + offsets, indexing="ij")
-        return columns(self.scene, self.faces, x.ravel(), y.ravel(), self.top_m)
+        count = round(TILE_M / COLUMN_M)
+        offsets = (np.arange(count) + 0.5) * COLUMN_M
+        y, x = (a.ravel() for a in np.meshgrid(j * TILE_M + offsets, i * TILE_M + offsets, indexing="ij"))
+        coarse, ray = columns(self.scene, self.faces, x, y, self.top_m)
+        solid = coarse.high > coarse.low
+        height = np.zeros(len(x))
+        np.maximum.at(height, ray[solid], (coarse.high - coarse.low)[solid])
+        edge = _edges(height.reshape(count, count)).ravel()
+        fine = (np.arange(EDGE_SPLIT) + 0.5) / EDGE_SPLIT * COLUMN_M - 0.5 * COLUMN_M
+        dy, dx = (a.ravel() for a in np.meshgrid(fine, fine, indexing="ij"))
+        fine_x, fine_y = (x[edge][:, None] + dx).ravel(), (y[edge][:, None] + dy).ravel()
+        refined, _ = columns(self.scene, self.faces, fine_x, fine_y, self.top_m)
+        return Intervals(*(np.concatenate(pair) for pair in zip(coarse, refined, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -65,11 +80,10 @@ class Faces:
 
 
 def faces_of(mesh: Mesh, surface_of_look: Int[np.ndarray, "L"]) -> Faces:
-    """Orientation and surface of each triangle; negative look numbers (paint) count as a vehicle's."""
+    """Orientation and surface of each triangle."""
     a, b = mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]
     upward = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    surface = np.where(mesh.look < 0, int(Surface.VEHICLE), surface_of_look[np.maximum(mesh.look, 0)])
-    return Faces(upward, surface)
+    return Faces(upward, surface_of_look[mesh.look])
 
 
 def columns(
@@ -78,9 +92,8 @@ def columns(
     x: Float[np.ndarray, "C"],
     y: Float[np.ndarray, "C"],
     top_m: float,
-    step_m: float = STEP_M,
-) -> Intervals:
-    """Matter below `top_m` at each x, y.
+) -> tuple[Intervals, Int[np.ndarray, "N"]]:
+    """Matter below `top_m` at each x, y, and which of them each interval belongs to.
 
     A ray straight down enters a closed mesh through a face that looks up and leaves it through one that
     looks down. The ground is a surface without depth; it also ends what reaches into it.
@@ -89,7 +102,7 @@ def columns(
     origin = np.column_stack([x, y, np.full(count, top_m)]).astype(np.float32)
     ray = np.arange(count)
     depth, opened, opened_as = np.zeros(count, int), np.zeros(count, np.float32), np.zeros(count, int)
-    last_ground = np.full(count, np.inf, np.float32)
+    last_ground, last_solid = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     found: list[tuple[np.ndarray, ...]] = []
 
     def emit(rays: np.ndarray, low: np.ndarray, high: np.ndarray, surface: np.ndarray) -> None:
@@ -106,10 +119,13 @@ def columns(
             break
         surface, upward = faces.surface[triangle], faces.upward[triangle]
         ground = np.isin(surface, _GROUND)
-        enters, leaves = ~ground & upward, ~ground & ~upward & (surface != Surface.HIDDEN)
-        enters &= surface != Surface.HIDDEN
+        solid = ~ground & ~np.isin(surface, _PASSED)
+        enters, leaves = solid & upward, solid & ~upward
         closing = (ground & (depth[ray] > 0)) | (leaves & (depth[ray] == 1))
-        emit(ray[closing], z[closing], opened[ray[closing]], opened_as[ray[closing]])
+        # A ray that grazed a crown's rim has lost count: leaves do not reach the ground.
+        leafy = ground & (opened_as[ray] == Surface.VEGETATION)
+        end = np.where(leafy, last_solid[ray], z)
+        emit(ray[closing], end[closing], opened[ray[closing]], opened_as[ray[closing]])
         emit(ray[ground], z[ground], z[ground], surface[ground])
         below = leaves & (depth[ray] == 0)
         deck = np.where(last_ground[ray] - z < DECK_DEPTH_M, last_ground[ray], z)
@@ -118,6 +134,17 @@ def columns(
         opened[ray[opening]], opened_as[ray[opening]] = z[opening], surface[opening]
         depth[ray] = np.where(ground, 0, depth[ray] + enters - (leaves & (depth[ray] > 0)))
         last_ground[ray] = np.where(ground, z, last_ground[ray])
-        origin[ray, 2] = z - step_m
+        last_solid[ray] = np.where(solid, z, last_solid[ray])
+        origin[ray, 2] = z - STEP_M
     rays, low, high, surface = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Intervals(origin[rays, 0], origin[rays, 1], low, high, surface)
+    return Intervals(origin[rays, 0], origin[rays, 1], low, high, surface), rays
+
+
+def _edges(height: Float[np.ndarray, "Y X"]) -> Bool[np.ndarray, "Y X"]:
+    """Where the height changes to a neighbour."""
+    edge = np.zeros(height.shape, dtype=bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(height, axis=axis)) > EDGE_M
+        edge |= np.concatenate([step, np.take(step, [-1], axis) & False], axis)
+        edge |= np.concatenate([np.take(step, [0], axis) & False, step], axis)
+    return edge

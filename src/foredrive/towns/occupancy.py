@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int
 
 from foredrive.data.modalities import FullOccupancy
 from foredrive.errors import InputError
-from foredrive.scene import Category, VoxelSpec
+from foredrive.scene import VoxelSpec
 from foredrive.towns.actor_shapes import Shape, unit_to_world
 from foredrive.towns.actors import ActorState
 from foredrive.towns.columns import COLUMN_M, Intervals, TownColumns
@@ -29,17 +29,11 @@ _PRIORITY = {
     Surface.BUILDING: 6,
     Surface.POLE: 7,
     Surface.SIGN: 8,
-    Surface.VEHICLE: 9,
 }
 """What a voxel is that holds several things: the highest."""
 _CODE = np.array([_PRIORITY.get(surface, 0) for surface in Surface])
 _SURFACE_OF_CODE = np.array([0, *sorted(_PRIORITY, key=lambda surface: _PRIORITY[surface])])
 _FIRST_ACTOR = 100
-
-
-def static_category(surface: Surface) -> int:
-    """How `FullOccupancy.category` names what is static: -1 minus the surface."""
-    return -1 - int(surface)
 
 
 def full_occupancy(
@@ -51,7 +45,7 @@ def full_occupancy(
 ) -> FullOccupancy:
     """Occupied voxels of a grid in the ego frame.
 
-    The static world's category is `static_category` of its surface, but for parked cars, which are cars.
+    The category of what is static is -1 minus its `Surface`. Parked cars are among the actors.
 
     Raises:
         InputError: voxels finer than the town is sampled.
@@ -96,14 +90,13 @@ def _collect(
     code = grid[tuple(index.T)]
     moving = code >= _FIRST_ACTOR
     surface = _SURFACE_OF_CODE[np.where(moving, 0, code)]
-    static = np.where(surface == Surface.VEHICLE, int(Category.CAR), -1 - surface)
     kinds = np.array([*(int(actor.category) for actor in actors), 0])
     velocity = np.array([*(actor.velocity_mps for actor in actors), np.zeros(3)]) @ T_ego_world[:3, :3].T
     who = np.where(moving, code - _FIRST_ACTOR, len(actors))
     return FullOccupancy(
         spec=spec,
         index_zyx=index,
-        category=np.where(moving, kinds[who], static),
+        category=np.where(moving, kinds[who], -1 - surface),
         velocity_mps=velocity[who].astype(np.float32),
     )
 
@@ -111,16 +104,20 @@ def _collect(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _fill(x, y, low, high, code, T, step, grid):
-    """Mark the voxels that vertical intervals run through, T leading to voxel indices; the highest code wins."""
+    """Mark the voxels that vertical intervals run through; T leads to indices, the highest code wins."""
     depth, height, width = grid.shape
     for i in range(len(x)):
-        count = max(int(np.ceil((high[i] - low[i]) / step)), 0) + 1
-        rise = (high[i] - low[i]) / max(count - 1, 1)
+        rest = T[2, 0] * x[i] + T[2, 1] * y[i] + T[2, 3]  # the grid's layers are nearly level: cut to them
+        bottom, top = max(low[i], -rest / T[2, 2]), min(high[i], (depth - rest) / T[2, 2])
+        if bottom > top:
+            continue
+        count = int(np.ceil((top - bottom) / step)) + 1
+        rise = (top - bottom) / max(count - 1, 1)
         for k in range(count):
-            z = low[i] + k * rise
+            z = bottom + k * rise
             a = int(np.floor(T[0, 0] * x[i] + T[0, 1] * y[i] + T[0, 2] * z + T[0, 3]))
             b = int(np.floor(T[1, 0] * x[i] + T[1, 1] * y[i] + T[1, 2] * z + T[1, 3]))
-            c = int(np.floor(T[2, 0] * x[i] + T[2, 1] * y[i] + T[2, 2] * z + T[2, 3]))
+            c = int(np.floor(T[2, 2] * z + rest))
             inside = 0 <= a < width and 0 <= b < height and 0 <= c < depth
             if inside and code[i] > grid[c, b, a]:
                 grid[c, b, a] = code[i]

@@ -126,7 +126,8 @@ class World:
             InputError: voxels finer than `occupancy.FINEST_VOXEL_M`.
         """
         reach_m = float(np.linalg.norm([*spec.lower_m, *spec.upper_m]))
-        near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
+        moving = [actor for actor in actors if not actor.parked]
+        near = [a for a in (*moving, *self.parked) if _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in near]
         return full_occupancy(self._columns, self.static.thin, shaped, T_world_ego, spec)
 
