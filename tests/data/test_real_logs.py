@@ -158,6 +158,21 @@ def test_pandaset_standing_boxes_do_not_move(pandaset: LogPath) -> None:
     assert 5 < speed[speed.isfinite()].max() < 25
 
 
+@pytest.mark.parametrize("name", ["pandaset", "av2", "nuscenes"])
+def test_moving_vehicles_drive_forwards(
+    pandaset: LogPath, av2: dict[str, LogPath], keyframe: LogPath, name: str
+) -> None:
+    log = Log({"pandaset": pandaset, "av2": av2["7fab"], "nuscenes": keyframe}[name])
+    cosines = []
+    for frame in range(0, len(log), 10):
+        boxes = read_boxes(log, frame)
+        boxes = boxes[(boxes.velocity.norm(dim=-1) > 2) & (boxes.category <= Category.MOTORCYCLE)]
+        heading = torch.stack([boxes.yaw.cos(), boxes.yaw.sin()], dim=-1)
+        cosines.append((boxes.velocity * heading).sum(-1) / boxes.velocity.norm(dim=-1))
+    assert len(torch.cat(cosines)) >= 5
+    assert torch.cat(cosines).quantile(0.1) > 0.9
+
+
 def test_av2_loads_with_its_cameras_masked(av2: dict[str, LogPath]) -> None:
     for path in av2.values():
         config = ClipConfig(past_frames=2, future_frames=6, image_hw=(96, 160), voxels=SPEC, map=True)

@@ -23,6 +23,9 @@ _KEY = ModalityType.BOX_DETECTIONS_SE3.serialize()
 _LONGEST_DIFFERENCE_S = 1.5
 """Sightings of a track further apart give no velocity, as in the nuScenes devkit's `box_velocity`."""
 
+_BACKWARDS = {"pandaset"}
+"""Data sets whose boxes py123d 0.7 turns by half a turn: every moving car of theirs drives in reverse."""
+
 _DEFAULT_CATEGORY = {
     DefaultBoxDetectionLabel.VEHICLE: Category.CAR,
     DefaultBoxDetectionLabel.TWO_WHEELER: Category.BICYCLE,
@@ -139,10 +142,13 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     if log.metadata.dataset != DATASET:
         logged[(logged == 0).all(-1)] = np.nan  # what py123d's parsers write when they do not know
     difference = _track_velocity(track_id, t_s, box[:, :3])
+    R_world_box = Rotation.from_quat(box[:, 3:7], scalar_first=True).as_matrix().reshape(-1, 3, 3)
+    if log.metadata.dataset in _BACKWARDS:
+        R_world_box = R_world_box @ np.diag([-1.0, -1.0, 1.0])
     return Tracks(
         first_row=first_row,
         centre=box[:, :3],
-        R_world_box=Rotation.from_quat(box[:, 3:7], scalar_first=True).as_matrix().reshape(-1, 3, 3),
+        R_world_box=R_world_box,
         size_lwh=box[:, 7:],
         velocity=np.where(np.isfinite(logged), logged, difference),
         track_id=track_id,
