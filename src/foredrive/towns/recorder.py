@@ -118,7 +118,7 @@ def _frames(world: World, moments: Iterator[Moment], sensors: SensorSuite, seed:
             images=seen.images,
             sweep=seen.sweep,
             boxes=boxes_of(near, moment.T_world_ego),
-            occupancy=world.occupancy(moment.actors, OCCUPANCY, moment.T_world_ego),
+            occupancy=world.occupancy(moment.actors, moment.T_world_ego, OCCUPANCY),
             lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         )
 
