@@ -8,6 +8,7 @@ from typing import Any
 
 import tyro
 
+from foredrive.cli.bench import bench
 from foredrive.cli.convert import convert
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.record import record
@@ -22,6 +23,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "evaluate": evaluate,
     "view": view,
+    "bench": bench,
 }
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly."

@@ -1,0 +1,63 @@
+"""`foredrive bench`."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from foredrive.evaluation import Benchmark
+
+
+def bench(
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = None,
+    arms: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ARM [ARM ...]")] = (),
+    folder: Path = Path("benchmarks"),
+) -> None:
+    """List the benchmarks, or run one and write FOLDER/results/NAME.json.
+
+    Args:
+        name: Benchmark to run; an interrupted one goes on where it stopped. Without a name they are listed.
+        arms: Run these arms only.
+        folder: Where the benchmarks lie: each is a Python file that defines BENCHMARK.
+    """
+    from foredrive.evaluation import run_benchmark
+
+    files = {path.stem: path for path in sorted(folder.glob("*.py"))}
+    if not files:
+        raise InputError(
+            f"{folder}: no benchmarks here; run this in Foredrive's checkout or name their --folder"
+        )
+    if name is None:
+        for found, path in files.items():
+            benchmark = _load(path)
+            if benchmark is None:
+                print(f"{found}: a script of its own; run it with python {path}")
+            else:
+                print(f"{found}: {benchmark.question}\n    arms: {', '.join(benchmark.arms)}")
+        return
+    if name not in files:
+        raise InputError(f"no benchmark {name!r} in {folder}; there are: {', '.join(files)}")
+    chosen = _load(files[name])
+    if chosen is None:
+        raise InputError(f"{files[name]}: defines no BENCHMARK")
+    print(f"wrote {run_benchmark(name, chosen, folder / 'results', arms=arms or None)}")
+
+
+def _load(path: Path) -> "Benchmark | None":
+    """The BENCHMARK that a file defines; None if it defines none."""
+    from foredrive.evaluation import Benchmark
+
+    module_name = f"benchmarks.{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module  # before it runs: its dataclasses look themselves up there
+    spec.loader.exec_module(module)
+    benchmark = getattr(module, "BENCHMARK", None)
+    return benchmark if isinstance(benchmark, Benchmark) else None
