@@ -76,10 +76,11 @@ def test_a_miss_frees_up_to_its_free_range_only() -> None:
 
 
 def test_returns_from_the_ego_vehicle_are_dropped() -> None:
-    sweep = beams([[1.0, 0.2, 0.9], [5.2, 3, 1]], [True, True])
+    ends = [[1.0, 0.2, 0.9], [2.0, 0.2, 1.85], [5.2, 3.1, 1], [2.0, 0.2, 2.9]]
+    sweep = beams(ends, [True] * 4, origin=(0, 0, 1.9))  # a sensor on the roof
     labels = voxel_labels(sweep, SPEC, None, (np.array([1.5, 0, 0.75]), np.array([4.5, 1.9, 1.5])))
+    assert [at(labels.occupied, *end) for end in ends] == [False, False, True, True]
     assert not at(labels.known, 1.0, 0.2, 0.9)
-    assert at(labels.occupied, 5.2, 3, 1)
 
 
 def test_a_sweep_without_points_leaves_everything_unknown() -> None:

@@ -20,13 +20,13 @@ from foredrive.data.modalities import expand_array, squeeze_array
 from foredrive.files import atomic_path
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
-LABEL_VERSION = 1
+LABEL_VERSION = 2
 """Part of every cache key: raise it when labels come out differently."""
 FREE_MARGIN_VOXELS = 0.5
 """A beam frees nothing this close before its return: ranges are noisy, and a surface at a voxel's border must
 not free the voxel in front that it also fills."""
 EGO_MARGIN_M = 0.2
-"""Returns from the ego vehicle's box, enlarged by mirrors and antennas, are dropped."""
+"""Returns from the ego vehicle's box enlarged by this (mirrors) are dropped."""
 BOX_MARGIN_M = 0.1
 """Annotated boxes are enlarged by this when points are assigned to them."""
 
@@ -70,8 +70,7 @@ def voxel_labels(
     returned = beams.returned.numpy()
     ends = origin + direction * range_m[:, None]
     if ego_box is not None:
-        centre, size_lwh = ego_box
-        on_ego = returned & (np.abs(ends - centre) <= 0.5 * size_lwh + EGO_MARGIN_M).all(-1)
+        on_ego = returned & _on_ego(ends, origin, *ego_box)
         origin, range_m, returned, ends = (a[~on_ego] for a in (origin, range_m, returned, ends))
 
     state = np.full(spec.shape_zyx, UNKNOWN, dtype=np.uint8)
@@ -92,6 +91,19 @@ def voxel_labels(
         flow_mps=torch.from_numpy(flow_mps),
         flow_known=torch.from_numpy(flow_known),
     )
+
+
+def _on_ego(
+    points: Float[np.ndarray, "N 3"],
+    origin: Float[np.ndarray, "N 3"],
+    centre: Float[np.ndarray, "3"],
+    size_lwh: Float[np.ndarray, "3"],
+) -> Bool[np.ndarray, "N"]:
+    """Whether points lie on the ego vehicle: in its box, or above it but not above its sensors."""
+    offset, reach = points - centre, 0.5 * size_lwh + EGO_MARGIN_M
+    top = max(reach[2], float(origin[:, 2].max(initial=-np.inf)) - centre[2] + EGO_MARGIN_M)
+    footprint = (np.abs(offset[:, :2]) <= reach[:2]).all(-1)
+    return footprint & (offset[:, 2] >= -reach[2]) & (offset[:, 2] <= top)
 
 
 def _voxels(points: Float[np.ndarray, "N 3"], spec: VoxelSpec) -> Int64[np.ndarray, "N"]:
