@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Int
+from py123d.datatypes import BaseMapObject, Lane, LaneGroup
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from rich.progress import track
 
@@ -87,7 +88,7 @@ def record(
     world = World(town_map, seed)
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
     drive = Drive(traffic, seconds)
-    maps = write_map(OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects(), town, out)
+    maps = write_map(_map_objects(town), town, out)
     name, count = f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, seed)
     route = drive.route.polyline(traffic.lanes)
@@ -95,6 +96,15 @@ def record(
         for frame in track(frames, description=f"recording {name}", total=count):
             writer.write(frame)
     return LogPath(writer.folder, maps)
+
+
+def _map_objects(town: str) -> Iterator[BaseMapObject]:
+    """The town's map as py123d parses it, but in an order that does not depend on the hashes of strings."""
+    for item in OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects():
+        if isinstance(item, Lane | LaneGroup):
+            item.predecessor_ids.sort()
+            item.successor_ids.sort()
+        yield item
 
 
 def _frames(world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int) -> Iterator[Frame]:
