@@ -79,18 +79,21 @@ class CameraCrossAttention(nn.Module):
 
     def forward(
         self,
-        query: Float[Tensor, "b Q D"],
+        query: Float[Tensor, "_b Q D"],
         features: Sequence[Float[Tensor, "b C _h _w D"]],
         uv: Float[Tensor, "b C Q 2"],
         visible: Bool[Tensor, "b C Q"],
     ) -> Float[Tensor, "b Q D"]:
-        """Args: voxel features; image features; projections in [0, 1]; which cameras see which voxel."""
-        b, q, _ = query.shape
-        offset = self.offset(query).view(b, q, self.heads, self.levels, self.points, 2)
-        weight = self.weight(query).view(b, q, self.heads, -1).softmax(-1)
-        weight = weight.view(b, q, self.heads, self.levels, self.points)
+        """Args: voxel features, of batch size b or 1; image features; projections; who sees what."""
+        q, b = query.shape[1], len(uv)
+        offset = self.offset(query).view(-1, q, self.heads, self.levels, self.points, 2)
+        weight = self.weight(query).view(-1, q, self.heads, self.levels * self.points).softmax(-1)
+        weight = weight.view(-1, q, self.heads, self.levels, self.points)
         values = [self.value(level) for level in features]
-        return self.out(lift(values, uv, visible, offset, weight))
+        read = lift(
+            values, uv, visible, offset.expand(b, *offset.shape[1:]), weight.expand(b, *weight.shape[1:])
+        )
+        return self.out(read)
 
 
 class LiftingLayer(nn.Module):
@@ -107,14 +110,18 @@ class LiftingLayer(nn.Module):
 
     def forward(
         self,
-        query: Float[Tensor, "b Q D"],
+        query: Float[Tensor, "_b Q D"],
         shape_zyx: tuple[int, int, int],
         place: Float[Tensor, "Q 3"],
         features: Sequence[Float[Tensor, "b C _h _w D"]],
         uv: Float[Tensor, "b C Q 2"],
         visible: Bool[Tensor, "b C Q"],
     ) -> Float[Tensor, "b Q D"]:
-        """One round of refinement; arguments as in the two attentions."""
+        """One round of refinement; arguments as in the two attentions.
+
+        A query batch of 1 stands for queries that are still the same for the whole batch: until they have
+        seen images, work on them is done once.
+        """
         query = self.norms[0](query + self.self_attention(query, shape_zyx, place))
         query = self.norms[1](query + self.cross_attention(query, features, uv, visible))
         return self.norms[2](query + self.feed_forward(query))
@@ -165,7 +172,7 @@ class LiftingEncoder(nn.Module):
     ) -> Float[Tensor, "b D Z Y X"]:
         """Lift image features; the result lies channels-last in memory."""
         uv, visible = self.project(rig, image_valid)
-        query = self.query.expand(len(image_valid), -1, -1)
+        query = self.query[None]  # the first layer expands it to the batch
         for layer in self.layers:
             query = layer(query, self.spec.shape_zyx, self.place, features, uv, visible)
         return query.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3)
