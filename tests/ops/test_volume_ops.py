@@ -241,7 +241,7 @@ def test_warp_follows_the_ego_vehicle() -> None:
 
 
 def test_warp_follows_the_flow_before_the_turn() -> None:
-    """ẑ = R (z + f) + t: with a quarter turn, one voxel along x of the result is one along y of what is read."""
+    """ẑ = R (z + f) + t: after a quarter turn, one voxel along x is one along y of what is read."""
     volume, flow = scene()
     flow[:, 0] = VOXEL_M
     quarter = matrix_from_yaw(torch.tensor([math.pi / 2]), torch.zeros(1, 3))
@@ -285,3 +285,13 @@ def test_warp_of_a_channels_last_volume_copies_nothing_wrong(parity: Parity) -> 
     assert torch.equal(
         warp_volume(last, flow, T, LOWER_M, VOXEL_M), warp_volume(volume, flow, T, LOWER_M, VOXEL_M)
     )
+
+
+def test_an_exported_program_holds_the_reference() -> None:
+    class Attend(torch.nn.Module):
+        def forward(self, values: Tensor, points: Tensor, weights: Tensor) -> Tensor:
+            return attend_volume(values, points, weights)
+
+    inputs = attention_case(0)
+    exported = torch.export.export(Attend(), tuple(inputs)).module()
+    torch.testing.assert_close(exported(*inputs), attend_volume(*inputs), rtol=1e-4, atol=1e-4)

@@ -16,6 +16,7 @@ from foredrive.ops.lanes import (
     ZERO,
     add_dots,
     kernel,
+    kernel_part,
     load,
     mul_add,
     neighbours,
@@ -74,7 +75,7 @@ class _Block(NamedTuple):
     """Float, four in a row for each point: what the pixels hold, times the gradient of the result."""
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _new_block():
     x, y, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -82,7 +83,7 @@ def _new_block():
     return _Block(x, y, weight, np.empty(4 * BLOCK, np.int32), part, dots)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _level(block, start):
     """The buffers from a level's first point on."""
@@ -90,7 +91,7 @@ def _level(block, start):
     return _Block(x, y, weight, block.corner[start:], block.part[start:], block.dots[4 * start :])
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _collect(inputs, block, first, last, head):
     """Fill `block` with the points of the pairs first … last."""
@@ -110,7 +111,7 @@ def _collect(inputs, block, first, last, head):
         _corners(_level(block, level * count), count, inputs.sizes[level], np.int32(inputs.values.shape[2]))
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _corners(block, count, size, channels):
     """Fill corner and part of one level."""
@@ -131,7 +132,7 @@ def _corners(block, count, size, channels):
         part[3 * BLOCK + i] = w * wy1 * wx1
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _read(inputs, block, first, last, channel, zero, out):
     """Add what each pair of a block reads from its image, in the channels from `channel` on."""
@@ -170,7 +171,7 @@ def lift_pairs(inputs, first_pair, last_pair, out):
                 _read(inputs, block, first, last, c, ZERO, out)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _read_back(inputs, block, first, last, channel, zero, grads):
     """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
@@ -201,7 +202,7 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
                         store(grads.values, at, mul_add(block.part[k * BLOCK + p], grad, total))
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _slopes(block, count, size):
     """Turn `dots` into gradients with respect to x, y and weight, which go to the first rows of `part`."""
@@ -217,7 +218,7 @@ def _slopes(block, count, size):
         slope[2 * BLOCK + i] = wy0 * (wx0 * d00 + wx1 * d01) + wy1 * (wx0 * d10 + wx1 * d11)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _hand_out(inputs, block, first, last, head, grads):
     """Add the gradients of a block's points to those of their queries. Overwrites `block.part`."""

@@ -79,12 +79,22 @@ def warp_volume(
         lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, the same in both frames.
     """
     with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
-        b, _, depth, height, width = volume.shape
-        axes = [torch.arange(n, dtype=flow.dtype, device=flow.device) for n in (depth, height, width)]
-        z, y, x = torch.meshgrid(*axes, indexing="ij")
-        lower = flow.new_tensor(lower_m)
-        centres_m = (torch.stack([x, y, z], dim=-1) + 0.5) * voxel_m + lower  # [Z Y X 3]
-        target_m = (centres_m + flow.permute(0, 2, 3, 4, 1)).flatten(1, 3)
-        source = (transform_points(T_src_dst, target_m) - lower) / voxel_m
-        read = sample_volume(volume.permute(0, 2, 3, 4, 1), source)
-        return read.view(b, depth, height, width, -1).permute(0, 4, 1, 2, 3)
+        read = sample_volume(
+            volume.permute(0, 2, 3, 4, 1), places_before(flow, T_src_dst, lower_m, voxel_m).flatten(1, 3)
+        )
+        return read.unflatten(1, volume.shape[2:]).permute(0, 4, 1, 2, 3)
+
+
+def places_before(
+    flow: Float[Tensor, "b 3 Z Y X"],
+    T_src_dst: Float[Tensor, "b 4 4"],
+    lower_m: tuple[float, float, float],
+    voxel_m: float,
+) -> Float[Tensor, "b Z Y X 3"]:
+    """Where `warp_volume` reads: ẑ = R (z + f) + t of every voxel centre z, x y z in voxel units."""
+    axes = [torch.arange(n, dtype=flow.dtype, device=flow.device) + 0.5 for n in flow.shape[2:]]
+    z, y, x = torch.meshgrid(*axes, indexing="ij")
+    lower = flow.new_tensor(lower_m)
+    target_m = torch.stack([x, y, z], dim=-1) * voxel_m + lower + flow.permute(0, 2, 3, 4, 1)
+    source_m = transform_points(T_src_dst, target_m.flatten(1, 3))
+    return ((source_m - lower) / voxel_m).unflatten(1, flow.shape[2:])

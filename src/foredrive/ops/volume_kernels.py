@@ -16,6 +16,7 @@ from foredrive.ops.lanes import (
     ZERO,
     add_dots,
     kernel,
+    kernel_part,
     load,
     mul_add,
     neighbours,
@@ -74,7 +75,7 @@ class _Block(NamedTuple):
     """Float, eight in a row for each point: what the voxels hold, times the gradient of the result."""
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _new_block():
     corner = np.empty(8 * BLOCK, np.int32)
@@ -82,7 +83,7 @@ def _new_block():
     return _Block(np.empty(3 * BLOCK, np.float32), np.empty(BLOCK, np.float32), corner, part, dots)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _collect(inputs, block, item, first, last, head):
     """Fill `block` with the points of the queries first … last of a batch item."""
@@ -96,7 +97,7 @@ def _collect(inputs, block, item, first, last, head):
     _corners(block, (last - first) * points, inputs.values.shape)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _corners(block, count, shape):
     """Fill corner and part."""
@@ -129,7 +130,7 @@ def _corners(block, count, shape):
         part[7 * BLOCK + i] = w * wz1 * wy1 * wx1
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _read(inputs, block, item, first, last, channel, zero, out):
     """Write what each query of a block reads, in the channels from `channel` on."""
@@ -167,7 +168,7 @@ def read_queries(inputs, item, first_query, last_query, out):
                 _read(inputs, block, item, first, last, c, ZERO, out)
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _read_back(inputs, block, item, first, last, channel, zero, grads):
     """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
@@ -200,7 +201,7 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
                     )
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _slopes(block, count, shape):
     """Turn `dots` into gradients with respect to x, y, z and weight, which go to the first rows of `part`."""
@@ -229,7 +230,7 @@ def _slopes(block, count, shape):
         slope[3 * BLOCK + i] = wz0 * d0 + wz1 * d1
 
 
-@kernel
+@kernel_part
 @no_type_check
 def _hand_out(inputs, block, item, first, last, slot, grads):
     """Write the gradients of a block's points. Overwrites `block.part`."""
