@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe
+from foredrive.recipes.demo import DemoSize, full_demo, quick_demo, run_demo
 from foredrive.recipes.evaluate import Inspection, evaluate_run, inspect_run
 from foredrive.recipes.nemo import nemo_base, nemo_tiny
 from foredrive.recipes.train import Run, find_all_logs, open_run, train_run
@@ -24,13 +25,17 @@ def find_recipe(name: str) -> Recipe:
 
 __all__ = [
     "RECIPES",
+    "DemoSize",
     "Inspection",
     "Recipe",
     "Run",
     "evaluate_run",
     "find_all_logs",
     "find_recipe",
+    "full_demo",
     "inspect_run",
     "open_run",
+    "quick_demo",
+    "run_demo",
     "train_run",
 ]
