@@ -10,6 +10,7 @@ import tyro
 
 from foredrive.cli.bench import bench
 from foredrive.cli.convert import convert
+from foredrive.cli.demo import demo
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.record import record
 from foredrive.cli.train import train
@@ -18,6 +19,7 @@ from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
 
 VERBS: dict[str, Callable[..., Any]] = {
+    "demo": demo,
     "record": record,
     "convert": convert,
     "train": train,

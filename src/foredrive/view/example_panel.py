@@ -198,10 +198,15 @@ def _now(panel: ExamplePanel) -> str:
         above.append(figure_html(volume_picture(panel), caption, "png"))
     return (
         '<div class="grid two">'
-        + figure_html(predicted_voxels(panel, 0), "Predicted occupancy, coloured by height")
+        + figure_html(predicted_voxels(panel, 0), f"Predicted occupancy, {_how_much(panel, 0)}")
         + figure_html(labelled_voxels(panel, 0), "Occupancy seen by the lidar, coloured by height")
         + f'</div><div class="grid three">{"".join(above)}{_comparison_key()}</div>'
     )
+
+
+def _how_much(panel: ExamplePanel, step: int) -> str:
+    """What there is to see in a picture of predicted voxels: without any it is black."""
+    return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
 
 
 def _comparison_key() -> str:
@@ -221,10 +226,10 @@ def _later(panel: ExamplePanel) -> str:
     columns = []
     for step in steps:
         when = f"+{float(clip.t_s[clip.now + step]):.1f} s"
-        columns.append(
-            f"<div>{figure_html(predicted_voxels(panel, step), f'Imagined occupancy at {when}')}</div>"
-            f"<div>{figure_html(comparison_picture(panel, step), f'Against lidar at {when}', 'png')}</div>"
-        )
+        caption = f"Imagined occupancy at {when}, {_how_much(panel, step)}"
+        imagined = figure_html(predicted_voxels(panel, step), caption)
+        compared = figure_html(comparison_picture(panel, step), f"Against lidar at {when}", "png")
+        columns.append(f"<div>{imagined}</div><div>{compared}</div>")
     return f'<p class="note">Imagined futures</p><div class="later">{"".join(columns)}</div>'
 
 

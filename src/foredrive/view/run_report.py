@@ -1,7 +1,7 @@
 """The report of a run that was evaluated."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from foredrive.data import LogPath
 from foredrive.evaluation import EvaluationResult
@@ -38,8 +38,9 @@ def report_on_run(
 def inspection_panel(inspection: Inspection) -> ExamplePanel:
     """One example as the report shows it."""
     log, _, t_us = inspection.example.key[0].rpartition("@")
+    taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     return ExamplePanel(
-        title=f"{log} at {int(t_us) * 1e-6:.2f} s",
+        title=f"{log} at {taken:%Y-%m-%d %H:%M:%S}.{taken.microsecond // 10_000:02d} UTC",
         example=inspection.example,
         occupied=inspection.occupancy_prob > OCCUPIED_ABOVE,
         rendered=inspection.rendered,
@@ -69,7 +70,7 @@ def _notes(
     run: Run,
     logs: Sequence[LogPath],
     result: EvaluationResult,
-    losses: dict[str, list[dict[str, float]]],
+    losses: Mapping[str, Sequence[Mapping[str, float | int]]],
 ) -> list[str]:
     """What keeps the figures from meaning what they seem to mean."""
     notes = []

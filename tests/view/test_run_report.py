@@ -1,0 +1,61 @@
+"""The report of a run: what its notes say and how its examples are named."""
+
+import json
+from pathlib import Path
+
+import torch
+
+from foredrive.data import LogPath
+from foredrive.evaluation import EvaluationResult
+from foredrive.evaluation.run import Failure
+from foredrive.recipes import Inspection, Run, find_recipe
+from foredrive.scene import Example
+from foredrive.view.run_report import inspection_panel, report_on_run
+
+SUMMARY = {"command": "foredrive evaluate a", "commit": None, "machine.cpu": "CPU", "machine.cores": 2}
+
+
+def make_run(folder: Path, perceptual: float) -> Run:
+    (folder / "pretrain").mkdir(parents=True)
+    line = {"step": 1, "loss": 2.0, "perc": perceptual}
+    (folder / "pretrain" / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    logs = (LogPath(folder / "logs" / "a_train" / "one", folder),)
+    return Run(folder, find_recipe("nemo_tiny"), logs, folder / "cache")
+
+
+def test_testing_on_training_logs_is_said(tmp_path: Path) -> None:
+    run = make_run(tmp_path, perceptual=0.3)
+    other = LogPath(tmp_path / "logs" / "a_test" / "two", tmp_path)
+    fair = report_on_run(run, [other], EvaluationResult(SUMMARY, ()), [])
+    unfair = report_on_run(run, [*run.logs, other], EvaluationResult(SUMMARY, ()), [])
+    assert fair.notes == []
+    assert unfair.notes[0].startswith("1 of the 2 evaluated logs were trained on")
+    assert fair.title == "nemo_tiny on a_test/two"
+    assert fair.commit == "not a git checkout"
+    assert fair.losses["pretrain"][0]["loss"] == 2.0
+    assert list(fair.losses["finetune"]) == []
+
+
+def test_a_perceptual_loss_that_was_off_and_failures_are_said(tmp_path: Path) -> None:
+    run = make_run(tmp_path, perceptual=0.0)
+    failures = tuple(Failure(f"log@{i}", "not finite") for i in range(9))
+    report = report_on_run(run, [], EvaluationResult(SUMMARY, failures), [])
+    assert "perceptual loss was off" in report.notes[0]
+    assert report.notes[1] == "Failed: log@0: not finite"
+    assert len(report.notes) == 1 + 5
+
+
+def test_an_example_is_named_by_log_and_time(example: Example) -> None:
+    shape = example.occupancy.spec.shape_zyx
+    inspection = Inspection(
+        example=Example(
+            example.clip, example.occupancy, example.flow, ("town_test/Town05_seed3@1577836802250000",)
+        ),
+        occupancy_prob=torch.stack([torch.full(shape, 0.4), torch.full(shape, 0.6)]),
+        rendered=torch.zeros(6, 3, 4, 4),
+        volume=torch.zeros(2, *shape),
+        plan=example.clip.future,
+    )
+    panel = inspection_panel(inspection)
+    assert panel.title == "town_test/Town05_seed3 at 2020-01-01 00:00:02.25 UTC"
+    assert panel.occupied.flatten(1).any(1).tolist() == [False, True]
