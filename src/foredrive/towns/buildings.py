@@ -219,8 +219,8 @@ class _Builder:
             slopes += [quads(top, roof, uvw), quads(top[:, ::-1] - [0.0, 0.0, 0.15], roof, uvw)]
         gables = np.array(
             [
-                [at(w, 0, eaves), at(w, d, eaves), at(w, 0.5 * d, ridge - 0.1)],
-                [at(0, d, eaves), at(0, 0, eaves), at(0, 0.5 * d, ridge - 0.1)],
+                [at(w, 0.0, eaves), at(w, d, eaves), at(w, 0.5 * d, ridge - 0.1)],
+                [at(0.0, d, eaves), at(0.0, 0.0, eaves), at(0.0, 0.5 * d, ridge - 0.1)],
             ]
         )
         return join([*slopes, triangles(gables, wall, np.zeros((2, 3, 3)))])

@@ -16,6 +16,9 @@ COLUMN_M = 0.25
 EDGE_SPLIT = 4
 """Columns on the edge of something solid are split into this many along x and y."""
 EDGE_M = 0.4
+WALL_SPACING_M = 0.2
+UPRIGHT = 0.3
+"""Largest vertical part of a wall's unit normal."""
 MOST_LAYERS = 40
 STEP_M = 2e-3
 DECK_DEPTH_M = 1.5
@@ -44,7 +47,16 @@ class TownColumns:
     faces: "Faces"
     top_m: float
     """Above everything."""
+    walls: Intervals
+    """Of faces that rays from above do not meet."""
     _tiles: dict[tuple[int, int], Intervals] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        key = np.floor(np.stack([self.walls.x, self.walls.y], axis=1) / TILE_M).astype(int)
+        order = np.lexsort(key.T)
+        starts = np.flatnonzero(np.diff(key[order], axis=0, prepend=key[order][:1] - 1).any(axis=1))
+        rows = np.split(order, starts[1:])
+        self._walls = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
 
     def around(self, centre_xy: Float[np.ndarray, "2"], radius_m: float) -> list[Intervals]:
         """All tiles within a distance."""
@@ -68,7 +80,9 @@ class TownColumns:
         dy, dx = (a.ravel() for a in np.meshgrid(fine, fine, indexing="ij"))
         fine_x, fine_y = (x[edge][:, None] + dx).ravel(), (y[edge][:, None] + dy).ravel()
         refined, _ = columns(self.scene, self.faces, fine_x, fine_y, self.top_m)
-        return Intervals(*(np.concatenate(pair) for pair in zip(coarse, refined, strict=True)))
+        rows = self._walls.get((i, j), np.zeros(0, dtype=int))
+        walls = Intervals(*(column[rows] for column in self.walls))
+        return Intervals(*(np.concatenate(parts) for parts in zip(coarse, refined, walls, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -138,6 +152,34 @@ def columns(
         origin[ray, 2] = z - STEP_M
     rays, low, high, surface = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return Intervals(origin[rays, 0], origin[rays, 1], low, high, surface), rays
+
+
+def wall_intervals(mesh: Mesh, faces: Faces) -> Intervals:
+    """The upright faces of what is built, as vertical intervals WALL_SPACING_M apart."""
+    built = np.isin(faces.surface, (Surface.BUILDING, Surface.STRUCTURE))
+    normal = np.cross(mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0])
+    upright = np.abs(normal[:, 2]) < UPRIGHT * np.linalg.norm(normal, axis=1)
+    corner = mesh.xyz[built & upright].astype(np.float64)
+    ahead = np.cross(normal[built & upright], [0.0, 0.0, 1.0])
+    along = np.einsum("fka,fa->fk", corner, ahead / np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9))
+    corner = np.take_along_axis(corner, np.argsort(along, axis=1)[..., None], axis=1)
+    a, b, c = np.sort(along, axis=1).T
+    count = np.ceil((c - a) / WALL_SPACING_M).astype(int) + 1
+    face = np.repeat(np.arange(len(count)), count)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    share = step / np.maximum(count - 1, 1)[face]  # along the longest side, from the first corner
+    s = a[face] + share * (c - a)[face]
+    side = corner[face, 0] + share[:, None] * (corner[face, 2] - corner[face, 0])
+    first = s <= b[face]
+    start, end = np.where(first, a[face], b[face]), np.where(first, b[face], c[face])
+    t = (s - start) / np.maximum(end - start, 1e-9)
+    z0 = np.where(first, corner[face, 0, 2], corner[face, 1, 2])
+    z1 = np.where(first, corner[face, 1, 2], corner[face, 2, 2])
+    other = z0 + t * (z1 - z0)
+    low, high = np.minimum(side[:, 2], other), np.maximum(side[:, 2], other)
+    surface = faces.surface[built & upright][face]
+    x, y, low, high = (v.astype(np.float32) for v in (side[:, 0], side[:, 1], low, high))
+    return Intervals(x, y, low, high, surface)
 
 
 def _edges(height: Float[np.ndarray, "Y X"]) -> Bool[np.ndarray, "Y X"]:

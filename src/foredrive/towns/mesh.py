@@ -12,6 +12,9 @@ import shapely
 from jaxtyping import Float, Float32, Int32
 
 
+Vector = Sequence[float | int]
+
+
 @dataclass(frozen=True)
 class Mesh:
     """F triangles."""
@@ -72,7 +75,7 @@ def ribbon(
 
 
 def polygon_cap(
-    polygon: shapely.Polygon, z: float, look: int, up: bool = True, origin: Sequence[float] = (0.0, 0.0)
+    polygon: shapely.Polygon, z: float, look: int, up: bool = True, origin: Vector = (0.0, 0.0)
 ) -> Mesh:
     """A level face; texture coordinates are x, y about `origin`."""
     xy = polygon_triangles(polygon)
@@ -132,7 +135,7 @@ def prism(
     return join(parts)
 
 
-def box(lower: Sequence[float], upper: Sequence[float], look: int) -> Mesh:
+def box(lower: Vector, upper: Vector, look: int) -> Mesh:
     """An axis-aligned box."""
     (x0, y0, z0), (x1, y1, z1) = lower, upper
     return hexahedron(
@@ -145,9 +148,7 @@ def box(lower: Sequence[float], upper: Sequence[float], look: int) -> Mesh:
 _HEX_FACES = ((3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
-def hexahedron(
-    bottom: Sequence[Sequence[float]], top: Sequence[Sequence[float]], looks: Sequence[int]
-) -> Mesh:
+def hexahedron(bottom: Sequence[Vector], top: Sequence[Vector], looks: Sequence[int]) -> Mesh:
     """A solid between two quads, each counter-clockwise from above.
 
     Args:
@@ -157,9 +158,7 @@ def hexahedron(
     return join([quads(corners[list(f)][None], n) for f, n in zip(_HEX_FACES, looks, strict=True)])
 
 
-def frustum(
-    bottom: Sequence[float], top: Sequence[float], radii: tuple[float, float], sides: int, look: int
-) -> Mesh:
+def frustum(bottom: Vector, top: Vector, radii: tuple[float, float], sides: int, look: int) -> Mesh:
     """A closed cone frustum between two points; a top radius of 0 makes a cone."""
     base, tip = np.asarray(bottom, dtype=float), np.asarray(top, dtype=float)
     axis = (tip - base) / np.linalg.norm(tip - base)

@@ -126,7 +126,7 @@ def _lot(
     def world(x: float, y: float) -> Float[np.ndarray, "2"]:
         return start + x * along + y * into
 
-    ring = np.array([world(0, 0), world(width, 0), world(width, LOT_DEPTH_M), world(0, LOT_DEPTH_M)])
+    ring = np.array([world(0.0, 0.0), world(width, 0.0), world(width, LOT_DEPTH_M), world(0.0, LOT_DEPTH_M)])
     area = shapely.Polygon(ring)
     heights = site.height(np.concatenate([ring, [ring.mean(axis=0)]]))
     if not site.is_free(area.buffer(0.3)) or np.ptp(heights) > LOT_SLOPE_M:

@@ -23,7 +23,7 @@ class TriangleScene:
     """An Embree scene of one mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self._scene = EmbreeScene()
+        self._scene = EmbreeScene(robust=True)  # no leaks along shared edges
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(mesh.xyz))
         up = np.array([[0.0, 0.0, 1.0]], dtype=np.float32)
         self._scene.run(up, up)  # builds the tree, which is not safe to do from several threads

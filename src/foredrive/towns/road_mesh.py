@@ -17,7 +17,6 @@ PAINT_M = 0.008
 STOP_LINE_M = 0.45
 STOP_LINE_GAP_M = 0.6
 STRIPE_PERIOD_M, STRIPE_M = 1.0, 0.5
-UNDERCOAT_M = 0.3
 DECK_M = 0.9
 PARAPET_M, PARAPET_WIDTH_M = 0.85, 0.25
 PILLAR_SPACING_M, PILLAR_RADIUS_M = 24.0, 0.7
@@ -43,7 +42,6 @@ class RoadLooks:
     walkway: int
     kerb: int
     median: int
-    hidden: int
     stripes: int
     line: int
     concrete: int
@@ -59,7 +57,6 @@ def add_road_looks(table: LookTable) -> RoadLooks:
         walkway=table.add(Look(Surface.SIDEWALK, Texture.SLABS, CONCRETE_RGB, 0.35, params=(1.2,))),
         kerb=table.add(kerb),
         median=table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.36, 0.42, 0.22), 0.45)),
-        hidden=table.add(Look(Surface.HIDDEN, Texture.PLAIN, ASPHALT_RGB, 0.15)),
         stripes=table.add(stripes),
         line=table.add(Look(Surface.ROAD, Texture.PLAIN, (0.86, 0.86, 0.84), 0.75, params=(0.5,))),
         concrete=table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.61, 0.58), 0.35, params=(1.0,))),
@@ -73,7 +70,6 @@ def build_roads(town: TownMap, plan: GroundPlan, table: LookTable) -> Mesh:
     parts += [_kerbs(piece, looks) for piece in plan.pieces if piece.raise_m > 0]
     plain = table.add(_asphalt(None, None))
     parts += [drape(fill, plan, plain, 0.0) for fill in plan.fills]
-    parts += _undercoat(plan, looks)
     parts += _crosswalks(town, plan, looks) + _stop_lines(town, looks)
     parts += _bridges(plan, looks)
     return join(parts)
@@ -90,9 +86,9 @@ def _asphalt(left: Marking | None, right: Marking | None) -> Look:
     params: list[float] = []
     for marking in (left, right):
         if marking is None or marking.kind not in _PATTERN:
-            params += [LinePattern.NONE, 0.0, 0.0]
+            params += [float(LinePattern.NONE), 0.0, 0.0]
         else:
-            params += [_PATTERN[marking.kind], float(marking.yellow), marking.width_m]
+            params += [float(_PATTERN[marking.kind]), float(marking.yellow), marking.width_m]
     return Look(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15, params=tuple(params))
 
 
@@ -148,18 +144,6 @@ def _rings(area: shapely.Geometry) -> list[shapely.LinearRing]:
     """All rings, the solid on their left."""
     oriented = shapely.get_parts(shapely.orient_polygons(area))
     return [ring for polygon in oriented for ring in (polygon.exterior, *polygon.interiors)]
-
-
-def _undercoat(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
-    """A second surface below the roads on the ground, for rays that slip through a crack between pieces."""
-    sunk = np.array([0.0, 0.0, -UNDERCOAT_M])
-    parts = [
-        ribbon(p.left_xyz + sunk, p.right_xyz + sunk, looks.hidden)
-        for p in plan.pieces
-        if p.whole and not p.bridge
-    ]
-    cut = [p.area for p in plan.pieces if not p.whole and not p.bridge]
-    return [*parts, *(drape(area, plan, looks.hidden, -UNDERCOAT_M) for area in [*cut, *plan.fills])]
 
 
 def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
@@ -269,7 +253,7 @@ def _pillars(bridge: list[Piece], plan: GroundPlan, looks: RoadLooks) -> list[Me
         if ground.intersects(spot.buffer(PILLAR_RADIUS_M + PILLAR_CLEARANCE_M)):
             continue
         placed = placed.union(spot)
-        base = float(plan.borders.road(np.array([x, y]))) - 1.0
+        base = float(plan.borders.road(np.array([[x, y]]))[0]) - 1.0
         radii = (PILLAR_RADIUS_M, PILLAR_RADIUS_M)
         parts.append(frustum((x, y, base), (x, y, z - DECK_M), radii, 10, looks.concrete))
     return parts

@@ -17,6 +17,7 @@ HORIZON_M = 1500.0
 EDGE_DROP_M = 0.02
 """The land begins this much below a road's edge."""
 ROAD_REACH_M = 1.5
+SUNK_M = 0.5
 DECK_CLEARANCE_M = 2.0
 SMOOTHING_ROUNDS = 200
 HILL_M, HILL_WAVE_M = 1.6, 45.0
@@ -57,7 +58,11 @@ def make_terrain(
 
 
 def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
-    """Mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon."""
+    """Mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon.
+
+    Below the roads it goes on, sunk, for rays that slip through a crack between the roads' pieces.
+    """
+    sunk = table.add(Look(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
     look = table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.36, 0.42, 0.22), 0.45))
     rows, columns = terrain.z.shape
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
@@ -70,6 +75,7 @@ def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
         [
             quads(_cell_corners(terrain, j[~touched], i[~touched]), look),
             _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), look),
+            quads(_cell_corners(terrain, j[touched], i[touched]) - np.array([0.0, 0.0, SUNK_M]), sunk),
             _horizon(terrain, look),
         ]
     )

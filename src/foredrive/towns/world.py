@@ -12,7 +12,7 @@ from foredrive.towns import raycast, sensing, shading
 from foredrive.towns.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.actors import ActorState
 from foredrive.towns.buildings import build_buildings
-from foredrive.towns.columns import TownColumns, faces_of
+from foredrive.towns.columns import TownColumns, faces_of, wall_intervals
 from foredrive.towns.ground_plan import make_ground_plan
 from foredrive.towns.light import daylight
 from foredrive.towns.lights import Light
@@ -73,12 +73,18 @@ class World:
         self._looks = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
         faces = faces_of(self.static.mesh, self._looks.surface)
-        self._columns = TownColumns(self._scene, faces, float(self.static.mesh.xyz[..., 2].max()) + 1.0)
+        top_m = float(self.static.mesh.xyz[..., 2].max()) + 1.0
+        self._columns = TownColumns(self._scene, faces, top_m, wall_intervals(self.static.mesh, faces))
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
         """Parked cars: a part of the world that `render` and `occupancy` know of already."""
         return self.static.parked
+
+    @property
+    def surfaces(self) -> Int[np.ndarray, "L"]:
+        """The `Surface` of each look in the static mesh."""
+        return self._looks.surface
 
     def render(
         self,

@@ -1,0 +1,63 @@
+"""Town maps."""
+
+import numpy as np
+import pytest
+
+from foredrive.errors import InputError
+from foredrive.towns.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
+
+
+def test_an_unknown_town_is_named_with_those_there_are() -> None:
+    with pytest.raises(InputError, match=r"Town99.*Town01.*Town10HD"):
+        load_town_map("Town99")
+
+
+def test_lanes_join_end_to_start(town02: TownMap) -> None:
+    lanes = {lane.lane_id: lane for lane in town02.lanes}
+    assert len(lanes) == 88
+    for lane in town02.lanes:
+        assert lane.successor_ids
+        for name in lane.successor_ids:
+            following = lanes[name]
+            assert np.linalg.norm(following.centreline_xyz[0] - lane.centreline_xyz[-1]) < 0.05
+            assert lane.lane_id in following.predecessor_ids
+
+
+def test_borders_lie_on_their_sides(town02: TownMap) -> None:
+    for lane in town02.lanes:
+        ahead = np.diff(lane.centreline_xyz[:, :2], axis=0)
+        across = (lane.left_boundary_xyz - lane.right_boundary_xyz)[:-1, :2]
+        assert (ahead[:, 0] * across[:, 1] - ahead[:, 1] * across[:, 0] > 0).all()  # left of the direction
+        assert lane.width_m == pytest.approx(4.0, abs=0.01)
+
+
+def test_town02_has_a_yellow_dashed_centre_line_kerbs_and_lights(town02: TownMap) -> None:
+    between = [lane for lane in town02.lanes if lane.junction_id is None]
+    assert {lane.left_marking for lane in between} == {MarkingKind.BROKEN}
+    strips = [s for s in town02.strips_of(StripKind.DRIVING) if s.junction_id is None]
+    assert all(marking.yellow for strip in strips for marking in strip.left_markings)
+    assert len(town02.strips_of(StripKind.SIDEWALK)) == 64
+    assert {zone.kind for zone in town02.stop_zones} == {StopZoneKind.TRAFFIC_LIGHT}
+
+
+def test_a_stop_zone_says_which_way_its_traffic_drives(town02: TownMap) -> None:
+    lanes = {lane.lane_id: lane for lane in town02.lanes}
+    for zone in town02.stop_zones:
+        ahead = np.array([np.cos(zone.post_yaw), np.sin(zone.post_yaw)])
+        for name in zone.lane_ids:
+            lane = lanes[name]
+            assert lane.junction_id is not None
+            step = lane.centreline_xyz[1, :2] - lane.centreline_xyz[0, :2]
+            assert step @ ahead > 0.9 * np.linalg.norm(step)
+
+
+def test_heights_follow_the_road_where_later_lane_sections_begin() -> None:
+    """Left and right border of a lane are level, in a town on hills and with bridges."""
+    town = load_town_map("Town04")
+    tilt = max(np.abs(s.left_xyz[:, 2] - s.right_xyz[:, 2]).max() for s in town.strips)
+    assert tilt < 1e-6
+    assert max(lane.centreline_xyz[:, 2].max() for lane in town.lanes) == pytest.approx(11.0, abs=0.1)
+    lanes = {lane.lane_id: lane for lane in town.lanes}
+    for lane in town.lanes:
+        for name in lane.successor_ids:
+            assert lanes[name].centreline_xyz[0, 2] == pytest.approx(lane.centreline_xyz[-1, 2], abs=0.05)
