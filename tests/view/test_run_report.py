@@ -6,8 +6,7 @@ from pathlib import Path
 import torch
 
 from foredrive.data import LogPath
-from foredrive.evaluation import EvaluationResult
-from foredrive.evaluation.run import Failure
+from foredrive.evaluation import Failure
 from foredrive.recipes import Inspection, Run, find_recipe
 from foredrive.scene import Example
 from foredrive.view.run_report import inspection_panel, report_on_run
@@ -26,8 +25,8 @@ def make_run(folder: Path, perceptual: float) -> Run:
 def test_testing_on_training_logs_is_said(tmp_path: Path) -> None:
     run = make_run(tmp_path, perceptual=0.3)
     other = LogPath(tmp_path / "logs" / "a_test" / "two", tmp_path)
-    fair = report_on_run(run, [other], EvaluationResult(SUMMARY, ()), [])
-    unfair = report_on_run(run, [*run.logs, other], EvaluationResult(SUMMARY, ()), [])
+    fair = report_on_run(run, [other], SUMMARY, [])
+    unfair = report_on_run(run, [*run.logs, other], SUMMARY, [])
     assert fair.notes == []
     assert unfair.notes[0].startswith("1 of the 2 evaluated logs were trained on")
     assert fair.title == "nemo_tiny on a_test/two"
@@ -39,7 +38,7 @@ def test_testing_on_training_logs_is_said(tmp_path: Path) -> None:
 def test_a_perceptual_loss_that_was_off_and_failures_are_said(tmp_path: Path) -> None:
     run = make_run(tmp_path, perceptual=0.0)
     failures = tuple(Failure(f"log@{i}", "not finite") for i in range(9))
-    report = report_on_run(run, [], EvaluationResult(SUMMARY, failures), [])
+    report = report_on_run(run, [], SUMMARY, [], failures)
     assert "perceptual loss was off" in report.notes[0]
     assert report.notes[1] == "Failed: log@0: not finite"
     assert len(report.notes) == 1 + 5

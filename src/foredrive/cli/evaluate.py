@@ -37,6 +37,7 @@ def evaluate(
     folder = out or run
     result = evaluate_run(trained, chosen, folder, batch_size)
     print_summary(result.summary, Console(), trained.recipe.name)
-    report = report_on_run(trained, chosen, result, inspect_run(trained, chosen, examples))
+    inspections = inspect_run(trained, chosen, examples)
+    report = report_on_run(trained, chosen, result.summary, inspections, result.failures)
     write_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")

@@ -4,7 +4,7 @@ import datetime
 from collections.abc import Mapping, Sequence
 
 from foredrive.data import LogPath
-from foredrive.evaluation import EvaluationResult
+from foredrive.evaluation import Failure
 from foredrive.recipes import Inspection, Run
 from foredrive.recipes.train import STAGES
 from foredrive.training import read_metrics
@@ -17,11 +17,14 @@ FAILURES_NAMED = 5
 
 
 def report_on_run(
-    run: Run, logs: Sequence[LogPath], result: EvaluationResult, inspections: Sequence[Inspection]
+    run: Run,
+    logs: Sequence[LogPath],
+    summary: Summary,
+    inspections: Sequence[Inspection],
+    failures: Sequence[Failure] = (),
 ) -> ReportData:
-    """Put together what the report of a run on some logs shows."""
+    """Put together what the report of a run on some logs shows; of the failures the first few are named."""
     losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
-    summary = result.summary
     return ReportData(
         title=f"{run.recipe.name} on {_names(logs)}",
         command=str(summary.get("command")),
@@ -31,7 +34,7 @@ def report_on_run(
         summary=summary,
         losses=losses,
         panels=[inspection_panel(inspection) for inspection in inspections],
-        notes=_notes(run, logs, result, losses),
+        notes=_notes(run, logs, failures, losses),
     )
 
 
@@ -69,7 +72,7 @@ def _names(logs: Sequence[LogPath]) -> str:
 def _notes(
     run: Run,
     logs: Sequence[LogPath],
-    result: EvaluationResult,
+    failures: Sequence[Failure],
     losses: Mapping[str, Sequence[Mapping[str, float | int]]],
 ) -> list[str]:
     """What keeps the figures from meaning what they seem to mean."""
@@ -82,5 +85,5 @@ def _notes(
         )
     if any(lines and not any(line.get("perc") for line in lines) for lines in losses.values()):
         notes.append("The perceptual loss was off in training (no VGG-16 weights, or weight 0).")
-    notes += [f"Failed: {failure.key}: {failure.reason}" for failure in result.failures[:FAILURES_NAMED]]
+    notes += [f"Failed: {failure.key}: {failure.reason}" for failure in failures[:FAILURES_NAMED]]
     return notes
