@@ -24,9 +24,9 @@ def free_acceleration(
 ) -> Float64[np.ndarray, "*n"]:
     """Acceleration on an open road, m/s².
 
-    Up to the wanted speed that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4). Above it, where their
-    model brakes without bound, the excess is taken off within `SLOWING_TIME_S`, no harder than twice the
-    comfortable deceleration: the wanted speed falls before curves and has to be kept up with.
+    Up to the wanted speed that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4). Above it, where
+    their model brakes without bound, the excess is taken off within `SLOWING_TIME_S`, no harder than twice
+    the comfortable deceleration: the wanted speed falls before curves and has to be kept up with.
     """
     wanted = np.maximum(wanted_mps, 0.1)
     below = accel_mps2 * (1 - (np.minimum(speed_mps, wanted) / wanted) ** EXPONENT)

@@ -183,9 +183,21 @@ def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
         while following := continued_by(pieces[-1]):
             pieces.append(following)
         index.update({piece.lane_id: len(whole) for piece in pieces})
-        line = np.concatenate([lane.centreline_xyz] + [piece.centreline_xyz[1:] for piece in pieces[1:]])
-        whole.append(dataclasses.replace(lane, centreline_xyz=line, successor_ids=pieces[-1].successor_ids))
+        whole.append(
+            dataclasses.replace(
+                lane,
+                successor_ids=pieces[-1].successor_ids,
+                centreline_xyz=_chained([piece.centreline_xyz for piece in pieces]),
+                left_boundary_xyz=_chained([piece.left_boundary_xyz for piece in pieces]),
+                right_boundary_xyz=_chained([piece.right_boundary_xyz for piece in pieces]),
+            )
+        )
     return whole, index
+
+
+def _chained(lines: list[Float64[np.ndarray, "_ 3"]]) -> Float64[np.ndarray, "_ 3"]:
+    """Lines that continue each other as one."""
+    return np.concatenate([lines[0]] + [line[1:] for line in lines[1:]])
 
 
 def _contested(
@@ -220,7 +232,7 @@ def _resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
     return np.stack([np.interp(s, along, column) for column in line.T], axis=1)
 
 
-def _heading(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n-1"]:
+def _heading(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "_"]:
     """Heading of each stretch between two samples, unwrapped."""
     d = np.diff(line, axis=0)
     return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))

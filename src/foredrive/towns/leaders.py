@@ -1,5 +1,7 @@
 """Who is ahead: the vehicles on each lane, and the nearest one on a vehicle's path."""
 
+from typing import no_type_check
+
 import numba
 import numpy as np
 from jaxtyping import Float64, Int
@@ -32,7 +34,8 @@ def find_leaders(
 
 
 @numba.njit(cache=True)
-def link_occupants(active, path, starts, length, front, rear, last, head, following, who, where):  # type: ignore[no-untyped-def]
+@no_type_check
+def link_occupants(active, path, starts, length, front, rear, last, head, following, who, where):
     """Linked lists of the vehicles on each lane: head[lane], then following[entry] until -1.
 
     The entry is of vehicle who[entry], on column where[entry] of its path. The next last[i] columns of
@@ -55,7 +58,8 @@ def link_occupants(active, path, starts, length, front, rear, last, head, follow
 
 
 @numba.njit(cache=True)
-def _find_leaders(active, path, starts, length, front, rear, sib_first, sib_other, sib_clear):  # type: ignore[no-untyped-def]
+@no_type_check
+def _find_leaders(active, path, starts, length, front, rear, sib_first, sib_other, sib_clear):
     count = len(active)
     head = np.full(len(length), -1)
     following, who, where = np.empty((3, count * WINDOW), np.int64)

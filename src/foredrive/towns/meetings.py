@@ -18,7 +18,7 @@ OVERPASS_M = 3.0
 class Meetings:
     """For each lane the lanes its traffic meets, in compressed rows: lane i has first[i]:first[i+1]."""
 
-    first: Int[np.ndarray, "L+1"]
+    first: Int[np.ndarray, "L_1"]
     other: Int[np.ndarray, "M"]
     enter_m: Float64[np.ndarray, "M"]
     """Arc length on this lane from which on its traffic is in the way of the other's."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -112,7 +113,7 @@ def step_pedestrians(
     dt_s: float,
     rng: np.random.Generator,
 ) -> Pedestrians:
-    """Where people are one time step later. They cross in front of traffic that a light (`light`) holds back."""
+    """Where people are one time step later; `light` is what shows at the start of each lane."""
     if not len(people.active) or not len(graph.length_m):
         return people
     s = people.s_m + people.onward * people.pace_mps * dt_s
@@ -205,7 +206,8 @@ def crossing_gap(
 
 
 @numba.njit(cache=True)
-def _crossing_gap(  # type: ignore[no-untyped-def]
+@no_type_check
+def _crossing_gap(
     active,
     path,
     starts,
@@ -271,7 +273,7 @@ def _may_cross(
 
 def _walks_into_vehicle(
     graph: WalkGraph, people: Pedestrians, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
-) -> Bool[np.ndarray, "N"]:
+) -> Bool[np.ndarray, "K"]:
     """Who is about to step in front of a vehicle that stands on the crossing or can no longer stop."""
     blocked = np.zeros(len(people.active), dtype=np.bool_)
     for i in np.flatnonzero(people.active & graph.is_crossing[people.walk]):

@@ -1,14 +1,16 @@
 """Who may enter a junction, and who goes first inside.
 
-A vehicle may enter lanes that others cross only once it has been granted its whole way through the junction.
-Requests are served in the order of arrival. A grant needs a green light (or a stop made at a stop sign), room
-beyond the junction, and that vehicles granted before will be out of the way when this one gets there. Should one
-of them be held up after all, the later one waits inside the junction, before their paths meet. The one granted
-first is thus never held up by others in the junction, which rules out deadlock. A request that has to wait holds
-back later ones that conflict with it, but not for long: where junctions touch, those may be what it waits for.
+A vehicle may enter lanes that others cross only once it has been granted its whole way through the
+junction. Requests are served in the order of arrival. A grant needs a green light (or a stop made at a stop
+sign), room beyond the junction, and that vehicles granted before will be out of the way when this one gets
+there. Should one of them be held up after all, the later one waits inside the junction, before their paths
+meet. The one granted first is thus never held up by others in the junction, which rules out deadlock. A
+request that has to wait holds back later ones that conflict with it, but not for long: where junctions touch,
+those may be what it waits for.
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -32,7 +34,7 @@ MOVING_ON_S = 1.5
 ENOUGH_ROOM_M = 60.0
 BRISK_MPS2 = 2.0
 SLOW_MPS = 2.0
-"""When others are out of the way is judged from at least this speed, when one gets there from `BRISK_MPS2`."""
+"""Others are taken to leave at this speed at least, oneself to arrive with this acceleration."""
 INSIDE_M = 0.2
 PATIENCE_S = 15.0
 """After this time a request no longer stands back for older ones."""
@@ -141,7 +143,8 @@ def _withdraw(
 
 
 @numba.njit(cache=True)
-def _serve(order, line_column, motion, granted, goes_on, impatient, length, contested, conflicts):  # type: ignore[no-untyped-def]
+@no_type_check
+def _serve(order, line_column, motion, granted, goes_on, impatient, length, contested, conflicts):
     active, path, starts, front, rear, _ = motion
     count = len(active)
     granted = granted.copy()
@@ -181,7 +184,8 @@ def _serve(order, line_column, motion, granted, goes_on, impatient, length, cont
 
 
 @numba.njit(cache=True)
-def _room(i, begin, motion, contested, length, entries):  # type: ignore[no-untyped-def]
+@no_type_check
+def _room(i, begin, motion, contested, length, entries):
     """Free length beyond a junction in a moment, up to the next vehicle or junction."""
     _, path, starts, front, rear, speed = motion
     head, following, who, where = entries
@@ -204,7 +208,8 @@ def _room(i, begin, motion, contested, length, entries):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True)
-def _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for):  # type: ignore[no-untyped-def]
+@no_type_check
+def _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for):
     """Whether all who have been granted conflicting lanes are out of the way when vehicle i gets there."""
     _, path, starts, front, rear, speed = motion
     first, other, enter, other_clear = conflicts
@@ -226,7 +231,8 @@ def _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for):  #
 
 
 @numba.njit(cache=True)
-def _is_behind(j, at, i, path, starts, rear):  # type: ignore[no-untyped-def]
+@no_type_check
+def _is_behind(j, at, i, path, starts, rear):
     """Whether vehicle j will pass where vehicle i is now before it comes to its column `at`."""
     for k in range(BEHIND, at + 1):
         if path[j, k] == path[i, BEHIND] and starts[j, k] + rear[i] > rear[j]:
@@ -235,7 +241,8 @@ def _is_behind(j, at, i, path, starts, rear):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _inside_gap(motion, granted, rank, length, conflicts):  # type: ignore[no-untyped-def]
+@no_type_check
+def _inside_gap(motion, granted, rank, length, conflicts):
     active, path, starts, front, rear, _ = motion
     first, other, enter, other_enter, other_clear = conflicts
     count = len(active)

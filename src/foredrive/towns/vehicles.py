@@ -11,7 +11,7 @@ from foredrive.towns.lane_graph import SLOWING_MPS2, LaneGraph
 BEHIND = 4
 AHEAD = 11
 WINDOW = BEHIND + 1 + AHEAD
-"""Lanes of its path that a vehicle knows: some behind it (where its rear may still be), its own, some ahead."""
+"""Lanes of its path that a vehicle knows: some behind (where its rear may still be), its own, some ahead."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def along_path(
     starts_m: Float64[np.ndarray, "N W"],
     s_m: Float64[np.ndarray, "N"],
 ) -> Float64[np.ndarray, "N 3"]:
-    """Points on paths, by arc length from the start of the current lane; beyond its ends a path is straight."""
+    """Points on paths, by arc length from the start of the current lane; straight on beyond the ends."""
     column = np.where(path >= 0, starts_m <= s_m[:, None], False)
     column = np.where(
         column.any(1), WINDOW - 1 - np.argmax(column[:, ::-1], axis=1), np.argmax(path >= 0, axis=1)
@@ -146,7 +146,7 @@ def along_path(
 
 
 def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
-    """Both axles on the path, so that the body turns as a vehicle does; slots that are not active are at the origin."""
+    """Both axles on the path, so that bodies turn as vehicles do; slots not active are at the origin."""
     live = np.flatnonzero(vehicles.active)
     path = vehicles.path[live]
     starts = path_starts(graph, path)

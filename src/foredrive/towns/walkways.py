@@ -36,7 +36,7 @@ class WalkGraph:
     xyz: Float64[np.ndarray, "P 3"]
     along_m: Float64[np.ndarray, "P"]
     """Arc length of each vertex on its walk."""
-    first: Int[np.ndarray, "E+1"]
+    first: Int[np.ndarray, "E_1"]
     length_m: Float64[np.ndarray, "E"]
     ends: Int[np.ndarray, "E 2"]
     """Places at the start and the end of each walk."""
@@ -250,7 +250,7 @@ def _lane_meetings(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: Lane
     tree = shapely.STRtree(lines)
     for walk in np.flatnonzero(is_crossing):
         way = shapely.LineString(walks[walk][:, :2])
-        for lane in tree.query(way, predicate="intersects"):
+        for lane in tree.query(way, predicate="intersects").tolist():
             points = lanes.samples(lane)
             near = shapely.distance(shapely.points(points[:, :2]), way) < ALONG_LANE_M
             near &= np.abs(points[:, 2] - walks[walk][:, 2].mean()) < 3.0

@@ -1,0 +1,66 @@
+"""Routes that can be driven and that turn either way."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from foredrive.scene import Command
+from foredrive.towns.fleet import find_starts
+from foredrive.towns.lane_graph import LaneGraph, build_lane_graph
+from foredrive.towns.routes import ROUTE_SPACING_M, Route, draw_route
+from foredrive.towns.town_map import TownMap
+
+
+@pytest.fixture(scope="module")
+def graph(town02: TownMap) -> LaneGraph:
+    return build_lane_graph(town02)
+
+
+def routes(graph: LaneGraph, count: int, length_m: float = 600.0) -> list[Route]:
+    starts = find_starts(graph)
+    return [draw_route(graph, starts, np.random.default_rng(seed), length_m, 200.0) for seed in range(count)]
+
+
+def test_each_lane_follows_the_one_before(graph: LaneGraph) -> None:
+    for route in routes(graph, 5):
+        for lane, following in zip(route.lanes[:-1], route.lanes[1:], strict=True):
+            assert following in graph.successors[lane]
+        assert graph.length_m[route.lanes].sum() - route.start_m >= 600.0
+        assert graph.junction[route.lanes[0]] < 0
+
+
+def test_a_route_is_a_line_on_the_lanes(graph: LaneGraph) -> None:
+    route = routes(graph, 1)[0]
+    line = route.polyline(graph)
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert steps.max() <= ROUTE_SPACING_M + 0.01
+    assert steps.min() > 0.9 * ROUTE_SPACING_M  # chords of curves and nothing else
+    every = np.concatenate([graph.samples(int(lane)) for lane in route.lanes])
+    for point in line[::20]:
+        assert np.linalg.norm(every - point, axis=1).min() < 0.3
+
+
+def test_the_same_seed_gives_the_same_route(graph: LaneGraph) -> None:
+    first, second = (routes(graph, 3) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.lanes, b.lanes)
+        assert a.start_m == b.start_m
+    assert not np.array_equal(first[0].lanes, first[1].lanes)
+
+
+def test_routes_turn_left_and_right_and_go_straight(graph: LaneGraph) -> None:
+    drawn = routes(graph, 20)
+    taken = Counter(command for route in drawn for command in route.commands(graph, 600.0))
+    assert min(taken[command] for command in Command) > 0.5 * max(taken.values())
+    for route in drawn:
+        soon = route.commands(graph, 200.0)
+        assert set(soon) - {Command.STRAIGHT}
+        assert len(set(soon)) > 1
+
+
+def test_commands_count_from_the_start_of_the_route(graph: LaneGraph) -> None:
+    route = routes(graph, 1)[0]
+    to_first_fork = graph.length_m[route.lanes[0]] - route.start_m
+    assert route.commands(graph, to_first_fork - 1.0) == []
+    assert route.commands(graph, to_first_fork + 1.0) == [graph.command(int(route.lanes[1]))]
