@@ -1,6 +1,6 @@
 """How fast the CPU kernels are and how much memory they take, beside their plain PyTorch references.
 
-Every kernel runs in a process of its own, and its reference in another: `python benchmarks/ops_speed.py`.
+Every kernel runs in a process of its own, and its reference in another: `foredrive bench ops`.
 """
 
 import json
@@ -17,10 +17,9 @@ from statistics import median
 from typing import NamedTuple
 
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
+from foredrive.evaluation import Benchmark
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, matrix_from_yaw, transform_points
 from foredrive.ops.attention3d import attend_volume, attend_volume_reference
@@ -100,20 +99,15 @@ def warp() -> Case:
 CASES: dict[str, Callable[[], Case]] = {case.__name__: case for case in (lifting, attention3d, rays, warp)}
 
 
-def measure() -> dict[str, float]:
+def measure(case: str) -> dict[str, float]:
     """Milliseconds (medians), peak MiB above the inputs, seconds of compiling, ratios of the two paths."""
     figures: dict[str, float] = {"threads": torch.get_num_threads()}
-    for case in CASES:
-        for path in ("fast", "reference"):
-            found = _in_a_process(case, path)
-            figures |= {f"{case}.{path}.{key}": value for key, value in found.items()}
-        fast, reference = (
-            {k: figures[f"{case}.{path}.{k}"] for k in ("forward_ms", "backward_ms", "peak_mib")}
-            for path in ("fast", "reference")
-        )
-        took = [each["forward_ms"] + each["backward_ms"] for each in (fast, reference)]
-        figures[f"{case}.speedup"] = took[1] / took[0]
-        figures[f"{case}.memory_ratio"] = fast["peak_mib"] / reference["peak_mib"]
+    found = {path: _in_a_process(case, path) for path in ("fast", "reference")}
+    for path, values in found.items():
+        figures |= {f"{path}.{key}": value for key, value in values.items()}
+    took = {path: values["forward_ms"] + values["backward_ms"] for path, values in found.items()}
+    figures["speedup"] = took["reference"] / took["fast"]
+    figures["memory_ratio"] = found["fast"]["peak_mib"] / found["reference"]["peak_mib"]
     return figures
 
 
@@ -176,22 +170,11 @@ def _memory_mib(field: str) -> float:
     return int(found[1]) / 1024
 
 
-def print_table(figures: dict[str, float]) -> None:
-    """One row per case and path."""
-    table = Table("op", "path", "forward ms", "backward ms", "peak MiB", "compile s", "speed-up", "memory")
-    for case in CASES:
-        for path in ("fast", "reference"):
-            row = {k.rsplit(".", 1)[1]: v for k, v in figures.items() if k.startswith(f"{case}.{path}.")}
-            cells = [f"{row[k]:.1f}" for k in ("forward_ms", "backward_ms", "peak_mib")]
-            if path == "fast":
-                cells += [f"{row['compile_s']:.1f}"]
-                cells += [f"{figures[f'{case}.{ratio}']:.2f}" for ratio in ("speedup", "memory_ratio")]
-            table.add_row(case, path, *cells)
-    Console().print(table)
-
+BENCHMARK = Benchmark(
+    question="How much faster and leaner are the CPU kernels than their plain PyTorch references?",
+    arms={case: lambda seed, case=case: measure(case) for case in CASES},  # type: ignore[misc]
+    seeds=(0,),
+)
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        print(json.dumps(_measure_here(*sys.argv[1:])))
-    else:
-        print_table(measure())
+    print(json.dumps(_measure_here(*sys.argv[1:])))
