@@ -44,10 +44,10 @@ def daylight(rng: np.random.Generator) -> LightArrays:
         zenith=rgb(0.14, 0.28, 0.60),
         horizon=rgb(0.62, 0.72, 0.83),
         cloud_rgb=rgb(0.95, 0.96, 0.98),
-        sky_rgb=rgb(0.36, 0.43, 0.54),
+        sky_rgb=rgb(0.42, 0.48, 0.57),
         bounce_rgb=rgb(0.21, 0.20, 0.18),
         haze_rgb=rgb(0.66, 0.73, 0.81),
         visibility_m=float(rng.uniform(700.0, 1400.0)),
         clouds=float(rng.uniform(0.1, 0.6)),
-        exposure=0.85,
+        exposure=0.78,
     )

@@ -207,7 +207,7 @@ def _tint(kind, p, look, x, y, z, uvw, extent, i):
     if kind == _FOLIAGE:
         leaf = noise((x + 0.7 * z) * 3.2, (y - 0.7 * z) * 3.2, size * 3.2, 41)
         clump = noise((x - z) * 1.1, (y + z) * 1.1, size * 1.1, 42)
-        shade = 1.0 + 0.35 * leaf + 0.25 * clump
+        shade = 0.95 + 0.42 * leaf + 0.38 * clump
         return shade * (1.0 + 0.1 * clump), shade, shade * (1.0 - 0.1 * leaf)
     if kind == _TILES:
         row = math.floor(uvw[i, 1] / 0.33)

@@ -18,6 +18,8 @@ LIDAR_REFERENCE_M = 45.0
 """At this distance half of the pulses from a surface of 2 % reflectivity, met head-on, are lost."""
 LIDAR_THRESHOLD = 0.02
 FOLIAGE_DEPTH_M = 0.25
+STREET_RGB = (0.30, 0.30, 0.29)
+"""What level rays are taken to meet in a mirror."""
 
 _FOLIAGE, _GLOW = int(Texture.FOLIAGE), int(Texture.GLOW)
 _ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
@@ -229,11 +231,15 @@ def shade(looks, found, t, direction, lit, light):
         facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
         direct = facing if lit[i] else 0.0
         if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
-            direct = (0.35 + 0.65 * facing) if lit[i] else 0.12
+            direct = (0.45 + 0.55 * facing) if lit[i] else 0.12
         gloss = min(1.0, looks.gloss[look] + 0.35 * glass)
         if gloss > 0.0:
             gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
-            _sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(dz + 2 * cosine * nz, 0.05), mirror)
+            rise = dz + 2 * cosine * nz
+            _sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(rise, 0.05), mirror)
+            open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
+            for c in range(3):
+                mirror[c] = open_sky * min(mirror[c], 3.0) + (1.0 - open_sky) * STREET_RGB[c]
         up = 0.5 + 0.5 * nz
         haze = 1.0 - math.exp(-t[i] / light.visibility_m)
         for c in range(3):
@@ -242,7 +248,7 @@ def shade(looks, found, t, direction, lit, light):
             if kind == _GLOW:
                 radiance = 2.5 * colour[c]
             if gloss > 0.0:
-                radiance = radiance * (1.0 - gloss) + gloss * min(mirror[c], 3.0)
+                radiance = radiance * (1.0 - gloss) + gloss * mirror[c]
             out[i, c] = radiance * (1.0 - haze) + haze * light.haze_rgb[c]
     return out
 

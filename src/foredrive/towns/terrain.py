@@ -63,7 +63,7 @@ def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
     Below the roads it goes on, sunk, for rays that slip through a crack between the roads' pieces.
     """
     sunk = table.add(Look(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
-    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.36, 0.42, 0.22), 0.45))
+    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.40, 0.43, 0.26), 0.45))
     rows, columns = terrain.z.shape
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     lower = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
