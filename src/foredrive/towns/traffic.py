@@ -345,7 +345,8 @@ def _drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> V
     a = np.clip(wanted, v.acceleration_mps2 - down * dt_s, v.acceleration_mps2 + JERK_UP_MPS3 * dt_s)
     stops = (v.speed_mps + a * dt_s <= CRAWL_MPS) & (a <= 0)
     braking = np.minimum(a, -1e-9)
-    distance = np.where(stops, -0.5 * v.speed_mps**2 / braking, (v.speed_mps + 0.5 * a * dt_s) * dt_s)
+    to_rest = np.minimum(-0.5 * v.speed_mps**2 / braking, v.speed_mps * dt_s)
+    distance = np.where(stops, to_rest, (v.speed_mps + 0.5 * a * dt_s) * dt_s)
     speed = np.where(stops, 0.0, v.speed_mps + a * dt_s)
     return dataclasses.replace(
         v,
