@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, box, frustum, hexahedron, join, triangles
+from foredrive.towns.mesh import Mesh, box, frustum, hexahedron, join, ribbon, triangles
 
 BODY, SECOND, THIRD = -1, -2, -3
 """Look numbers that an actor's own paint replaces."""
@@ -173,12 +173,23 @@ def _ball(centre: tuple[float, float, float], radius: float, look: int) -> Mesh:
     return triangles((sphere.vertices * radius + centre)[sphere.faces], look)
 
 
+def _rim(x: float, radius: float, thick: float, look: int) -> Mesh:
+    """A tyre that one sees through, its axis along y."""
+    angle = np.arange(15) * (2 * np.pi / 14)
+    circle = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
+    centre, aside = np.array([x, 0.0, radius]), np.array([0.0, thick, 0.0])
+    inner, outer = (1.0 - 0.1 - thick) * radius, radius
+    rings = [inner * circle - aside, outer * circle - aside, outer * circle + aside, inner * circle + aside]
+    bands = [ribbon(centre + a, centre + b, look) for a, b in zip(rings, rings[1:] + rings[:1], strict=True)]
+    return join(bands)
+
+
 def _two_wheeler(looks: MeshLooks, wheel_m: float, thick: float, frame_look: int) -> Mesh:
     """A bicycle or motorcycle with its rider."""
     reach = 0.95 - wheel_m
     parts = []
     for x in (-reach, reach):
-        parts.append(frustum((x, -thick, wheel_m), (x, thick, wheel_m), (wheel_m, wheel_m), 14, looks.tyre))
+        parts.append(_rim(x, wheel_m, thick, looks.tyre))
     seat, bar = 0.9, 1.0
     tube = 0.6 * thick + 0.02
     parts += [
@@ -240,7 +251,7 @@ def _pedestrian(looks: MeshLooks, swing: float) -> Mesh:
         frustum((0, 0, 0.86), (0, 0, 1.47), (0.16, 0.2), 8, BODY),
         frustum((0, 0, 1.45), (0, 0, 1.54), (0.06, 0.055), 6, THIRD),
         _ball((0.01, 0.0, 1.63), 0.115, THIRD),
-        _ball((-0.015, 0.0, 1.655), 0.108, looks.hair),
+        _ball((-0.04, 0.0, 1.67), 0.11, looks.hair),
     ]
     return join(parts)
 

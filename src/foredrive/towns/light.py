@@ -45,7 +45,7 @@ def daylight(rng: np.random.Generator) -> LightArrays:
         horizon=rgb(0.62, 0.72, 0.83),
         cloud_rgb=rgb(0.95, 0.96, 0.98),
         sky_rgb=rgb(0.42, 0.48, 0.57),
-        bounce_rgb=rgb(0.21, 0.20, 0.18),
+        bounce_rgb=rgb(0.27, 0.26, 0.235),
         haze_rgb=rgb(0.66, 0.73, 0.81),
         visibility_m=float(rng.uniform(700.0, 1400.0)),
         clouds=float(rng.uniform(0.1, 0.6)),

@@ -103,7 +103,7 @@ def _road(p, look, x, y, uvw, extent, i, out):
     shade = 1.0 + 0.10 * noise(x / 11.0, y / 11.0, size / 11.0, 1)
     shade += 0.08 * noise(x / 2.3, y / 2.3, size / 2.3, 2) + 0.10 * noise(x * 4.0, y * 4.0, size * 4.0, 3)
     if lattice(math.floor(x / 9.0), math.floor(y / 6.0), 4) > 0.9:
-        shade *= 0.82
+        shade *= 0.9
     left, right = uvw[i, 0], uvw[i, 1]
     if 2.5 < left + right < 5.0:
         track = abs(abs(0.5 * (left - right)) - 0.85)

@@ -14,6 +14,7 @@ from foredrive.towns import raycast, shading
 from foredrive.towns.light import LightArrays
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
+CREASE_COS = 0.8
 
 Rays = Float32[np.ndarray, "N 3"]
 
@@ -25,21 +26,30 @@ class SensorSuite:
     rig: CameraRig
     """Without leading dimensions."""
     lidar: SpinningLidar
-    samples_per_pixel: int = 1
-    """A square number. Textures are filtered anyway; more samples smooth the outlines of things."""
+    samples_per_outline_pixel: int = 4
+    """A square number. One ray sees a pixel, textures being filtered; where outlines or shadows run through
+    it there are this many."""
 
     @cached_property
     def pixel_rays(self) -> tuple[Rays, Rays]:
-        """Origins and directions in the ego frame: cameras, rows, columns, samples."""
-        rays = camera_rays(self.rig, self.samples_per_pixel)
-        return rays.origin_ego.reshape(-1, 3).numpy(), rays.dir_ego.reshape(-1, 3).numpy()
+        """Origins and directions of the pixels' central rays in the ego frame: cameras, rows, columns."""
+        return _flat_rays(self.rig, 1)
 
     @cached_property
-    def ray_rad(self) -> Float32[np.ndarray, "R"]:
-        """Angle between neighbouring rays."""
+    def outline_rays(self) -> tuple[Rays, Rays]:
+        """The same with the rays of an outline pixel next to each other."""
+        return _flat_rays(self.rig, self.samples_per_outline_pixel)
+
+    @cached_property
+    def pixel_rad(self) -> Float32[np.ndarray, "P"]:
+        """Angle between neighbouring pixels, one for each."""
         height, width = self.rig.size_hw
-        angle = 1.0 / (self.rig.K[:, 0, 0] * self.samples_per_pixel**0.5)
-        return angle.repeat_interleave(height * width * self.samples_per_pixel).numpy()
+        return (1.0 / self.rig.K[:, 0, 0]).repeat_interleave(height * width).numpy()
+
+
+def _flat_rays(rig: CameraRig, samples: int) -> tuple[Rays, Rays]:
+    rays = camera_rays(rig, samples)
+    return rays.origin_ego.reshape(-1, 3).numpy(), rays.dir_ego.reshape(-1, 3).numpy()
 
 
 @dataclass(frozen=True)
@@ -76,24 +86,64 @@ class Seen:
 def see(
     moment: Moment, sensors: SensorSuite, T_world_ego: Float64[np.ndarray, "4 4"]
 ) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
-    """Images of all cameras, and what the first sample of each pixel met [C·H·W]."""
-    samples, rays_ego = sensors.samples_per_pixel, sensors.pixel_rays
-    count = len(rays_ego[0]) // samples
+    """Images of all cameras, and what each pixel's central ray met [C·H·W]."""
+    shape = (len(sensors.rig.names), *sensors.rig.size_hw)
+    count = int(np.prod(shape))
     rgb = np.empty((count, 3), np.uint8)
     seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
+    look, lit, normal = np.empty(count, np.int32), np.empty(count, np.bool_), np.empty((count, 3), np.float32)
 
-    def job(start: int, stop: int) -> None:
-        part = slice(start * samples, stop * samples)
-        origin, direction = _to_world(T_world_ego, rays_ego[0][part], rays_ego[1][part])
-        hits = moment.cast(origin, direction)
-        found = shading.surfaces(moment.scene, hits, origin, direction, sensors.ray_rad[part])
-        lit = moment.sunlit(found, hits)
-        radiance = shading.shade(moment.scene.looks, found, hits.t, direction, lit, moment.light)
-        rgb[start:stop] = shading.develop(radiance, moment.light.exposure, samples)
-        seen.triangle[start:stop], seen.actor[start:stop] = hits.triangle[::samples], hits.actor[::samples]
+    def first_look(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        rays = _to_world(T_world_ego, sensors.pixel_rays[0][part], sensors.pixel_rays[1][part])
+        radiance, hits, found, lit[part] = _look(moment, *rays, sensors.pixel_rad[part])
+        rgb[part] = shading.develop(radiance, moment.light.exposure, 1)
+        seen.triangle[part], seen.actor[part] = hits.triangle, hits.actor
+        look[part], normal[part] = found.look, found.normal
 
-    in_parallel(job, count, PIXEL_GRAIN)
-    return rgb.reshape(len(sensors.rig.names), *sensors.rig.size_hw, 3), seen
+    in_parallel(first_look, count, PIXEL_GRAIN)
+    samples = sensors.samples_per_outline_pixel
+    if samples == 1:
+        return rgb.reshape(*shape, 3), seen
+    kind = np.stack([look, seen.actor, lit], axis=-1).reshape(*shape, 3)
+    pixels = np.flatnonzero(_outlines(kind, normal.reshape(*shape, 3)))
+
+    def closer_look(start: int, stop: int) -> None:
+        some = pixels[start:stop]
+        rows = (some[:, None] * samples + np.arange(samples)).ravel()
+        rays = _to_world(T_world_ego, sensors.outline_rays[0][rows], sensors.outline_rays[1][rows])
+        ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
+        radiance, *_ = _look(moment, *rays, ray_rad)
+        rgb[some] = shading.develop(radiance, moment.light.exposure, samples)
+
+    in_parallel(closer_look, len(pixels), PIXEL_GRAIN // samples)
+    return rgb.reshape(*shape, 3), seen
+
+
+def _look(
+    moment: Moment, origin: Rays, direction: Rays, ray_rad: Float32[np.ndarray, "N"]
+) -> tuple[Rays, shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
+    """Radiance along rays, and what they met."""
+    hits = moment.cast(origin, direction)
+    found = shading.surfaces(moment.scene, hits, origin, direction, ray_rad)
+    lit = moment.sunlit(found, hits)
+    radiance = shading.shade(moment.scene.looks, found, hits.t, direction, lit, moment.light)
+    return radiance, hits, found, lit
+
+
+def _outlines(
+    kind: Int32[np.ndarray, "C H W 3"], normal: Float32[np.ndarray, "C H W 3"]
+) -> Bool[np.ndarray, "C H W"]:
+    """Pixels that differ from a neighbour in what they show, in light and shadow, or in their slope."""
+    outline = np.zeros(kind.shape[:3], dtype=np.bool_)
+    for axis in (1, 2):
+        low = (slice(None), *(slice(None, -1) if a == axis else slice(None) for a in (1, 2)))
+        high = (slice(None), *(slice(1, None) if a == axis else slice(None) for a in (1, 2)))
+        differs = (kind[low] != kind[high]).any(-1)
+        differs |= (kind[low][..., 0] >= 0) & ((normal[low] * normal[high]).sum(-1) < CREASE_COS)
+        outline[low] |= differs
+        outline[high] |= differs
+    return outline
 
 
 def sweep(

@@ -98,7 +98,7 @@ def surfaces(
     out = Surfaces(
         np.full(count, MISS, np.int32),
         np.empty((count, 3), np.float32),
-        np.empty((count, 3), np.float32),
+        np.zeros((count, 3), np.float32),
         np.empty(count, np.float32),
         np.empty((count, 3), np.float32),
         np.empty((count, 4), np.float32),

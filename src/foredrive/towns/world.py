@@ -41,7 +41,7 @@ class SensorFrame:
 
     images: dict[str, UInt8[np.ndarray, "H W 3"]]
     pixel_ids: dict[str, Int[np.ndarray, "H W"]]
-    """Of a pixel's first sample."""
+    """At the pixels' centres."""
     sweep: LidarSweep
     """Unbatched, in the ego frame at the frame's time; a beam that got lost is free up to where it hit."""
     beam_ids: Int[np.ndarray, "N"]
