@@ -174,8 +174,10 @@ def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N
 
 def _on_bridges(area: np.ndarray, z: Float[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
     """Whether a piece lies above, or close beside, a piece of a lower level."""
-    tree = shapely.STRtree(area)
-    i, j = tree.query(area, predicate="dwithin", distance=BRIDGE_REACH_M)
+    high = np.flatnonzero(z - z.min() > LEVEL_GAP_M)
+    low = np.flatnonzero(z.max() - z > LEVEL_GAP_M)
+    i, j = shapely.STRtree(area[low]).query(area[high], predicate="dwithin", distance=BRIDGE_REACH_M)
+    i, j = high[i], low[j]
     above = z[i] - z[j] > LEVEL_GAP_M
     i, j = i[above], j[above]
     steep = z[i] - z[j] > LEVEL_GAP_M + BANK_SLOPE * shapely.distance(area[i], area[j])

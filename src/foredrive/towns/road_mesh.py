@@ -158,7 +158,8 @@ def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]
         length = float(np.linalg.norm(along))
         along /= length
         across = np.array([-along[1], along[0]])
-        start = corners[:4][np.argmin(corners[:4] @ along)] @ along
+        start = float((corners @ along).min())
+        raised = shapely.clip_by_rect(walkways, *area.bounds)
         for s in np.arange(start, start + length, PATCH_M):
             band = shapely.Polygon(
                 [
@@ -166,7 +167,7 @@ def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]
                     for u, v in ((s, -1e4), (s + PATCH_M, -1e4), (s + PATCH_M, 1e4), (s, 1e4))
                 ]
             )
-            patch = area.intersection(band).difference(walkways)
+            patch = area.intersection(band).difference(raised)
             mesh = drape(patch, plan, looks.stripes, PAINT_M)
             u = mesh.xyz[..., :2] @ along - start
             parts.append(triangles(mesh.xyz, looks.stripes, np.stack([u, 0 * u, 0 * u], axis=-1)))
