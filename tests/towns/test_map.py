@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.towns.junction_heights import level_junction
 from foredrive.towns.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
 
 
@@ -54,10 +55,32 @@ def test_a_stop_zone_says_which_way_its_traffic_drives(town02: TownMap) -> None:
 def test_heights_follow_the_road_where_later_lane_sections_begin() -> None:
     """Left and right border of a lane are level, in a town on hills and with bridges."""
     town = load_town_map("Town04")
-    tilt = max(np.abs(s.left_xyz[:, 2] - s.right_xyz[:, 2]).max() for s in town.strips)
+    between = [strip for strip in town.strips if strip.junction_id is None]
+    tilt = max(np.abs(s.left_xyz[:, 2] - s.right_xyz[:, 2]).max() for s in between)
     assert tilt < 1e-6
     assert max(lane.centreline_xyz[:, 2].max() for lane in town.lanes) == pytest.approx(11.0, abs=0.1)
     lanes = {lane.lane_id: lane for lane in town.lanes}
     for lane in town.lanes:
         for name in lane.successor_ids:
             assert lanes[name].centreline_xyz[0, 2] == pytest.approx(lane.centreline_xyz[-1, 2], abs=0.05)
+
+
+def test_crossing_roads_of_a_junction_agree_on_their_height() -> None:
+    def road(start: tuple[float, float], end: tuple[float, float], bump_m: float) -> tuple[np.ndarray, ...]:
+        xy = np.linspace(start, end, 41)
+        z = bump_m * np.sin(np.linspace(0.0, np.pi, 41)) ** 2
+        ahead = (xy[-1] - xy[0]) / np.linalg.norm(xy[-1] - xy[0])
+        across = 2.0 * np.array([-ahead[1], ahead[0]])
+        return np.column_stack([xy + across, z]), np.column_stack([xy - across, z])
+
+    even, bumpy = road((-20.0, 0.0), (20.0, 0.0), 0.0), road((0.0, -20.0), (0.0, 20.0), 0.4)
+    (a, _), (b, _) = level_junction([even, bumpy])
+    assert np.hypot(a[20, 0] - b[20, 0], a[20, 1] - b[20, 1]) < 4.0
+    near = (
+        np.argmin(np.hypot(a[:, 0] + 2.0, a[:, 1] - 2.0)),
+        np.argmin(np.hypot(b[:, 0] + 2.0, b[:, 1] - 2.0)),
+    )
+    assert abs(a[near[0], 2] - b[near[1], 2]) < 0.02  # .4 m before
+    np.testing.assert_array_equal(b[[0, -1]], bumpy[0][[0, -1]])  # where they meet the roads outside
+    (same, _), _ = level_junction([even, even])
+    assert same is even[0]

@@ -3,6 +3,7 @@
 The maps are the OpenDRIVE files in py123d's wheel (CARLA, CC BY 4.0), read with py123d's parser.
 """
 
+import dataclasses
 import enum
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -20,6 +21,7 @@ from py123d.parser.opendrive.xodr_parser.opendrive import XODR
 from py123d.parser.opendrive.xodr_parser.reference import XODRReferenceLine
 
 from foredrive.errors import InputError
+from foredrive.towns.junction_heights import level_junction
 
 MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
 TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD")
@@ -193,7 +195,7 @@ def load_town_map(name: str) -> TownMap:
     roads, _, helpers, _, objects, centre_marks, signals = collect_element_helpers(
         xodr, SAMPLE_SPACING_M, CONNECTION_TOLERANCE_M
     )
-    strips = tuple(_strip(helper, helpers, centre_marks, roads) for helper in helpers.values())
+    strips = _level([_strip(helper, helpers, centre_marks, roads) for helper in helpers.values()])
     lanes = tuple(_lane(strip, helpers) for strip in strips if strip.kind is StripKind.DRIVING)
     crosswalks = tuple(
         Crosswalk(o.object_id, np.concatenate([o.outline_3d, o.outline_3d[:1]])) for o in objects.values()
@@ -243,6 +245,20 @@ def _strip(
         left_markings=_markings(helper, inner_marks, swap_inner),
         right_markings=_markings(helper, helper.open_drive_lane.road_marks, swap=False),
     )
+
+
+def _level(strips: list[Strip]) -> tuple[Strip, ...]:
+    """Bring the roads that cross in junctions to one height."""
+    levelled = list(strips)
+    by_junction: dict[int, list[int]] = {}
+    for index, strip in enumerate(strips):
+        if strip.junction_id is not None:
+            by_junction.setdefault(strip.junction_id, []).append(index)
+    for indices in by_junction.values():
+        borders = level_junction([(strips[i].left_xyz, strips[i].right_xyz) for i in indices])
+        for index, (left, right) in zip(indices, borders, strict=True):
+            levelled[index] = dataclasses.replace(strips[index], left_xyz=left, right_xyz=right)
+    return tuple(levelled)
 
 
 def _beside(helper: Any, step: int) -> str:

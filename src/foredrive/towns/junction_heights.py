@@ -1,0 +1,59 @@
+"""Roads that cross in a junction, brought to one height.
+
+The maps' connecting roads each have their own elevation profile, and where two of them cross these differ by
+up to half a metre (Town03, Town07).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+Points = Float[np.ndarray, "N 3"]
+Line = Float[np.ndarray, "_ 3"]
+
+REACH_M, SIGMA_M = 1.8, 0.7
+LEVEL_GAP_M = 1.5
+"""Points further apart in height belong to different levels."""
+BLEND_M = 4.0
+"""Towards the ends of a road its own height returns, so that it meets the road outside."""
+STEP_M = 0.02
+"""Junctions whose roads differ by less are left alone."""
+
+
+def level_junction(roads: Sequence[tuple[Line, Line]]) -> list[tuple[Line, Line]]:
+    """Left and right borders of all strips of a junction, at heights that agree where strips overlap."""
+    middles = [0.5 * (left + right) for left, right in roads]
+    points = np.concatenate([*(line for road in roads for line in road), *middles])
+    if np.ptp(points[:, 2]) < STEP_M:
+        return list(roads)
+    tree = cKDTree(points[:, :2])
+    levelled = []
+    for (left, right), middle in zip(roads, middles, strict=True):
+        share = _blend(middle)
+        left_z, right_z = (_mean_height(line, points, tree) for line in (left, right))
+        levelled.append((_blended(left, left_z, share), _blended(right, right_z, share)))
+    return levelled
+
+
+def _blend(line: Points) -> Float[np.ndarray, "N"]:
+    """0 at the ends of a line, 1 further than BLEND_M from them."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    t = np.clip(np.minimum(along, along[-1] - along) / BLEND_M, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _blended(line: Points, z: Float[np.ndarray, "N"], share: Float[np.ndarray, "N"]) -> Points:
+    return np.column_stack([line[:, :2], line[:, 2] + share * (z - line[:, 2])])
+
+
+def _mean_height(line: Points, points: Float[np.ndarray, "P 3"], tree: cKDTree) -> Float[np.ndarray, "N"]:
+    """Gaussian mean of the heights around each point of a line, of its own level."""
+    near = tree.query_ball_point(line[:, :2], REACH_M, return_sorted=True)
+    row = np.repeat(np.arange(len(line)), [len(n) for n in near])
+    other = points[np.concatenate(near).astype(int)]
+    weight = np.exp(-0.5 * ((other[:, :2] - line[row, :2]) ** 2).sum(1) / SIGMA_M**2)
+    weight *= np.abs(other[:, 2] - line[row, 2]) < LEVEL_GAP_M
+    total = np.bincount(row, weight, len(line))
+    return np.bincount(row, weight * other[:, 2], len(line)) / total
