@@ -1,6 +1,6 @@
 """Where the traffic of two lanes meets: lanes that part from a common start, cross, or merge."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -14,8 +14,7 @@ OVERPASS_M = 3.0
 """Lanes further apart in height do not meet."""
 
 
-@dataclass(frozen=True)
-class Meetings:
+class Meetings(NamedTuple):
     """For each lane the lanes its traffic meets, in compressed rows: lane i has first[i]:first[i+1]."""
 
     first: Int[np.ndarray, "L_1"]

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.leaders import LOOK_M
+from foredrive.towns.leaders import LOOK_M, motion_of
 from foredrive.towns.lights import Light
 from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
 from foredrive.towns.walkways import WalkGraph
@@ -186,63 +186,37 @@ def crossing_gap(
     """Gap from each front bumper to the crossing at which it has to wait for people, m (infinite: none)."""
     if not len(graph.lane) or not people.active.any():
         return np.full(len(vehicles.active), np.inf)
-    return _crossing_gap(
-        vehicles.active,
-        vehicles.path,
-        starts_m,
-        vehicles.front_m,
-        vehicles.speed_mps,
-        graph.lane,
-        graph.crossing,
-        graph.lane_span_m,
-        graph.walk_span_m,
-        people.active,
-        people.walk,
-        people.s_m,
-        people.onward,
-        people.pace_mps,
-        vehicles.size_lwh[:, 0],
-    )
+    passing = (graph.lane, graph.crossing, graph.lane_span_m, graph.walk_span_m)
+    walking = np.flatnonzero(people.active & graph.is_crossing[people.walk])
+    crossers = (people.walk[walking], people.s_m[walking], people.onward[walking], people.pace_mps[walking])
+    return _crossing_gap(motion_of(vehicles, starts_m), passing, crossers)
 
 
 @numba.njit(cache=True)
 @no_type_check
-def _crossing_gap(
-    active,
-    path,
-    starts,
-    front,
-    speed,
-    lanes,
-    crossings,
-    lane_span,
-    walk_span,
-    walking,
-    walk,
-    s,
-    onward,
-    pace,
-    length,
-):
-    gap = np.full(len(active), np.inf)
-    for i in range(len(active)):
-        if not active[i]:
+def _crossing_gap(motion, passing, crossers):
+    lanes, crossings, lane_span, walk_span = passing
+    walk, s, onward, pace = crossers
+    gap = np.full(len(motion.active), np.inf)
+    for i in range(len(motion.active)):
+        if not motion.active[i]:
             continue
-        too_late = speed[i] ** 2 / (2 * YIELD_BRAKING_MPS2)
+        speed, length = motion.speed_mps[i], motion.front_m[i] - motion.rear_m[i]
+        too_late = speed**2 / (2 * YIELD_BRAKING_MPS2)
         for k in range(BEHIND, WINDOW):
-            lane = path[i, k]
-            if lane < 0 or starts[i, k] - front[i] > LOOK_M:
+            lane, start = motion.path[i, k], motion.starts_m[i, k] - motion.front_m[i]
+            if lane < 0 or start > LOOK_M:
                 break
             for m in range(np.searchsorted(lanes, lane), np.searchsorted(lanes, lane + 1)):
-                to_go = starts[i, k] + lane_span[m, 0] - front[i]
+                to_go = start + lane_span[m, 0]
                 if to_go < too_late or to_go < IN_THE_WAY_M or to_go >= gap[i]:
                     continue
-                for p in range(len(walking)):
-                    if not walking[p] or walk[p] != crossings[m]:
-                        continue
-                    if (onward[p] > 0 and s[p] < walk_span[m, 1]) or (
-                        onward[p] < 0 and s[p] > walk_span[m, 0]
-                    ):
+                cleared_s = (to_go + length + ALONG_CROSSING_M) / max(speed, SLOW_MPS)
+                for p in range(len(walk)):
+                    near, far = walk_span[m, 0] - s[p], walk_span[m, 1] - s[p]
+                    if onward[p] < 0:
+                        near, far = -far, -near
+                    if walk[p] == crossings[m] and far > 0 and near < pace[p] * (cleared_s + SPARE_S):
                         gap[i] = to_go
     return gap
 

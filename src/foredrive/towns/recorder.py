@@ -56,6 +56,7 @@ def record(
     rate_hz: float = 10.0,
     sensors: SensorSuite | None = None,
     crowd: Crowd | None = None,
+    occupancy: VoxelSpec | None = OCCUPANCY,
 ) -> LogPath:
     """Record one drive; the same arguments give the same bytes.
 
@@ -71,6 +72,7 @@ def record(
         rate_hz: frames per second.
         sensors: six cameras of 144 × 256 px and 32 × 720 beams by default.
         crowd: `Crowd()` by default.
+        occupancy: grid of the exact occupancy with flow; None leaves it out.
 
     Raises:
         InputError: there is no such town, or no frame to record.
@@ -90,7 +92,7 @@ def record(
     drive = Drive(traffic, seconds)
     maps = write_map(_map_objects(town), town, out)
     name, count = f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
-    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, seed)
+    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, occupancy, seed)
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
         for frame in track(frames, description=f"recording {name}", total=count):
@@ -107,7 +109,9 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
         yield item
 
 
-def _frames(world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int) -> Iterator[Frame]:
+def _frames(
+    world: World, moments: Iterator[Moment], sensors: SensorSuite, spec: VoxelSpec | None, seed: int
+) -> Iterator[Frame]:
     for index, moment in enumerate(moments):
         actors = [*moment.actors, *world.parked]
         seen = world.render(
@@ -128,7 +132,7 @@ def _frames(world: World, moments: Iterator[Moment], sensors: SensorSuite, seed:
             images=seen.images,
             sweep=seen.sweep,
             boxes=boxes_of(near, moment.T_world_ego),
-            occupancy=world.occupancy(moment.actors, moment.T_world_ego, OCCUPANCY),
+            occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
             lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         )
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.lane_graph import TURN_RAD, Control, LaneGraph
-from foredrive.towns.leaders import link_occupants
+from foredrive.towns.leaders import add_occupant, link_occupants, motion_of
 from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
 
 STANDSTILL_M = 2.0
@@ -64,59 +64,48 @@ def claim_junctions(
 ) -> RightOfWay:
     """Serve the requests for right of way; `green` are the lanes that no light forbids to enter."""
     kept = _withdraw(graph, vehicles, starts_m, green)
-    line_column, line_gap = _next_line(graph, vehicles.path, kept, starts_m, vehicles.front_m)
-    rows = np.arange(len(kept))
-    lane = vehicles.path[rows, line_column]
-    # Whose way through was longer than the path known at the time goes on; others ask one junction at a time.
+    column, line_gap = _next_line(graph, vehicles.path, kept, starts_m, vehicles.front_m)
+    lane = vehicles.path[np.arange(len(kept)), column]
     inside = graph.contested[vehicles.lane]
-    before_line = vehicles.path[rows, line_column - 1]
-    no_room = graph.contested[before_line] | (
-        graph.length_m[before_line] < vehicles.size_lwh[:, 0] + STANDSTILL_M
-    )
-    goes_on = inside & no_room & (line_column == BEHIND + kept + 1)
-    stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
+    goes_on = inside & _is_cut_off(graph, vehicles, kept, column)
     queued = (leader >= 0) & (leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
     near = vehicles.active & (line_gap < reach) & ((~queued & ~inside) | goes_on)
+    stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
     asks = near & ((green[lane] & stop_made) | goes_on)
     asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
     turn = graph.turn_rad[lane]
     waits = np.where(turn > TURN_RAD, LEFT_WAITS_S, np.where(turn < -TURN_RAD, RIGHT_WAITS_S, 0.0))
     order = np.argsort(np.where(goes_on, -np.inf, asked_s + waits), kind="stable")
     order = order[asks[order]]
-    conflicts = graph.conflicts
-    motion = (vehicles.active, vehicles.path, starts_m, vehicles.front_m, vehicles.rear_m, vehicles.speed_mps)
-    granted = _serve(
-        order,
-        line_column,
-        motion,
-        kept,
-        goes_on,
-        asks & (time_s - asked_s > PATIENCE_S),
-        graph.length_m,
-        graph.contested,
-        (conflicts.first, conflicts.other, conflicts.enter_m, conflicts.other_clear_m),
-    )
-    entered = (granted > kept) & ~goes_on
-    rank = vehicles.rank.copy()
-    rank[order] = np.where(entered[order], time_s + 1e-6 * np.arange(len(order)), rank[order])
-    inside_gap = _inside_gap(
-        motion,
-        granted,
-        rank,
-        graph.length_m,
-        (
-            conflicts.first,
-            conflicts.other,
-            conflicts.enter_m,
-            conflicts.other_enter_m,
-            conflicts.other_clear_m,
-        ),
-    )
+    impatient = asks & (time_s - asked_s > PATIENCE_S)
+    motion = motion_of(vehicles, starts_m)
+    lanes = (graph.length_m, graph.contested, graph.conflicts)
+    granted = _serve(motion, lanes, kept, order, column, goes_on, impatient)
     served = granted > kept
+    rank = vehicles.rank.copy()
+    enters = order[(served & ~goes_on)[order]]
+    rank[enters] = time_s + 1e-6 * np.arange(len(enters))
     return RightOfWay(
-        granted, np.where(served, np.inf, asked_s), rank, np.where(served, np.inf, line_gap), inside_gap
+        granted=granted,
+        asked_s=np.where(served, np.inf, asked_s),
+        rank=rank,
+        line_gap_m=np.where(served, np.inf, line_gap),
+        inside_gap_m=_inside_gap(motion, lanes, granted, rank),
     )
+
+
+def _is_cut_off(
+    graph: LaneGraph, vehicles: Vehicles, granted: Int[np.ndarray, "N"], line_column: Int[np.ndarray, "N"]
+) -> Bool[np.ndarray, "N"]:
+    """Whose way through a junction was longer than the path known when it was granted.
+
+    All others ask for one junction at a time.
+    """
+    before_line = vehicles.path[np.arange(len(granted)), line_column - 1]
+    need_m = vehicles.size_lwh[:, 0] + STANDSTILL_M
+    no_room = graph.contested[before_line] | (graph.length_m[before_line] < need_m)
+    return no_room & (line_column == BEHIND + granted + 1)
 
 
 def _next_line(
@@ -144,17 +133,15 @@ def _withdraw(
 
 @numba.njit(cache=True)
 @no_type_check
-def _serve(order, line_column, motion, granted, goes_on, impatient, length, contested, conflicts):
-    active, path, starts, front, rear, _ = motion
-    count = len(active)
+def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
+    path, starts, front, rear = motion.path, motion.starts_m, motion.front_m, motion.rear_m
+    length, contested, _ = lanes
     granted = granted.copy()
-    head = np.full(len(length), -1)
-    following, who, where = np.empty((3, 2 * count * WINDOW), np.int64)
-    used = link_occupants(active, path, starts, length, front, rear, granted, head, following, who, where)
+    on = link_occupants(motion, length, granted)
     promised, waited_for = np.zeros(len(length)), np.zeros(len(length), np.bool_)
-    for j in range(count):  # room beyond the junction that is spoken for
+    for j in range(len(granted)):  # room beyond the junction that is spoken for
         k = BEHIND + granted[j] + 1
-        on_its_way = active[j] and k < WINDOW and (granted[j] > 0 or contested[path[j, BEHIND]])
+        on_its_way = motion.active[j] and k < WINDOW and (granted[j] > 0 or contested[path[j, BEHIND]])
         if on_its_way and path[j, k] >= 0 and front[j] < starts[j, k]:
             promised[path[j, k]] += front[j] - rear[j] + STANDSTILL_M
     for i in order:
@@ -164,12 +151,9 @@ def _serve(order, line_column, motion, granted, goes_on, impatient, length, cont
             end += 1
         exit_lane = path[i, end] if end < WINDOW else -1
         if not goes_on[i]:
-            entries = (head, following, who, where)
-            if exit_lane >= 0:
-                room = _room(i, end, motion, contested, length, entries)
-                if room - promised[exit_lane] < need:
-                    continue
-            if not _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for & ~impatient[i]):
+            if exit_lane >= 0 and _room(i, end, motion, lanes, on) - promised[exit_lane] < need:
+                continue
+            if not _is_clear(i, begin, end, motion, lanes, on, waited_for & ~impatient[i]):
                 for k in range(begin, end):
                     waited_for[path[i, k]] = True
                 continue
@@ -177,30 +161,27 @@ def _serve(order, line_column, motion, granted, goes_on, impatient, length, cont
         if exit_lane >= 0:
             promised[exit_lane] += need
         for k in range(begin, end):
-            who[used], where[used] = i, k
-            following[used], head[path[i, k]] = head[path[i, k]], used
-            used += 1
+            add_occupant(on, path[i, k], i, k)
     return granted
 
 
 @numba.njit(cache=True)
 @no_type_check
-def _room(i, begin, motion, contested, length, entries):
+def _room(i, begin, motion, lanes, on):
     """Free length beyond a junction in a moment, up to the next vehicle or junction."""
-    _, path, starts, front, rear, speed = motion
-    head, following, who, where = entries
+    length, contested, _ = lanes
     room = 0.0
     for k in range(begin, WINDOW):
-        lane = path[i, k]
+        lane = motion.path[i, k]
         if lane < 0 or contested[lane]:
             return room
         ahead = length[lane]
-        entry = head[lane]
+        entry = on.head[lane]
         while entry >= 0:
-            j, at = who[entry], where[entry]
-            if j != i and front[j] > starts[j, at]:
-                ahead = min(ahead, rear[j] - starts[j, at] + MOVING_ON_S * speed[j])
-            entry = following[entry]
+            j, start = on.who[entry], motion.starts_m[on.who[entry], on.where[entry]]
+            if j != i and motion.front_m[j] > start:
+                ahead = min(ahead, motion.rear_m[j] - start + MOVING_ON_S * motion.speed_mps[j])
+            entry = on.following[entry]
         room += ahead
         if ahead < length[lane] or room > ENOUGH_ROOM_M:
             return room
@@ -209,25 +190,53 @@ def _room(i, begin, motion, contested, length, entries):
 
 @numba.njit(cache=True)
 @no_type_check
-def _is_clear(i, begin, end, motion, length, conflicts, entries, waited_for):
+def _is_clear(i, begin, end, motion, lanes, on, waited_for):
     """Whether all who have been granted conflicting lanes are out of the way when vehicle i gets there."""
-    _, path, starts, front, rear, speed = motion
-    first, other, enter, other_clear = conflicts
-    head, following, who, where = entries
+    length, _, conflicts = lanes
+    speed = motion.speed_mps
     for k in range(begin, end):
-        for m in range(first[path[i, k]], first[path[i, k] + 1]):
-            if waited_for[other[m]]:
+        lane = motion.path[i, k]
+        for m in range(conflicts.first[lane], conflicts.first[lane + 1]):
+            other = conflicts.other[m]
+            if waited_for[other]:
                 return False
-            to_go = max(0.0, starts[i, k] + enter[m] - front[i])
+            to_go = max(0.0, motion.starts_m[i, k] + conflicts.enter_m[m] - motion.front_m[i])
             arrival_s = (np.sqrt(speed[i] ** 2 + 2 * BRISK_MPS2 * to_go) - speed[i]) / BRISK_MPS2
-            entry = head[other[m]]
+            clear = min(conflicts.other_clear_m[m], length[other])
+            entry = on.head[other]
             while entry >= 0:
-                j = who[entry]
-                to_clear = min(other_clear[m], length[other[m]]) - (rear[j] - starts[j, where[entry]])
+                j = on.who[entry]
+                to_clear = clear - (motion.rear_m[j] - motion.starts_m[j, on.where[entry]])
                 if j != i and to_clear > 0 and to_clear / max(speed[j], SLOW_MPS) > arrival_s:
                     return False
-                entry = following[entry]
+                entry = on.following[entry]
     return True
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _inside_gap(motion, lanes, granted, rank):
+    _, path, starts, front, rear, _ = motion
+    length, _, conflicts = lanes
+    on = link_occupants(motion, length, granted)
+    gap = np.full(len(granted), np.inf)
+    for i in range(len(granted)):
+        if not motion.active[i]:
+            continue
+        for k in range(BEHIND, BEHIND + granted[i] + 1):
+            lane = path[i, k]
+            for m in range(conflicts.first[lane], conflicts.first[lane + 1]):
+                to_go = starts[i, k] + conflicts.enter_m[m] - front[i]
+                entry = on.head[conflicts.other[m]] if -INSIDE_M < to_go < gap[i] else -1
+                while entry >= 0:
+                    j, at = on.who[entry], on.where[entry]
+                    entry = on.following[entry]
+                    is_there = front[j] - starts[j, at] > conflicts.other_enter_m[m] + INSIDE_M
+                    in_the_way = j != i and rear[j] - starts[j, at] < conflicts.other_clear_m[m]
+                    goes_first = in_the_way and (is_there or rank[j] < rank[i])
+                    if goes_first and not _is_behind(j, at, i, path, starts, rear):
+                        gap[i] = to_go
+    return gap
 
 
 @numba.njit(cache=True)
@@ -238,35 +247,3 @@ def _is_behind(j, at, i, path, starts, rear):
         if path[j, k] == path[i, BEHIND] and starts[j, k] + rear[i] > rear[j]:
             return True
     return False
-
-
-@numba.njit(cache=True)
-@no_type_check
-def _inside_gap(motion, granted, rank, length, conflicts):
-    active, path, starts, front, rear, _ = motion
-    first, other, enter, other_enter, other_clear = conflicts
-    count = len(active)
-    head = np.full(len(length), -1)
-    following, who, where = np.empty((3, 2 * count * WINDOW), np.int64)
-    link_occupants(active, path, starts, length, front, rear, granted, head, following, who, where)
-    gap = np.full(count, np.inf)
-    for i in range(count):
-        if not active[i]:
-            continue
-        for k in range(BEHIND, BEHIND + granted[i] + 1):
-            lane = path[i, k]
-            for m in range(first[lane], first[lane + 1]):
-                to_go = starts[i, k] + enter[m] - front[i]
-                entry = head[other[m]] if -INSIDE_M < to_go < gap[i] else -1
-                while entry >= 0:
-                    j, at = who[entry], where[entry]
-                    entry = following[entry]
-                    is_there = front[j] - starts[j, at] > other_enter[m] + INSIDE_M
-                    in_the_way = j != i and rear[j] - starts[j, at] < other_clear[m]
-                    if (
-                        in_the_way
-                        and (is_there or rank[j] < rank[i])
-                        and not _is_behind(j, at, i, path, starts, rear)
-                    ):
-                        gap[i] = to_go
-    return gap
