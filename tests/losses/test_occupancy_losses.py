@@ -17,6 +17,12 @@ def test_bce_ignores_unknown_voxels_by_hand() -> None:
     torch.testing.assert_close(loss, torch.tensor(math.log(2)))
 
 
+def test_occupied_voxels_weigh_more_where_asked() -> None:
+    logit, occupied, known = grid(0.0, 0.0), grid(1, 0), grid(1, 1).bool()
+    loss = occupancy_bce(logit, occupied, known, occupied_weight=3.0)
+    torch.testing.assert_close(loss, torch.tensor(2 * math.log(2)))  # (3 + 1) / 2
+
+
 def test_affinity_by_hand() -> None:
     p = torch.tensor([0.8, 0.6, 0.1, 0.9])  # the last voxel is unknown
     y = grid(1, 0, 0, 0)

@@ -30,6 +30,9 @@ VERBS: dict[str, Callable[..., Any]] = {
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly."
 )
+# OpenMP threads that spin while they wait would take the cores from kernels and data workers.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 DISK_FULL_TEXT = "No space left on device"
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
 DISK_ERRORS = {

@@ -9,10 +9,17 @@ EPS = 1e-6
 
 
 def occupancy_bce(
-    logit: Float[Tensor, "*b Z Y X"], occupied: Float[Tensor, "*b Z Y X"], known: Bool[Tensor, "*b Z Y X"]
+    logit: Float[Tensor, "*b Z Y X"],
+    occupied: Float[Tensor, "*b Z Y X"],
+    known: Bool[Tensor, "*b Z Y X"],
+    occupied_weight: float = 1.0,
 ) -> Float[Tensor, ""]:
-    """Binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known."""
-    per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none")
+    """Binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known.
+
+    `occupied_weight` multiplies the terms of occupied voxels; eq. 10 has 1.
+    """
+    weight = logit.new_tensor([occupied_weight])
+    per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none", pos_weight=weight)
     return (per_voxel * known).sum() / known.sum().clamp_min(1)
 
 
@@ -44,8 +51,8 @@ def occupancy_loss(
     *,
     scal_weight: float,
     bce_weight: float,
+    occupied_weight: float = 1.0,
 ) -> Float[Tensor, ""]:
     """L_occ = λ_scal·L_scal + λ_BCE·L_BCE (eq. 11; the paper: 10 and 1)."""
-    return scal_weight * scene_class_affinity(logit, occupied, known) + bce_weight * occupancy_bce(
-        logit, occupied, known
-    )
+    bce = occupancy_bce(logit, occupied, known, occupied_weight)
+    return scal_weight * scene_class_affinity(logit, occupied, known) + bce_weight * bce

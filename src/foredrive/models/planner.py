@@ -9,6 +9,8 @@ from foredrive.scene import Command, Trajectory
 
 SPEED_SCALE_MPS = 10.0
 MOVES_M = 0.1
+STEP_SCALE_M = 3.0
+"""What an output of 1 stands for: with steps of this order the last layer need not grow first."""
 
 
 class FutureAttention(nn.Module):
@@ -102,7 +104,7 @@ class VolumePlanner(nn.Module):
             [self.command(command), self.speed(speed), self.plan.expand(len(command), -1)], dim=-1
         )
         decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        steps = self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
+        steps = STEP_SCALE_M * self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
         xy = steps.cumsum(dim=2)
         return Trajectory(
             xy=xy,

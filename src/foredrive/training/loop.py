@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from foredrive.errors import InputError
 from foredrive.scene import Example
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from foredrive.training.interrupts import hold_interrupts, start_fork_server
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def train(
     `objective(example, generator)` returns losses by name, of which "loss" is descended. Writes
     `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is started again gives
     the same losses as one that was not: the order of data and every random number follow from the seed and
-    the step. Ctrl-C saves a checkpoint of the last finished step first.
+    the step. Ctrl-C ends it after the step that is under way, with a checkpoint; a second one ends it at once.
 
     Raises:
         InputError: on an empty data set, or when a loss is not finite (the batch is named).
@@ -105,22 +106,20 @@ def train(
     )
     model.train()
     step = done
-    try:
-        with _progress(fabric) as progress:
-            task = progress.add_task(folder.name, total=total, completed=done, note="")
-            for example in loader:
-                assert isinstance(example, Example)
-                losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
-                step += 1
-                if log is not None:
-                    log.add(step, losses)
-                progress.update(task, completed=step, note=f"loss {losses['loss'].item():.3f}")
-                if (step % schedule.checkpoint_every == 0 or step == total) and fabric.is_global_zero:
-                    save_checkpoint(checkpoints, objective, optimizer, step)
-    except KeyboardInterrupt:
-        if fabric.is_global_zero and step > done:
-            save_checkpoint(checkpoints, objective, optimizer, step)
-        raise
+    with hold_interrupts() as interrupted, _progress(fabric) as progress:
+        task = progress.add_task(folder.name, total=total, completed=done, note="")
+        for example in loader:
+            assert isinstance(example, Example)
+            losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
+            step += 1
+            if log is not None:
+                log.add(step, losses)
+            progress.update(task, completed=step, note=f"loss {losses['loss'].item():.3f}")
+            last = step == total or interrupted()
+            if (last or step % schedule.checkpoint_every == 0) and fabric.is_global_zero:
+                save_checkpoint(checkpoints, objective, optimizer, step)
+            if last:
+                break
 
 
 def _loader(
@@ -136,6 +135,8 @@ def _loader(
     batches = itertools.islice(
         batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed), done, total
     )
+    if schedule.workers:
+        start_fork_server(preload=type(dataset).__module__)
     mine = [_share(batch, fabric.global_rank, fabric.world_size) for batch in batches]
     return DataLoader(
         dataset,

@@ -26,6 +26,8 @@ class LossWeights:
     scal: float = 10.0
     bce: float = 1.0
     perc: float = 0.1
+    occupied: float = 1.0
+    """Weight of occupied voxels within the BCE; above the road they are a few in a hundred."""
 
 
 class NemoObjective(nn.Module):
@@ -74,6 +76,7 @@ class NemoObjective(nn.Module):
                 example.occupancy.known[:, frame],
                 scal_weight=weights.scal,
                 bce_weight=weights.bce,
+                occupied_weight=weights.occupied,
             ) / len(decoded)
             if weights.recon > 0:
                 rays = thinned_rays(clip, frame, self.ray_stride, generator)
