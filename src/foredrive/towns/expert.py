@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.fleet import find_starts, place
+from foredrive.towns.fleet import place
 from foredrive.towns.routes import Route, draw_route
 from foredrive.towns.traffic import Traffic, TrafficState
 from foredrive.towns.vehicles import Vehicles, empty_slots, vehicle_poses
@@ -59,7 +59,7 @@ class Drive:
         fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
         driven_m = AVERAGE_MPS * (seconds + SETTLE_S)
         self._traffic = traffic
-        self._planned = draw_route(lanes, find_starts(lanes), rng, fastest_m, driven_m)
+        self._planned = draw_route(lanes, traffic.starts, rng, fastest_m, driven_m)
         self._state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
         while not self._is_settled():
             self._state = traffic.step(self._state, LONGEST_STEP_S)

@@ -92,7 +92,7 @@ class Traffic:
         self.lanes: LaneGraph = build_lane_graph(town)
         self.walks: WalkGraph = build_walk_graph(town, self.lanes)
         self.signals: SignalPlan = plan_signals(self.lanes, np.random.default_rng((seed, 0)))
-        self._starts: Starts = find_starts(self.lanes)
+        self.starts: Starts = find_starts(self.lanes)
         self._zone_count = len(town.stop_zones)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
         self._is_motorway = self.lanes.limit_mps > MOTORWAY_LIMIT_MPS
@@ -282,9 +282,9 @@ class Traffic:
         rows = np.flatnonzero(~state.vehicles.active)[:most]
         if not len(rows):
             return state
-        places = np.arange(len(self._starts.lane))
+        places = np.arange(len(self.starts.lane))
         if len(state.route):
-            distance = np.linalg.norm(self._starts.xyz - self.poses(state).centre_m[0], axis=1)
+            distance = np.linalg.norm(self.starts.xyz - self.poses(state).centre_m[0], axis=1)
             places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
         if not len(places):
             return state
@@ -293,23 +293,21 @@ class Traffic:
             tries = rng.choice(places, TRIES)
             at = tries[self._is_free(vehicles, tries)][:1]
             if len(at):
-                lane = self._starts.lane[at]
+                lane = self.starts.lane[at]
                 track_id = np.array([state.next_track_id + k])
                 one = draw_fleet(rng, track_id, self._for_large[lane], ~self._is_motorway[lane])
-                vehicles = vehicles.replace_rows(
-                    row[None], place(self.lanes, one, lane, self._starts.s_m[at])
-                )
+                vehicles = vehicles.replace_rows(row[None], place(self.lanes, one, lane, self.starts.s_m[at]))
         state = dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
         return self._know_path(state, rng)
 
     def _is_free(self, vehicles: Vehicles, starts: Int[np.ndarray, "k"]) -> np.ndarray:
         """Which starts are far from all vehicles, and in time from those ahead and behind."""
         centres = vehicle_poses(self.lanes, vehicles).centre_m[vehicles.active]
-        offset = centres[None] - self._starts.xyz[starts][:, None]
-        forward = self._starts.forward[starts][:, None]
+        offset = centres[None] - self.starts.xyz[starts][:, None]
+        forward = self.starts.forward[starts][:, None]
         along = np.sum(offset * forward, axis=2)
         aside = np.linalg.norm(offset - along[..., None] * forward, axis=2)
-        speed = self.lanes.speed(self._starts.lane[starts], self._starts.s_m[starts])
+        speed = self.lanes.speed(self.starts.lane[starts], self.starts.s_m[starts])
         reach = CLEAR_M + CLEAR_S * speed[:, None]
         return ~((np.hypot(along, aside) < CLEAR_M) | ((np.abs(along) < reach) & (aside < 3.0))).any(axis=1)
 
