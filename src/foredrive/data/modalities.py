@@ -30,7 +30,7 @@ class FullOccupancy:
     spec: VoxelSpec
     index_zyx: Int[np.ndarray, "K 3"]
     category: Int[np.ndarray, "K"]
-    """A `Category`; -1 for the static world."""
+    """A `Category`; below 0 for the static world (a town says what it is: -1 minus its `Surface`)."""
     velocity_mps: Float[np.ndarray, "K 3"]
     """Velocity over ground in the ego axes of the frame."""
 

@@ -11,7 +11,6 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Float32, Int32
 
-
 Vector = Sequence[float | int]
 
 

@@ -188,9 +188,9 @@ def _facade(p, look, x, y, uvw, extent, i, out):
 
 @_kernel
 @no_type_check
-def _tint(kind, p, look, x, y, z, uvw, extent, i):
+def _tint(kind, p, look, xyz, uvw, extent, i):
     """Factors on red, green and blue of the simpler textures."""
-    size = extent[i, 3]
+    x, y, z, size = xyz[i, 0], xyz[i, 1], xyz[i, 2], extent[i, 3]
     if kind == _GRASS:
         wide = noise(x / 23.0, y / 23.0, size / 23.0, 21)
         fine = noise(x * 1.7, y * 1.7, size * 1.7, 22) + 0.6 * noise(x * 6.0, y * 6.0, size * 6.0, 23)
@@ -235,7 +235,7 @@ def texture(looks, look, xyz, uvw, extent, i, out):
         out: [5] filled with red, green, blue (linear), share of glass, share of paint.
     """
     kind, p = looks.texture[look], looks.params
-    x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+    x, y = xyz[i, 0], xyz[i, 1]
     for c in range(3):
         out[c] = looks.albedo[look, c]
     out[3] = out[4] = 0.0
@@ -252,7 +252,7 @@ def texture(looks, look, xyz, uvw, extent, i, out):
     else:
         if kind == _GLASS:
             out[3] = 1.0
-        r, g, b = _tint(kind, p, look, x, y, z, uvw, extent, i)
+        r, g, b = _tint(kind, p, look, xyz, uvw, extent, i)
         out[0] *= r
         out[1] *= g
         out[2] *= b

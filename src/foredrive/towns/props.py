@@ -25,8 +25,6 @@ POST_CLEARANCE_M = 0.3
 POLE_SAMPLE_M = 0.2
 TRUNK_M = 2.0
 CROWN_SPREAD = 1.35
-LARGEST_FOOT_M2 = 2.0
-"""What stands on more ground than this is not just a post or a trunk."""
 
 _LEAVES = ((0.27, 0.38, 0.14), (0.33, 0.42, 0.17), (0.22, 0.33, 0.15), (0.40, 0.44, 0.18), (0.25, 0.36, 0.20))
 _NEEDLES = ((0.17, 0.28, 0.17), (0.20, 0.31, 0.18))
@@ -234,11 +232,11 @@ def _plant(site: Site, xy: Float[np.ndarray, "2"], looks: _Looks, rng: np.random
     if not site.is_free(shapely.Point(xy).buffer(0.35)):
         return None
     spread = shapely.Point(xy).buffer(CROWN_SPREAD * radius, quad_segs=2)
-    if kind == "bush":
+    if kind in ("bush", "conifer"):
         has_room = site.is_free(spread)
-    else:  # over a walkway, above a lamp's foot, but clear of lanes and walls
+    else:  # its crown may hang over a walkway
         has_room = not site.plan.lanes.intersects(spread) and not site.plan.bridges.intersects(spread)
-        has_room &= not any(a.area > LARGEST_FOOT_M2 and a.intersects(spread) for a in site.near(spread))
+        has_room &= not any(other.intersects(spread) for other in site.near(spread))
     if not has_room:
         return None
     site.take(shapely.Point(xy).buffer(0.6))
