@@ -81,4 +81,4 @@ def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
     if there.is_dir():  # logs are whole or not there
         return LogPath(there, folder / "maps")
     sensors = SensorSuite(camera_rig(nemo_tiny().clips.image_hw), roof_lidar())
-    return record(town, seconds, seed, folder, rate_hz=RATE_HZ, sensors=sensors)
+    return record(town, seconds, seed, folder, rate_hz=RATE_HZ, sensors=sensors, occupancy=None)
