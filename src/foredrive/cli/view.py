@@ -52,19 +52,16 @@ def _clip_at(path: "LogPath", t_s: float | None) -> tuple["Clip", float]:
         raise InputError(f"{path.folder}: no time {wanted_s:g} s in this log of {duration_s:.2f} s")
     camera = next(iter(pinhole_cameras(log).values()), None)
     aspect = 9 / 16 if camera is None else camera.height / camera.width
-    at_start = wanted_s <= log.period_s / 2
     config = ClipConfig(
         past_frames=0,
         future_frames=0,
         image_hw=(round(CAMERA_WIDTH_PX * aspect), CAMERA_WIDTH_PX),
         voxels=VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2)),  # labels are not drawn
-        now_stride_s=1.0 + duration_s if at_start else wanted_s,  # clips lie at 0, stride, 2 stride, ...
+        now_stride_s=log.period_s or 1.0,
         lidar=True,
         map=True,
     )
     dataset = ClipDataset([path], config, cache_dir=None)
-    example = dataset[min(0 if at_start else 1, len(dataset) - 1)]
-    read_s = (int(example.key[0].rpartition("@")[2]) - int(log.t_us[0])) * 1e-6
-    if abs(read_s - wanted_s) > max(log.period_s, 1e-3):
-        raise InputError(f"{path.folder}: no frame near {wanted_s:g} s")
-    return example.clip, read_s
+    times_s = [(dataset.now_us(index) - int(log.t_us[0])) * 1e-6 for index in range(len(dataset))]
+    nearest = min(range(len(times_s)), key=lambda index: abs(times_s[index] - wanted_s))
+    return dataset[nearest].clip, times_s[nearest]

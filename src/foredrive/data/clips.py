@@ -85,6 +85,11 @@ class ClipDataset(Dataset[Example]):
     def __len__(self) -> int:
         return len(self._clips)
 
+    def now_us(self, index: int) -> int:
+        """A clip's now, in the time of its log."""
+        number, frames = self._clips[index]
+        return int(self._logs[number].t_us[frames[self.config.past_frames]])
+
     def __getitem__(self, index: int) -> Example:
         """Read one clip.
 
@@ -107,7 +112,7 @@ class ClipDataset(Dataset[Example]):
                 values=torch.stack([label.flow_mps for label in labels]),
                 known=torch.stack([label.flow_known for label in labels]),
             ),
-            key=(f"{log.path.name}@{log.t_us[frames[self.config.past_frames]]}",),
+            key=(f"{log.path.name}@{self.now_us(index)}",),
         )
 
     def _choose_cameras(self) -> tuple[str, ...]:
