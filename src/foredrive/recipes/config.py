@@ -76,14 +76,21 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
 
 
 def load_recipe(path: Path) -> Recipe:
-    """Read a recipe that `save_recipe` wrote."""
+    """Read a recipe that `save_recipe` wrote.
+
+    Raises:
+        InputError: naming the file, and the entry that is wrong, missing or unknown.
+    """
     try:
-        return TypeAdapter(Recipe).validate_python(yaml.safe_load(path.read_text()))
+        return TypeAdapter(Recipe).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
     except OSError as error:
         raise InputError(f"{path.parent}: not a run folder, {path.name} cannot be read") from error
-    except (yaml.YAMLError, ValidationError) as error:
-        first_line = str(error).splitlines()[0]
-        raise InputError(f"{path}: not a recipe: {first_line}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(f"{path}: not a recipe: {f'{where}: ' if where else ''}{first['msg']}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a recipe: {str(error).splitlines()[0]}") from error
 
 
 def _plain(value: object) -> object:

@@ -48,25 +48,29 @@ def open_run(folder: Path) -> Run:
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not a run folder (no {CONFIG})")
     recipe = load_recipe(folder / CONFIG)
-    written = json.loads((folder / LOGS).read_text())
-    logs = tuple(LogPath(Path(entry["folder"]), Path(entry["maps_dir"])) for entry in written["logs"])
-    return Run(folder, recipe, logs, Path(written["cache_dir"]))
+    try:
+        written = json.loads((folder / LOGS).read_text())
+        logs = tuple(LogPath(Path(entry["folder"]), Path(entry["maps_dir"])) for entry in written["logs"])
+        return Run(folder, recipe, logs, Path(written["cache_dir"]))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
 
 
 def train_run(recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None = None) -> Run:
     """Pre-train, then fine-tune; goes on where an earlier call with the same recipe and logs stopped.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe or other logs.
+        InputError: if `folder` holds a run of another recipe or other logs, or on logs that cannot be read.
     """
-    run = Run(folder, recipe, tuple(logs), cache_dir or folder / "cache")
-    if (folder / CONFIG).is_file():
+    run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute())
+    started_before = (folder / CONFIG).is_file()
+    if started_before:
         _check_same(open_run(folder), run)
-    else:
+    dataset = ClipDataset(run.logs, recipe.clips, run.cache_dir)
+    if not started_before:  # only now: logs that cannot be read must not make a run
         _write(run)
     fabric = Fabric(devices="auto" if torch.cuda.is_available() else 1, precision=recipe.precision)
     fabric.launch()
-    dataset = ClipDataset(run.logs, recipe.clips, run.cache_dir)
     torch.manual_seed(recipe.pretrain.schedule.seed)
     agent = build_agent(recipe)
     _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
@@ -104,6 +108,9 @@ def _write(run: Run) -> None:
 
 
 def _check_same(there: Run, wanted: Run) -> None:
-    for what in ("recipe", "logs"):
-        if getattr(there, what) != getattr(wanted, what):
-            raise InputError(f"{there.folder}: holds a run with another {what}; choose another folder")
+    for what, same in (
+        ("another recipe", there.recipe == wanted.recipe),
+        ("other logs", there.logs == wanted.logs),
+    ):
+        if not same:
+            raise InputError(f"{there.folder}: holds a run with {what}; choose another folder")

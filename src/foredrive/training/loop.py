@@ -80,7 +80,7 @@ def train(
     `objective(example, generator)` returns losses by name, of which "loss" is descended. Writes
     `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is started again gives
     the same losses as one that was not: the order of data and every random number follow from the seed and
-    the step. Ctrl-C ends it after the step that is under way, with a checkpoint; a second one ends it at once.
+    the step. Ctrl-C ends it after the step that is under way, with a checkpoint; a second one at once.
 
     Raises:
         InputError: on an empty data set, or when a loss is not finite (the batch is named).

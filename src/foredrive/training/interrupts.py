@@ -1,0 +1,57 @@
+"""Ctrl-C between steps, and never in the middle of one."""
+
+import contextlib
+import multiprocessing
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from multiprocessing import forkserver
+
+
+@contextlib.contextmanager
+def hold_interrupts() -> Iterator[Callable[[], bool]]:
+    """Note a first Ctrl-C, and raise it as KeyboardInterrupt at the end of the block only.
+
+    A step that is interrupted halfway has changed some of the weights or statistics already: a checkpoint of
+    it would be of no step at all. A second Ctrl-C is raised at once. Where Ctrl-C does not raise
+    KeyboardInterrupt (outside the main thread, or with a handler of somebody else's) nothing is changed.
+
+    Yields:
+        a function that tells whether Ctrl-C was pressed, so that the block can come to its end.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield lambda: False
+        return
+    pressed = False
+
+    def note(signum: int, frame: object) -> None:
+        nonlocal pressed
+        if pressed:
+            raise KeyboardInterrupt
+        pressed = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def start_fork_server(preload: str) -> None:
+    """Start the process that worker processes are forked from, if it does not run yet.
+
+    It keeps SIGINT blocked, and its children inherit that: a terminal sends Ctrl-C to every process, but
+    workers shall not die of it before the step is done that needs them.
+
+    Args:
+        preload: module that the workers need; it is imported once and not in each of them.
+    """
+    multiprocessing.set_forkserver_preload([preload])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,79 @@
+"""A run of seconds: NeMo with every part but hardly any width, and a log of five seconds to train it on."""
+
+import dataclasses
+from pathlib import Path
+
+import synthetic_log
+
+from foredrive.data import ClipConfig, LogPath, find_logs
+from foredrive.recipes import Recipe
+from foredrive.recipes.config import BackboneSize, NemoSize, Stage
+from foredrive.scene import VoxelSpec
+from foredrive.training import LossWeights, Schedule
+
+STEPS = 3
+"""Of either stage."""
+
+
+def miniature() -> Recipe:
+    """A step takes some hundredths of a second."""
+    return Recipe(
+        name="miniature",
+        clips=ClipConfig(
+            past_frames=1,
+            future_frames=2,
+            image_hw=(32, 64),
+            voxels=VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=2.0, shape_zyx=(2, 16, 16)),
+        ),
+        model=NemoSize(
+            backbone=BackboneSize(
+                embedding_size=8,
+                hidden_sizes=(8, 16, 16),
+                depths=(1, 1, 1),
+                layer_type="basic",
+                stages=("stage2", "stage3"),
+            ),
+            channels=8,
+            heads=2,
+            points=2,
+            lifting_layers=1,
+            occupancy_hidden=8,
+            motion_hidden=4,
+            ray_near_m=1.0,
+            ray_far_m=24.0,
+            ray_samples=8,
+            recon_hidden=16,
+            planner_width=16,
+            planner_layers=1,
+            planner_heads=2,
+            attention_pool=(1, 4, 4),
+        ),
+        pretrain=Stage(
+            schedule=Schedule(batch_size=2, lr=2e-3, steps=STEPS, warmup_steps=1),
+            weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
+            ray_stride=4,
+        ),
+        finetune=Stage(
+            schedule=Schedule(batch_size=2, lr=1e-3, steps=STEPS, warmup_steps=1),
+            weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
+            ray_stride=8,
+        ),
+    )
+
+
+def with_steps(recipe: Recipe, pretrain: int, finetune: int) -> Recipe:
+    """The recipe with other lengths of its stages."""
+    stages = {
+        name: dataclasses.replace(stage, schedule=dataclasses.replace(stage.schedule, steps=steps))
+        for name, stage, steps in (
+            ("pretrain", recipe.pretrain, pretrain),
+            ("finetune", recipe.finetune, finetune),
+        )
+    }
+    return dataclasses.replace(recipe, **stages)
+
+
+def write_log(root: Path, name: str = "flat", frames: int = 51) -> LogPath:
+    """Write a log at 10 Hz, 5 s long by default, with two cameras, lidar and boxes."""
+    (log,) = find_logs(synthetic_log.write(root, frames=frames, name=name))
+    return log
