@@ -59,7 +59,7 @@ def main() -> None:
     top.plot([7.0, 8.5], [3.0, 3.0], ":", color="#b4690e")
     arrow(top, (7.0, 3.0), (1.25, 0.68), "#b4690e", "l")
     top.text(8.75, 3.05, "yaw", color="#b4690e", va="center")
-    top.text(6.9, 1.75, "box: centre, l × w × h", color="#b4690e", ha="center")
+    top.text(6.9, 1.75, "box: centre and size l, w, h", color="#b4690e", ha="center")
     top.set(xlim=(-1.6, 10.0), ylim=(-1.5, 4.4), aspect="equal", title="from above")
     for ax in (side, top):
         ax.axis("off")

@@ -79,7 +79,10 @@ class VolumePlanner(nn.Module):
         self.speed = nn.Sequential(nn.Linear(2, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
-        layer = nn.TransformerDecoderLayer(width, heads, 2 * width, dropout=0.1, batch_first=True)
+        # Normalising first keeps an open path for speed and command, which most of a plan follows from.
+        layer = nn.TransformerDecoderLayer(
+            width, heads, 2 * width, dropout=0.1, batch_first=True, norm_first=True
+        )
         self.decoder = nn.TransformerDecoder(layer, layers)
         self.waypoints = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)

@@ -23,7 +23,7 @@ class Belief(Record):
     history: Float[Tensor, "b T D Z Y X"] | None = None
     """Volumes of the past frames, now last, where imagining needs them."""
     T_now_ego: Float[Tensor, "b 4 4"] | None = None
-    """Predicted ego motion: this belief's ego frame -> the ego frame at now; None for the belief about now."""
+    """Predicted ego motion: this belief's ego frame -> the ego frame at now; None for now's belief."""
 
 
 @dataclass(frozen=True)

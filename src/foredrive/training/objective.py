@@ -28,6 +28,8 @@ class LossWeights:
     perc: float = 0.1
     occupied: float = 1.0
     """Weight of occupied voxels within the BCE; above the road they are a few in a hundred."""
+    future: float = 1.0
+    """Weight of each imagined key frame beside now's; the paper counts all alike."""
 
 
 class NemoObjective(nn.Module):
@@ -68,16 +70,17 @@ class NemoObjective(nn.Module):
             plan = None
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
-        for k, belief in enumerate(decoded):
+        shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
+        for k, (belief, share) in enumerate(zip(decoded, shares / shares.sum(), strict=True)):
             frame = now + k
-            losses["occ"] = losses["occ"] + occupancy_loss(
+            losses["occ"] = losses["occ"] + share * occupancy_loss(
                 belief.occupancy_logit,
                 example.occupancy.values[:, frame, 0],
                 example.occupancy.known[:, frame],
                 scal_weight=weights.scal,
                 bce_weight=weights.bce,
                 occupied_weight=weights.occupied,
-            ) / len(decoded)
+            )
             if weights.recon > 0:
                 rays = thinned_rays(clip, frame, self.ray_stride, generator)
                 rendered = self.agent.world_model.renderer(
@@ -86,11 +89,11 @@ class NemoObjective(nn.Module):
                 b, c, _, h, w = rays.rgb.shape
                 predicted = rendered.rgb.view(b * c, h, w, 3).permute(0, 3, 1, 2)
                 truth, valid = rays.rgb.flatten(0, 1), rays.valid.flatten()
-                losses["l1"] = losses["l1"] + l1_loss(predicted, truth, valid) / len(decoded)
+                losses["l1"] = losses["l1"] + share * l1_loss(predicted, truth, valid)
                 if self.image_features is not None:
-                    losses["perc"] = losses["perc"] + perceptual_loss(
+                    losses["perc"] = losses["perc"] + share * perceptual_loss(
                         predicted, truth, valid, self.image_features
-                    ) / len(decoded)
+                    )
 
         losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
             losses["l1"] + weights.perc * losses["perc"]
