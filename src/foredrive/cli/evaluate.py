@@ -27,7 +27,7 @@ def evaluate(
     """
     from rich.console import Console
 
-    from foredrive.evaluation import print_summary
+    from foredrive.evaluation import print_summary, read_summary
     from foredrive.recipes import evaluate_run, find_all_logs, inspect_run, open_run
     from foredrive.view.report import write_report
     from foredrive.view.run_report import report_on_run
@@ -36,8 +36,9 @@ def evaluate(
     chosen = find_all_logs(logs) if logs else trained.logs
     folder = out or run
     result = evaluate_run(trained, chosen, folder, batch_size)
-    print_summary(result.summary, Console(), trained.recipe.name)
+    summary = read_summary(folder / "summary.json")
+    print_summary(summary, Console(), trained.recipe.name)
     inspections = inspect_run(trained, chosen, examples)
-    report = report_on_run(trained, chosen, result.summary, inspections, result.failures)
+    report = report_on_run(trained, chosen, summary, inspections, result.failures)
     write_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")

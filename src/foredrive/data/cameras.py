@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.common.runtime import get_dataset_paths
 from py123d.datatypes import ModalityType, PinholeCameraMetadata
@@ -132,7 +132,10 @@ def _open_image(
 ) -> Image.Image:
     """An image as 123D stores it: encoded bytes, a path under the data set's root, or a video's frame."""
     if isinstance(data, bytes):
-        return Image.open(io.BytesIO(data))
+        try:
+            return Image.open(io.BytesIO(data))
+        except UnidentifiedImageError as error:
+            raise ValueError(f"these {len(data)} bytes are not an image") from error
     if isinstance(data, str):
         root = get_dataset_paths().get_sensor_root(log.metadata.dataset)
         if root is None:

@@ -61,8 +61,9 @@ def evaluate(
         command_source: how many commands came from a route, the driven future, nowhere.
         on_items: told the number of items after each batch.
 
-    An item at which the predictor raises an error or says something that is not finite, or a batch that
-    cannot be loaded, counts as failed; a batch is then tried again item by item.
+    An item at which the predictor raises an error or says something that is not finite counts as failed; its
+    batch is then tried again item by item. Where the loader raises an InputError and can go on after it, a
+    batch (of its `batch_size`; without one, an item) counts as failed.
 
     Raises:
         InputError: if there are no items, or all of them failed.
@@ -73,7 +74,7 @@ def evaluate(
     failures: list[Failure] = []
     judged = 0
     with torch.inference_mode():
-        for loaded in _load(loader, failures):
+        for loaded in _load(loader, failures, on_items):
             example = loaded.to(device)
             obstacles = future_obstacles(example.clip, STEPS, STEP_S)
             for chosen, prediction in _attempt(predictor.predict, _whole_prediction, example, failures):
@@ -169,7 +170,9 @@ def labels_from_now(labels: VoxelGrid, clip: Clip, frames: int) -> VoxelGrid:
     return labels[:, now : now + frames]
 
 
-def _load(loader: Iterable[Example], failures: list[Failure]) -> Iterator[Example]:
+def _load(
+    loader: Iterable[Example], failures: list[Failure], on_items: Callable[[int], None]
+) -> Iterator[Example]:
     """The batches that can be loaded."""
     batches = iter(loader)
     batch_size = getattr(loader, "batch_size", None) or 1
@@ -180,6 +183,7 @@ def _load(loader: Iterable[Example], failures: list[Failure]) -> Iterator[Exampl
             return
         except InputError as error:  # the loader has moved on and can give the next batch
             failures.extend([Failure("not loaded", _line(error))] * batch_size)
+            on_items(batch_size)
             continue
         yield batch
 

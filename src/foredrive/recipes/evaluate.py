@@ -1,7 +1,7 @@
 """Evaluating a run on logs: the model, the baselines it has to beat, one summary."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.errors import InputError
 from foredrive.evaluation import (
     ConstantVelocity,
     EvaluationResult,
@@ -26,7 +27,7 @@ from foredrive.metrics import VoxelPrior
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.recipes.predict import NemoPredictor
-from foredrive.recipes.train import Run, load_agent
+from foredrive.recipes.train import Run, load_agent, open_clips
 from foredrive.scene import Example, Trajectory
 
 SUMMARY = "summary.json"
@@ -53,11 +54,34 @@ def evaluation_data(run: Run, logs: Sequence[LogPath]) -> ClipDataset:
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     config = dataclasses.replace(clips, future_frames=frames, future_images=False)
-    return ClipDataset(logs, config, run.cache_dir)
+    return open_clips(logs, config, run.cache_dir)
+
+
+class _Batches(Iterator[Example]):
+    """Clips in batches. A clip that cannot be read raises an InputError; the next call goes on after it."""
+
+    def __init__(self, dataset: ClipDataset, batch_size: int) -> None:
+        self._dataset, self._batch_size = dataset, batch_size
+        self._left = iter(range(len(dataset)))
+        self._read: list[Example] = []
+
+    def __next__(self) -> Example:
+        while len(self._read) < self._batch_size and (index := next(self._left, None)) is not None:
+            self._read.append(self._dataset[index])
+        if not self._read:
+            raise StopIteration
+        batch, self._read = collate(self._read), []
+        return batch
 
 
 def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int = 4) -> EvaluationResult:
-    """Judge a trained run on logs; writes `out/summary.json`."""
+    """Judge a trained run on logs; writes `out/summary.json`. Clips that cannot be read count as failed.
+
+    Raises:
+        InputError: if there is nothing to judge: the run has not finished a stage, no clip can be read.
+    """
+    if batch_size < 1:
+        raise InputError(f"a batch has at least one clip, got a batch size of {batch_size}")
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs)
@@ -69,7 +93,7 @@ def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int =
         task = progress.add_task("evaluate", total=len(dataset))
         result = evaluate(
             NemoPredictor(agent, clips.future_frames, RENDER_STRIDE),
-            DataLoader(dataset, batch_size, collate_fn=collate),
+            _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,
             baselines={
                 "stand_still": StandStill(steps, dt_s),
@@ -97,15 +121,18 @@ def _fit_baselines(run: Run) -> tuple[VoxelPrior, EgoMLP]:
 
 @torch.no_grad()
 def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
-    """The model on `count` examples spread evenly over the logs."""
+    """The model on `count` examples spread evenly over the logs; one that cannot be read is left out."""
     agent = load_agent(run)
     clips = run.recipe.clips
     config = dataclasses.replace(clips, lidar=True, map=True)
-    dataset = ClipDataset(logs, config, run.cache_dir)
+    dataset = open_clips(logs, config, run.cache_dir)
     predictor = NemoPredictor(agent, clips.future_frames, RENDER_STRIDE)
     found = []
     for k in range(min(count, len(dataset))):
-        item = dataset[int((k + 0.5) * len(dataset) / count)]
+        try:
+            item = dataset[int((k + 0.5) * len(dataset) / count)]
+        except InputError:
+            continue
         observed = collate([item]).clip.observed()
         prediction = predictor.predict(observed)
         assert prediction.occupancy_logit is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from lightning_fabric import Fabric
 
-from foredrive.data import ClipDataset, LogPath, collate, find_logs
+from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.nemo import NemoAgent
@@ -56,6 +56,19 @@ def open_run(folder: Path) -> Run:
         raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
 
 
+def open_clips(logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path) -> ClipDataset:
+    """Clips that a model can see something in; cameras that some of the logs lack are masked.
+
+    Raises:
+        InputError: if none of the logs has a camera.
+    """
+    dataset = ClipDataset(logs, config, cache_dir)
+    if not dataset.camera_names:
+        others = f" and {len(logs) - 1} more logs" if len(logs) > 1 else ""
+        raise InputError(f"{logs[0].folder}{others}: no pinhole camera, and NeMo sees by cameras alone")
+    return dataset
+
+
 def train_run(recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None = None) -> Run:
     """Pre-train, then fine-tune; goes on where an earlier call with the same recipe and logs stopped.
 
@@ -66,7 +79,7 @@ def train_run(recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: 
     started_before = (folder / CONFIG).is_file()
     if started_before:
         _check_same(open_run(folder), run)
-    dataset = ClipDataset(run.logs, recipe.clips, run.cache_dir)
+    dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
     if not started_before:  # only now: logs that cannot be read must not make a run
         _write(run)
     fabric = Fabric(devices="auto" if torch.cuda.is_available() else 1, precision=recipe.precision)
