@@ -8,7 +8,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 WHILE_WRITING = "while writing "
-"""Starts the note that `atomic_path` adds to an error; the final path follows."""
+"""Starts the note that `naming` adds to an error; the path follows."""
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Note on errors of the block (a full disk) what it writes: they may name a scratch file, or nothing."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"{WHILE_WRITING}{path}")
+        raise
 
 
 @contextlib.contextmanager
@@ -20,16 +30,14 @@ def atomic_path(final: Path) -> Iterator[Path]:
     removed and the final name is left as it was.
     """
     final = Path(final)
-    final.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent))
-    temporary = scratch / final.name
-    try:
-        yield temporary
-        if temporary.is_dir() and final.is_dir():
-            final.rename(scratch / "replaced")
-        os.replace(temporary, final)
-    except Exception as error:  # a full disk is reported by what was to be written, not by a scratch name
-        error.add_note(f"{WHILE_WRITING}{final}")
-        raise
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with naming(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent))
+        temporary = scratch / final.name
+        try:
+            yield temporary
+            if temporary.is_dir() and final.is_dir():
+                final.rename(scratch / "replaced")
+            os.replace(temporary, final)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)

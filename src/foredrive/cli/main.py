@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -33,14 +34,19 @@ DESCRIPTION = (
 # OpenMP threads that spin while they wait would take the cores from kernels and data workers.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-DISK_FULL_TEXT = "No space left on device"
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
 DISK_ERRORS = {
     errno.ENOSPC: "no space left on the disk",
     errno.EDQUOT: "disk quota exceeded",
+    errno.EFBIG: "larger than files may be here",
     errno.EROFS: "the disk is read-only",
     errno.EACCES: "permission denied",
+    errno.EEXIST: "there is a file of that name",
+    errno.ENOTDIR: "a part of this path is a file",
+    errno.EISDIR: "there is a folder of that name",
 }
+ERROR_NUMBER = re.compile(r"\[Errno (\d+)\]|\(os error (\d+)\)")
+"""How Python and Rust write an operating system's error in a text."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -87,21 +93,24 @@ def _disk_reason(error: BaseException) -> str | None:
     Libraries wrap the operating system's error in their own, some keep only its text.
     """
     for cause in _causes(error):
-        if isinstance(cause, OSError) and cause.errno in DISK_ERRORS:
-            reason, where = DISK_ERRORS[cause.errno], _written(error) or cause.filename2 or cause.filename
-        elif DISK_FULL_TEXT in str(cause):
-            reason, where = DISK_ERRORS[errno.ENOSPC], _written(error)
-        else:
-            continue
-        return f"{where}: {reason}" if where else reason
+        number, where = None, None
+        if isinstance(cause, OSError):
+            number, where = cause.errno, cause.filename2 or cause.filename
+        if number is None and (told := ERROR_NUMBER.search(str(cause))):
+            number = int(told[1] or told[2])
+        if number in DISK_ERRORS:
+            where = _written(error) or where
+            return f"{where}: {DISK_ERRORS[number]}" if where else DISK_ERRORS[number]
     return None
 
 
 def _written(error: BaseException) -> str | None:
-    """The final path of what was being written, which `atomic_path` notes."""
-    notes = [note for cause in _causes(error) for note in getattr(cause, "__notes__", ())]
-    paths = [note.removeprefix(WHILE_WRITING) for note in notes if note.startswith(WHILE_WRITING)]
-    return paths[0] if paths else None
+    """The final path of what was being written: noted by `files.naming`; of a worker's error in its text."""
+    for cause in _causes(error):
+        for line in (*getattr(cause, "__notes__", ()), *str(cause).splitlines()):
+            if line.startswith(WHILE_WRITING):
+                return line.removeprefix(WHILE_WRITING)
+    return None
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:

@@ -1,6 +1,7 @@
 """Reading Arrow files of a 123D log as arrays, with errors that name the file."""
 
 import contextlib
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,19 +12,30 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
 
+_REFUSES_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+
 
 @contextlib.contextmanager
 def reading(file: Path, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it."""
+    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it.
+
+    A disk that refuses what is written meanwhile is not the file's fault: that error goes on as it is.
+    """
     try:
         yield
     except InputError:
         raise
-    except (pa.ArrowException, OSError, ValueError, LookupError, AssertionError) as error:
-        reason = str(error).strip().splitlines()
-        raise InputError(
-            f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
-        ) from error
+    except OSError as error:
+        if error.errno in _REFUSES_WRITING:
+            raise
+        raise InputError(_said(file, what, error)) from error
+    except (pa.ArrowException, ValueError, LookupError, AssertionError) as error:
+        raise InputError(_said(file, what, error)) from error
+
+
+def _said(file: Path, what: str, error: Exception) -> str:
+    reason = str(error).strip().splitlines()
+    return f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
 
 
 def check_whole(folder: Path) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
+from foredrive.files import atomic_path, naming
 from foredrive.scene import Example
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import hold_interrupts, start_fork_server
@@ -193,9 +194,9 @@ class MetricsLog:
     """metrics.jsonl: one line a step; lines past the step that is resumed from are dropped."""
 
     def __init__(self, path: Path, done: int) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         kept = [line for line in read_metrics(path) if line["step"] <= done]
-        path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
         self.path = path
         self.started = time.perf_counter()
 
@@ -203,7 +204,7 @@ class MetricsLog:
         """Add the losses of one finished step."""
         now = time.perf_counter()
         line = {"step": step, **{name: value.item() for name, value in losses.items()}}
-        with self.path.open("a") as file:
+        with naming(self.path), self.path.open("a") as file:
             file.write(json.dumps({**line, "step_s": round(now - self.started, 4)}) + "\n")
         self.started = now
 
