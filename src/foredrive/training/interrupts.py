@@ -5,7 +5,7 @@ import multiprocessing
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 
 
 @contextlib.contextmanager
@@ -50,6 +50,7 @@ def start_fork_server(preload: str) -> None:
         preload: module that the workers need; it is imported once and not in each of them.
     """
     multiprocessing.set_forkserver_preload([preload])
+    resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()

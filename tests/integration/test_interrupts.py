@@ -1,0 +1,155 @@
+"""Ctrl-C in every phase of every verb that writes: 130, one line, nothing half-written, and it can go on.
+
+The program runs as a process of its own group, and the whole group gets SIGINT, as a terminal sends it.
+"""
+
+import fnmatch
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from miniature import miniature
+
+from foredrive.data import LogPath
+from foredrive.evaluation import read_summary
+from foredrive.recipes import Run, train_run
+from foredrive.training import read_metrics
+
+PROGRAM = """
+import sys
+from miniature import miniature
+from foredrive.cli.main import main
+from foredrive.recipes import RECIPES
+RECIPES["miniature"] = miniature
+sys.exit(main(sys.argv[1:]))
+"""
+PATIENCE_S = 300.0
+TESTS = Path(__file__).parents[1]
+Sign = Callable[[], bool]
+
+
+def start(*args: str | Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-W", "error", "-c", PROGRAM, *map(str, args)]
+    environment = os.environ | {"PYTHONPATH": f"{TESTS}:{TESTS / 'data'}"}
+    return subprocess.Popen(
+        command, stdout=-1, stderr=-1, text=True, env=environment, start_new_session=True, cwd=TESTS
+    )
+
+
+def finish(*args: str | Path) -> None:
+    process = start(*args)
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (0, "")
+
+
+def interrupt(sign: Sign, *args: str | Path) -> None:
+    """Start the program, press Ctrl-C when the sign is there, and see it end as it should."""
+    process = start(*args)
+    until = time.monotonic() + PATIENCE_S
+    while not sign():
+        assert process.poll() is None, f"ended before the sign: {process.communicate()}"
+        assert time.monotonic() < until, "the sign did not come"
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (130, "foredrive: interrupted\n")
+
+
+def all_files(folder: Path) -> set[str]:
+    """Files by their path in the folder, scratch files included; a folder may vanish meanwhile."""
+    return {os.path.relpath(Path(at, name), folder) for at, _, names in os.walk(folder) for name in names}
+
+
+def there(folder: Path, pattern: str) -> Sign:
+    """A file in `folder` matches, scratch files included."""
+    return lambda: bool(fnmatch.filter(all_files(folder), pattern))
+
+
+def no_scratch(folder: Path) -> bool:
+    return not any(".part" in file for file in all_files(folder))
+
+
+def test_record(tmp_path: Path) -> None:
+    arguments = (
+        "record",
+        "--town",
+        "Town02",
+        "--seconds",
+        "3",
+        "--image-size",
+        "36",
+        "64",
+        "--out",
+        tmp_path,
+    )
+    interrupt(there(tmp_path, "logs/*.part/*"), *arguments)
+    assert all_files(tmp_path) == {"maps/foredrive/foredrive_Town02.arrow"}
+    finish(*arguments)
+    assert "logs/town_train/Town02_seed0/sync.arrow" in all_files(tmp_path)
+
+
+@pytest.mark.real
+def test_convert(real_data: Path, tmp_path: Path) -> None:
+    interrupt(
+        there(tmp_path, "logs/*.part/*"), "convert", "pandaset", real_data / "pandaset", "--out", tmp_path
+    )
+    assert not [file for file in all_files(tmp_path) if file.startswith("logs/")]
+    assert no_scratch(tmp_path)
+
+
+def test_train(log: LogPath, trained: Run, tmp_path: Path) -> None:
+    arguments = ("train", "miniature", "--logs", log.folder, "--out", tmp_path)
+    interrupt(there(tmp_path / "cache", "*.labels"), *arguments)
+    assert no_scratch(tmp_path)
+    interrupt(there(tmp_path / "finetune", "metrics.jsonl"), *arguments)
+    assert no_scratch(tmp_path)
+    finish(*arguments)
+    assert all_files(tmp_path) == all_files(trained.folder)
+    for stage in ("pretrain", "finetune"):
+        found, expected = (
+            [line["loss"] for line in read_metrics(folder / stage / "metrics.jsonl")]
+            for folder in (tmp_path, trained.folder)
+        )
+        assert found == pytest.approx(expected, rel=1e-6)  # another process, other threads
+    assert len(expected) == miniature().finetune.schedule.steps
+
+
+def test_evaluate(log: LogPath, tmp_path: Path) -> None:
+    """While labels are made, and while the report is drawn."""
+    run = train_run(miniature(), [log], tmp_path / "run").folder
+    shutil.rmtree(run / "cache")
+    before, out = all_files(run), tmp_path / "out"
+    arguments = ("evaluate", run, "--out", out)
+    interrupt(there(run / "cache", "*.labels"), *arguments)
+    assert not out.exists()
+    interrupt(there(out, "summary.json"), *arguments)
+    assert all_files(out) == {"summary.json"}
+    assert {file for file in all_files(run) if not file.startswith("cache/")} == before
+    assert no_scratch(tmp_path)
+
+
+def test_the_demo_goes_on_from_every_phase(tmp_path: Path) -> None:
+    """The quick demo, interrupted in each of its phases, ends with what an undisturbed one has."""
+    run, arguments = tmp_path / "run", ("demo", "--quick", "--out", tmp_path)
+    interrupt(there(tmp_path, "*Town02_seed1.*.part/*"), *arguments)
+    assert not (tmp_path / "towns/logs/town_train/Town02_seed1").exists()
+    for sign in (
+        lambda: len(read_metrics(run / "pretrain/metrics.jsonl")) > 1,
+        lambda: len(read_metrics(run / "finetune/metrics.jsonl")) > 1,
+        there(run, "summary.json"),
+    ):
+        interrupt(sign, *arguments)
+        assert no_scratch(tmp_path)
+    assert not (run / "report.html").exists()
+    finish(*arguments)
+    assert [line["step"] for line in read_metrics(run / "pretrain/metrics.jsonl")] == list(range(1, 13))
+    assert read_summary(run / "summary.json")["failed"] == 0
+    assert re.search(r"<img[^>]*data:image", (run / "report.html").read_text())
+    assert (run / "hero.png").is_file()
