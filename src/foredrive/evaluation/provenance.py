@@ -29,7 +29,7 @@ def collect_provenance() -> dict[str, float | int | str | None]:
         "version.foredrive": metadata.version("foredrive"),
         "version.python": platform.python_version(),
         "version.torch": torch.__version__,
-        "commit": git_commit(Path(foredrive.__file__).parents[2]),
+        "commit": COMMIT,
         "command": command_line(),
     }
 
@@ -89,3 +89,7 @@ def _cpu_model() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
+
+
+COMMIT = git_commit(Path(foredrive.__file__).parents[2])
+"""Of the code this process runs. Read as it starts: the checkout may change before figures are written."""

@@ -134,7 +134,7 @@ def _tiles(summary: Summary) -> str:
         tiles.append(_tile(title, summary.get(f"planning.{metric}"), 2, unit, note))
     psnr = next((value for key, value in summary.items() if key.endswith(".psnr_db")), None)
     tiles.append(_tile("Rendered images, PSNR", psnr, 1, "dB", ""))
-    tiles.append(_tile("Wall time", summary.get("wall_s"), 0, "s", ""))
+    tiles.append(_tile("Time of evaluation", summary.get("wall_s"), 0, "s", ""))
     tiles.append(_tile("Peak memory", summary.get("peak_rss_gib"), 1, "GiB", ""))
     shown = "".join(tiles)
     return f'<div class="tiles">{shown}</div>' if shown else ""
