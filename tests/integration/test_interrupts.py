@@ -67,6 +67,10 @@ def all_files(folder: Path) -> set[str]:
     return {os.path.relpath(Path(at, name), folder) for at, _, names in os.walk(folder) for name in names}
 
 
+def without_cache(folder: Path) -> set[str]:
+    return {file for file in all_files(folder) if not file.startswith("cache/")}
+
+
 def there(folder: Path, pattern: str) -> Sign:
     """A file in `folder` matches, scratch files included."""
     return lambda: bool(fnmatch.filter(all_files(folder), pattern))
@@ -111,7 +115,7 @@ def test_train(log: LogPath, trained: Run, tmp_path: Path) -> None:
     interrupt(there(tmp_path / "finetune", "metrics.jsonl"), *arguments)
     assert no_scratch(tmp_path)
     finish(*arguments)
-    assert all_files(tmp_path) == all_files(trained.folder)
+    assert without_cache(tmp_path) == without_cache(trained.folder)
     for stage in ("pretrain", "finetune"):
         found, expected = (
             [line["loss"] for line in read_metrics(folder / stage / "metrics.jsonl")]
@@ -131,7 +135,7 @@ def test_evaluate(log: LogPath, tmp_path: Path) -> None:
     assert not out.exists()
     interrupt(there(out, "summary.json"), *arguments)
     assert all_files(out) == {"summary.json"}
-    assert {file for file in all_files(run) if not file.startswith("cache/")} == before
+    assert without_cache(run) == before
     assert no_scratch(tmp_path)
 
 
