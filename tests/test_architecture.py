@@ -97,3 +97,19 @@ def test_third_party_packages_stay_where_they_belong() -> None:
             if homes is not None and folder not in homes:
                 wrong.append(f"{path} imports {module}")
     assert not wrong, "\n".join(wrong)
+
+
+TOWN_FLOORS = [{"map"}, {"traffic", "place"}, {"sensing"}, {"labels"}]
+"""Within towns; traffic knows nothing of looks, and what is beside the folders puts them together."""
+
+
+def test_imports_flow_downwards_within_towns() -> None:
+    level = {folder: i for i, floor in enumerate(TOWN_FLOORS) for folder in floor}
+    wrong = []
+    for folder, floor in level.items():
+        for path in (ROOT / "towns" / folder).rglob("*.py"):
+            for module in imported_modules(path):
+                other = module.removeprefix("foredrive.towns.").split(".")[0]
+                if other in level and other != folder and level[other] >= floor:
+                    wrong.append(f"{path} imports {module}")
+    assert not wrong, "\n".join(wrong)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from foredrive.towns.town_map import TownMap, load_town_map
+from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.world import World
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from foredrive.data.log_writer import EGO_VEHICLE
-from foredrive.towns.expert import Drive, Moment
-from foredrive.towns.town_map import TownMap, load_town_map
-from foredrive.towns.traffic import Traffic
+from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.traffic import Traffic
 
 DT_S = 0.1
 

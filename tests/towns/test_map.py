@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.towns.junction_heights import level_junction
-from foredrive.towns.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
+from foredrive.towns.map.junction_heights import level_junction
+from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
 
 
 def test_an_unknown_town_is_named_with_those_there_are() -> None:

@@ -6,15 +6,15 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foredrive.towns.ground_plan import make_ground_plan
-from foredrive.towns.looks import LookTable, Surface
-from foredrive.towns.mesh import Mesh, box, frustum, join, prism, walls
-from foredrive.towns.parking import footprint
-from foredrive.towns.raycast import TriangleScene
-from foredrive.towns.road_mesh import build_roads
-from foredrive.towns.shading import MISS
-from foredrive.towns.terrain import build_terrain, make_terrain
-from foredrive.towns.town_map import Strip, StripKind, TownMap
+from foredrive.towns.map.ground_plan import make_ground_plan
+from foredrive.towns.map.town_map import Strip, StripKind, TownMap
+from foredrive.towns.place.looks import LookTable, Surface
+from foredrive.towns.place.mesh import Mesh, box, frustum, join, prism, walls
+from foredrive.towns.place.parking import footprint
+from foredrive.towns.place.road_mesh import build_roads
+from foredrive.towns.place.terrain import build_terrain, make_terrain
+from foredrive.towns.sensing.raycast import TriangleScene
+from foredrive.towns.sensing.shading import MISS
 from foredrive.towns.world import World
 
 CORRIDOR_M = 3.0

@@ -20,8 +20,8 @@ from foredrive.errors import InputError
 from foredrive.scene import Category, VoxelSpec
 from foredrive.towns import recorder
 from foredrive.towns.recorder import Crowd, record, split_of
-from foredrive.towns.rig import camera_rig, roof_lidar
-from foredrive.towns.sensing import SensorSuite
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.world import World
 
 FRAMES = 5

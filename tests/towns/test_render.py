@@ -14,12 +14,12 @@ from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors import SpinningLidar
 from foredrive.towns.actors import ActorState
-from foredrive.towns.lights import Light
-from foredrive.towns.looks import Surface
-from foredrive.towns.patterns import band, bands
-from foredrive.towns.rig import camera_rig, roof_lidar
-from foredrive.towns.sensing import SensorSuite
-from foredrive.towns.town_map import TownMap
+from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.place.looks import Surface
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.patterns import band, bands
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+from foredrive.towns.traffic.lights import Light
 from foredrive.towns.world import NOBODY, World
 
 SIZE = (48, 80)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Command
-from foredrive.towns.fleet import find_starts
-from foredrive.towns.lane_graph import LaneGraph, build_lane_graph
-from foredrive.towns.routes import ROUTE_SPACING_M, Route, draw_route
-from foredrive.towns.town_map import TownMap
+from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.traffic.fleet import find_starts
+from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
+from foredrive.towns.traffic.routes import ROUTE_SPACING_M, Route, draw_route
 
 
 @pytest.fixture(scope="module")

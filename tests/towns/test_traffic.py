@@ -8,11 +8,11 @@ import pytest
 import shapely
 
 from foredrive.scene import Category
-from foredrive.towns.car_following import HARDEST_BRAKING_MPS2
-from foredrive.towns.lights import GREEN_S, PHASE_S, YELLOW_S, Light
-from foredrive.towns.town_map import TownMap, load_town_map
-from foredrive.towns.traffic import Traffic, TrafficState
-from foredrive.towns.vehicles import BEHIND, Vehicles
+from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.traffic.car_following import HARDEST_BRAKING_MPS2
+from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, Light
+from foredrive.towns.traffic.traffic import Traffic, TrafficState
+from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
 
 DT_S = 0.1
 MINUTES = 2.0

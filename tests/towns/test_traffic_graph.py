@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Command
-from foredrive.towns.lane_graph import Control, LaneGraph, build_lane_graph, lanes_for
-from foredrive.towns.leaders import find_leaders
-from foredrive.towns.town_map import Lane, MarkingKind, StopZone, StopZoneKind, TownMap
-from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts, vehicle_poses
+from foredrive.towns.map.town_map import Lane, MarkingKind, StopZone, StopZoneKind, TownMap
+from foredrive.towns.traffic.lane_graph import Control, LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.traffic.leaders import find_leaders
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts, vehicle_poses
 
 
 def lane(

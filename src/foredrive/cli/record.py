@@ -30,8 +30,8 @@ def record(
     """
     from foredrive.towns.recorder import Crowd
     from foredrive.towns.recorder import record as record_drive
-    from foredrive.towns.rig import camera_rig, roof_lidar
-    from foredrive.towns.sensing import SensorSuite
+    from foredrive.towns.sensing.capture import SensorSuite
+    from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
     sensors = SensorSuite(camera_rig(image_size), roof_lidar())
     log = record_drive(town, seconds, seed, out, rate, sensors, Crowd(vehicles, people))

@@ -11,8 +11,8 @@ from foredrive.recipes.evaluate import evaluate_run
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.recipes.train import Run, train_run
 from foredrive.towns.recorder import record, split_of
-from foredrive.towns.rig import camera_rig, roof_lidar
-from foredrive.towns.sensing import SensorSuite
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 RATE_HZ = 2.0
 """Key frames alone: one every 0.5 s."""

@@ -17,11 +17,11 @@ from foredrive.data.maps import write_map
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
-from foredrive.towns.expert import Drive, Moment
-from foredrive.towns.rig import camera_rig, roof_lidar
-from foredrive.towns.sensing import SensorSuite
-from foredrive.towns.town_map import MAP_FOLDER, load_town_map
-from foredrive.towns.traffic import Traffic
+from foredrive.towns.map.town_map import MAP_FOLDER, load_town_map
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
 TEST_TOWNS = ("Town05",)

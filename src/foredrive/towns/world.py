@@ -8,24 +8,24 @@ from jaxtyping import Float, Float64, Int, Int32, UInt8
 
 from foredrive.data.modalities import FullOccupancy
 from foredrive.scene import LidarSweep, VoxelSpec
-from foredrive.towns import raycast, sensing, shading
-from foredrive.towns.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.actors import ActorState
-from foredrive.towns.buildings import build_buildings
-from foredrive.towns.columns import TownColumns, faces_of, wall_intervals
-from foredrive.towns.ground_plan import make_ground_plan
-from foredrive.towns.light import daylight
-from foredrive.towns.lights import Light
-from foredrive.towns.looks import LookArrays, LookTable, Texture, srgb_to_linear
-from foredrive.towns.mesh import Mesh, join
-from foredrive.towns.occupancy import full_occupancy
-from foredrive.towns.parking import build_car_parks, numbered, park_on_strips
-from foredrive.towns.props import SignalHead, ThinThings, build_furniture, build_posts, join_thin
-from foredrive.towns.road_mesh import build_roads
-from foredrive.towns.sensing import SensorSuite
-from foredrive.towns.site import Site
-from foredrive.towns.terrain import build_terrain, make_terrain
-from foredrive.towns.town_map import TownMap
+from foredrive.towns.labels.occupancy import full_occupancy
+from foredrive.towns.map.ground_plan import make_ground_plan
+from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.place.buildings import build_buildings
+from foredrive.towns.place.looks import LookArrays, LookTable, Texture, srgb_to_linear
+from foredrive.towns.place.mesh import Mesh, join
+from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
+from foredrive.towns.place.props import SignalHead, ThinThings, build_furniture, build_posts, join_thin
+from foredrive.towns.place.road_mesh import build_roads
+from foredrive.towns.place.site import Site
+from foredrive.towns.place.terrain import build_terrain, make_terrain
+from foredrive.towns.sensing import capture, raycast, shading
+from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.columns import TownColumns, faces_of, wall_intervals
+from foredrive.towns.sensing.light import daylight
+from foredrive.towns.traffic.lights import Light
 
 NOBODY = -1
 ACTOR_REACH_M = 200.0
@@ -108,9 +108,9 @@ class World:
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
         moment = self._moment(near, lights)
-        images, seen = sensing.see(moment, sensors, T_world_ego)
+        images, seen = capture.see(moment, sensors, T_world_ego)
         noise = np.random.default_rng(noise_seed)
-        sweep, met = sensing.sweep(moment, sensors.lidar, T_world_ego, twist_ego, noise)
+        sweep, met = capture.sweep(moment, sensors.lidar, T_world_ego, twist_ego, noise)
         names = sensors.rig.names
         pixel_ids = self._track_ids(seen, near).reshape(len(names), *sensors.rig.size_hw)
         return SensorFrame(
@@ -137,7 +137,7 @@ class World:
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in near]
         return full_occupancy(self._columns, self.static.thin, shaped, T_world_ego, spec)
 
-    def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> sensing.Moment:
+    def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> capture.Moment:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         placed = raycast.place(tuple(shape.scene for shape in shapes), T)
@@ -149,7 +149,7 @@ class World:
             actors=shading.ActorArrays(placed.T_world_unit, first, paint),
             looks=self._lit_looks(lights),
         )
-        return sensing.Moment(scene, self._scene, placed, self.light)
+        return capture.Moment(scene, self._scene, placed, self.light)
 
     def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
         if lights is None:
@@ -162,7 +162,7 @@ class World:
                     texture[lamp], albedo[lamp] = Texture.GLOW, rgb
         return self._looks._replace(texture=texture, albedo=albedo)
 
-    def _track_ids(self, seen: sensing.Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
+    def _track_ids(self, seen: capture.Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
         track = np.array([*(actor.track_id for actor in actors), NOBODY], dtype=np.int64)
         static = self.static.track[np.maximum(seen.triangle, 0)]
         owner = np.where(seen.actor >= 0, track[seen.actor], static)

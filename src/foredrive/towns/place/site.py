@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from foredrive.towns.ground_plan import GroundPlan
-from foredrive.towns.terrain import Terrain
+from foredrive.towns.map.ground_plan import GroundPlan
+from foredrive.towns.place.terrain import Terrain
 
 GRID_M = 20.0
 

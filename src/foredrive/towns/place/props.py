@@ -8,10 +8,10 @@ import shapely
 import trimesh
 from jaxtyping import Float, Int
 
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, box, frustum, join, triangles
-from foredrive.towns.site import Site, frontages
-from foredrive.towns.town_map import StopZone, StopZoneKind, TownMap
+from foredrive.towns.map.town_map import StopZone, StopZoneKind, TownMap
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, box, frustum, join, triangles
+from foredrive.towns.place.site import Site, frontages
 
 LAMP_SPACING_M, LAMP_HEIGHT_M, LAMP_ARM_M = 30.0, 7.5, 1.6
 LAMP_SETBACK_M, TREE_SETBACK_M = 0.5, 1.5

@@ -10,11 +10,11 @@ from jaxtyping import Float64, Int
 from foredrive.data.modalities import FullOccupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
-from foredrive.towns.actor_shapes import Shape, unit_to_world
 from foredrive.towns.actors import ActorState
-from foredrive.towns.columns import COLUMN_M, Intervals, TownColumns
-from foredrive.towns.looks import Surface
-from foredrive.towns.props import ThinThings
+from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.props import ThinThings
+from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
+from foredrive.towns.sensing.columns import COLUMN_M, Intervals, TownColumns
 
 FINEST_VOXEL_M = COLUMN_M * 2**0.5
 """A column of a turned grid must not slip between the town's columns."""

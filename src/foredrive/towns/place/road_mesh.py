@@ -6,10 +6,10 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from foredrive.towns.ground_plan import GroundPlan, Piece
-from foredrive.towns.looks import LinePattern, Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, frustum, join, polygon_triangles, quads, ribbon, triangles, walls
-from foredrive.towns.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
+from foredrive.towns.map.ground_plan import GroundPlan, Piece
+from foredrive.towns.map.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
+from foredrive.towns.place.looks import LinePattern, Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, frustum, join, polygon_triangles, quads, ribbon, triangles, walls
 
 KERB_FOOT_M = 0.3
 PAINT_M = 0.008

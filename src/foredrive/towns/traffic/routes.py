@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from foredrive.scene import Command
-from foredrive.towns.fleet import Starts
-from foredrive.towns.lane_graph import LaneGraph
+from foredrive.towns.traffic.fleet import Starts
+from foredrive.towns.traffic.lane_graph import LaneGraph
 
 CANDIDATES = 48
 ROUTE_SPACING_M = 1.0

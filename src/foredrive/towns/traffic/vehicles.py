@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.lane_graph import SLOWING_MPS2, LaneGraph
+from foredrive.towns.traffic.lane_graph import SLOWING_MPS2, LaneGraph
 
 BEHIND = 4
 AHEAD = 11

@@ -13,8 +13,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32
 
-from foredrive.towns.mesh import Mesh
-from foredrive.towns.shading import MISS, Hits
+from foredrive.towns.place.mesh import Mesh
+from foredrive.towns.sensing.shading import MISS, Hits
 
 Rays = Float32[np.ndarray, "N 3"]
 

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float64, Int
 from scipy.ndimage import uniform_filter1d
 
 from foredrive.scene import Command
-from foredrive.towns.meetings import Meetings, find_meetings
-from foredrive.towns.town_map import Lane, StopZoneKind, TownMap
+from foredrive.towns.map.town_map import Lane, StopZoneKind, TownMap
+from foredrive.towns.traffic.meetings import Meetings, find_meetings
 
 SAMPLE_M = 0.5
 TURN_RAD = np.deg2rad(30.0)

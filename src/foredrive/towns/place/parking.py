@@ -6,11 +6,11 @@ from jaxtyping import Float
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, join, quads, ribbon, walls
-from foredrive.towns.road_mesh import ASPHALT_RGB
-from foredrive.towns.site import Frontage, Site, frontages
-from foredrive.towns.town_map import Strip, StripKind, TownMap
+from foredrive.towns.map.town_map import Strip, StripKind, TownMap
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
+from foredrive.towns.place.road_mesh import ASPHALT_RGB
+from foredrive.towns.place.site import Frontage, Site, frontages
 
 FIRST_TRACK_ID = 1_000_000
 """Parked cars are numbered from here on, so that they never share a number with traffic."""

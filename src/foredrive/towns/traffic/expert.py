@@ -14,10 +14,10 @@ from jaxtyping import Float64, Int
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.fleet import place
-from foredrive.towns.routes import Route, draw_route
-from foredrive.towns.traffic import Traffic, TrafficState
-from foredrive.towns.vehicles import Vehicles, empty_slots, vehicle_poses
+from foredrive.towns.traffic.fleet import place
+from foredrive.towns.traffic.routes import Route, draw_route
+from foredrive.towns.traffic.traffic import Traffic, TrafficState
+from foredrive.towns.traffic.vehicles import Vehicles, empty_slots, vehicle_poses
 
 LONGEST_STEP_S = 0.1
 SETTLE_S = 6.0

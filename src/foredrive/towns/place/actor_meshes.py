@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, box, frustum, hexahedron, join, ribbon, triangles
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, box, frustum, hexahedron, join, ribbon, triangles
 
 BODY, SECOND, THIRD = -1, -2, -3
 """Look numbers that an actor's own paint replaces."""

@@ -6,9 +6,9 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, box, hexahedron, join, polygon_cap, quads, triangles, walls
-from foredrive.towns.site import Frontage, Site, frontages
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, box, hexahedron, join, polygon_cap, quads, triangles, walls
+from foredrive.towns.place.site import Frontage, Site, frontages
 
 FOUNDATION_M = 1.5
 PARAPET_M = 0.5

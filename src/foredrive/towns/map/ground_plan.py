@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from foredrive.towns.town_map import Points, Strip, StripKind, TownMap
+from foredrive.towns.map.town_map import Points, Strip, StripKind, TownMap
 
 PIECE_SAMPLES = 8
 LEVEL_GAP_M = 2.5

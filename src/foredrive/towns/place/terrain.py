@@ -7,9 +7,9 @@ import shapely
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
-from foredrive.towns.ground_plan import GroundPlan
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, join, quads, triangles
+from foredrive.towns.map.ground_plan import GroundPlan
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, join, quads, triangles
 
 CELL_M = 4.0
 MARGIN_M = 90.0

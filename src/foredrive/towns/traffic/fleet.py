@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene import Category
-from foredrive.towns.lane_graph import LaneGraph
-from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles, empty_slots
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots
 
 LARGE_RADIUS_M = 9.0
 START_SPACING_M = 2.0

@@ -8,10 +8,10 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.leaders import LOOK_M, motion_of
-from foredrive.towns.lights import Light
-from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
-from foredrive.towns.walkways import WalkGraph
+from foredrive.towns.traffic.leaders import LOOK_M, motion_of
+from foredrive.towns.traffic.lights import Light
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
+from foredrive.towns.traffic.walkways import WalkGraph
 
 CATCH_UP = 1.3
 """Where walks meet at an angle, people cut the corner, at most this much faster than they walk."""

@@ -16,9 +16,9 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.lane_graph import TURN_RAD, Control, LaneGraph
-from foredrive.towns.leaders import add_occupant, link_occupants, motion_of
-from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
+from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
+from foredrive.towns.traffic.leaders import add_occupant, link_occupants, motion_of
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 STANDSTILL_M = 2.0
 EARLY_M = 12.0

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import SpinningLidar, camera_rays
-from foredrive.towns import raycast, shading
-from foredrive.towns.light import LightArrays
+from foredrive.towns.sensing import raycast, shading
+from foredrive.towns.sensing.light import LightArrays
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
 CREASE_COS = 0.8

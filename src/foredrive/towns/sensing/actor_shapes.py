@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from foredrive.scene import Category
-from foredrive.towns.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
 from foredrive.towns.actors import ActorState
-from foredrive.towns.columns import Intervals
-from foredrive.towns.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.mesh import Mesh, join
-from foredrive.towns.raycast import TriangleScene
-from foredrive.towns.shading import MISS
+from foredrive.towns.place.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.mesh import Mesh, join
+from foredrive.towns.sensing.columns import Intervals
+from foredrive.towns.sensing.raycast import TriangleScene
+from foredrive.towns.sensing.shading import MISS
 
 SLOTS = 3
 SOLID_CELL_M = 0.15

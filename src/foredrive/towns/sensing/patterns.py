@@ -10,7 +10,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from foredrive.towns.looks import LinePattern, Texture
+from foredrive.towns.place.looks import LinePattern, Texture
 
 _TABLE_BITS = 12
 _TABLE_MASK = (1 << _TABLE_BITS) - 1

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from foredrive.towns.looks import Surface
-from foredrive.towns.mesh import Mesh
-from foredrive.towns.raycast import TriangleScene
-from foredrive.towns.shading import MISS
+from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.mesh import Mesh
+from foredrive.towns.sensing.raycast import TriangleScene
+from foredrive.towns.sensing.shading import MISS
 
 TILE_M = 32.0
 COLUMN_M = 0.25

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.lane_graph import Control, LaneGraph
+from foredrive.towns.traffic.lane_graph import Control, LaneGraph
 
 GREEN_S = 8.0
 YELLOW_S = 3.0

@@ -21,7 +21,7 @@ from py123d.parser.opendrive.xodr_parser.opendrive import XODR
 from py123d.parser.opendrive.xodr_parser.reference import XODRReferenceLine
 
 from foredrive.errors import InputError
-from foredrive.towns.junction_heights import level_junction
+from foredrive.towns.map.junction_heights import level_junction
 
 MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
 TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD")

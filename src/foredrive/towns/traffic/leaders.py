@@ -6,8 +6,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.lane_graph import LaneGraph
-from foredrive.towns.vehicles import BEHIND, WINDOW, Vehicles
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 LOOK_M = 150.0
 

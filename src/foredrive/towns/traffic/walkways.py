@@ -10,9 +10,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from foredrive.towns.ground_plan import WALKWAY_RAISE_M
-from foredrive.towns.lane_graph import Control, LaneGraph
-from foredrive.towns.town_map import StripKind, TownMap
+from foredrive.towns.map.ground_plan import WALKWAY_RAISE_M
+from foredrive.towns.map.town_map import StripKind, TownMap
+from foredrive.towns.traffic.lane_graph import Control, LaneGraph
 
 JOIN_M = 1.5
 """Ends of walkways this close are one place."""

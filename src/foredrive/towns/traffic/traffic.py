@@ -8,7 +8,8 @@ from jaxtyping import Float64, Int
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.car_following import (
+from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.traffic.car_following import (
     CRAWL_MPS,
     EMERGENCY_MPS2,
     HARDEST_BRAKING_MPS2,
@@ -19,20 +20,19 @@ from foredrive.towns.car_following import (
     follow_acceleration,
     free_acceleration,
 )
-from foredrive.towns.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
-from foredrive.towns.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
-from foredrive.towns.leaders import find_leaders
-from foredrive.towns.lights import Light, SignalPlan, plan_signals
-from foredrive.towns.pedestrians import (
+from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
+from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.traffic.leaders import find_leaders
+from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
+from foredrive.towns.traffic.pedestrians import (
     Pedestrians,
     crossing_gap,
     draw_people,
     empty_pavement,
     step_pedestrians,
 )
-from foredrive.towns.right_of_way import STANDSTILL_M, claim_junctions
-from foredrive.towns.town_map import TownMap
-from foredrive.towns.vehicles import (
+from foredrive.towns.traffic.right_of_way import STANDSTILL_M, claim_junctions
+from foredrive.towns.traffic.vehicles import (
     BEHIND,
     Poses,
     Vehicles,
@@ -41,7 +41,7 @@ from foredrive.towns.vehicles import (
     speed_to_drive,
     vehicle_poses,
 )
-from foredrive.towns.walkways import WalkGraph, build_walk_graph
+from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 LINE_STANDSTILL_M = 1.0
 HALT_MPS = 0.4

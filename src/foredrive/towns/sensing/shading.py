@@ -7,8 +7,8 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from foredrive.towns.looks import LookArrays, Texture
-from foredrive.towns.patterns import PAINT_REFLECTIVITY, noise, texture
+from foredrive.towns.place.looks import LookArrays, Texture
+from foredrive.towns.sensing.patterns import PAINT_REFLECTIVITY, noise, texture
 
 MISS = -1
 SHADOW_OFFSET_M = 4e-3

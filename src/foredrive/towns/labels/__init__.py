@@ -1,0 +1,1 @@
+"""What is true in a town: exact labels of what was sensed."""

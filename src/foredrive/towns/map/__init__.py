@@ -1,0 +1,1 @@
+"""A town's map: lanes, stop zones and surfaces as the OpenDRIVE file has them."""

@@ -1,0 +1,1 @@
+"""What cameras and lidars make of a town: rays, light and returns."""
