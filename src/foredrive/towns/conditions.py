@@ -1,0 +1,70 @@
+"""Time of day and weather of a drive: what light falls on a town and what is in its air."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from foredrive.errors import InputError
+
+CLEAR_VISIBILITY_M = 20_000.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Constant over a drive.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    hour: float = 12.0
+    """Solar time, 0 to 24: the sun rises at 6, sets at 18 and stands highest at 12."""
+    clouds: float = 0.2
+    """Share of the sky, 0 clear to 1 overcast."""
+    rain_mmph: float = 0.0
+    """Rain rate, mm/h: 2 is light, 10 moderate, 50 heavy."""
+    wetness: float = 0.0
+    """Of the ground, 0 dry to 1 under water; a rainy drive is on wet ground whatever stands here."""
+    visibility_m: float = CLEAR_VISIBILITY_M
+    """Meteorological optical range: at this distance 5 % of the contrast is left. Fog is below 1000 m."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("hour", 0.0, 24.0),
+            ("clouds", 0.0, 1.0),
+            ("rain_mmph", 0.0, 200.0),
+            ("wetness", 0.0, 1.0),
+            ("visibility_m", 10.0, 200_000.0),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} lies between {low:g} and {high:g}, got {value:g}")
+
+
+CONDITIONS = {
+    "clear": Conditions(),
+    "morning": Conditions(hour=8.0, clouds=0.1),
+    "overcast": Conditions(clouds=1.0, visibility_m=8_000.0),
+    "dusk": Conditions(hour=17.7, clouds=0.3),
+    "night": Conditions(hour=23.0, clouds=0.2),
+    "rain": Conditions(clouds=1.0, rain_mmph=15.0, wetness=0.8, visibility_m=2_500.0),
+    "night_rain": Conditions(hour=22.0, clouds=1.0, rain_mmph=15.0, wetness=0.9, visibility_m=2_500.0),
+    "fog": Conditions(hour=9.0, clouds=0.9, wetness=0.2, visibility_m=150.0),
+}
+"""By the names the command line knows."""
+
+
+def find_conditions(name: str) -> Conditions:
+    """Conditions by name.
+
+    Raises:
+        InputError: there are none of that name.
+    """
+    if name not in CONDITIONS:
+        raise InputError(f"no conditions are named {name}; there are {', '.join(CONDITIONS)}")
+    return CONDITIONS[name]
+
+
+def draw_daylight(rng: np.random.Generator) -> Conditions:
+    """A bright day, some time between morning and afternoon, with a few clouds."""
+    return Conditions(hour=float(rng.uniform(8.0, 16.0)), clouds=float(rng.uniform(0.0, 0.45)))
