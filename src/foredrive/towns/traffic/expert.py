@@ -14,7 +14,8 @@ from jaxtyping import Float64, Int
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.traffic.fleet import place
+from foredrive.towns.traffic.fleet import Starts, place
+from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.routes import Route, draw_route
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import Vehicles, empty_slots, vehicle_poses
@@ -54,12 +55,8 @@ class Drive:
     """
 
     def __init__(self, traffic: Traffic, seconds: float) -> None:
-        rng = np.random.default_rng((traffic.seed, 3))
-        lanes = traffic.lanes
-        fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
-        driven_m = AVERAGE_MPS * (seconds + SETTLE_S)
         self._traffic = traffic
-        self._planned = draw_route(lanes, traffic.starts, rng, fastest_m, driven_m)
+        self._planned = plan_route(traffic.lanes, traffic.starts, traffic.seed, seconds)
         self._state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
         while not self._is_settled():
             self._state = traffic.step(self._state, LONGEST_STEP_S)
@@ -98,6 +95,18 @@ class Drive:
             actors=self._traffic.actors(self._state),
             lights=self._traffic.zone_lights(self._state.time_s),
         )
+
+
+def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> Route:
+    """The route of a drive, which depends on nothing else."""
+    rng = np.random.default_rng((seed, 3))
+    fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
+    return draw_route(lanes, starts, rng, fastest_m, driven_m(seconds))
+
+
+def driven_m(seconds: float) -> float:
+    """About how much of its route a drive follows, from the route's start on."""
+    return AVERAGE_MPS * (seconds + SETTLE_S)
 
 
 def _ego_vehicle(traffic: Traffic, route: Route) -> Vehicles:
