@@ -2,6 +2,7 @@
 
 import pytest
 
+from foredrive.towns.conditions import Conditions
 from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.world import World
 
@@ -13,4 +14,4 @@ def town02() -> TownMap:
 
 @pytest.fixture(scope="session")
 def world02(town02: TownMap) -> World:
-    return World(town02, seed=3)
+    return World(town02, seed=3, conditions=Conditions(hour=12.0))

@@ -17,6 +17,7 @@ from foredrive.data.maps import write_map
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
+from foredrive.towns.conditions import Conditions
 from foredrive.towns.map.town_map import MAP_FOLDER, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
@@ -57,6 +58,7 @@ def record(
     sensors: SensorSuite | None = None,
     crowd: Crowd | None = None,
     occupancy: VoxelSpec | None = OCCUPANCY,
+    conditions: Conditions | None = None,
 ) -> LogPath:
     """Record one drive; the same arguments give the same bytes.
 
@@ -73,6 +75,7 @@ def record(
         sensors: six cameras of 144 × 256 px and 32 × 720 beams by default.
         crowd: `Crowd()` by default.
         occupancy: grid of the exact occupancy with flow; None leaves it out.
+        conditions: time of day and weather; None draws bright daylight from the seed.
 
     Raises:
         InputError: there is no such town, or no frame to record.
@@ -87,7 +90,7 @@ def record(
     town_map = load_town_map(town)
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
     crowd = crowd or Crowd()
-    world = World(town_map, seed)
+    world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
     drive = Drive(traffic, seconds)
     maps = write_map(_map_objects(town), town, out)

@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64, Int, Int32, UInt8
 from foredrive.data.modalities import FullOccupancy
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.towns.actors import ActorState
+from foredrive.towns.conditions import Conditions, draw_daylight
 from foredrive.towns.labels.occupancy import full_occupancy
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
@@ -24,7 +25,7 @@ from foredrive.towns.sensing import capture, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.columns import TownColumns, faces_of, wall_intervals
-from foredrive.towns.sensing.light import daylight
+from foredrive.towns.sensing.light import make_light
 from foredrive.towns.traffic.lights import Light
 
 NOBODY = -1
@@ -61,13 +62,17 @@ class StaticWorld:
 
 
 class World:
-    """A town grown from a seed: the same map and the same seed give the same world."""
+    """A town grown from a seed: the same map, seed and conditions give the same world.
 
-    def __init__(self, town: TownMap, seed: int) -> None:
-        rng = np.random.default_rng([seed, *town.name.encode()])
+    The conditions change the light and the air alone; None draws bright daylight from the seed.
+    """
+
+    def __init__(self, town: TownMap, seed: int, conditions: Conditions | None = None) -> None:
+        rng, weather_rng = np.random.default_rng([seed, *town.name.encode()]).spawn(2)
         table = LookTable()
         self.town = town
-        self.light = daylight(rng)
+        self.conditions = conditions or draw_daylight(weather_rng)
+        self.light = make_light(self.conditions, east_rad=float(weather_rng.uniform(0.0, 2.0 * np.pi)))
         self._shapes = make_shape_library(table)
         self.static = build_static(town, table, self._shapes, rng)
         self._looks = table.arrays()
