@@ -40,12 +40,22 @@ class SignalHead:
 
 
 @dataclass(frozen=True)
+class StreetLamps:
+    """What shines along the streets at night."""
+
+    xyz: Float[np.ndarray, "N 3"]
+    look: int
+    """Of what shines."""
+
+
+@dataclass(frozen=True)
 class Props:
     """All props of a town."""
 
     mesh: Mesh
     heads: tuple[SignalHead, ...]
     thin: "ThinThings"
+    lamps: StreetLamps
 
 
 @dataclass(frozen=True)
@@ -92,13 +102,14 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
         else:
             parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
             poles.append(_along_pole(foot, z, SIGN_HEIGHT_M))
-    return Props(join(parts), tuple(heads), join_thin([_thin(poles, Surface.POLE)]))
+    lamps = StreetLamps(np.zeros((0, 3)), looks.lamp)
+    return Props(join(parts), tuple(heads), join_thin([_thin(poles, Surface.POLE)]), lamps)
 
 
 def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
     """Lamps along the roads, then trees along walkways and in the open."""
     looks = _Looks(table)
-    parts, poles = [], []
+    parts, poles, lamps = [], [], []
     for frontage in frontages(site.plan, LAMP_SETBACK_M):
         for s in np.arange(rng.uniform(0.0, LAMP_SPACING_M), frontage.line.length, LAMP_SPACING_M):
             foot = frontage.at(s)
@@ -107,6 +118,8 @@ def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> P
                 ahead = frontage.at(min(s + 0.5, frontage.line.length)) - foot
                 z = float(site.height(foot[None])[0])
                 parts.append(_lamp(foot, z, ahead, looks))
+                over_road = (LAMP_ARM_M + 0.2) * np.array([-ahead[1], ahead[0]]) / np.linalg.norm(ahead)
+                lamps.append([*(foot + over_road), z + LAMP_HEIGHT_M + 0.1])
                 poles.append(_along_pole(foot, z, LAMP_HEIGHT_M))
     trunks = []
     for xy in _street_tree_spots(site, rng) + _open_tree_spots(site, rng):
@@ -114,7 +127,8 @@ def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> P
         if mesh is not None:
             parts.append(mesh)
             trunks.append(_along_pole(xy, float(site.height(xy[None])[0]), TRUNK_M))
-    return Props(join(parts), (), join_thin([_thin(poles, Surface.POLE), _thin(trunks, Surface.VEGETATION)]))
+    thin = join_thin([_thin(poles, Surface.POLE), _thin(trunks, Surface.VEGETATION)])
+    return Props(join(parts), (), thin, StreetLamps(np.array(lamps).reshape(-1, 3), looks.lamp))
 
 
 def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
