@@ -81,6 +81,20 @@ class Seen:
 
     triangle: Int32[np.ndarray, "N"]
     actor: Int32[np.ndarray, "N"]
+    look: Int32[np.ndarray, "N"]
+    """`shading.MISS` where a ray met nothing."""
+    range_m: Float32[np.ndarray, "N"]
+    """Along the ray; infinite where it met nothing."""
+
+
+def _nothing_seen(count: int) -> Seen:
+    triangle, actor, look = (np.empty(count, np.int32) for _ in range(3))
+    return Seen(triangle, actor, look, np.empty(count, np.float32))
+
+
+def _note(seen: Seen, part: slice, hits: shading.Hits, look: Int32[np.ndarray, "n"]) -> None:
+    seen.triangle[part], seen.actor[part], seen.look[part] = hits.triangle, hits.actor, look
+    seen.range_m[part] = np.where(look == shading.MISS, np.inf, hits.t)
 
 
 def see(
@@ -90,22 +104,22 @@ def see(
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
     rgb = np.empty((count, 3), np.uint8)
-    seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
-    look, lit, normal = np.empty(count, np.int32), np.empty(count, np.bool_), np.empty((count, 3), np.float32)
+    seen = _nothing_seen(count)
+    lit, normal = np.empty(count, np.bool_), np.empty((count, 3), np.float32)
 
     def first_look(start: int, stop: int) -> None:
         part = slice(start, stop)
         rays = _to_world(T_world_ego, sensors.pixel_rays[0][part], sensors.pixel_rays[1][part])
         radiance, hits, found, lit[part] = _look(moment, *rays, sensors.pixel_rad[part])
         rgb[part] = shading.develop(radiance, moment.light.exposure, 1)
-        seen.triangle[part], seen.actor[part] = hits.triangle, hits.actor
-        look[part], normal[part] = found.look, found.normal
+        _note(seen, part, hits, found.look)
+        normal[part] = found.normal
 
     in_parallel(first_look, count, PIXEL_GRAIN)
     samples = sensors.samples_per_outline_pixel
     if samples == 1:
         return rgb.reshape(*shape, 3), seen
-    kind = np.stack([look, seen.actor, lit], axis=-1).reshape(*shape, 3)
+    kind = np.stack([seen.look, seen.actor, lit], axis=-1).reshape(*shape, 3)
     pixels = np.flatnonzero(_outlines(kind, normal.reshape(*shape, 3)))
 
     def closer_look(start: int, stop: int) -> None:
@@ -164,7 +178,7 @@ def sweep(
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
-    seen = Seen(np.empty(count, np.int32), np.empty(count, np.int32))
+    seen = _nothing_seen(count)
     beam_rad = np.full(count, 2 * np.pi / lidar.azimuth_steps, dtype=np.float32)
 
     def job(start: int, stop: int) -> None:
@@ -175,7 +189,7 @@ def sweep(
         range_m[part], returned[part], intensity[part] = shading.lidar_returns(
             moment.scene.looks, found, hits.t, np.float32(lidar.max_range_m), chance[part]
         )
-        seen.triangle[part], seen.actor[part] = hits.triangle, hits.actor
+        _note(seen, part, hits, found.look)
 
     in_parallel(job, count, BEAM_GRAIN)
     returned &= range_m >= lidar.min_range_m
