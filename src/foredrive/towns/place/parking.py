@@ -12,7 +12,7 @@ from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
 from foredrive.towns.place.road_mesh import ASPHALT_RGB
 from foredrive.towns.place.site import Frontage, Site, frontages
 
-FIRST_TRACK_ID = 1_000_000
+FIRST_TRACK_ID = 50_000
 """Parked cars are numbered from here on, so that they never share a number with traffic."""
 SHARE_OF_BAYS = 0.6
 KERB_BAY_M, KERB_WIDTH_M = 6.2, 2.0
