@@ -59,10 +59,11 @@ def record(
     crowd: Crowd | None = None,
     occupancy: VoxelSpec | None = OCCUPANCY,
     conditions: Conditions | None = None,
+    log_name: str | None = None,
 ) -> LogPath:
     """Record one drive; the same arguments give the same bytes.
 
-    The log lies at out/logs/SPLIT/TOWN_seedN and replaces one of that name; the map, once for all logs of the
+    The log lies at out/logs/SPLIT/NAME and replaces one of that name; the map, once for all logs of the
     town, at out/maps. Boxes are those of all road users within `BOXES_WITHIN_M`, parked cars included; the
     number of lidar returns from each tells hidden ones from visible ones.
 
@@ -76,6 +77,7 @@ def record(
         crowd: `Crowd()` by default.
         occupancy: grid of the exact occupancy with flow; None leaves it out.
         conditions: time of day and weather; None draws bright daylight from the seed.
+        log_name: TOWN_seedN by default.
 
     Raises:
         InputError: there is no such town, or no frame to record.
@@ -94,7 +96,7 @@ def record(
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
     drive = Drive(traffic, seconds)
     maps = write_map(_map_objects(town), town, out)
-    name, count = f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
+    name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, occupancy, seed)
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
