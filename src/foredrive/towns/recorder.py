@@ -18,15 +18,13 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
-from foredrive.towns.map.town_map import MAP_FOLDER, load_town_map
+from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive, Moment
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
-TEST_TOWNS = ("Town05",)
-"""Held out, as in the papers; all others are for training."""
 FIRST_TIME_US = 1_577_836_800_000_000
 """Midnight of 1 January 2020 UTC: a log's time must not depend on when it was made."""
 BOXES_WITHIN_M = 80.0

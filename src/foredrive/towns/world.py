@@ -2,25 +2,30 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Int32, UInt8
+from jaxtyping import Float, Float32, Float64, Int, Int32, UInt8
 
 from foredrive.data.modalities import FullOccupancy
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions, draw_daylight
 from foredrive.towns.labels.occupancy import full_occupancy
+from foredrive.towns.labels.semantics import SKY
+from foredrive.towns.labels.visibility import visibility
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.place.assets import Assets, AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.buildings import build_buildings
 from foredrive.towns.place.looks import LookArrays, LookTable, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
-from foredrive.towns.place.props import SignalHead, ThinThings, build_furniture, build_posts, join_thin
+from foredrive.towns.place.props import SignalHead, ThinThings, build_posts, build_street_lamps, join_thin
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.terrain import build_terrain, make_terrain
+from foredrive.towns.place.vegetation import build_vegetation
 from foredrive.towns.sensing import capture, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
@@ -42,11 +47,17 @@ class SensorFrame:
 
     images: dict[str, UInt8[np.ndarray, "H W 3"]]
     pixel_ids: dict[str, Int[np.ndarray, "H W"]]
-    """At the pixels' centres."""
+    """At the pixels' centres, as all that is told of pixels."""
+    pixel_surface: dict[str, Int[np.ndarray, "H W"]]
+    """A `Surface`, -1 for the sky."""
+    pixel_range_m: dict[str, Float32[np.ndarray, "H W"]]
+    """Along the pixel's ray; infinite for the sky."""
     sweep: LidarSweep
     """Unbatched, in the ego frame at the frame's time; a beam that got lost is free up to where it hit."""
     beam_ids: Int[np.ndarray, "N"]
     """Of all beams, also of those that did not return."""
+    beam_surface: Int[np.ndarray, "N"]
+    """Likewise; -1 where a beam met nothing."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +75,25 @@ class StaticWorld:
 class World:
     """A town grown from a seed: the same map, seed and conditions give the same world.
 
-    The conditions change the light and the air alone; None draws bright daylight from the seed.
+    The conditions change the light and the air alone; None draws bright daylight from the seed. The assets
+    are those of the town's split by default: a held-out town holds looks and shapes never seen in training.
     """
 
-    def __init__(self, town: TownMap, seed: int, conditions: Conditions | None = None) -> None:
+    def __init__(
+        self,
+        town: TownMap,
+        seed: int,
+        conditions: Conditions | None = None,
+        assets: AssetSet | None = None,
+    ) -> None:
         rng, weather_rng = np.random.default_rng([seed, *town.name.encode()]).spawn(2)
         table = LookTable()
+        chosen = assets_of(assets or asset_set_of(town.name))
         self.town = town
         self.conditions = conditions or draw_daylight(weather_rng)
         self.light = make_light(self.conditions, east_rad=float(weather_rng.uniform(0.0, 2.0 * np.pi)))
         self._shapes = make_shape_library(table)
-        self.static = build_static(town, table, self._shapes, rng)
+        self.static = build_static(town, table, self._shapes, chosen, rng)
         self._looks = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
         faces = faces_of(self.static.mesh, self._looks.surface)
@@ -117,12 +136,15 @@ class World:
         noise = np.random.default_rng(noise_seed)
         sweep, met = capture.sweep(moment, sensors.lidar, T_world_ego, twist_ego, noise)
         names = sensors.rig.names
-        pixel_ids = self._track_ids(seen, near).reshape(len(names), *sensors.rig.size_hw)
+        shape = (len(names), *sensors.rig.size_hw)
         return SensorFrame(
             images=dict(zip(names, images, strict=True)),
-            pixel_ids=dict(zip(names, pixel_ids, strict=True)),
+            pixel_ids=dict(zip(names, self._track_ids(seen, near).reshape(shape), strict=True)),
+            pixel_surface=dict(zip(names, self._surfaces(seen).reshape(shape), strict=True)),
+            pixel_range_m=dict(zip(names, seen.range_m.reshape(shape), strict=True)),
             sweep=sweep,
             beam_ids=self._track_ids(met, near),
+            beam_surface=self._surfaces(met),
         )
 
     def occupancy(
@@ -141,6 +163,26 @@ class World:
         near = [a for a in (*moving, *self.parked) if _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in near]
         return full_occupancy(self._columns, self.static.thin, shaped, T_world_ego, spec)
+
+    def visibility(
+        self,
+        actors: Sequence[ActorState],
+        sensors: SensorSuite,
+        T_world_ego: Float64[np.ndarray, "4 4"],
+        frame: SensorFrame,
+    ) -> Float32[np.ndarray, "M"]:
+        """How much of each road user, parked cars included, a frame shows (see `labels.visibility`)."""
+        shaped = [(actor, self._shapes.shape_of(actor)) for actor in actors]
+        return visibility(shaped, sensors, T_world_ego, np.stack(list(frame.pixel_ids.values())))
+
+    @cached_property
+    def signal_xyz(self) -> dict[int, Float64[np.ndarray, "3"]]:
+        """Where the lamps of each traffic light are, by the index of its stop zone."""
+        look, xyz = self.static.mesh.look, self.static.mesh.xyz
+        return {
+            head.zone: xyz[np.isin(look, head.lamps)].mean(axis=(0, 1), dtype=np.float64)
+            for head in self.static.heads
+        }
 
     def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> capture.Moment:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
@@ -167,6 +209,10 @@ class World:
                     texture[lamp], albedo[lamp] = Texture.GLOW, rgb
         return self._looks._replace(texture=texture, albedo=albedo)
 
+    def _surfaces(self, seen: capture.Seen) -> Int[np.ndarray, "N"]:
+        surface = self._looks.surface.astype(np.int8)
+        return np.where(seen.look == shading.MISS, np.int8(SKY), surface[seen.look])
+
     def _track_ids(self, seen: capture.Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
         track = np.array([*(actor.track_id for actor in actors), NOBODY], dtype=np.int64)
         static = self.static.track[np.maximum(seen.triangle, 0)]
@@ -175,7 +221,7 @@ class World:
 
 
 def build_static(
-    town: TownMap, table: LookTable, shapes: ShapeLibrary, rng: np.random.Generator
+    town: TownMap, table: LookTable, shapes: ShapeLibrary, assets: Assets, rng: np.random.Generator
 ) -> StaticWorld:
     """Grow a town. What the map says comes first, then what needs most room."""
     plan = make_ground_plan(town)
@@ -190,19 +236,21 @@ def build_static(
             build_terrain(terrain, plan, table),
             posts.mesh,
             lots,
-            build_buildings(site, town.name, table, rng),
+            build_buildings(site, town.name, assets, table, rng),
         ]
     )
-    furniture = build_furniture(site, table, rng)
+    lamps = build_street_lamps(site, table, rng)
+    plants, trunks = build_vegetation(site, assets, table, rng)
+    place = join([place, lamps.mesh, plants])
     vehicles = [_standing(car, shapes) for car in parked]
-    track = [np.full(len(place.look) + len(furniture.mesh.look), NOBODY, dtype=np.int32)]
+    track = [np.full(len(place.look), NOBODY, dtype=np.int32)]
     track += [np.full(len(v.look), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)]
     return StaticWorld(
-        mesh=join([place, furniture.mesh, *vehicles]),
+        mesh=join([place, *vehicles]),
         track=np.concatenate(track),
         parked=parked,
         heads=posts.heads,
-        thin=join_thin([posts.thin, furniture.thin]),
+        thin=join_thin([posts.thin, lamps.thin, trunks]),
     )
 
 

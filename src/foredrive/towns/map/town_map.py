@@ -25,6 +25,8 @@ from foredrive.towns.map.junction_heights import level_junction
 
 MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
 TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD")
+TEST_TOWNS = ("Town05",)
+"""Held out, as in the papers; all others are for training."""
 SAMPLE_SPACING_M = 1.0
 CONNECTION_TOLERANCE_M = 0.1
 MIN_MARKING_M = 0.1

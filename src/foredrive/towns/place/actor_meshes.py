@@ -31,7 +31,9 @@ class MeshLooks:
         self.rear_light = add(Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08)
         self.plate = add(Texture.PLAIN, (0.90, 0.90, 0.85), 1.0, 0.0)
         self.orange = add(Texture.PLAIN, (0.95, 0.35, 0.08), 0.8, 0.0)
-        self.hair = add(Texture.PLAIN, (0.16, 0.11, 0.08), 0.2, 0.0)
+        self.hair = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.16, 0.11, 0.08), 0.2))
+        self.helmet = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.12, 0.12, 0.13), 0.12))
+        self.tank = add(Texture.PLAIN, (0.45, 0.06, 0.05), 0.3, 0.08)
 
 
 def _taper(
@@ -220,10 +222,10 @@ def _bicycle(looks: MeshLooks) -> Mesh:
 
 def _motorcycle(looks: MeshLooks) -> Mesh:
     bulk = [
-        _taper((-0.6, 0.5), (0.35, 0.85), (0.17, 0.12), (0.1, 0.2), (BODY, BODY, looks.dark)),
+        _taper((-0.6, 0.5), (0.35, 0.85), (0.17, 0.12), (0.1, 0.2), (looks.tank, looks.tank, looks.dark)),
         box((0.5, -0.12, 0.85), (0.62, 0.12, 1.05), looks.front_light),
         box((-0.75, -0.1, 0.75), (-0.6, 0.1, 0.85), looks.rear_light),
-        _ball((0.12, 0.0, 1.64), 0.15, looks.dark),
+        _ball((0.12, 0.0, 1.64), 0.15, looks.helmet),
     ]
     return join([_two_wheeler(looks, 0.31, 0.07, looks.dark), *bulk])
 

@@ -25,6 +25,8 @@ class Surface(enum.IntEnum):
     PEDESTRIAN = 9
     HIDDEN = 10
     """Under the road, where only a ray through a crack gets to."""
+    SIGNAL = 11
+    """Heads of traffic lights."""
 
 
 class Texture(enum.IntEnum):
@@ -36,12 +38,13 @@ class Texture(enum.IntEnum):
     """Asphalt with lines. u, v: distance from the left and right border; w: along, all in m.
     p0..p2: `LinePattern`, colour (0 white, 1 yellow), width of the left line; p3..p5: the right line."""
     SLABS = 2
-    """p0: edge length of the slabs, m."""
+    """u, v: distance from the left and right edge, where a kerb stone lies. p0: edge of the slabs, m."""
     GRASS = 3
     FACADE = 4
     """u: from the wall's left end; v: above the ground; w: from its right end, m.
     p0: storey height; p1: bay width; p2: share of the bay that is window; p3: of the storey;
-    p4: height of the ground floor; p5: brick (1) or plain wall (0)."""
+    p4: height of the ground floor; p5: `WallKind`; p6: `WindowKind`; p7: `GroundFloor`; p8: row of
+    `patterns.ACCENT_RGB` for doors, shutters and signs."""
     TILES = 5
     """u: along the eaves; v: up the slope, m."""
     FOLIAGE = 6
@@ -62,7 +65,48 @@ class LinePattern(enum.IntEnum):
     DOUBLE_BROKEN = 4
 
 
-PARAMETERS = 6
+class WallKind(enum.IntEnum):
+    """What a façade is made of."""
+
+    PLASTER = 0
+    BRICK = 1
+    STONE = 2
+    """Large slabs."""
+    SHEET = 3
+    """Corrugated metal."""
+    BOARDS = 4
+
+
+class WindowKind(enum.IntEnum):
+    """How the windows of a façade are made."""
+
+    CASEMENT = 0
+    """Two leaves over a sill."""
+    TALL = 1
+    """Down to the floor, behind a rail."""
+    RIBBON = 2
+    """Side by side along the whole storey."""
+    CURTAIN = 3
+    """A wall of glass."""
+    HALL = 4
+    """A band below the eaves."""
+    SHUTTERED = 5
+    GRID = 6
+    """Many small panes."""
+    SLIT = 7
+    """Two narrow ones in each bay."""
+
+
+class GroundFloor(enum.IntEnum):
+    """What a façade's ground floor is."""
+
+    DOORS = 0
+    SHOPS = 1
+    GATES = 2
+    """Roller doors of a hall."""
+
+
+PARAMETERS = 9
 
 
 @dataclass(frozen=True)

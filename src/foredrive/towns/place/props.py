@@ -1,33 +1,24 @@
-"""Street furniture and vegetation: traffic lights, signs, lamps, trees, bushes."""
+"""What stands on posts: traffic lights, signs that the map has, street lamps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
-import trimesh
 from jaxtyping import Float, Int
 
 from foredrive.towns.map.town_map import StopZone, StopZoneKind, TownMap
 from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
-from foredrive.towns.place.mesh import Mesh, box, frustum, join, triangles
+from foredrive.towns.place.mesh import Mesh, box, frustum, join
 from foredrive.towns.place.site import Site, frontages
 
 LAMP_SPACING_M, LAMP_HEIGHT_M, LAMP_ARM_M = 30.0, 7.5, 1.6
-LAMP_SETBACK_M, TREE_SETBACK_M = 0.5, 1.5
-TREE_SPACING_M = (7.0, 15.0)
-STREET_TREES, OPEN_TREES_PER_M2 = 0.6, 1 / 260.0
-FIRST_TREE_M, LAST_TREE_M = 5.0, 80.0
+LAMP_SETBACK_M = 0.5
 MAST_HEIGHT_M, HEAD_GAP_M = 5.6, 3.0
 LONGEST_ARM_M = 9.0
 SIGN_HEIGHT_M = 2.3
 POST_CLEARANCE_M = 0.3
 POLE_SAMPLE_M = 0.2
-TRUNK_M = 2.0
-CROWN_SPREAD = 1.35
-
-_LEAVES = ((0.27, 0.38, 0.14), (0.33, 0.42, 0.17), (0.22, 0.33, 0.15), (0.40, 0.44, 0.18), (0.25, 0.36, 0.20))
-_NEEDLES = ((0.17, 0.28, 0.17), (0.20, 0.31, 0.18))
 
 
 @dataclass(frozen=True)
@@ -73,13 +64,10 @@ class _Looks:
     def __post_init__(self) -> None:
         add = self.table.add
         self.metal = add(Look(Surface.POLE, Texture.PLAIN, (0.42, 0.43, 0.44), 0.45, gloss=0.03))
-        self.dark = add(Look(Surface.POLE, Texture.PLAIN, (0.16, 0.17, 0.17), 0.25))
-        self.bark = add(Look(Surface.VEGETATION, Texture.PLAIN, (0.36, 0.29, 0.23), 0.35, params=(2.0,)))
+        self.dark = add(Look(Surface.SIGNAL, Texture.PLAIN, (0.16, 0.17, 0.17), 0.25))
         self.lamp = add(Look(Surface.POLE, Texture.PLAIN, (0.90, 0.90, 0.86), 0.6))
         self.red_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.75, 0.09, 0.09), 1.0))
         self.white_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.92, 0.92, 0.92), 1.0))
-        self.leaves = [add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, 0.5)) for rgb in _LEAVES]
-        self.needles = [add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, 0.45)) for rgb in _NEEDLES]
 
 
 def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
@@ -98,16 +86,16 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
             lamps = _lamp_looks(table, index)
             parts.append(_traffic_light(town, zone, np.array([*foot[:2], z]), lamps, looks))
             heads.append(SignalHead(index, lamps))
-            poles.append(_along_pole(foot, z, MAST_HEIGHT_M))
+            poles.append(along_pole(foot, z, MAST_HEIGHT_M))
         else:
             parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
-            poles.append(_along_pole(foot, z, SIGN_HEIGHT_M))
-    lamps = StreetLamps(np.zeros((0, 3)), looks.lamp)
-    return Props(join(parts), tuple(heads), join_thin([_thin(poles, Surface.POLE)]), lamps)
+            poles.append(along_pole(foot, z, SIGN_HEIGHT_M))
+    unlit = StreetLamps(np.zeros((0, 3)), looks.lamp)
+    return Props(join(parts), tuple(heads), thin_things(poles, Surface.POLE), unlit)
 
 
-def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
-    """Lamps along the roads, then trees along walkways and in the open."""
+def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
+    """Lamps along the roads."""
     looks = _Looks(table)
     parts, poles, lamps = [], [], []
     for frontage in frontages(site.plan, LAMP_SETBACK_M):
@@ -120,14 +108,8 @@ def build_furniture(site: Site, table: LookTable, rng: np.random.Generator) -> P
                 parts.append(_lamp(foot, z, ahead, looks))
                 over_road = (LAMP_ARM_M + 0.2) * np.array([-ahead[1], ahead[0]]) / np.linalg.norm(ahead)
                 lamps.append([*(foot + over_road), z + LAMP_HEIGHT_M + 0.1])
-                poles.append(_along_pole(foot, z, LAMP_HEIGHT_M))
-    trunks = []
-    for xy in _street_tree_spots(site, rng) + _open_tree_spots(site, rng):
-        mesh = _plant(site, xy, looks, rng)
-        if mesh is not None:
-            parts.append(mesh)
-            trunks.append(_along_pole(xy, float(site.height(xy[None])[0]), TRUNK_M))
-    thin = join_thin([_thin(poles, Surface.POLE), _thin(trunks, Surface.VEGETATION)])
+                poles.append(along_pole(foot, z, LAMP_HEIGHT_M))
+    thin = thin_things(poles, Surface.POLE)
     return Props(join(parts), (), thin, StreetLamps(np.array(lamps).reshape(-1, 3), looks.lamp))
 
 
@@ -145,7 +127,7 @@ def _lamp_looks(table: LookTable, zone: int) -> tuple[int, int, int]:
     """Looks of a light's own three lamps, unlit; the zone keeps them apart from those of other lights."""
     off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
     red, yellow, green = (
-        table.add(Look(Surface.SIGN, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
+        table.add(Look(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
     )
     return red, yellow, green
 
@@ -216,101 +198,14 @@ def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"],
     return _turned(join(parts), np.array([*foot, z]), float(np.arctan2(ahead[1], ahead[0])))
 
 
-def _street_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
-    spots = []
-    for frontage in frontages(site.plan, TREE_SETBACK_M):
-        s = rng.uniform(*TREE_SPACING_M)
-        while s < frontage.line.length:
-            if rng.random() < STREET_TREES:
-                spots.append(frontage.at(s) + rng.normal(0.0, 0.2, 2))
-            s += rng.uniform(*TREE_SPACING_M)
-    return spots
-
-
-def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
-    """Trees in clumps on the land that is left."""
-    terrain = site.terrain
-    extent = np.array(terrain.z.shape[::-1]) * 4.0
-    count = int(extent.prod() * OPEN_TREES_PER_M2)
-    xy = terrain.origin_xy + rng.random((count, 2)) * extent
-    away = site.distance_to_road(xy)
-    clump = np.sin(xy[:, 0] / 17.0 + 1.3 * np.sin(xy[:, 1] / 23.0)) + np.sin(xy[:, 1] / 19.0)
-    wanted = (away > FIRST_TREE_M) & (away < LAST_TREE_M) & (clump > rng.uniform(-0.6, 1.6, count))
-    return list(xy[wanted])
-
-
-def _plant(site: Site, xy: Float[np.ndarray, "2"], looks: _Looks, rng: np.random.Generator) -> Mesh | None:
-    """A tree if its crown has room, a bush if only that fits, else nothing."""
-    kind = rng.choice(["round", "tall", "conifer", "bush"], p=[0.45, 0.25, 0.18, 0.12])
-    radius = {"round": rng.uniform(1.6, 2.8), "tall": rng.uniform(1.0, 1.6)}.get(kind, rng.uniform(0.8, 1.5))
-    if not site.is_free(shapely.Point(xy).buffer(0.35)):
-        return None
-    spread = shapely.Point(xy).buffer(CROWN_SPREAD * radius, quad_segs=2)
-    if kind in ("bush", "conifer"):
-        has_room = site.is_free(spread)
-    else:  # its crown may hang over a walkway
-        has_room = not site.plan.lanes.intersects(spread) and not site.plan.bridges.intersects(spread)
-        has_room &= not any(other.intersects(spread) for other in site.near(spread))
-    if not has_room:
-        return None
-    site.take(shapely.Point(xy).buffer(0.6))
-    foot = np.array([*xy, float(site.height(xy[None])[0])])
-    leaves = looks.needles if kind == "conifer" else looks.leaves
-    return _tree(kind, foot, radius, looks.bark, leaves[int(rng.integers(len(leaves)))], rng)
-
-
-def _tree(
-    kind: str,
-    foot: Float[np.ndarray, "3"],
-    radius: float,
-    bark: int,
-    leaves: int,
-    rng: np.random.Generator,
-) -> Mesh:
-    x, y, z = foot
-    if kind == "bush":
-        return _crown(foot + np.array([0, 0, 0.45 * radius]), (radius, radius, 0.7 * radius), leaves, rng)
-    if kind == "conifer":
-        height = rng.uniform(5.0, 9.0)
-        parts = [frustum((x, y, z - 0.3), (x, y, z + 1.6), (0.16, 0.13), 5, bark)]
-        for k in range(3):
-            low = z + 1.0 + 0.26 * k * height
-            top = min(low + 0.48 * height, z + height)
-            parts.append(frustum((x, y, low), (x, y, top), (radius * (1.25 - 0.3 * k), 0.0), 8, leaves))
-        return join(parts)
-    trunk_m = rng.uniform(2.4, 3.2)
-    stretch = rng.uniform(1.7, 2.3) if kind == "tall" else rng.uniform(0.85, 1.15)
-    middle = foot + np.array([0.0, 0.0, trunk_m + 0.95 * radius * stretch])
-    parts = [
-        frustum((x, y, z - 0.3), tuple(middle), (0.09 + 0.05 * radius, 0.05), 6, bark),
-        _crown(middle, (radius, radius, radius * stretch), leaves, rng),
-    ]
-    if kind == "round":
-        for _ in range(2):
-            angle, r = rng.uniform(0.0, 2.0 * np.pi), radius * rng.uniform(0.55, 0.75)
-            offset = 0.6 * radius * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.2, 0.5)])
-            parts.append(_crown(middle + offset, (r, r, 0.9 * r), leaves, rng))
-    return join(parts)
-
-
-_SPHERE = trimesh.creation.icosphere(subdivisions=1)
-
-
-def _crown(
-    centre: Float[np.ndarray, "3"], radii: tuple[float, float, float], look: int, rng: np.random.Generator
-) -> Mesh:
-    """A lumpy ball of leaves."""
-    lumps = rng.uniform(0.8, 1.15, (len(_SPHERE.vertices), 1))
-    vertices = centre + _SPHERE.vertices * lumps * radii
-    return triangles(vertices[_SPHERE.faces], look)
-
-
-def _along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
+def along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
+    """Points up a pole."""
     up = np.arange(0.0, height, POLE_SAMPLE_M)
     return np.column_stack([np.full_like(up, foot[0]), np.full_like(up, foot[1]), z + up])
 
 
-def _thin(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinThings:
+def thin_things(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinThings:
+    """Points of one surface."""
     xyz = np.concatenate([np.zeros((0, 3)), *lines])
     return ThinThings(xyz, np.full(len(xyz), int(surface)))
 

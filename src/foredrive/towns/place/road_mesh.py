@@ -110,10 +110,8 @@ def _surface(piece: Piece, looks: RoadLooks, table: LookTable) -> Mesh:
     if not piece.whole:
         xy = polygon_triangles(piece.area)
         z = piece.height(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + piece.raise_m
-        return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+        return triangles(np.concatenate([xy, z[..., None]], axis=-1), look, np.full((*xy.shape[:2], 3), 9.0))
     left, right = piece.left_xyz + lift, piece.right_xyz + lift
-    if piece.raise_m > 0:
-        return ribbon(left, right, look)
     width = np.linalg.norm(left - right, axis=1)
     zero = np.zeros_like(width)
     return ribbon(

@@ -1,0 +1,388 @@
+"""What buildings look like: houses, blocks, towers, halls and barns, each on its plot."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from foredrive.towns.place.assets import Assets, Rgb
+from foredrive.towns.place.looks import GroundFloor, Look, LookTable, Surface, Texture, WallKind, WindowKind
+from foredrive.towns.place.mesh import (
+    Mesh,
+    Vector,
+    box,
+    frustum,
+    hexahedron,
+    join,
+    polygon_cap,
+    prism,
+    quads,
+    triangles,
+    walls,
+)
+from foredrive.towns.place.styles import Style
+
+FOUNDATION_M = 1.5
+PARAPET_M = 0.5
+EAVES_M = 0.45
+CORNER_M = 0.4
+"""At either end of a wall there are no windows."""
+FENCE_M, HEDGE_M = 1.0, 1.2
+BALCONY_M = 1.15
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A rectangle to build on. Local x runs along the front with the street behind it, y into the plot."""
+
+    corner: Float[np.ndarray, "2"]
+    """Where the front begins, seen from inside on the left."""
+    along: Float[np.ndarray, "2"]
+    width_m: float
+    depth_m: float
+
+    @property
+    def into(self) -> Float[np.ndarray, "2"]:
+        """Unit direction away from the street."""
+        return np.array([-self.along[1], self.along[0]])
+
+    def world(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Map local points to the town."""
+        return self.corner + xy[..., :1] * self.along + xy[..., 1:] * self.into
+
+    def polygon(self, grow_m: float = 0.0) -> shapely.Polygon:
+        """The rectangle in the town, grown on all sides."""
+        w, d, g = self.width_m, self.depth_m, grow_m
+        return shapely.Polygon(self.world(np.array([[-g, -g], [w + g, -g], [w + g, d + g], [-g, d + g]])))
+
+    def placed(self, mesh: Mesh) -> Mesh:
+        """A mesh in local coordinates, moved to the town; its z stays."""
+        T = np.eye(4)
+        T[:2, 0], T[:2, 1], T[:2, 3] = self.along, self.into, self.corner
+        return mesh.transformed(T)
+
+
+@dataclass(frozen=True)
+class _Facade:
+    """What a façade's look holds, for things that hang on it."""
+
+    look: int
+    storey_m: float
+    bay_m: float
+    ground_m: float
+
+    def centres(self, width_m: float) -> Float[np.ndarray, "n"]:
+        """Where the bays of a wall have their middle, as the texture has them."""
+        usable = width_m - 2 * CORNER_M
+        count = max(1, int(usable / self.bay_m + 0.3))
+        return CORNER_M + (np.arange(count) + 0.5) * usable / count
+
+
+@dataclass
+class BuildingMaker:
+    """Draws buildings in the style of a town from the assets it has."""
+
+    table: LookTable
+    rng: np.random.Generator
+    assets: Assets
+    style: Style
+    _hedge: int = field(init=False)
+    _wood: int = field(init=False)
+    _metal: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        hedge = Look(Surface.VEGETATION, Texture.FOLIAGE, self.assets.leaves[-1], 0.5)
+        self._hedge = self.table.add(hedge)
+        wood = Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.56, 0.48), 0.4, params=(1.5,))
+        self._wood = self.table.add(wood)
+        self._metal = self.table.add(Look(Surface.BUILDING, Texture.PLAIN, (0.20, 0.21, 0.22), 0.3))
+
+    def build(self, kind: str, plot: Plot, base: float, detail: bool) -> Mesh:
+        """A building of a kind.
+
+        Args:
+            base: height of the ground.
+            detail: whether it stands in the first row and so has balconies, cornices and the like.
+        """
+        if kind == "house":
+            return self._house(plot, base)
+        if kind == "hall":
+            return self._hall(plot, base)
+        if kind == "barn":
+            return self._barn(plot, base)
+        return self._block(plot, base, kind == "tower", detail)
+
+    def border(self, kind: str, plot: Plot, ends: Float[np.ndarray, "2 2"], base: float) -> Mesh:
+        """A hedge or a fence between two local points of the same y."""
+        (x0, y), (x1, _) = ends
+        if kind == "hedge":
+            top = base + HEDGE_M
+            return plot.placed(box((x0, y - 0.25, base - 0.4), (x1, y + 0.25, top), self._hedge))
+        parts = [
+            box((x0, y - 0.02, base + z), (x1, y + 0.02, base + z + 0.1), self._wood) for z in (0.25, 0.75)
+        ]
+        for x in np.arange(x0, x1, 0.3):
+            tall, half = (FENCE_M, 0.045) if round((x - x0) / 0.3) % 6 else (FENCE_M + 0.1, 0.06)
+            parts.append(box((x - half, y - 0.05, base - 0.3), (x + half, y - 0.02, base + tall), self._wood))
+        return plot.placed(join(parts))
+
+    def _choose(self, options: tuple[Rgb, ...]) -> Rgb:
+        return options[int(self.rng.integers(len(options)))]
+
+    def _plain(self, rgb: Rgb, reflectivity: float, texture: Texture = Texture.PLAIN) -> int:
+        return self.table.add(Look(Surface.BUILDING, texture, rgb, reflectivity, params=(1.0,)))
+
+    def _facade(
+        self,
+        wall: tuple[WallKind, Rgb],
+        windows: WindowKind,
+        ground_floor: GroundFloor,
+        storey_bay_ground_m: tuple[float, float, float],
+        share: tuple[float, float],
+    ) -> _Facade:
+        storey, bay, ground = storey_bay_ground_m
+        accent = self.assets.accents[int(self.rng.integers(len(self.assets.accents)))]
+        kinds = (float(wall[0]), float(windows), float(ground_floor), float(accent))
+        params = (storey, bay, *share, ground, *kinds)
+        reflectivity = 0.55 if wall[0] is WallKind.SHEET else 0.3 + 0.25 * float(np.mean(wall[1]))
+        look = Look(Surface.BUILDING, Texture.FACADE, wall[1], reflectivity, params=params)
+        return _Facade(self.table.add(look), storey, bay, ground)
+
+    def _wall(self, *but: WallKind) -> tuple[WallKind, Rgb]:
+        options = [wall for wall in self.assets.walls if wall[0] not in but]
+        return options[int(self.rng.integers(len(options)))]
+
+    def _house(self, plot: Plot, base: float) -> Mesh:
+        """One or two storeys under a gabled or hipped roof, with a chimney and a porch."""
+        rng = self.rng
+        storeys, ground_m, storey_m = int(rng.integers(1, 3)), 2.9, 2.8
+        windows = self.assets.windows[0]
+        facade = self._facade(
+            self._wall(WallKind.STONE),
+            windows,
+            GroundFloor.DOORS,
+            (storey_m, 2.9, ground_m - 0.1),
+            (0.42, 0.5),
+        )
+        roof = self._plain(self._choose(self.assets.roofs), 0.35, Texture.TILES)
+        eaves = base + ground_m + (storeys - 1) * storey_m
+        w, d = plot.width_m, plot.depth_m
+        ridge = eaves + rng.uniform(0.5, 0.85) * 0.5 * d
+        parts = [self._walls(plot, [[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look)]
+        if w > d + 1.0 and rng.random() < 0.35:
+            parts.append(self._hip_roof(plot, eaves, ridge, roof))
+        else:
+            parts.append(self._gable_roof(plot, eaves, ridge, roof, facade.look))
+        if rng.random() < 0.6:
+            x, y = rng.uniform(0.35, 0.6) * w, 0.5 * d + rng.uniform(0.3, 1.2)
+            brick = self._plain((0.45, 0.30, 0.26), 0.35)
+            parts.append(self._box(plot, (x, y), (0.7, 0.7), (eaves, ridge + 0.9), brick))
+        if rng.random() < 0.5:
+            x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(1.6, 3.0)
+            parts.append(self._box(plot, (x, -0.6), (wide, 1.4), (base + 2.55, base + 2.7), self._metal))
+            parts.append(self._box(plot, (x, -0.5), (wide, 1.1), (base - 0.5, base + 0.15), facade.look))
+            for side in (-0.46, 0.46):
+                post = (x + side * wide, -1.15)
+                parts.append(self._box(plot, post, (0.12, 0.12), (base, base + 2.55), self._wood))
+        return join(parts)
+
+    def _barn(self, plot: Plot, base: float) -> Mesh:
+        """A farm's barn, often with a silo beside it."""
+        rng, w, d = self.rng, plot.width_m, plot.depth_m
+        rgb = self._choose(((0.45, 0.16, 0.13), (0.36, 0.28, 0.22), *self.assets.sheet[:1]))
+        ground = float(rng.uniform(4.0, 5.5))
+        wall = (WallKind.SHEET, rgb)
+        facade = self._facade(wall, WindowKind.HALL, GroundFloor.GATES, (3.0, 5.0, ground), (0.2, 0.2))
+        roof = self._plain(self._choose(self.assets.roofs), 0.4, Texture.TILES)
+        eaves, ridge = base + ground, base + ground + rng.uniform(0.6, 0.9) * 0.5 * d
+        parts = [
+            self._walls(plot, [[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look),
+            self._gable_roof(plot, eaves, ridge, roof, facade.look),
+        ]
+        if rng.random() < 0.6:
+            steel = self._plain((0.70, 0.71, 0.72), 0.6)
+            radius, top = rng.uniform(1.4, 2.0), base + rng.uniform(7.0, 11.0)
+            x, y = w - radius - 0.3, d - radius + 0.2
+            silo = [
+                frustum((x, y, base - 1.0), (x, y, top), (radius, radius), 12, steel),
+                frustum((x, y, top), (x, y, top + 0.8 * radius), (radius, 0.2), 12, steel),
+            ]
+            parts.append(plot.placed(join(silo)))
+        return join(parts)
+
+    def _hall(self, plot: Plot, base: float) -> Mesh:
+        """A warehouse with roller doors, or a market with shop windows and a sign."""
+        rng, w, d = self.rng, plot.width_m, plot.depth_m
+        market = rng.random() < 0.4
+        ground = float(rng.uniform(5.5, 9.0))
+        wall = (WallKind.SHEET, self._choose(self.assets.sheet))
+        if market:
+            wall = self._wall(WallKind.BOARDS)
+        floor = GroundFloor.SHOPS if market else GroundFloor.GATES
+        glazed = 4.2 if market else ground
+        facade = self._facade(wall, WindowKind.HALL, floor, (40.0, 5.5, glazed), (0.0, 0.0))
+        roof = self._plain(self._choose(self.assets.flat_roofs), 0.3)
+        top = base + ground + PARAPET_M
+        ring: list[Vector] = [[0, 0], [w, 0], [w, d], [0, d]]
+        parts = [
+            self._walls(plot, ring, base, top, facade.look),
+            polygon_cap(plot.polygon(), top - PARAPET_M, roof),
+            *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(2, 6))),
+        ]
+        if market or rng.random() < 0.4:
+            x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(0.2, 0.35) * w
+            sign = self._plain(self._choose(self.assets.awnings), 0.6)
+            parts.append(self._box(plot, (x, -0.15), (wide, 0.3), (top - 1.9, top + 0.3), sign))
+        if market:
+            z = base + 3.2
+            parts.append(self._box(plot, (0.5 * w, -0.9), (0.8 * w, 1.8), (z, z + 0.3), self._metal))
+        return join(parts)
+
+    def _block(self, plot: Plot, base: float, tower: bool, detail: bool) -> Mesh:
+        """Several storeys under a flat roof; some with a notch in the back."""
+        rng, w, d = self.rng, plot.width_m, plot.depth_m
+        low, high = self.style.storeys
+        storeys = int(rng.integers(8, 17) if tower else rng.integers(low, high + 1))
+        facade, homes = self._block_facade(tower)
+        roof = self._plain(self._choose(self.assets.flat_roofs), 0.3)
+        top = base + facade.ground_m + (storeys - 1) * facade.storey_m + PARAPET_M
+        outline: list[Vector] = [[0, 0], [w, 0], [w, d], [0, d]]
+        if w > 15.0 and rng.random() < 0.45:
+            x, y = rng.uniform(0.35, 0.65) * w, rng.uniform(0.4, 0.6) * d
+            outline = [[0, 0], [w, 0], [w, d], [x, d], [x, y], [0, y]]
+        area = shapely.Polygon(plot.world(np.array(outline, float)))
+        parts = [
+            self._walls(plot, outline, base, top, facade.look),
+            polygon_cap(area, top - PARAPET_M, roof),
+            *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(1, 4))),
+        ]
+        if not detail:
+            return join(parts)
+        if not tower and rng.random() < 0.5:
+            ledge = self._plain((0.74, 0.72, 0.68), 0.4)
+            rim = area.buffer(0.3, join_style="mitre")
+            z = top - 0.35 if rng.random() < 0.7 else top - facade.storey_m - 0.3
+            parts.append(prism(rim, z, z + 0.35, ledge, ledge))
+        if homes and storeys > 2 and rng.random() < 0.55:
+            parts += self._balconies(plot, base, storeys, facade)
+        elif not tower and rng.random() < 0.6:
+            parts.append(self._awning(plot, base + facade.ground_m - 1.0))
+        return join(parts)
+
+    def _block_facade(self, tower: bool) -> tuple[_Facade, bool]:
+        """The façade, and whether people live behind it."""
+        rng = self.rng
+        storey, ground = float(rng.uniform(2.9, 3.4)), float(rng.uniform(3.6, 4.5))
+        if rng.random() < (0.5 if tower else 0.08):
+            wall = (WallKind.PLASTER, self._choose(self.assets.curtain))
+            bay = float(rng.uniform(1.4, 2.4))
+            return (
+                self._facade(
+                    wall, WindowKind.CURTAIN, GroundFloor.SHOPS, (storey + 0.4, bay, ground), (0.9, 0.74)
+                ),
+                False,
+            )
+        windows = self.assets.windows[int(rng.integers(len(self.assets.windows)))]
+        share = (float(rng.uniform(0.36, 0.6)), float(rng.uniform(0.45, 0.6)))
+        floor = GroundFloor.SHOPS if rng.random() < self.style.shops else GroundFloor.DOORS
+        sizes = (storey, float(rng.uniform(2.4, 3.8)), ground)
+        facade = self._facade(self._wall(), windows, floor, sizes, share)
+        return facade, windows not in (WindowKind.RIBBON, WindowKind.SLIT, WindowKind.GRID)
+
+    def _balconies(self, plot: Plot, base: float, storeys: int, facade: _Facade) -> list[Mesh]:
+        """One above the other before some of the bays of the front."""
+        rng = self.rng
+        centres = facade.centres(plot.width_m)
+        slab, rail = self._plain((0.70, 0.69, 0.66), 0.4), self._metal
+        if rng.random() < 0.5:
+            rail = self._plain(self._choose(self.assets.awnings), 0.4)
+        half = 0.46 * facade.bay_m
+        parts = []
+        for x in centres[int(rng.integers(0, 2)) :: int(rng.integers(2, 4))]:
+            for row in range(storeys - 1):
+                z = base + facade.ground_m + row * facade.storey_m
+                y = -BALCONY_M
+                parts.append(box((x - half, y, z - 0.1), (x + half, 0.05, z + 0.08), slab))
+                parts.append(box((x - half, y, z + 0.12), (x + half, y + 0.05, z + 1.0), rail))
+                for side in (x - half, x + half - 0.05):
+                    parts.append(box((side, y + 0.05, z + 0.12), (side + 0.05, 0.05, z + 1.0), rail))
+        return [plot.placed(join(parts))] if parts else []
+
+    def _roof_boxes(self, plot: Plot, z: float, look: int, count: int) -> list[Mesh]:
+        """Stairs, lifts and air conditioning on a flat roof."""
+        rng = self.rng
+        parts = []
+        for _ in range(count):
+            size = tuple(rng.uniform(1.5, 4.0, 2))
+            centre = (rng.uniform(0.2, 0.8) * plot.width_m, rng.uniform(0.15, 0.35) * plot.depth_m)
+            parts.append(self._box(plot, centre, size, (z - 0.2, z + rng.uniform(1.0, 2.6)), look))
+        return parts
+
+    def _gable_roof(self, plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> Mesh:
+        w, d, e = plot.width_m, plot.depth_m, EAVES_M
+        drop = (ridge - eaves) / (0.5 * d) * e
+        slopes = []
+        for y0, x0, x1 in ((-e, -e, w + e), (d + e, w + e, -e)):
+            corners = [[x0, y0, eaves - drop], [x1, y0, eaves - drop]]
+            corners += [[x1, 0.5 * d, ridge], [x0, 0.5 * d, ridge]]
+            run = float(np.hypot(0.5 * d + e, ridge - eaves + drop))
+            uvw = np.array([[[0, 0, 0], [w, 0, 0], [w, run, 0], [0, run, 0]]], float)
+            top = np.array([corners])
+            slopes += [quads(top, roof, uvw), quads(top[:, ::-1] - [0.0, 0.0, 0.15], roof, uvw)]
+        peak = ridge - 0.1
+        gables = np.array(
+            [
+                [[w, 0.0, eaves], [w, d, eaves], [w, 0.5 * d, peak]],
+                [[0.0, d, eaves], [0.0, 0.0, eaves], [0.0, 0.5 * d, peak]],
+            ]
+        )
+        # Without u and w a façade has no windows.
+        return plot.placed(join([*slopes, triangles(gables, wall, np.zeros((2, 3, 3)))]))
+
+    @staticmethod
+    def _hip_roof(plot: Plot, eaves: float, ridge: float, roof: int) -> Mesh:
+        w, d, e = plot.width_m, plot.depth_m, EAVES_M
+        a, b, c, f = [-e, -e, eaves], [w + e, -e, eaves], [w + e, d + e, eaves], [-e, d + e, eaves]
+        p, q = [0.5 * d, 0.5 * d, ridge], [w - 0.5 * d, 0.5 * d, ridge]
+        run = float(np.hypot(0.5 * d + e, ridge - eaves))
+        parts = [quads(np.array([[f, c, b, a]], float), roof)]
+        for corners in ([a, b, q, p], [c, f, p, q]):
+            uvw = np.array([[[0, 0, 0], [w, 0, 0], [w - 0.5 * d, run, 0], [0.5 * d, run, 0]]], float)
+            parts.append(quads(np.array([corners], float), roof, uvw))
+        for triangle in ([b, c, q], [f, a, p]):
+            uvw = np.array([[[0, 0, 0], [d, 0, 0], [0.5 * d, run, 0]]], float)
+            parts.append(triangles(np.array([triangle], float), roof, uvw))
+        return plot.placed(join(parts))
+
+    @staticmethod
+    def _walls(plot: Plot, outline: Sequence[Vector], base: float, top: float, look: int) -> Mesh:
+        """Walls that reach into the ground; the façade's v starts at the base."""
+        ring = plot.world(np.array([*outline, outline[0]], float))
+        mesh = walls(ring, base - FOUNDATION_M, top, look)
+        mesh.uvw[..., 1] -= FOUNDATION_M
+        return mesh
+
+    @staticmethod
+    def _box(plot: Plot, centre: Vector, size: Vector, z: tuple[float, float], look: int) -> Mesh:
+        (x, y), (a, b) = centre, (0.5 * size[0], 0.5 * size[1])
+        moved = plot.placed(box((x - a, y - b, z[0]), (x + a, y + b, z[1]), look))
+        return Mesh(moved.xyz, np.zeros_like(moved.uvw), moved.look)
+
+    def _awning(self, plot: Plot, z: float) -> Mesh:
+        rng = self.rng
+        look = self._plain(self._choose(self.assets.awnings), 0.4)
+        start, width = rng.uniform(0.1, 0.3) * plot.width_m, rng.uniform(0.3, 0.6) * plot.width_m
+        reach, thick, low = 1.0, 0.08, z - 0.45
+        x0, x1 = start, start + width
+
+        def slab(sink: float) -> list[list[float]]:
+            return [
+                [x0, -reach, low - sink],
+                [x1, -reach, low - sink],
+                [x1, 0.0, z - sink],
+                [x0, 0.0, z - sink],
+            ]
+
+        return plot.placed(hexahedron(slab(thick), slab(0.0), [look] * 6))

@@ -1,0 +1,40 @@
+"""What each town builds, how densely, and what stands along its roads."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Style:
+    """The character of a town."""
+
+    kinds: tuple[tuple[str, float], ...]
+    """Shares of "house", "block", "tower", "hall" and "barn"."""
+    storeys: tuple[int, int]
+    """Of blocks."""
+    density: float
+    """Share of the frontage along walkways that is built on."""
+    open_density: float
+    """The same along roads without walkways."""
+    skyline: float
+    """Share of the free spots behind the first row that are built on."""
+    shops: float
+    """Share of blocks with shops on the ground floor."""
+    power_lines: float
+    """Share of the roads with wires on poles beside them, in place of street lamps."""
+    billboards: float
+    """Per kilometre of road."""
+
+
+_SMALL = (("house", 0.55), ("block", 0.45))
+_SUBURB = (("house", 0.20), ("block", 0.42), ("hall", 0.26), ("tower", 0.12))
+_OUTSKIRTS = (("house", 0.32), ("block", 0.28), ("hall", 0.36), ("tower", 0.04))
+STYLES = {
+    "Town01": Style(_SMALL, (2, 4), 0.75, 0.3, 0.25, 0.35, 0.3, 0.3),
+    "Town02": Style((("house", 0.4), ("block", 0.6)), (2, 5), 0.85, 0.3, 0.30, 0.4, 0.3, 0.3),
+    "Town03": Style(_SUBURB, (3, 7), 0.75, 0.3, 0.32, 0.45, 0.1, 1.0),
+    "Town04": Style(_OUTSKIRTS, (2, 5), 0.70, 0.14, 0.10, 0.35, 0.15, 1.0),
+    "Town05": Style((("block", 0.78), ("tower", 0.22)), (3, 8), 0.80, 0.15, 0.35, 0.7, 0.0, 1.2),
+    "Town06": Style(_OUTSKIRTS, (1, 4), 0.60, 0.22, 0.10, 0.3, 0.2, 1.2),
+    "Town07": Style((("house", 0.66), ("barn", 0.34)), (1, 2), 0.50, 0.20, 0.07, 0.2, 0.7, 0.1),
+    "Town10HD": Style((("block", 0.6), ("tower", 0.4)), (4, 10), 0.90, 0.3, 0.50, 0.8, 0.0, 1.0),
+}
