@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -10,13 +11,18 @@ from torch import Tensor
 from foredrive.geometry.se3 import exp_se3, rotate_vectors, transform_points
 from foredrive.sensors.rays import TimedRays
 
+GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
+
 
 @dataclass(frozen=True)
 class SpinningLidar:
-    """A column of lasers that turns clockwise, seen from above, and fires a whole column at a time.
+    """A column of lasers that turns clockwise, seen from above, and fires column by column.
 
     A revolution starts and ends looking backwards, and the frame's time is its end, so that all of a frame
-    has been seen by then: straight ahead was seen half a period before.
+    has been seen by then: straight ahead was seen half a period before. `lidar_models` has real ones.
+
+    Raises:
+        ValueError: a table with another number of channels, or lasers that fire longer than a column takes.
     """
 
     elevation_rad: tuple[float, ...]
@@ -31,6 +37,26 @@ class SpinningLidar:
     """Standard deviation of a measured range."""
     T_ego_lidar: Float[Tensor, "4 4"]
     """lidar (x forward, y left, z up) -> ego."""
+    firing_s: tuple[float, ...] | None = None
+    """When each channel fires, the head turning meanwhile; None: a whole column at once."""
+    azimuth_offset_rad: tuple[float, ...] | None = None
+    """How far each channel looks counter-clockwise of its column; None: all along it."""
+    divergence_rad: float = 0.0
+    """Full angle of the cone that a beam is."""
+    rays_per_beam: int = 1
+    """Rays that stand for a beam's footprint; 1: its axis alone."""
+    pulse_m: float = 0.75
+    """Depth within which the echoes of one pulse are one echo: half the length of a pulse of 5 ns."""
+    echo: Literal["strongest", "last"] = "strongest"
+    """Which of a beam's echoes is returned."""
+
+    def __post_init__(self) -> None:
+        for table in (self.firing_s, self.azimuth_offset_rad):
+            if table is not None and len(table) != len(self.elevation_rad):
+                raise ValueError(f"{len(self.elevation_rad)} channels, but a table of {len(table)}")
+        column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
+        if self.firing_s is not None and max(self.firing_s) - min(self.firing_s) > column_s:
+            raise ValueError(f"the lasers of a column fire longer than the {column_s * 1e6:.1f} µs it takes")
 
     @property
     def channel(self) -> Int[Tensor, "N"]:
@@ -40,6 +66,8 @@ class SpinningLidar:
     def beams(self, twist_ego: Float[Tensor, "6"]) -> TimedRays:
         """The beams of one revolution, column by column, channels within a column in their order.
 
+        A column's azimuth and time are those of the channel that fires last.
+
         Args:
             twist_ego: the ego frame's velocity (m/s), then its turn rate (rad/s), in its own axes, taken
                 as constant over the revolution.
@@ -48,23 +76,55 @@ class SpinningLidar:
             Rays [N] in the ego frame at the end of the revolution; dt_s runs from -1/rate to 0.
         """
         steps = torch.arange(self.azimuth_steps)
-        column_dt_s = ((steps + 1) / self.azimuth_steps - 1) / self.rate_hz
-        azimuth = math.pi - (steps + 0.5) * (2 * math.pi / self.azimuth_steps)
+        dt_s = (((steps + 1) / self.azimuth_steps - 1) / self.rate_hz)[:, None]
+        azimuth = (math.pi - (steps + 0.5) * (2 * math.pi / self.azimuth_steps))[:, None]
+        if self.firing_s is not None:
+            early_s = max(self.firing_s) - torch.tensor(self.firing_s)
+            dt_s = dt_s - early_s
+            azimuth = azimuth + 2 * math.pi * self.rate_hz * early_s
+        if self.azimuth_offset_rad is not None:
+            azimuth = azimuth + torch.tensor(self.azimuth_offset_rad)
         elevation = torch.tensor(self.elevation_rad)
         level = elevation.cos()
         direction = torch.stack(
             [
-                azimuth.cos()[:, None] * level,
-                azimuth.sin()[:, None] * level,
+                azimuth.cos() * level,
+                azimuth.sin() * level,
                 elevation.sin().expand(self.azimuth_steps, -1),
             ],
             dim=-1,
         )  # [columns, channels, 3], lidar frame
-        T_end_then = exp_se3(column_dt_s[:, None] * twist_ego)  # ego frame at firing -> at the end
+        moments = dt_s.shape[1]  # of a column: 1, or one for each channel
+        direction = direction.reshape(self.azimuth_steps, moments, -1, 3)
+        T_end_then = exp_se3(dt_s[..., None] * twist_ego)  # ego frame at firing -> at the end
         T = T_end_then @ self.T_ego_lidar
         origin = transform_points(T, torch.zeros_like(direction))
         return TimedRays(
-            origin_ego=origin.flatten(0, 1),
-            dir_ego=rotate_vectors(T, direction).flatten(0, 1),
-            dt_s=column_dt_s.repeat_interleave(len(elevation)),
+            origin_ego=origin.reshape(-1, 3),
+            dir_ego=rotate_vectors(T, direction).reshape(-1, 3),
+            dt_s=dt_s.expand(-1, len(elevation)).reshape(-1),
+        )
+
+    def footprints(self, beams: TimedRays) -> TimedRays:
+        """The rays of all beams [N · rays_per_beam], those of a beam next to each other.
+
+        They fill the cone evenly (Vogel, "A better way to construct the sunflower head", 1979), so that each
+        carries the same share of the pulse.
+        """
+        if self.rays_per_beam == 1:
+            return beams
+        k = torch.arange(self.rays_per_beam)
+        radius = 0.5 * self.divergence_rad * ((k + 0.5) / self.rays_per_beam).sqrt()
+        ahead = beams.dir_ego[..., None, :]
+        up = torch.tensor([0.0, 0.0, 1.0]).expand_as(ahead)
+        level = torch.nn.functional.normalize(ahead.cross(up, dim=-1), dim=-1)
+        upright = level.cross(ahead, dim=-1)
+        aside = (k * GOLDEN_ANGLE_RAD).cos()[:, None] * level + (k * GOLDEN_ANGLE_RAD).sin()[
+            :, None
+        ] * upright
+        direction = radius.cos()[:, None] * ahead + radius.sin()[:, None] * aside
+        return TimedRays(
+            origin_ego=beams.origin_ego.repeat_interleave(self.rays_per_beam, dim=0),
+            dir_ego=direction.flatten(0, 1),
+            dt_s=beams.dt_s.repeat_interleave(self.rays_per_beam),
         )

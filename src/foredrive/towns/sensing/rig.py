@@ -1,13 +1,15 @@
 """The recording vehicle's sensors: six cameras like nuScenes', and a spinning lidar on the roof."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.errors import InputError
 from foredrive.scene import CameraRig
-from foredrive.sensors import SpinningLidar
+from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
 
 _MOUNTS = {
     "PCAM_F0": ((1.70, 0.00, 1.60), 0.0, 70.0),
@@ -20,10 +22,19 @@ _MOUNTS = {
 """Position in the ego frame (m), heading and horizontal field of view (degrees), by 123D's camera names."""
 _EGO_FROM_CAM_AXES = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _LIDAR_XYZ_M = (0.94, 0.0, 1.84)
+LIDARS: dict[str, Callable[[Float[Tensor, "4 4"], float], SpinningLidar]] = {
+    "hdl32e": hdl32e,
+    "pandar64": pandar64,
+    "vlp16": vlp16,
+}
+"""Real lidars by name, made of where they are mounted and how often a second they turn."""
 
 
-def camera_rig(size_hw: tuple[int, int]) -> CameraRig:
-    """Six cameras all around, without leading dimensions; the principal point is the image's centre."""
+def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:
+    """Six cameras all around, without leading dimensions; the principal point is the image's centre.
+
+    Rows are read from the top within `readout_s`, the middle one at the frame's time; 0: a global shutter.
+    """
     height, width = size_hw
     K, T_ego_cam = [], []
     for xyz_m, heading_deg, fov_deg in _MOUNTS.values():
@@ -35,7 +46,7 @@ def camera_rig(size_hw: tuple[int, int]) -> CameraRig:
         K=torch.stack(K),
         T_ego_cam=torch.stack(T_ego_cam),
         dist=torch.zeros(count, 5),
-        readout_s=torch.zeros(count),
+        readout_s=torch.full((count,), readout_s),
         names=tuple(_MOUNTS),
         size_hw=size_hw,
     )
@@ -43,8 +54,6 @@ def camera_rig(size_hw: tuple[int, int]) -> CameraRig:
 
 def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:
     """A lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°); channel 0 looks lowest."""
-    T_ego_lidar = torch.eye(4)
-    T_ego_lidar[:3, 3] = torch.tensor(_LIDAR_XYZ_M)
     elevation_deg = torch.linspace(-30.67, 10.67, channels)
     return SpinningLidar(
         elevation_rad=tuple(elevation_deg.deg2rad().tolist()),
@@ -53,8 +62,25 @@ def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10
         min_range_m=1.0,
         max_range_m=100.0,
         range_noise_m=0.02,
-        T_ego_lidar=T_ego_lidar,
+        T_ego_lidar=_on_roof(),
     )
+
+
+def find_lidar(name: str, rate_hz: float = 10.0) -> SpinningLidar:
+    """A real lidar on the roof, one of `LIDARS`.
+
+    Raises:
+        InputError: there is no such lidar.
+    """
+    if name not in LIDARS:
+        raise InputError(f"no lidar {name!r}: one of {', '.join(LIDARS)}")
+    return LIDARS[name](_on_roof(), rate_hz)
+
+
+def _on_roof() -> Float[Tensor, "4 4"]:
+    T_ego_lidar = torch.eye(4)
+    T_ego_lidar[:3, 3] = torch.tensor(_LIDAR_XYZ_M)
+    return T_ego_lidar
 
 
 def _mount(xyz_m: tuple[float, float, float], heading_rad: float) -> Float[Tensor, "4 4"]:

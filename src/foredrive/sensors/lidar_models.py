@@ -1,0 +1,108 @@
+"""Lidars that are on real cars: channels, firing times and limits as their makers publish them.
+
+What no manual of theirs gives is taken to be typical: the divergence of the HDL-32E and the Pandar64 is that
+of Velodyne's VLP-16, and beams are round cones although those of real lasers are wider than high.
+"""
+
+import math
+
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.sensors.lidar import SpinningLidar
+
+_DIVERGENCE_RAD = 3.0e-3
+
+_PANDAR64_ELEVATION_DEG = (
+    *(14.882, 11.032, 8.059, 5.057, 3.040, 2.028, 1.860, 1.688, 1.522, 1.351, 1.184, 1.013, 0.846),
+    *(0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675, -0.845, -1.013, -1.184, -1.351),
+    *(-1.522, -1.688, -1.860, -2.028, -2.198, -2.365, -2.536, -2.700, -2.873, -3.040, -3.210, -3.375),
+    *(-3.548, -3.712, -3.884, -4.050, -4.221, -4.385, -4.558, -4.720, -4.892, -5.057, -5.229, -5.391),
+    *(-5.565, -5.726, -5.898, -6.061, -7.063, -8.059, -9.060, -9.885, -11.032, -12.006, -12.974, -13.930),
+    *(-18.889, -24.897),
+)
+_PANDAR64_CLOCKWISE_DEG = (
+    *(-1.042,) * 6,
+    *(1.042, 3.125, 5.208, -5.208, -3.125, -1.042) * 8,
+    *(-1.042,) * 10,
+)
+_PANDAR64_PAIRS = (
+    *((51, 61), (45, 60), (39, 57), (9, 55), (49, 63), (43, 59), (7, 56), (53, 64), (47, 62), (41, 58)),
+    *((6, 54), (5, 48), (4, 50), (3, 52), (2, 46), (1, 44), (24, 33), (27, 42), (21, 36), (15, 30)),
+    *((22, 37), (16, 31), (10, 25), (19, 34), (13, 28), (20, 35), (14, 29), (8, 23), (17, 32), (11, 26)),
+    *((18, 38), (12, 40)),
+)
+"""Lasers that fire together, those of the last pair first."""
+
+
+def pandar64(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
+    """Hesai's Pandar64, PandaSet's lidar: dense from -6° to 2°; channel 0 looks highest, as Hesai counts.
+
+    Angles, azimuth offsets and firing times of the user's manual, appendices I and II; each device comes with
+    a calibration of its own, off by some hundredths of a degree.
+    """
+    before_end_us = [0.0] * 64
+    for k, pair in enumerate(_PANDAR64_PAIRS):
+        for laser in pair:
+            before_end_us[laser - 1] = 1.304 * min(k, 15) + 1.968 * max(k - 15, 0)
+    first_us = max(before_end_us)
+    return SpinningLidar(
+        elevation_rad=_radians(_PANDAR64_ELEVATION_DEG),
+        azimuth_steps=round(18_000 / rate_hz),
+        rate_hz=rate_hz,
+        min_range_m=0.3,
+        max_range_m=200.0,
+        range_noise_m=0.02,
+        T_ego_lidar=T_ego_lidar,
+        firing_s=tuple(1e-6 * (first_us - us) for us in before_end_us),
+        azimuth_offset_rad=tuple(-x for x in _radians(_PANDAR64_CLOCKWISE_DEG)),
+        divergence_rad=_DIVERGENCE_RAD,
+    )
+
+
+def hdl32e(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
+    """Velodyne's HDL-32E, nuScenes' lidar (there at 20 Hz): -30.67° to 10.67°; channel 0 looks lowest.
+
+    User's manual: a laser fires every 1.152 µs, lower and upper half in turn, a column every 46.08 µs.
+    """
+    lowest_deg, step_deg = -92.0 / 3.0, 4.0 / 3.0
+    return SpinningLidar(
+        elevation_rad=_radians(tuple(lowest_deg + step_deg * ring for ring in range(32))),
+        azimuth_steps=round(1e6 / (46.08 * rate_hz)),
+        rate_hz=rate_hz,
+        min_range_m=1.0,
+        max_range_m=100.0,
+        range_noise_m=0.02,
+        T_ego_lidar=T_ego_lidar,
+        firing_s=_in_turn(32, 1.152e-6),
+        divergence_rad=_DIVERGENCE_RAD,
+    )
+
+
+def vlp16(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
+    """Velodyne's VLP-16: -15° to 15° in steps of 2°; channel 0 looks lowest.
+
+    User's manual: a laser fires every 2.304 µs, lower and upper half in turn, a column every 55.296 µs.
+    """
+    return SpinningLidar(
+        elevation_rad=_radians(tuple(-15.0 + 2.0 * ring for ring in range(16))),
+        azimuth_steps=round(1e6 / (55.296 * rate_hz)),
+        rate_hz=rate_hz,
+        min_range_m=1.0,
+        max_range_m=100.0,
+        range_noise_m=0.03,
+        T_ego_lidar=T_ego_lidar,
+        firing_s=_in_turn(16, 2.304e-6),
+        divergence_rad=_DIVERGENCE_RAD,
+    )
+
+
+def _radians(angles_deg: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(math.radians(a) for a in angles_deg)
+
+
+def _in_turn(channels: int, step_s: float) -> tuple[float, ...]:
+    """Firing times where the lower and the upper half of the channels take turns, each from below."""
+    half = channels // 2
+    order = [2 * ring if ring < half else 2 * (ring - half) + 1 for ring in range(channels)]
+    return tuple(step_s * k for k in order)
