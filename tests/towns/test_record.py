@@ -44,7 +44,7 @@ def digests(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def built_already(world02: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare building the town again, for which most of the time of a small recording goes."""
-    monkeypatch.setattr(recorder, "World", lambda town, seed: world02)
+    monkeypatch.setattr(recorder, "World", lambda town, seed, conditions: world02)
 
 
 @pytest.fixture(scope="module")

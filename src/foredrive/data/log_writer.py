@@ -5,14 +5,16 @@ import dataclasses
 import datetime
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Float, Float64, Int, UInt8, UInt16
 from py123d.api.scene.arrow.arrow_log_writer import ArrowLogWriter
 from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.api.scene.arrow.utils.route_utils import ROUTE_POSITION_KEY
@@ -25,7 +27,7 @@ from py123d.datatypes import (
     BoxDetectionSE3,
     BoxDetectionsSE3,
     Camera,
-    CameraID,
+    DefaultLidarSegmentationLabel,
     DynamicStateSE3,
     EgoStateSE3,
     EgoStateSE3Metadata,
@@ -35,23 +37,34 @@ from py123d.datatypes import (
     LogMetadata,
     MapMetadata,
     PinholeCameraMetadata,
-    PinholeIntrinsics,
     RouteMetadata,
     Timestamp,
 )
 from py123d.datatypes.custom.custom_modality import CustomModality, CustomModalityMetadata
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.modalities.base_modality import BaseModality
+from py123d.datatypes.sensors.base_camera import BaseCameraMetadata
 from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
 from py123d.parser.base_dataset_parser import ModalitiesSync
 from py123d.parser.registry import NuScenesBoxDetectionLabel as Label
 
+from foredrive.data.camera_streams import (
+    CameraSpec,
+    camera_ids,
+    camera_metadata,
+    depth_metadata,
+    instance_metadata,
+    semantic_metadata,
+)
 from foredrive.data.modalities import (
+    BOX_VISIBILITY,
+    CAPTION,
     LIDAR_BEAMS,
     FullOccupancy,
     occupancy_metadata,
     pack_beams,
     pack_occupancy,
+    pack_visibility,
 )
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
@@ -88,22 +101,6 @@ LABEL_OF_CATEGORY = {
 }
 """nuScenes' labels, which keep every category apart and which py123d reads without Foredrive."""
 
-_CAMERA_IDS_LEFT = (CameraID.PCAM_L0, CameraID.PCAM_L1, CameraID.PCAM_L2)
-_CAMERA_IDS_RIGHT = (CameraID.PCAM_R0, CameraID.PCAM_R1, CameraID.PCAM_R2)
-_CAMERA_IDS_SPARE = (CameraID.PCAM_STEREO_L, CameraID.PCAM_STEREO_R, CameraID.PCAM_D0)
-_AHEAD_RAD = np.deg2rad(22.5)
-
-
-@dataclass(frozen=True)
-class CameraSpec:
-    """A pinhole camera without distortion, fixed to the vehicle."""
-
-    name: str
-    K: Float[np.ndarray, "3 3"]
-    """px, pixel centres at +0.5."""
-    T_ego_cam: Float[np.ndarray, "4 4"]
-    size_hw: tuple[int, int]
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -119,9 +116,23 @@ class Frame:
     """Unbatched, in the ego frame at `t_us`, misses included."""
     boxes: Boxes
     """Unbatched, in the ego frame at `t_us`."""
+    _: KW_ONLY
     occupancy: FullOccupancy | None = None
     lidar_points: Int[np.ndarray, "M"] | None = None
     """Returns from each of `boxes`: 0 where it is hidden; None if they were not counted."""
+    visibility: Float[np.ndarray, "M"] | None = None
+    """Share of each of `boxes` that the cameras see of what they would if nothing hid it, 0 to 1."""
+    caption: str | None = None
+    depth_m: dict[str, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """Along the optical axis, by camera name; infinite for the sky."""
+    semantic: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """`DefaultCameraSegmentationLabel`s by camera name."""
+    instance: dict[str, UInt16[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """Track ids by camera name, 0 for what is in no box."""
+    beam_semantic: UInt8[np.ndarray, "N"] | None = None
+    """`DefaultLidarSegmentationLabel`s of the beams of `sweep`."""
+    beam_instance: UInt16[np.ndarray, "N"] | None = None
+    """Track ids, likewise."""
 
 
 class LogWriter:
@@ -156,7 +167,7 @@ class LogWriter:
             raise InputError(f"split {split!r} must be lower case and end in _train, _val or _test")
         self.folder = Path(root) / "logs" / split / log_name
         self._metadata = LogMetadata(DATASET, split, log_name, location, _map_metadata(map_dir, location))
-        self._cameras = {spec.name: (spec, _camera_metadata(spec, id_)) for spec, id_ in _camera_ids(cameras)}
+        self._cameras = {spec.name: (spec, camera_metadata(spec, id_)) for spec, id_ in camera_ids(cameras)}
         self._route_xyz = route_xyz
         self._stack = contextlib.ExitStack()
         self._lidar: LidarMetadata | None = None
@@ -200,11 +211,15 @@ class LogWriter:
             raise InputError(
                 f"{self.folder}: time runs backwards, {frame.t_us} µs after {self._previous.t_us} µs"
             )
-        modalities = [self._ego_state(frame), _boxes(frame), *self._images(frame)]
+        modalities = [self._ego_state(frame), _boxes(frame), *self._images(frame), *self._label_images(frame)]
         if frame.sweep is not None:
-            modalities += self._sweep(frame.t_us, frame.sweep)
+            modalities += self._sweep(frame, frame.sweep)
         if frame.occupancy is not None:
             modalities.append(self._occupancy(frame.t_us, frame.occupancy))
+        if frame.visibility is not None:
+            modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
+        if frame.caption is not None:
+            modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
         self._writer.write_sync(ModalitiesSync(Timestamp.from_us(frame.t_us), modalities))
         self._previous = frame
 
@@ -224,25 +239,42 @@ class LogWriter:
             ),
         )
 
-    def _images(self, frame: Frame) -> list[BaseModality]:
-        cameras: list[BaseModality] = []
+    def _images(self, frame: Frame) -> Iterator[Camera]:
         for name, image in frame.images.items():
-            if name not in self._cameras:
-                raise InputError(f"{self.folder}: image of camera {name!r}, which was not declared")
-            spec, metadata = self._cameras[name]
-            if image.shape[:2] != tuple(spec.size_hw):
-                raise InputError(f"{self.folder}: image of {name} is {image.shape[:2]}, not {spec.size_hw}")
-            pose = _pose(frame.T_world_ego @ spec.T_ego_cam)
-            cameras.append(Camera(metadata, image, pose, Timestamp.from_us(frame.t_us)))
-        return cameras
+            yield self._camera(frame, self._declared(name, image), image)
 
-    def _sweep(self, t_us: int, sweep: LidarSweep) -> list[BaseModality]:
-        returns = sweep[sweep.valid & sweep.returned]
+    def _label_images(self, frame: Frame) -> Iterator[Camera]:
+        for name, depth_m in frame.depth_m.items():
+            depth = depth_metadata(self._declared(name, depth_m))
+            yield self._camera(frame, depth, depth.encode_depth(depth_m))
+        for name, label in frame.semantic.items():
+            yield self._camera(frame, semantic_metadata(self._declared(name, label)), label)
+        for name, track_id in frame.instance.items():
+            yield self._camera(frame, instance_metadata(self._declared(name, track_id)), track_id)
+
+    def _declared(self, name: str, image: np.ndarray) -> PinholeCameraMetadata:
+        """The camera that an image is of."""
+        if name not in self._cameras:
+            raise InputError(f"{self.folder}: image of camera {name!r}, which was not declared")
+        spec, metadata = self._cameras[name]
+        if image.shape[:2] != tuple(spec.size_hw):
+            raise InputError(f"{self.folder}: image of {name} is {image.shape[:2]}, not {spec.size_hw}")
+        return metadata
+
+    def _camera(self, frame: Frame, metadata: BaseCameraMetadata, image: np.ndarray) -> Camera:
+        spec, _ = self._cameras[metadata.camera_name]
+        pose = _pose(frame.T_world_ego @ spec.T_ego_cam)
+        return Camera(metadata, image, pose, Timestamp.from_us(frame.t_us))
+
+    def _sweep(self, frame: Frame, sweep: LidarSweep) -> list[BaseModality]:
+        t_us, kept = frame.t_us, sweep.valid & sweep.returned
+        returns = sweep[kept]
         if (returns.beam > 255).any():
             raise InputError(f"{self.folder}: 123D holds lidar channels 0 to 255")
         if self._lidar is None:  # static extrinsics, from the beam nearest the frame's time
             position = sweep.origin_ego[sweep.dt_s.abs().argmin()].tolist() if len(sweep.dt_s) else [0, 0, 0]
-            self._lidar = LidarMetadata("lidar", LidarID.LIDAR_TOP, PoseSE3(*position, 1, 0, 0, 0))
+            classes = None if frame.beam_semantic is None else DefaultLidarSegmentationLabel
+            self._lidar = LidarMetadata("lidar", LidarID.LIDAR_TOP, PoseSE3(*position, 1, 0, 0, 0), classes)
         dt_us = np.round(returns.dt_s.numpy().astype(np.float64) * 1e6).astype(np.int64)
         features = {
             "intensity": np.round(returns.intensity.numpy() * 255).astype(np.uint8),
@@ -250,6 +282,10 @@ class LogWriter:
         }
         if (returns.beam >= 0).all():
             features["channel"] = returns.beam.numpy().astype(np.uint8)
+        if frame.beam_semantic is not None:
+            features["semantic"] = frame.beam_semantic[kept.numpy()]
+        if frame.beam_instance is not None:
+            features["instance"] = frame.beam_instance[kept.numpy()]
         seen_us = sweep.dt_s[sweep.valid].double() * 1e6
         start_us, end_us = (int(seen_us.min()), int(seen_us.max())) if len(seen_us) else (0, 0)
         lidar = Lidar(
@@ -259,10 +295,7 @@ class LogWriter:
             point_cloud_3d=returns.points_ego.numpy().astype(np.float32),
             point_cloud_features=features,
         )
-        beams = CustomModality(
-            pack_beams(sweep), CustomModalityMetadata(LIDAR_BEAMS), Timestamp.from_us(t_us)
-        )
-        return [lidar, beams]
+        return [lidar, _custom(frame, LIDAR_BEAMS, pack_beams(sweep))]
 
     def _occupancy(self, t_us: int, occupancy: FullOccupancy) -> CustomModality:
         self._spec = self._spec or occupancy.spec
@@ -297,6 +330,10 @@ def _boxes(frame: Frame) -> BoxDetectionsSE3:
     return BoxDetectionsSE3(detections, Timestamp.from_us(frame.t_us), metadata)
 
 
+def _custom(frame: Frame, kind: str, data: dict[str, Any]) -> CustomModality:
+    return CustomModality(data, CustomModalityMetadata(kind), Timestamp.from_us(frame.t_us))
+
+
 def _pose(T: Float64[np.ndarray, "4 4"]) -> PoseSE3:
     return PoseSE3.from_transformation_matrix(T)
 
@@ -309,48 +346,6 @@ def _map_metadata(map_dir: Path | None, location: str | None) -> MapMetadata | N
         raise InputError(f"{file}: no such map; write the town's map before its logs")
     with pa.memory_map(str(file)) as source:
         return get_metadata_from_arrow_schema(pa.ipc.open_file(source).schema, MapMetadata)
-
-
-def _camera_metadata(spec: CameraSpec, camera_id: CameraID) -> PinholeCameraMetadata:
-    return PinholeCameraMetadata(
-        camera_name=spec.name,
-        camera_id=camera_id,
-        intrinsics=PinholeIntrinsics.from_camera_matrix(spec.K.astype(np.float64)),
-        distortion=None,
-        width=spec.size_hw[1],
-        height=spec.size_hw[0],
-        camera_to_imu_se3=_pose(spec.T_ego_cam.astype(np.float64)),
-        is_undistorted=True,
-    )
-
-
-def _camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
-    """Give each camera a 123D id by where it looks: ahead, behind, left and right from front to back."""
-    azimuth = {c.name: float(np.arctan2(c.T_ego_cam[1, 2], c.T_ego_cam[0, 2])) for c in cameras}
-    spare = [*_CAMERA_IDS_SPARE, *_CAMERA_IDS_LEFT[::-1], *_CAMERA_IDS_RIGHT[::-1]]
-    if len(azimuth) < len(cameras):
-        raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
-    taken: dict[CameraID, CameraSpec] = {}
-    left_over = []
-    for camera in sorted(cameras, key=lambda c: abs(azimuth[c.name])):
-        angle = azimuth[camera.name]
-        if abs(angle) <= _AHEAD_RAD:
-            wanted: tuple[CameraID, ...] = (CameraID.PCAM_F0,)
-        elif abs(angle) >= np.pi - _AHEAD_RAD:
-            wanted = (CameraID.PCAM_B0,)
-        else:
-            wanted = _CAMERA_IDS_LEFT if angle > 0 else _CAMERA_IDS_RIGHT
-        free = [id_ for id_ in wanted if id_ not in taken]
-        if free:
-            taken[free[0]] = camera
-        else:
-            left_over.append(camera)
-    for camera in left_over:
-        free = [id_ for id_ in spare if id_ not in taken]
-        if not free:
-            raise InputError(f"123D names at most 11 cameras, got {len(cameras)}")
-        taken[free[0]] = camera
-    return [(camera, id_) for id_, camera in taken.items()]
 
 
 def _date_route_by(folder: Path, t_us: int) -> None:

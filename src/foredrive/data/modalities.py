@@ -1,6 +1,6 @@
-"""What Foredrive adds to 123D's modalities: beams that did not return, and exact occupancy with flow.
+"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility, captions.
 
-Both travel as 123D custom modalities, one row a frame; arrays are zstd-compressed one by one, so that a row
+All travel as 123D custom modalities, one row a frame; arrays are zstd-compressed one by one, so that a row
 can be read without touching its neighbours.
 """
 
@@ -18,6 +18,9 @@ from foredrive.scene import LidarSweep, VoxelSpec
 
 LIDAR_BEAMS = "lidar_beams"
 FULL_OCCUPANCY = "full_occupancy"
+BOX_VISIBILITY = "box_visibility"
+CAPTION = "caption"
+"""One text a frame."""
 
 _ORIGIN_STEP_M = 1e-4
 _DIRECTION_STEP = 1 / 32767
@@ -112,6 +115,16 @@ def unpack_occupancy(data: dict[str, Any], metadata: CustomModalityMetadata) -> 
         category=expand_array(data["category"]).astype(np.int64),
         velocity_mps=expand_array(data["velocity_mps"]).astype(np.float32),
     )
+
+
+def pack_visibility(visibility: Float[np.ndarray, "M"]) -> dict[str, Any]:
+    """Visibilities in the order of the frame's boxes, kept to .0005."""
+    return {"visibility": squeeze_array(visibility.astype(np.float16))}
+
+
+def unpack_visibility(data: dict[str, Any]) -> Float[np.ndarray, "M"]:
+    """Inverse of `pack_visibility`."""
+    return expand_array(data["visibility"]).astype(np.float32)
 
 
 def squeeze_array(array: np.ndarray) -> dict[str, Any]:

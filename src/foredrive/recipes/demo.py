@@ -10,7 +10,7 @@ from foredrive.recipes.config import Recipe, Stage
 from foredrive.recipes.evaluate import evaluate_run
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.recipes.train import Run, train_run
-from foredrive.towns.recorder import record, split_of
+from foredrive.towns.recorder import LabelKinds, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
@@ -85,4 +85,12 @@ def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
     if there.is_dir():  # logs are whole or not there
         return LogPath(there, folder / "maps")
     sensors = SensorSuite(camera_rig(nemo_tiny().clips.image_hw), roof_lidar())
-    return record(town, seconds, seed, folder, rate_hz=RATE_HZ, sensors=sensors, occupancy=None)
+    return record(
+        town,
+        seconds,
+        seed,
+        folder,
+        rate_hz=RATE_HZ,
+        sensors=sensors,
+        labels=LabelKinds(occupancy=None, captions=False),
+    )

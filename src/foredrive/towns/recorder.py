@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,12 +19,19 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
+from foredrive.towns.labels.semantics import (
+    CategoryOfTrack,
+    camera_labels,
+    instance_labels,
+    lidar_labels,
+    z_depth,
+)
 from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive, Moment
 from foredrive.towns.traffic.traffic import Traffic
-from foredrive.towns.world import World
+from foredrive.towns.world import SensorFrame, World
 
 FIRST_TIME_US = 1_577_836_800_000_000
 """Midnight of 1 January 2020 UTC: a log's time must not depend on when it was made."""
@@ -42,6 +50,21 @@ class Crowd:
     """Where the town has walkways."""
 
 
+@dataclass(frozen=True)
+class LabelKinds:
+    """Which exact labels a recording carries, besides boxes with their lidar points and visibility."""
+
+    occupancy: VoxelSpec | None = OCCUPANCY
+    """Grid of the occupancy with flow, seen or not."""
+    depth: bool = False
+    """Images."""
+    semantic: bool = False
+    """Images, and a label for each lidar return."""
+    instance: bool = False
+    """Track ids as images, and for each lidar return."""
+    captions: bool = True
+
+
 def split_of(town: str) -> str:
     """The 123D split that recordings of a town belong to."""
     return "town_test" if town in TEST_TOWNS else "town_train"
@@ -55,7 +78,7 @@ def record(
     rate_hz: float = 10.0,
     sensors: SensorSuite | None = None,
     crowd: Crowd | None = None,
-    occupancy: VoxelSpec | None = OCCUPANCY,
+    labels: LabelKinds | None = None,
     conditions: Conditions | None = None,
     log_name: str | None = None,
 ) -> LogPath:
@@ -63,7 +86,7 @@ def record(
 
     The log lies at out/logs/SPLIT/NAME and replaces one of that name; the map, once for all logs of the
     town, at out/maps. Boxes are those of all road users within `BOXES_WITHIN_M`, parked cars included; the
-    number of lidar returns from each tells hidden ones from visible ones.
+    number of lidar returns from each, and how much of it the cameras see, tell hidden ones from visible ones.
 
     Args:
         town: one of `TOWNS`.
@@ -73,7 +96,7 @@ def record(
         rate_hz: frames per second.
         sensors: six cameras of 144 × 256 px and 32 × 720 beams by default.
         crowd: `Crowd()` by default.
-        occupancy: grid of the exact occupancy with flow; None leaves it out.
+        labels: `LabelKinds()` by default.
         conditions: time of day and weather; None draws bright daylight from the seed.
         log_name: TOWN_seedN by default.
 
@@ -90,12 +113,13 @@ def record(
     town_map = load_town_map(town)
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
     crowd = crowd or Crowd()
+    labels = labels or LabelKinds()
     world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
     drive = Drive(traffic, seconds)
     maps = write_map(_map_objects(town), town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
-    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, occupancy, seed)
+    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, labels, seed)
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
         for frame in track(frames, description=f"recording {name}", total=count):
@@ -113,10 +137,9 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
 
 
 def _frames(
-    world: World, moments: Iterator[Moment], sensors: SensorSuite, spec: VoxelSpec | None, seed: int
+    world: World, moments: Iterator[Moment], sensors: SensorSuite, labels: LabelKinds, seed: int
 ) -> Iterator[Frame]:
     for index, moment in enumerate(moments):
-        actors = [*moment.actors, *world.parked]
         seen = world.render(
             moment.actors,
             sensors,
@@ -125,8 +148,10 @@ def _frames(
             noise_seed=np.random.SeedSequence((seed, index)).generate_state(1)[0].item(),
             lights=moment.lights,
         )
-        near = [a for a in actors if _distance_m(a, moment) < BOXES_WITHIN_M]
+        everyone = [*moment.actors, *world.parked]
+        near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
         returned = seen.beam_ids[seen.sweep.returned.numpy()]
+        spec = labels.occupancy
         yield Frame(
             t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
             T_world_ego=moment.T_world_ego,
@@ -137,7 +162,30 @@ def _frames(
             boxes=boxes_of(near, moment.T_world_ego),
             occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
             lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
+            visibility=world.visibility(near, sensors, moment.T_world_ego, seen),
+            **_ray_labels(seen, everyone, sensors, labels),
         )
+
+
+def _ray_labels(
+    seen: SensorFrame, actors: list[ActorState], sensors: SensorSuite, labels: LabelKinds
+) -> dict[str, Any]:
+    """Labels of pixels and beams, by the names they have in `Frame`."""
+    out: dict[str, Any] = {}
+    names = list(seen.images)
+    if labels.depth:
+        range_m = np.stack(list(seen.pixel_range_m.values()))
+        out["depth_m"] = dict(zip(names, z_depth(range_m, sensors.pixel_rays[1], sensors.rig), strict=True))
+    if labels.semantic:
+        kinds = CategoryOfTrack(actors)
+        out["semantic"] = {
+            name: camera_labels(seen.pixel_surface[name], kinds[seen.pixel_ids[name]]) for name in names
+        }
+        out["beam_semantic"] = lidar_labels(seen.beam_surface, kinds[seen.beam_ids])
+    if labels.instance:
+        out["instance"] = {name: instance_labels(seen.pixel_ids[name]) for name in names}
+        out["beam_instance"] = instance_labels(seen.beam_ids)
+    return out
 
 
 def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:

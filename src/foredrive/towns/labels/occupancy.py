@@ -29,6 +29,7 @@ _PRIORITY = {
     Surface.BUILDING: 6,
     Surface.POLE: 7,
     Surface.SIGN: 8,
+    Surface.SIGNAL: 9,
 }
 """What a voxel is that holds several things: the highest."""
 _CODE = np.array([_PRIORITY.get(surface, 0) for surface in Surface])

@@ -1,0 +1,96 @@
+"""Cameras as 123D describes them: their ids, geometry, and the label images that share it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from py123d.datatypes import (
+    CameraChannelType,
+    CameraID,
+    DefaultCameraSegmentationLabel,
+    DepthCameraMetadata,
+    PinholeCameraMetadata,
+    PinholeIntrinsics,
+    SegmentationCameraMetadata,
+)
+from py123d.geometry import PoseSE3
+
+from foredrive.errors import InputError
+
+DEPTH_STEP_M = 0.01
+_DEPTH_CODES = 2**16 - 2
+"""0 means that there is no depth."""
+
+_CAMERA_IDS_LEFT = (CameraID.PCAM_L0, CameraID.PCAM_L1, CameraID.PCAM_L2)
+_CAMERA_IDS_RIGHT = (CameraID.PCAM_R0, CameraID.PCAM_R1, CameraID.PCAM_R2)
+_CAMERA_IDS_SPARE = (CameraID.PCAM_STEREO_L, CameraID.PCAM_STEREO_R, CameraID.PCAM_D0)
+_AHEAD_RAD = np.deg2rad(22.5)
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A pinhole camera without distortion, fixed to the vehicle."""
+
+    name: str
+    K: Float[np.ndarray, "3 3"]
+    """px, pixel centres at +0.5."""
+    T_ego_cam: Float[np.ndarray, "4 4"]
+    size_hw: tuple[int, int]
+
+
+def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> PinholeCameraMetadata:
+    """123D's description of a camera."""
+    return PinholeCameraMetadata(
+        camera_name=spec.name,
+        camera_id=camera_id,
+        intrinsics=PinholeIntrinsics.from_camera_matrix(spec.K.astype(np.float64)),
+        distortion=None,
+        width=spec.size_hw[1],
+        height=spec.size_hw[0],
+        camera_to_imu_se3=PoseSE3.from_transformation_matrix(spec.T_ego_cam.astype(np.float64)),
+        is_undistorted=True,
+    )
+
+
+def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
+    """Give each camera a 123D id by where it looks: ahead, behind, left and right from front to back."""
+    azimuth = {c.name: float(np.arctan2(c.T_ego_cam[1, 2], c.T_ego_cam[0, 2])) for c in cameras}
+    spare = [*_CAMERA_IDS_SPARE, *_CAMERA_IDS_LEFT[::-1], *_CAMERA_IDS_RIGHT[::-1]]
+    if len(azimuth) < len(cameras):
+        raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
+    taken: dict[CameraID, CameraSpec] = {}
+    left_over = []
+    for camera in sorted(cameras, key=lambda c: abs(azimuth[c.name])):
+        angle = azimuth[camera.name]
+        if abs(angle) <= _AHEAD_RAD:
+            wanted: tuple[CameraID, ...] = (CameraID.PCAM_F0,)
+        elif abs(angle) >= np.pi - _AHEAD_RAD:
+            wanted = (CameraID.PCAM_B0,)
+        else:
+            wanted = _CAMERA_IDS_LEFT if angle > 0 else _CAMERA_IDS_RIGHT
+        free = [id_ for id_ in wanted if id_ not in taken]
+        if free:
+            taken[free[0]] = camera
+        else:
+            left_over.append(camera)
+    for camera in left_over:
+        free = [id_ for id_ in spare if id_ not in taken]
+        if not free:
+            raise InputError(f"123D names at most 11 cameras, got {len(cameras)}")
+        taken[free[0]] = camera
+    return [(camera, id_) for id_, camera in taken.items()]
+
+
+def depth_metadata(camera: PinholeCameraMetadata) -> DepthCameraMetadata:
+    """Depth along the optical axis in steps of `DEPTH_STEP_M`, up to 655 m; the sky has none (NaN)."""
+    return DepthCameraMetadata(camera, max_depth=DEPTH_STEP_M * _DEPTH_CODES, has_invalid=True)
+
+
+def semantic_metadata(camera: PinholeCameraMetadata) -> SegmentationCameraMetadata:
+    """Pixels labelled by 123D's own classes."""
+    return SegmentationCameraMetadata(camera, DefaultCameraSegmentationLabel, CameraChannelType.SEMANTIC)
+
+
+def instance_metadata(camera: PinholeCameraMetadata) -> SegmentationCameraMetadata:
+    """Pixels labelled by the track ids of the boxes, 0 for what is in none."""
+    return SegmentationCameraMetadata(camera, DefaultCameraSegmentationLabel, CameraChannelType.INSTANCE)

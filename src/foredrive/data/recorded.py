@@ -1,0 +1,54 @@
+"""Exact labels that recordings carry beyond 123D's own modalities."""
+
+from jaxtyping import Float
+from py123d.datatypes.custom.custom_modality import CustomModality
+from torch import Tensor, from_numpy
+
+from foredrive.data.arrow_files import reading
+from foredrive.data.logs import Log
+from foredrive.data.modalities import (
+    BOX_VISIBILITY,
+    CAPTION,
+    FULL_OCCUPANCY,
+    FullOccupancy,
+    unpack_occupancy,
+    unpack_visibility,
+)
+
+
+def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
+    """How much of each box of `read_boxes` the cameras see, 0 to 1; None if it was not recorded.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    with reading(log.file(f"custom.{BOX_VISIBILITY}"), f"the visibility at frame {frame}"):
+        row = _row(log, frame, BOX_VISIBILITY)
+        return None if row is None else from_numpy(unpack_visibility(row.data))
+
+
+def read_caption(log: Log, frame: int) -> str | None:
+    """What the cameras see in plain English; None if it was not recorded.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    with reading(log.file(f"custom.{CAPTION}"), f"the caption at frame {frame}"):
+        row = _row(log, frame, CAPTION)
+        return None if row is None else str(row.data["text"])
+
+
+def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
+    """Every occupied voxel, seen or not, in the frame's ego frame; None if it was not recorded.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    with reading(log.file(f"custom.{FULL_OCCUPANCY}"), f"the occupancy at frame {frame}"):
+        row = _row(log, frame, FULL_OCCUPANCY)
+        return None if row is None else unpack_occupancy(row.data, row.metadata)
+
+
+def _row(log: Log, frame: int, kind: str) -> CustomModality | None:
+    row = log.scene.get_custom_modality_at_iteration(log.iteration(frame), kind)
+    return row if isinstance(row, CustomModality) else None

@@ -1,0 +1,86 @@
+"""How much of each road user the cameras see, of what they would see if nothing stood in the way."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int, Int64
+
+from foredrive.towns.actors import ActorState
+from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
+from foredrive.towns.sensing.capture import SensorSuite
+
+RAYS_PER_CAMERA = 1024
+"""A road user that fills more of an image is judged by an even grid of about this many of its pixels."""
+NEAR_M = 0.1
+_CORNERS = np.array([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def visibility(
+    actors: Sequence[tuple[ActorState, Shape]],
+    sensors: SensorSuite,
+    T_world_ego: Float64[np.ndarray, "4 4"],
+    pixel_ids: Int[np.ndarray, "C H W"],
+) -> Float32[np.ndarray, "M"]:
+    """Share of each road user's silhouette, over all images, that is seen: 0 hidden to 1 in full view.
+
+    The silhouette is that of its shape alone, by the same rays as the images': what lies beyond the images'
+    borders does not count, and one that fills no pixel's centre has 0. nuScenes' visibility levels are this
+    share cut at .4, .6 and .8.
+
+    Args:
+        pixel_ids: the track id that each pixel shows.
+    """
+    out = np.zeros(len(actors), dtype=np.float32)
+    seen = np.isin([actor.track_id for actor, _ in actors], np.unique(pixel_ids))
+    if not seen.any():
+        return out
+    rows: list[int] = np.flatnonzero(seen).tolist()
+    T_ego_unit = np.linalg.inv(T_world_ego) @ np.array([unit_to_world(actors[m][0]) for m in rows])
+    windows = _windows(T_ego_unit, sensors)
+    flat_ids, (origin, direction) = pixel_ids.ravel(), sensors.pixel_rays
+    for m, T, of_cameras in zip(rows, np.linalg.inv(T_ego_unit), windows, strict=True):
+        actor, shape = actors[m]
+        pixels, weight = _pixels(of_cameras, sensors.rig.size_hw)
+        R = T[:3, :3].T.astype(np.float32)
+        unit = origin[pixels] @ R + T[:3, 3].astype(np.float32), direction[pixels] @ R
+        filled = shape.scene.occluded(*unit) * weight
+        if filled.any():
+            out[m] = (filled * (flat_ids[pixels] == actor.track_id)).sum() / filled.sum()
+    return out
+
+
+def _windows(T_ego_unit: Float64[np.ndarray, "M 4 4"], sensors: SensorSuite) -> Int64[np.ndarray, "M C 4"]:
+    """Rows and columns, from and up to, that hold each unit box in each image; empty where it is not."""
+    rig = sensors.rig
+    height, width = rig.size_hw
+    T_cam_ego = np.linalg.inv(rig.T_ego_cam.double().numpy())
+    corners = np.einsum("cij,mjk,nk->mcni", T_cam_ego, T_ego_unit, _CORNERS)[..., :3]
+    depth = corners[..., 2]
+    K = rig.K.double().numpy()
+    uvw = np.einsum("cij,mcnj->mcni", K, corners)
+    uv = uvw[..., :2] / np.maximum(uvw[..., 2:], NEAR_M)
+    low, high = np.floor(uv.min(axis=2)) - 1, np.ceil(uv.max(axis=2)) + 1
+    across = (depth.min(axis=-1) < NEAR_M)[..., None]  # it reaches behind the camera: the whole image
+    size = np.array([width, height])
+    low = np.where(across, 0, low.clip(0, size))
+    high = np.where(across, size, high.clip(0, size))
+    high = np.where((depth.max(axis=-1) < NEAR_M)[..., None], low, high)
+    return np.stack([low[..., 1], high[..., 1], low[..., 0], high[..., 0]], axis=-1).astype(np.int64)
+
+
+def _pixels(
+    windows: Int64[np.ndarray, "C 4"], size_hw: tuple[int, int]
+) -> tuple[Int64[np.ndarray, "P"], Float32[np.ndarray, "P"]]:
+    """Flat indices of the pixels to look through, and how many pixels each stands for."""
+    height, width = size_hw
+    pixels, weights = [], []
+    for c, (top, bottom, left, right) in enumerate(windows.tolist()):
+        area = max(0, bottom - top) * max(0, right - left)
+        if area:
+            step = max(1, int(np.ceil((area / RAYS_PER_CAMERA) ** 0.5)))
+            rows, columns = np.arange(top, bottom, step), np.arange(left, right, step)
+            pixels.append(((c * height + rows[:, None]) * width + columns).ravel())
+            weights.append(np.full(len(rows) * len(columns), step**2, dtype=np.float32))
+    if not pixels:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.float32)
+    return np.concatenate(pixels), np.concatenate(weights)
