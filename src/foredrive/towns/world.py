@@ -92,7 +92,7 @@ class World:
         self.town = town
         self.conditions = conditions or draw_daylight(weather_rng)
         self.light = make_light(self.conditions, east_rad=float(weather_rng.uniform(0.0, 2.0 * np.pi)))
-        self._shapes = make_shape_library(table)
+        self._shapes = make_shape_library(table, chosen)
         self.static = build_static(town, table, self._shapes, chosen, rng)
         self._looks = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)

@@ -39,7 +39,7 @@ class Assets:
     needles: Palette
     trees: tuple[str, ...]
     vehicles: tuple[str, ...]
-    """Shapes: names in `actor_meshes.BUILDERS`."""
+    """Shapes: names in `actor_meshes.VEHICLES`."""
     car_paints: Palette
     cargo_paints: Palette
     bus_paints: Palette
@@ -137,7 +137,7 @@ _TEST = Assets(
         "crossover",
         "people_carrier",
         "panel_van",
-        "flatbed",
+        "tanker",
         "coach",
         "scooter",
         "city_bike",

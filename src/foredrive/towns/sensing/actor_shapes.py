@@ -7,9 +7,12 @@ from jaxtyping import Float, Int32
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.place.actor_meshes import BUILDERS, PEDESTRIAN_BOX, MeshLooks
+from foredrive.towns.place.actor_looks import MeshLooks
+from foredrive.towns.place.actor_meshes import DRESSES, PEOPLE, SHAPES_OF_KIND, THINGS, VEHICLES
+from foredrive.towns.place.assets import Assets, Palette
 from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join
+from foredrive.towns.place.people_meshes import PEDESTRIAN_BOX, POSES
 from foredrive.towns.sensing.columns import Intervals
 from foredrive.towns.sensing.raycast import TriangleScene
 from foredrive.towns.sensing.shading import MISS
@@ -17,54 +20,20 @@ from foredrive.towns.sensing.shading import MISS
 SLOTS = 3
 SOLID_CELL_M = 0.15
 """Shapes are sampled about this finely for occupancy."""
-_USUAL_SIZE_M = {"bus": (11.0, 2.6), "truck": (8.5, 2.6), "van": (6.0, 2.1)}
-VAN_LENGTH_M, VAN_HEIGHT_M = 5.0, 1.9
+_USUAL_SIZE_M = {
+    "bus": (11.0, 2.6),
+    "coach": (11.0, 2.6),
+    "truck": (8.5, 2.6),
+    "tanker": (8.5, 2.6),
+    "van": (6.0, 2.1),
+    "panel_van": (6.0, 2.1),
+}
+VAN_LENGTH_M, VAN_HEIGHT_M, HIGH_CAR_M = 5.0, 1.9, 1.58
 STRIDE_M = 1.4
+"""Length of a double step."""
 WALKING_MPS = 0.3
-WALK_POSES = 4
 
-Palette = tuple[tuple[float, float, float], ...]
-_CAR_PAINTS: Palette = (
-    (0.93, 0.93, 0.93),
-    (0.08, 0.08, 0.09),
-    (0.45, 0.46, 0.48),
-    (0.72, 0.73, 0.75),
-    (0.60, 0.08, 0.08),
-    (0.10, 0.20, 0.45),
-    (0.20, 0.23, 0.26),
-    (0.85, 0.84, 0.80),
-    (0.12, 0.28, 0.20),
-    (0.40, 0.30, 0.22),
-    (0.82, 0.55, 0.10),
-    (0.30, 0.45, 0.62),
-)
-_CARGO_PAINTS: Palette = (
-    (0.90, 0.90, 0.88),
-    (0.75, 0.76, 0.74),
-    (0.20, 0.35, 0.60),
-    (0.80, 0.72, 0.30),
-    (0.62, 0.20, 0.16),
-)
-_BUS_PAINTS: Palette = (
-    (0.80, 0.15, 0.12),
-    (0.92, 0.92, 0.90),
-    (0.15, 0.35, 0.60),
-    (0.85, 0.70, 0.15),
-    (0.20, 0.50, 0.35),
-)
-_CLOTHES: Palette = (
-    (0.15, 0.16, 0.20),
-    (0.55, 0.12, 0.14),
-    (0.18, 0.30, 0.52),
-    (0.85, 0.83, 0.78),
-    (0.30, 0.42, 0.28),
-    (0.62, 0.52, 0.36),
-    (0.35, 0.36, 0.38),
-    (0.80, 0.62, 0.20),
-    (0.50, 0.32, 0.48),
-    (0.12, 0.12, 0.13),
-)
-_SKINS: Palette = ((0.90, 0.72, 0.60), (0.78, 0.57, 0.44), (0.55, 0.38, 0.28), (0.40, 0.27, 0.20))
+_SKINS = ((0.90, 0.72, 0.60), (0.78, 0.57, 0.44), (0.55, 0.38, 0.28), (0.40, 0.27, 0.20))
 
 
 @dataclass(frozen=True)
@@ -90,7 +59,13 @@ class ShapeLibrary:
 
     def shape_of(self, actor: ActorState) -> Shape:
         """The shape of a road user; one who walks is in one of a few poses."""
-        return self.shapes[shape_name(actor)]
+        if actor.category is Category.PEDESTRIAN:
+            return self.shapes[_person(actor)]
+        kind = _kind_of(actor)
+        if kind not in SHAPES_OF_KIND:
+            return self.shapes[kind]
+        options = [name for name in SHAPES_OF_KIND[kind] if name in self.shapes]
+        return self.shapes[options[actor.style % len(options)]]
 
     def paint_of(self, actor: ActorState) -> Int32[np.ndarray, "3"]:
         """Looks for the three paint slots."""
@@ -105,12 +80,13 @@ class ShapeLibrary:
         return np.array(chosen, dtype=np.int32)
 
 
-def make_shape_library(table: LookTable) -> ShapeLibrary:
-    """Build every shape once."""
+def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:
+    """Build every shape of the assets once."""
     looks = MeshLooks(table)
+    vehicles = {name: VEHICLES[name] for name in assets.vehicles}
     shapes, first = {}, 0
-    for name, build in BUILDERS.items():
-        mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name.startswith("pedestrian") else None)
+    for name, build in {**vehicles, **PEOPLE, **THINGS}.items():
+        mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name in PEOPLE else None)
         scene = TriangleScene(mesh)
         shapes[name] = Shape(scene, mesh, first, _solid(scene, _USUAL_SIZE_M.get(name, (5.0, 2.0))))
         first += len(mesh.look)
@@ -126,33 +102,35 @@ def make_shape_library(table: LookTable) -> ShapeLibrary:
         shapes=shapes,
         soup=join([shape.mesh for shape in shapes.values()]),
         paints={
-            "car": paints(_CAR_PAINTS, 0.07),
-            "cargo": paints(_CARGO_PAINTS, 0.02),
-            "bus": paints(_BUS_PAINTS, 0.05),
-            "clothes": paints(_CLOTHES, 0.0),
+            "car": paints(assets.car_paints, 0.07),
+            "cargo": paints(assets.cargo_paints, 0.02),
+            "bus": paints(assets.bus_paints, 0.05),
+            "clothes": paints(assets.clothes, 0.0),
             "skin": paints(_SKINS, 0.0),
         },
     )
 
 
-def shape_name(actor: ActorState) -> str:
-    """Which shape fits a road user."""
-    if actor.category is Category.PEDESTRIAN:
-        if np.linalg.norm(actor.velocity_mps) < WALKING_MPS:
-            return "pedestrian_standing"
-        along = actor.centre_m[0] * np.cos(actor.yaw) + actor.centre_m[1] * np.sin(actor.yaw)
-        return f"pedestrian_{int(along / STRIDE_M * WALK_POSES) % WALK_POSES}"
+def _person(actor: ActorState) -> str:
+    """Dress and pose: the legs follow the distance walked along the heading."""
+    dress = DRESSES[actor.style % len(DRESSES)]
+    if np.linalg.norm(actor.velocity_mps) < WALKING_MPS:
+        return f"{dress}_standing"
+    along = actor.centre_m[0] * np.cos(actor.yaw) + actor.centre_m[1] * np.sin(actor.yaw)
+    return f"{dress}_{int(along / STRIDE_M * POSES) % POSES}"
+
+
+def _kind_of(actor: ActorState) -> str:
+    """Which kind of shape fits a road user that is no pedestrian."""
     if actor.category is Category.CAR:
         length, _, height = actor.size_lwh
         if length > VAN_LENGTH_M and height > VAN_HEIGHT_M:
             return "van"
-        if height > 1.58:
-            return "suv"
-        return "hatchback" if actor.style % 3 == 0 else "sedan"
-    return _NAME_OF_CATEGORY.get(actor.category, "block")
+        return "high_car" if height > HIGH_CAR_M else "low_car"
+    return _KIND_OF_CATEGORY.get(actor.category, "block")
 
 
-_NAME_OF_CATEGORY = {
+_KIND_OF_CATEGORY = {
     Category.TRUCK: "truck",
     Category.BUS: "bus",
     Category.MOTORCYCLE: "motorcycle",

@@ -1,0 +1,31 @@
+"""Looks that road users share, and the slots that each one's own paint fills."""
+
+from dataclasses import dataclass
+
+from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+
+BODY, SECOND, THIRD = -1, -2, -3
+"""Look numbers that an actor's own paint replaces."""
+
+
+@dataclass
+class MeshLooks:
+    """Numbers of the looks that do not change from one road user to the next."""
+
+    table: LookTable
+
+    def __post_init__(self) -> None:
+        def add(texture: Texture, rgb: tuple[float, float, float], reflectivity: float, gloss: float) -> int:
+            return self.table.add(Look(Surface.VEHICLE, texture, rgb, reflectivity, gloss))
+
+        self.glass = add(Texture.GLASS, (0.05, 0.06, 0.07), 0.1, 0.05)
+        self.tyre = add(Texture.PLAIN, (0.07, 0.07, 0.07), 0.08, 0.0)
+        self.hub = add(Texture.PLAIN, (0.55, 0.56, 0.57), 0.5, 0.1)
+        self.dark = add(Texture.PLAIN, (0.12, 0.12, 0.13), 0.12, 0.0)
+        self.front_light = add(Texture.PLAIN, (0.95, 0.95, 0.92), 0.9, 0.15)
+        self.rear_light = add(Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08)
+        self.plate = add(Texture.PLAIN, (0.90, 0.90, 0.85), 1.0, 0.0)
+        self.orange = add(Texture.PLAIN, (0.95, 0.35, 0.08), 0.8, 0.0)
+        self.hair = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.16, 0.11, 0.08), 0.2))
+        self.helmet = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.12, 0.12, 0.13), 0.12))
+        self.tank = add(Texture.PLAIN, (0.45, 0.06, 0.05), 0.3, 0.08)

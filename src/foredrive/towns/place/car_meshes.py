@@ -1,0 +1,200 @@
+"""Meshes of cars, lofted through cross-sections: in metres, x ahead, standing on z = 0."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from foredrive.towns.place.actor_looks import BODY, MeshLooks
+from foredrive.towns.place.mesh import Mesh, box, frustum, join, quads, triangles
+
+HALF_WIDTH_M = 0.9
+PILLAR_M = 0.09
+_END_WIDTH = ((0.0, 0.84), (0.12, 0.94), (0.35, 1.0), (3.6, 1.0), (4.3, 0.95), (4.42, 0.84), (4.5, 0.7))
+"""Half the width as a share of the greatest, by the distance from the rear of a car of 4.5 m."""
+
+
+@dataclass(frozen=True)
+class CarForm:
+    """The side view of a car of 4.5 m whose front is at x = 2.25."""
+
+    deck: tuple[tuple[float, float], ...]
+    """x, z of the upper edge of the body from the rear to the front: boot, belt, bonnet."""
+    cabin: tuple[float, float, float, float]
+    """x of the rear window's foot, the roof's rear end, its front end and the windscreen's foot."""
+    roof_z: float
+    clearance_m: float = 0.2
+    cladding: bool = False
+    """Dark plastic around the sills, as on cars for rough roads."""
+    bed: bool = False
+    """A load bed behind the cabin."""
+
+
+FORMS = {
+    "sedan": CarForm(
+        ((-2.25, 0.8), (-2.15, 0.95), (-1.6, 1.0), (0.9, 0.95), (1.95, 0.82), (2.25, 0.62)),
+        (-1.7, -0.95, 0.2, 1.0),
+        1.45,
+    ),
+    "hatchback": CarForm(
+        ((-2.25, 0.75), (-2.2, 0.95), (-1.6, 1.0), (1.05, 0.97), (2.0, 0.84), (2.25, 0.62)),
+        (-2.17, -1.75, 0.3, 1.15),
+        1.5,
+    ),
+    "estate": CarForm(
+        ((-2.25, 0.8), (-2.2, 0.97), (-1.6, 0.99), (0.95, 0.95), (1.95, 0.82), (2.25, 0.62)),
+        (-2.2, -1.95, 0.2, 1.0),
+        1.48,
+    ),
+    "suv": CarForm(
+        ((-2.25, 0.9), (-2.2, 1.08), (-1.6, 1.1), (1.0, 1.06), (2.05, 0.98), (2.25, 0.72)),
+        (-2.18, -1.85, 0.3, 1.05),
+        1.7,
+        clearance_m=0.28,
+        cladding=True,
+    ),
+    "pickup": CarForm(
+        ((-2.25, 1.0), (-2.24, 1.06), (-0.85, 1.06), (1.0, 1.06), (2.05, 1.0), (2.25, 0.74)),
+        (-0.8, -0.7, 0.4, 1.0),
+        1.75,
+        clearance_m=0.32,
+        bed=True,
+    ),
+    "coupe": CarForm(
+        ((-2.25, 0.75), (-2.15, 0.95), (-1.7, 0.97), (0.6, 0.9), (1.9, 0.72), (2.25, 0.52)),
+        (-1.9, -0.65, -0.1, 0.85),
+        1.32,
+    ),
+    "compact": CarForm(
+        ((-2.25, 0.75), (-2.22, 1.05), (-1.6, 1.06), (1.25, 1.02), (2.05, 0.9), (2.25, 0.66)),
+        (-2.22, -2.0, 0.25, 1.5),
+        1.62,
+    ),
+    "crossover": CarForm(
+        ((-2.25, 0.85), (-2.15, 1.12), (-1.7, 1.12), (0.9, 1.02), (2.0, 0.9), (2.25, 0.68)),
+        (-2.1, -1.1, 0.1, 1.05),
+        1.62,
+        clearance_m=0.3,
+        cladding=True,
+    ),
+    "people_carrier": CarForm(
+        ((-2.25, 0.8), (-2.22, 1.0), (-1.6, 1.02), (1.35, 1.0), (2.05, 0.86), (2.25, 0.62)),
+        (-2.22, -2.1, 0.55, 1.6),
+        1.75,
+    ),
+}
+
+
+def loft(
+    x: Float[np.ndarray, "S"],
+    rings: Float[np.ndarray, "S K 2"],
+    looks: Sequence[Sequence[int]],
+    ends: tuple[int, int],
+) -> Mesh:
+    """A closed solid through S cross-sections, each K points (y, z) counter-clockwise seen from ahead.
+
+    Args:
+        looks: of each face, stretch by stretch from the rear, then around the ring from its first point on.
+        ends: looks of the rear and the front face.
+    """
+    xyz = np.concatenate([np.broadcast_to(x[:, None, None], (*rings.shape[:2], 1)), rings], axis=-1)
+    after = np.roll(xyz, -1, axis=1)
+    corners = np.stack([xyz[:-1], after[:-1], after[1:], xyz[1:]], axis=2).reshape(-1, 4, 3)
+    sides = quads(corners, 0)
+    look = np.repeat(np.array(looks, dtype=np.int32).ravel(), 2)
+    fans = []
+    for end, ring in zip(ends, (xyz[0, ::-1], xyz[-1]), strict=True):
+        hub = np.broadcast_to(ring.mean(axis=0), ring.shape)
+        fans.append(triangles(np.stack([hub, ring, np.roll(ring, -1, axis=0)], axis=1), end))
+    return join([Mesh(sides.xyz, sides.uvw, look), *fans])
+
+
+def wheels(
+    positions_m: Sequence[float], half_width: float, radius: float, looks: MeshLooks, arches: int | None
+) -> Mesh:
+    """Pairs of wheels; with arches of a look on a body of this half width."""
+    parts = []
+    for x in positions_m:
+        for side in (-1.0, 1.0):
+            outer, inner = side * (half_width + 0.012), side * (half_width - 0.22)
+            parts.append(frustum((x, inner, radius), (x, outer, radius), (radius, radius), 12, looks.tyre))
+            hub = (x, outer, radius), (x, outer + side * 0.012, radius)
+            parts.append(frustum(*hub, (0.62 * radius, 0.5 * radius), 7, looks.hub))
+            if arches is not None:
+                angle = np.linspace(0.0, np.pi, 9)
+                rim = np.stack([x + 1.2 * radius * np.cos(angle), radius + 1.2 * radius * np.sin(angle)], -1)
+                y = np.full((8, 1), side * (half_width + 0.004))
+                first, second = (np.insert(r, [1], y, axis=1) for r in (rim[:-1], rim[1:]))
+                hub_xyz = np.broadcast_to([x, side * (half_width + 0.004), radius], first.shape)
+                order = (hub_xyz, second, first) if side > 0 else (hub_xyz, first, second)
+                parts.append(triangles(np.stack(order, axis=1), arches))
+    return join(parts)
+
+
+def car(looks: MeshLooks, form: CarForm) -> Mesh:
+    """Body, cabin, wheels, lights, bumpers, plates and mirrors."""
+    w, rear, front = HALF_WIDTH_M, -2.25, 2.25
+    belt_z = float(np.interp(form.cabin[3], *np.array(form.deck).T))
+    parts = [
+        _body(looks, form),
+        _cabin(looks, form),
+        wheels((-1.38, 1.4), w - 0.01, 0.33, looks, looks.dark),
+        box((rear - 0.03, -0.7 * w, 0.3), (rear + 0.1, 0.7 * w, 0.48), looks.dark),
+        box((front - 0.2, -0.62 * w, 0.28), (front + 0.02, 0.62 * w, 0.5), looks.dark),
+        box((rear - 0.05, -0.26, 0.62), (rear + 0.02, 0.26, 0.73), looks.plate),
+        box((front - 0.05, -0.26, 0.36), (front + 0.04, 0.26, 0.47), looks.plate),
+    ]
+    nose_z, tail_z = form.deck[-1][1], form.deck[0][1]
+    for side in (-1.0, 1.0):
+        y0, y1 = sorted((side * 0.72 * w, side * 0.46 * w))
+        parts.append(
+            box((front - 0.16, y0, nose_z - 0.1), (front + 0.005, y1, nose_z + 0.03), looks.front_light)
+        )
+        y0, y1 = sorted((side * 0.87 * w, side * 0.62 * w))
+        parts.append(box((rear - 0.02, y0, tail_z - 0.14), (rear + 0.1, y1, tail_z + 0.02), looks.rear_light))
+        y0, y1 = sorted((side * (w - 0.06), side * (w + 0.1)))
+        mirror_x = form.cabin[3] - 0.4
+        parts.append(box((mirror_x - 0.1, y0, belt_z), (mirror_x + 0.05, y1, belt_z + 0.13), BODY))
+    if form.bed:
+        bed = (rear + 0.08, -w + 0.12, 1.0), (form.cabin[0] - 0.05, w - 0.12, 1.075)
+        parts.append(box(*bed, looks.dark))
+    return join(parts)
+
+
+def _body(looks: MeshLooks, form: CarForm) -> Mesh:
+    """From the sills up to the belt, the boot and the bonnet."""
+    from_rear, share = np.array(_END_WIDTH).T
+    deck_x, deck_z = np.array(form.deck).T
+    x = np.unique(np.concatenate([from_rear - 2.25, deck_x]).round(3))
+    half = HALF_WIDTH_M * np.interp(x, from_rear - 2.25, share)
+    top = np.interp(x, deck_x, deck_z)
+    low = form.clearance_m + 0.1 * (np.abs(x) > 2.1)
+    shoulder, sill = top - 0.09, low + 0.16
+    right = [(0.9 * half, low), (half, sill), (half, shoulder), (half - 0.09, top)]
+    ring = [*right, *((-y, z) for y, z in reversed(right))]
+    rings = np.stack([np.stack(np.broadcast_arrays(y, z), axis=-1) for y, z in ring], axis=1)
+    edge = looks.dark if form.cladding else BODY
+    around = [edge, BODY, BODY, BODY, BODY, BODY, edge, looks.dark]
+    return loft(x, rings, [around] * (len(x) - 1), (BODY, BODY))
+
+
+def _cabin(looks: MeshLooks, form: CarForm) -> Mesh:
+    """Windows between pillars, under a roof."""
+    a, b, c, d = form.cabin
+    middle = 0.5 * (b + c) - 0.1
+    x = np.array([a, b, b + PILLAR_M, middle, middle + PILLAR_M, c - 0.02, c, d])
+    deck_x, deck_z = np.array(form.deck).T
+    belt = np.interp(x, deck_x, deck_z) - 0.03
+    top = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0]) * (form.roof_z - belt - 0.04) + belt + 0.02
+    lean = (top - belt) / (form.roof_z - 0.95)
+    foot = np.full_like(x, HALF_WIDTH_M - 0.09)
+    eave = foot - 0.16 * lean
+    right = [(foot, belt), (eave, top), (eave - 0.08, top + 0.035 * lean.round())]
+    ring = [*right, *((-y, z) for y, z in reversed(right))]
+    rings = np.stack([np.stack([y, z], axis=-1) for y, z in ring], axis=1)
+    pane, post = looks.glass, BODY
+    sides = [pane, post, pane, post, pane, post, pane]
+    roofs = [pane, post, post, post, post, post, pane]
+    around = [[s, post, r, post, s, looks.dark] for s, r in zip(sides, roofs, strict=True)]
+    return loft(x, rings, around, (post, post))
