@@ -3,13 +3,15 @@
 import dataclasses
 import enum
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial import cKDTree
 
 from foredrive.scene import Command
-from foredrive.towns.map.town_map import Lane, StopZoneKind, TownMap
+from foredrive.towns.map.town_map import Lane, MarkingKind, StopZoneKind, TownMap
 from foredrive.towns.traffic.meetings import Meetings, find_meetings
 
 SAMPLE_M = 0.5
@@ -24,6 +26,15 @@ LATERAL_MPS2 = 2.0
 SLOWING_MPS2 = 1.5
 """Comfortable deceleration towards a curve or a lower limit."""
 WAITING_ROOM_M = 12.0
+ASIDE_M = 0.5
+NARROWEST_M = 2.8
+CROSSABLE = (
+    MarkingKind.NONE,
+    MarkingKind.BROKEN,
+    MarkingKind.BROKEN_BROKEN,
+    MarkingKind.BROKEN_SOLID,
+)
+"""Lines between lanes of one direction that may be crossed from the lane that they are seen from."""
 
 
 class Control(enum.IntEnum):
@@ -40,6 +51,18 @@ CONTROL_OF_ZONE = {
     StopZoneKind.STOP_SIGN: Control.STOP,
     StopZoneKind.YIELD_SIGN: Control.YIELD,
 }
+
+
+class Sides(NamedTuple):
+    """Left and right neighbours as kernels take them."""
+
+    lane: Int[np.ndarray, "2 L"]
+    """-1 for none."""
+    abreast_m: Float64[np.ndarray, "2 P"]
+    """Arc length on the neighbour of the point next to each sample of a lane."""
+    first: Int[np.ndarray, "L"]
+    sample_count: Int[np.ndarray, "L"]
+    step_m: Float64[np.ndarray, "L"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +92,9 @@ class LaneGraph:
     left: Int[np.ndarray, "L"]
     """Neighbour of the same direction, -1 for none; `right` likewise."""
     right: Int[np.ndarray, "L"]
+    sides: Sides
+    may_cross: Bool[np.ndarray, "2 L"]
+    """Whether one may change to the left, to the right neighbour: not over solid lines, not in junctions."""
     junction: Int[np.ndarray, "L"]
     """-1 outside junctions."""
     control: Int[np.ndarray, "L"]
@@ -117,7 +143,7 @@ class LaneGraph:
 def build_lane_graph(town: TownMap) -> LaneGraph:
     """Lane graph of a town."""
     lanes, index = _whole_connectors(town.lanes)
-    lines = [_resample(lane.centreline_xyz) for lane in lanes]
+    lines = [_resample(line) for line in _joined(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
     bends = [_bend(line) for line in lines]
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
@@ -127,6 +153,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
     groups = [lane.group_id for lane in lanes]
     siblings, conflicts = find_meetings(lines, length, successors, predecessors, junction, groups)
+    beside = np.array([[index.get(i or "", -1) for i in (lane.left_id, lane.right_id)] for lane in lanes]).T
     control, zone = _guards(town, index, len(lanes))
     return LaneGraph(
         ids=tuple(lane.lane_id for lane in lanes),
@@ -143,8 +170,10 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         successors=_padded(successors),
         successor_count=np.array([len(row) for row in successors]),
         predecessors=_padded(predecessors),
-        left=np.array([index.get(lane.left_id or "", -1) for lane in lanes]),
-        right=np.array([index.get(lane.right_id or "", -1) for lane in lanes]),
+        left=beside[0],
+        right=beside[1],
+        sides=_sides(lines, beside, count, length / (count - 1)),
+        may_cross=(junction < 0) & _crossable(lanes),
         junction=junction,
         control=control,
         zone=zone,
@@ -225,6 +254,20 @@ def _contested(
     return contested
 
 
+def _joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
+    """Centrelines, led over to where the next lane begins: where two lanes merge, that may be to the side."""
+    lines = [lane.centreline_xyz for lane in lanes]
+    for i, lane in enumerate(lanes):
+        starts = [lines[index[name]][0] for name in lane.successor_ids]
+        aside = min((start - lines[i][-1] for start in starts), key=np.linalg.norm, default=np.zeros(3))
+        if np.linalg.norm(aside) > ASIDE_M:
+            x = np.linspace(0.0, 1.0, 2 * len(lines[i]))[:, None]
+            every = np.linspace(0.0, len(lines[i]) - 1.0, len(x))
+            fine = np.stack([np.interp(every, np.arange(len(lines[i])), c) for c in lines[i].T], axis=1)
+            lines[i] = fine + x**3 * (10 - 15 * x + 6 * x**2) * aside
+    return lines
+
+
 def _resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
@@ -269,6 +312,39 @@ def _guards(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.n
         control[lanes] = CONTROL_OF_ZONE.get(stop.kind, Control.NONE)
         zone[lanes] = i
     return control, zone
+
+
+def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m: np.ndarray) -> Sides:
+    abreast = np.zeros((2, count.sum()))
+    first = np.cumsum(count) - count
+    for side, a in np.argwhere(lane >= 0).tolist():
+        b = lane[side, a]
+        _, near = cKDTree(lines[b]).query(lines[a])
+        near = np.clip(near, 1, len(lines[b]) - 2) if len(lines[b]) > 2 else np.zeros_like(near)
+        ahead = lines[b][np.minimum(near + 1, len(lines[b]) - 1)] - lines[b][np.maximum(near - 1, 0)]
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+        along = near * step_m[b] + np.sum((lines[a] - lines[b][near]) * ahead, axis=1)
+        abreast[side, first[a] : first[a] + count[a]] = along
+    return Sides(lane.astype(np.int64), abreast, first, count, step_m)
+
+
+def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
+    """Whether there is a full lane to the left, to the right of each, and the line between may be crossed."""
+    starts = {lane.lane_id: (lane.centreline_xyz[0], lane.centreline_xyz[-1]) for lane in lanes}
+
+    def is_open(lane: Lane, beside: str | None, marking: MarkingKind) -> bool:
+        ends = starts.get(beside or "")
+        if ends is None or marking not in CROSSABLE:
+            return False
+        gaps = [np.linalg.norm(lane.centreline_xyz[i] - end) for i, end in zip((0, -1), ends, strict=True)]
+        return bool(min(gaps) > NARROWEST_M)  # lanes that begin or end grow from nothing
+
+    return np.array(
+        [
+            [is_open(lane, lane.left_id, lane.left_marking) for lane in lanes],
+            [is_open(lane, lane.right_id, lane.right_marking) for lane in lanes],
+        ]
+    )
 
 
 def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:

@@ -10,6 +10,7 @@ from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 LOOK_M = 150.0
+PASSING_M = 2.0
 
 
 class Motion(NamedTuple):
@@ -21,18 +22,22 @@ class Motion(NamedTuple):
     front_m: Float64[np.ndarray, "N"]
     rear_m: Float64[np.ndarray, "N"]
     speed_mps: Float64[np.ndarray, "N"]
+    beside: Int[np.ndarray, "N"]
+    to_clear_m: Float64[np.ndarray, "N"]
 
 
 class Occupants(NamedTuple):
     """Linked lists of the vehicles on each lane: head[lane], then following[entry], until -1.
 
-    An entry is of vehicle who[entry], on column where[entry] of its path.
+    An entry is of vehicle who[entry], on column where[entry] of its path or, while it changes lanes, beside
+    that. Its rear is at rear_m[entry] on the lane.
     """
 
     head: Int[np.ndarray, "L"]
     following: Int[np.ndarray, "E"]
     who: Int[np.ndarray, "E"]
     where: Int[np.ndarray, "E"]
+    rear_m: Float64[np.ndarray, "E"]
     used: Int[np.ndarray, "1"]
     """Number of entries."""
 
@@ -40,7 +45,14 @@ class Occupants(NamedTuple):
 def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motion:
     """What kernels need to know of vehicles."""
     return Motion(
-        vehicles.active, vehicles.path, starts_m, vehicles.front_m, vehicles.rear_m, vehicles.speed_mps
+        active=vehicles.active,
+        path=vehicles.path,
+        starts_m=starts_m,
+        front_m=vehicles.front_m,
+        rear_m=vehicles.rear_m,
+        speed_mps=vehicles.speed_mps,
+        beside=vehicles.beside,
+        to_clear_m=vehicles.to_clear_m,
     )
 
 
@@ -49,18 +61,20 @@ def find_leaders(
 ) -> tuple[Int[np.ndarray, "N"], Float64[np.ndarray, "N"]]:
     """Index of the vehicle ahead on each path (-1: none) and the gap to it, m, bumper to bumper.
 
-    Vehicles that have just turned off onto a sibling lane count for as long as they are in the way.
+    Vehicles that have just turned off onto a sibling lane count for as long as they are in the way. Those
+    that change lanes are on both, and keep behind what they would reach before they have left the old one.
     """
-    return _find_leaders(motion_of(vehicles, starts_m), graph.length_m, graph.siblings)
+    return _find_leaders(motion_of(vehicles, starts_m), graph.length_m, graph.sides, graph.siblings)
 
 
 @numba.njit(cache=True)
 @no_type_check
-def link_occupants(motion, length, granted):
+def link_occupants(motion, length, sides, granted):
     """Who is on which lane; vehicle i also counts on the next granted[i] lanes of its path."""
-    size = 2 * len(motion.active) * WINDOW  # every lane may be granted once more
+    size = 3 * len(motion.active) * WINDOW  # every lane may be granted once more, or straddled
     following, who, where = np.empty((3, size), np.int64)
-    occupants = Occupants(np.full(len(length), -1), following, who, where, np.zeros(1, np.int64))
+    head, used = np.full(len(length), -1), np.zeros(1, np.int64)
+    occupants = Occupants(head, following, who, where, np.empty(size), used)
     for i in range(len(motion.active)):
         if not motion.active[i]:
             continue
@@ -70,26 +84,49 @@ def link_occupants(motion, length, granted):
                 continue
             on_it = start < motion.front_m[i] and start + length[lane] > motion.rear_m[i]
             if on_it or BEHIND < k <= BEHIND + granted[i]:
-                add_occupant(occupants, lane, i, k)
+                add_occupant(occupants, lane, i, k, motion.rear_m[i] - start)
+            old = lane_beside(lane, motion.beside[i], sides)
+            if on_it and old >= 0:
+                rear = abreast(lane, motion.rear_m[i] - start, motion.beside[i], sides)
+                add_occupant(occupants, old, i, k, rear)
     return occupants
 
 
 @numba.njit(cache=True)
 @no_type_check
-def add_occupant(occupants, lane, vehicle, column):
-    """Note that a lane is on one column of a vehicle's path."""
+def lane_beside(lane, beside, sides):
+    """The neighbour to the left (beside 1) or the right (-1); -1: there is none, or none is asked for."""
+    return -1 if beside == 0 else sides.lane[0 if beside > 0 else 1, lane]
+
+
+@numba.njit(cache=True)
+@no_type_check
+def abreast(lane, s, beside, sides):
+    """Arc length on the neighbour of the point next to one on a lane; straight on beyond its ends."""
+    side = 0 if beside > 0 else 1
+    steps = s / sides.step_m[lane]
+    i = min(max(int(steps), 0), sides.sample_count[lane] - 2)
+    a, b = sides.abreast_m[side, sides.first[lane] + i], sides.abreast_m[side, sides.first[lane] + i + 1]
+    return a + (steps - i) * (b - a)
+
+
+@numba.njit(cache=True)
+@no_type_check
+def add_occupant(occupants, lane, vehicle, column, rear_m):
+    """Note that a vehicle is on a lane, which is on one column of its path or beside it."""
     entry = occupants.used[0]
     occupants.who[entry], occupants.where[entry] = vehicle, column
+    occupants.rear_m[entry] = rear_m
     occupants.following[entry], occupants.head[lane] = occupants.head[lane], entry
     occupants.used[0] += 1
 
 
 @numba.njit(cache=True)
 @no_type_check
-def _find_leaders(motion, length, siblings):
-    active, path, starts, front, rear, _ = motion
+def _find_leaders(motion, length, sides, siblings):
+    active, path, starts, front, rear = motion[:5]
     count = len(active)
-    on = link_occupants(motion, length, np.zeros(count, np.int64))
+    on = link_occupants(motion, length, sides, np.zeros(count, np.int64))
     leader, gap = np.full(count, -1), np.full(count, np.inf)
     for i in range(count):
         if not active[i]:
@@ -100,17 +137,23 @@ def _find_leaders(motion, length, siblings):
             if lane < 0 or starts[i, k] - front[i] > min(gap[i], LOOK_M):
                 break
             first = siblings.first[lane]
-            for m in range(first - 1, siblings.first[lane + 1]):  # one before: the lane itself
-                itself = m < first
-                entry = on.head[lane if itself else siblings.other[m]]
+            old = lane_beside(lane, motion.beside[i], sides)
+            for m in range(first - 2, siblings.first[lane + 1]):  # before the siblings: the old lane, itself
+                is_old, itself = m == first - 2, m == first - 1
+                if is_old and old < 0:
+                    continue
+                entry = on.head[old if is_old else lane if itself else siblings.other[m]]
                 while entry >= 0:
-                    j, rear_j = on.who[entry], rear[on.who[entry]] - starts[on.who[entry], on.where[entry]]
+                    j, rear_j = on.who[entry], on.rear_m[entry]
                     entry = on.following[entry]
-                    if j == i or not (itself or rear_j < siblings.other_clear_m[m]):
+                    if is_old:
+                        rear_j = abreast(old, rear_j, -motion.beside[i], sides)
+                    if j == i or not (is_old or itself or rear_j < siblings.other_clear_m[m]):
                         continue
                     centre_j = starts[i, k] + rear_j + 0.5 * (front[j] - rear[j])
                     if centre_j < centre or (centre_j == centre and j < i):
                         continue
-                    if starts[i, k] + rear_j - front[i] < gap[i]:
-                        leader[i], gap[i] = j, starts[i, k] + rear_j - front[i]
+                    gap_j = starts[i, k] + rear_j - front[i]
+                    if gap_j < gap[i] and not (is_old and gap_j > motion.to_clear_m[i] + PASSING_M):
+                        leader[i], gap[i] = j, gap_j
     return leader, gap

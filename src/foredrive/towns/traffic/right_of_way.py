@@ -80,7 +80,7 @@ def claim_junctions(
     order = order[asks[order]]
     impatient = asks & (time_s - asked_s > PATIENCE_S)
     motion = motion_of(vehicles, starts_m)
-    lanes = (graph.length_m, graph.contested, graph.conflicts)
+    lanes = (graph.length_m, graph.sides, graph.contested, graph.conflicts)
     granted = _serve(motion, lanes, kept, order, column, goes_on, impatient)
     served = granted > kept
     rank = vehicles.rank.copy()
@@ -135,9 +135,9 @@ def _withdraw(
 @no_type_check
 def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
     path, starts, front, rear = motion.path, motion.starts_m, motion.front_m, motion.rear_m
-    length, contested, _ = lanes
+    length, sides, contested, _ = lanes
     granted = granted.copy()
-    on = link_occupants(motion, length, granted)
+    on = link_occupants(motion, length, sides, granted)
     promised, waited_for = np.zeros(len(length)), np.zeros(len(length), np.bool_)
     for j in range(len(granted)):  # room beyond the junction that is spoken for
         k = BEHIND + granted[j] + 1
@@ -161,7 +161,7 @@ def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
         if exit_lane >= 0:
             promised[exit_lane] += need
         for k in range(begin, end):
-            add_occupant(on, path[i, k], i, k)
+            add_occupant(on, path[i, k], i, k, rear[i] - starts[i, k])
     return granted
 
 
@@ -169,7 +169,7 @@ def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
 @no_type_check
 def _room(i, begin, motion, lanes, on):
     """Free length beyond a junction in a moment, up to the next vehicle or junction."""
-    length, contested, _ = lanes
+    length, _, contested, _ = lanes
     room = 0.0
     for k in range(begin, WINDOW):
         lane = motion.path[i, k]
@@ -178,9 +178,9 @@ def _room(i, begin, motion, lanes, on):
         ahead = length[lane]
         entry = on.head[lane]
         while entry >= 0:
-            j, start = on.who[entry], motion.starts_m[on.who[entry], on.where[entry]]
-            if j != i and motion.front_m[j] > start:
-                ahead = min(ahead, motion.rear_m[j] - start + MOVING_ON_S * motion.speed_mps[j])
+            j, rear = on.who[entry], on.rear_m[entry]
+            if j != i and rear + motion.front_m[j] - motion.rear_m[j] > 0:
+                ahead = min(ahead, rear + MOVING_ON_S * motion.speed_mps[j])
             entry = on.following[entry]
         room += ahead
         if ahead < length[lane] or room > ENOUGH_ROOM_M:
@@ -192,7 +192,7 @@ def _room(i, begin, motion, lanes, on):
 @no_type_check
 def _is_clear(i, begin, end, motion, lanes, on, waited_for):
     """Whether all who have been granted conflicting lanes are out of the way when vehicle i gets there."""
-    length, _, conflicts = lanes
+    length, _, _, conflicts = lanes
     speed = motion.speed_mps
     for k in range(begin, end):
         lane = motion.path[i, k]
@@ -206,7 +206,7 @@ def _is_clear(i, begin, end, motion, lanes, on, waited_for):
             entry = on.head[other]
             while entry >= 0:
                 j = on.who[entry]
-                to_clear = clear - (motion.rear_m[j] - motion.starts_m[j, on.where[entry]])
+                to_clear = clear - on.rear_m[entry]
                 if j != i and to_clear > 0 and to_clear / max(speed[j], SLOW_MPS) > arrival_s:
                     return False
                 entry = on.following[entry]
@@ -216,9 +216,9 @@ def _is_clear(i, begin, end, motion, lanes, on, waited_for):
 @numba.njit(cache=True)
 @no_type_check
 def _inside_gap(motion, lanes, granted, rank):
-    _, path, starts, front, rear, _ = motion
-    length, _, conflicts = lanes
-    on = link_occupants(motion, length, granted)
+    path, starts, front, rear = motion.path, motion.starts_m, motion.front_m, motion.rear_m
+    length, sides, _, conflicts = lanes
+    on = link_occupants(motion, length, sides, granted)
     gap = np.full(len(granted), np.inf)
     for i in range(len(granted)):
         if not motion.active[i]:
@@ -229,10 +229,10 @@ def _inside_gap(motion, lanes, granted, rank):
                 to_go = starts[i, k] + conflicts.enter_m[m] - front[i]
                 entry = on.head[conflicts.other[m]] if -INSIDE_M < to_go < gap[i] else -1
                 while entry >= 0:
-                    j, at = on.who[entry], on.where[entry]
+                    j, at, rear_j = on.who[entry], on.where[entry], on.rear_m[entry]
                     entry = on.following[entry]
-                    is_there = front[j] - starts[j, at] > conflicts.other_enter_m[m] + INSIDE_M
-                    in_the_way = j != i and rear[j] - starts[j, at] < conflicts.other_clear_m[m]
+                    is_there = rear_j + front[j] - rear[j] > conflicts.other_enter_m[m] + INSIDE_M
+                    in_the_way = j != i and rear_j < conflicts.other_clear_m[m]
                     goes_first = in_the_way and (is_there or rank[j] < rank[i])
                     if goes_first and not _is_behind(j, at, i, path, starts, rear):
                         gap[i] = to_go

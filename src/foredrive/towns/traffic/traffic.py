@@ -4,23 +4,14 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Int
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.car_following import (
-    CRAWL_MPS,
-    EMERGENCY_MPS2,
-    HARDEST_BRAKING_MPS2,
-    JERK_DOWN_MPS3,
-    JERK_EMERGENCY_MPS3,
-    JERK_UP_MPS3,
-    SOFT_STOP_S,
-    follow_acceleration,
-    free_acceleration,
-)
+from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
 from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
+from foredrive.towns.traffic.lane_changes import begin_change, choose_change, find_stretches, who_may_change
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
@@ -31,19 +22,17 @@ from foredrive.towns.traffic.pedestrians import (
     empty_pavement,
     step_pedestrians,
 )
-from foredrive.towns.traffic.right_of_way import STANDSTILL_M, claim_junctions
+from foredrive.towns.traffic.right_of_way import claim_junctions
 from foredrive.towns.traffic.vehicles import (
     BEHIND,
     Poses,
     Vehicles,
     empty_slots,
     path_starts,
-    speed_to_drive,
     vehicle_poses,
 )
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
-LINE_STANDSTILL_M = 1.0
 HALT_MPS = 0.4
 AT_LINE_M = 4.0
 BORN_BEYOND_M = 95.0
@@ -94,6 +83,7 @@ class Traffic:
         self.signals: SignalPlan = plan_signals(self.lanes, np.random.default_rng((seed, 0)))
         self.starts: Starts = find_starts(self.lanes)
         self._zone_count = len(town.stop_zones)
+        self._stretches = find_stretches(self.lanes)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
         self._is_motorway = self.lanes.limit_mps > MOTORWAY_LIMIT_MPS
         self._vehicle_count = vehicle_count
@@ -138,7 +128,7 @@ class Traffic:
         way = claim_junctions(self.lanes, v, starts_m, leader, leader_gap, green, state.time_s)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
-        wanted = self._wanted_acceleration(v, starts_m, leader, leader_gap, halt_gap)
+        ahead = see_ahead(self.lanes, v, starts_m, leader, leader_gap, halt_gap)
         halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
         v = dataclasses.replace(
             v,
@@ -152,9 +142,12 @@ class Traffic:
             state,
             time_s=state.time_s + dt_s,
             step_index=state.step_index + 1,
-            vehicles=_drive(v, wanted, dt_s),
+            vehicles=v,
             people=people,
         )
+        state = self._begin_change(state, ahead, rng)
+        vehicles = drive(state.vehicles, ahead.wanted_mps2(v), dt_s)
+        state = dataclasses.replace(state, vehicles=vehicles)
         state = self._change_lanes_at_ends(state, rng)
         return self._turn_over(state, rng)
 
@@ -205,24 +198,17 @@ class Traffic:
             )
         return out
 
-    def _wanted_acceleration(
-        self,
-        v: Vehicles,
-        starts_m: np.ndarray,
-        leader: np.ndarray,
-        leader_gap: np.ndarray,
-        halt_gap: np.ndarray,
-    ) -> Float64[np.ndarray, "N"]:
-        speed = v.speed_mps
-        free = free_acceleration(speed, speed_to_drive(self.lanes, v, starts_m), v.accel_mps2, v.decel_mps2)
-        driver = (v.time_gap_s, v.accel_mps2, v.decel_mps2)
-        closing = speed - np.where(leader >= 0, speed[leader], speed)
-        standstill = np.full(len(speed), STANDSTILL_M)
-        behind = follow_acceleration(free, speed, closing, leader_gap, standstill, *driver)
-        # A line needs no time gap: nothing moves there.
-        at_line = np.full(len(speed), LINE_STANDSTILL_M)
-        halt = follow_acceleration(free, speed, speed, halt_gap, at_line, 0.3 * v.time_gap_s, *driver[1:])
-        return np.minimum(behind, halt)
+    def _begin_change(self, state: TrafficState, ahead: Situation, rng: np.random.Generator) -> TrafficState:
+        """Let the one driver who gains most by it change lanes."""
+        v = state.vehicles
+        fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
+        urge = np.zeros((2, len(v.active)))
+        may = who_may_change(self._stretches, v, fits, urge > 0)
+        change = choose_change(self.lanes, self._stretches, v, ahead, may, urge)
+        if change is None:
+            return state
+        changed = begin_change(self.lanes, v, *change)
+        return self._know_path(dataclasses.replace(state, vehicles=changed), rng)
 
     def _know_path(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Fill in the lanes ahead that are not known yet: the route's, or a random turn."""
@@ -332,23 +318,3 @@ class Traffic:
         ids = state.next_track_id + np.flatnonzero(found)
         people = state.people.replace_rows(rows[found], draw_people(self.walks, rng, ids, walk, s))
         return dataclasses.replace(state, people=people, next_track_id=state.next_track_id + len(rows))
-
-
-def _drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> Vehicles:
-    """Change speed as wanted, within comfortable jerk unless it is an emergency; ballistic update."""
-    wanted = np.clip(wanted_mps2, -HARDEST_BRAKING_MPS2, v.accel_mps2)
-    gentle = np.maximum(wanted, -v.speed_mps / SOFT_STOP_S)  # no jolt at the end
-    wanted = np.where(wanted < -EMERGENCY_MPS2, wanted, gentle)
-    down = np.where(wanted < -EMERGENCY_MPS2, JERK_EMERGENCY_MPS3, JERK_DOWN_MPS3)
-    a = np.clip(wanted, v.acceleration_mps2 - down * dt_s, v.acceleration_mps2 + JERK_UP_MPS3 * dt_s)
-    stops = (v.speed_mps + a * dt_s <= CRAWL_MPS) & (a <= 0)
-    braking = np.minimum(a, -1e-9)
-    to_rest = np.minimum(-0.5 * v.speed_mps**2 / braking, v.speed_mps * dt_s)
-    distance = np.where(stops, to_rest, (v.speed_mps + 0.5 * a * dt_s) * dt_s)
-    speed = np.where(stops, 0.0, v.speed_mps + a * dt_s)
-    return dataclasses.replace(
-        v,
-        s_m=np.where(v.active, v.s_m + distance, v.s_m),
-        speed_mps=np.where(v.active, speed, 0.0),
-        acceleration_mps2=np.where(v.active & ~stops, a, 0.0),
-    )

@@ -10,6 +10,8 @@ from foredrive.towns.traffic.lane_graph import SLOWING_MPS2, LaneGraph
 
 BEHIND = 4
 AHEAD = 11
+CLEAR_OF_LANE = 0.64
+"""At this part of a lane change three quarters of the way over are done: others can pass on the old lane."""
 WINDOW = BEHIND + 1 + AHEAD
 """Lanes of its path that a vehicle knows: some behind (where its rear may still be), its own, some ahead."""
 
@@ -48,6 +50,11 @@ class Vehicles:
     """When right of way was granted: in a junction the lower goes first."""
     has_stopped: Bool[np.ndarray, "N"]
     """Whether the vehicle has come to a halt at the line ahead of it."""
+    shift_m: Float64[np.ndarray, "N"]
+    """How far left of the path the latest lane change began, negative: right; 0 before the first."""
+    change_length_m: Float64[np.ndarray, "N"]
+    changed_m: Float64[np.ndarray, "N"]
+    """How far into its lane change the rear axle is; counts on after the end."""
 
     @property
     def lane(self) -> Int[np.ndarray, "N"]:
@@ -63,6 +70,30 @@ class Vehicles:
     def rear_m(self) -> Float64[np.ndarray, "N"]:
         """Arc length of the rear bumper, counted from the start of `lane`."""
         return self.s_m - 0.5 * self.size_lwh[:, 0]
+
+    @property
+    def beside(self) -> Int[np.ndarray, "N"]:
+        """On which side of the path is the lane that a vehicle has not left yet: 1 left, -1 right, 0 none."""
+        return np.where(self.to_clear_m > 0, np.sign(self.shift_m), 0.0).astype(np.int64)
+
+    @property
+    def to_clear_m(self) -> Float64[np.ndarray, "N"]:
+        """How far to drive until the lane that one comes from is free."""
+        to_go = CLEAR_OF_LANE * self.change_length_m - self.changed_m
+        return np.where(self.shift_m != 0, np.maximum(to_go, 0.0), 0.0)
+
+    def offset_m(self, ahead_m: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
+        """How far left of the path a point is that lies ahead of the rear axle.
+
+        Lane changes follow the quintic with no lateral speed or acceleration at either end (Takahashi et al.
+        1989, with fixed ends), over a length instead of a time: a vehicle that stands does not slide.
+        """
+        x = np.clip((self.changed_m + ahead_m) / self.change_length_m, 0.0, 1.0)
+        return self.lateral_m + self.shift_m * (1 - x**3 * (10 - 15 * x + 6 * x**2))
+
+    def moved(self, distance_m: Float64[np.ndarray, "N"]) -> "Vehicles":
+        """These vehicles further along."""
+        return dataclasses.replace(self, s_m=self.s_m + distance_m, changed_m=self.changed_m + distance_m)
 
     def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Vehicles") -> "Vehicles":
         """These vehicles with some slots taken over by the k vehicles of `other`."""
@@ -105,7 +136,7 @@ def empty_slots(count: int) -> Vehicles:
         values[name] = np.zeros(count, dtype=np.bool_)
     for name in ("track_id", "category", "style", "granted"):
         values[name] = np.zeros(count, dtype=np.int64)
-    for name in ("wheelbase_m", "accel_mps2", "decel_mps2", "haste"):
+    for name in ("wheelbase_m", "accel_mps2", "decel_mps2", "haste", "change_length_m"):
         values[name] = np.ones(count)
     values["path"] = np.full((count, WINDOW), -1)
     values["asked_s"] = np.full(count, np.inf)
@@ -153,17 +184,22 @@ def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
     axle_s = vehicles.s_m[live] - vehicles.axle_to_centre_m[live]
     rear = along_path(graph, path, starts, axle_s)
     front = along_path(graph, path, starts, axle_s + vehicles.wheelbase_m[live])
-    forward = front - rear
+    left = _left_of(front - rear)
+    axle = rear + vehicles.offset_m(np.zeros(len(vehicles.active)))[live, None] * left
+    forward = front + vehicles.offset_m(vehicles.wheelbase_m)[live, None] * left - axle
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    left = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(live))], axis=1)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    axle = rear + vehicles.lateral_m[live, None] * left
+    left = _left_of(forward)
     centre = axle + vehicles.axle_to_centre_m[live, None] * forward
     centre += 0.5 * vehicles.size_lwh[live, 2:] * np.cross(forward, left)
     out = [np.zeros((len(vehicles.active), 3)) for _ in range(3)]
     for whole, part in zip(out, (axle, centre, forward), strict=True):
         whole[live] = part
     return Poses(*out)
+
+
+def _left_of(forward: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    left = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(forward))], axis=1)
+    return left / np.linalg.norm(left, axis=1, keepdims=True)
 
 
 def speed_to_drive(

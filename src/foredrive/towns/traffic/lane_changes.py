@@ -1,0 +1,266 @@
+"""Lane changes: who wants one and may have it, by MOBIL (Kesting, Treiber & Helbing 2007), and its begin."""
+
+import dataclasses
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.towns.traffic.car_following import free_acceleration
+from foredrive.towns.traffic.drivers import Situation, behind
+from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
+from foredrive.towns.traffic.leaders import LOOK_M, abreast, lane_beside, link_occupants, motion_of
+from foredrive.towns.traffic.vehicles import BEHIND, CLEAR_OF_LANE, WINDOW, Vehicles, path_starts
+
+LEFT, RIGHT = 0, 1
+POLITENESS = 0.3
+THRESHOLD_MPS2 = 0.2
+SAFE_BRAKING_MPS2 = 3.0
+KEEP_RIGHT_MPS2 = 0.3
+"""On motorways, for the right lane and against the left."""
+CHANGE_S = 3.5
+SHORTEST_CHANGE_M = 16.0
+STOPPING_MPS2 = 2.5
+"""Whoever need not change does so only where there is room to stop this gently after it."""
+NEAREST_M = 2.0
+SETTLED_M = 60.0
+"""Drivers stay in a lane for this long before they change again, unless they have to."""
+LONGEST_STRETCH_M = 600.0
+FLAT_M = 0.3
+"""Lanes further apart in height are not side by side."""
+
+
+class Stretches(NamedTuple):
+    """For the left and the right side of L lanes, how far one may change to the neighbour."""
+
+    target: Int[np.ndarray, "2 L"]
+    """The neighbour, -1 if one may not change."""
+    room_m: Float64[np.ndarray, "2 L"]
+    """From the start of the lane to where one may no longer, over the ends of lanes; 0 if one may not."""
+    goes_back: Bool[np.ndarray, "2 L"]
+    """Whether both lanes side by side begin where two others side by side end."""
+
+
+class Gaps(NamedTuple):
+    """Whom N vehicles would have ahead and behind in another lane (-1: nobody), and the gaps to them, m."""
+
+    leader: Int[np.ndarray, "N"]
+    leader_gap_m: Float64[np.ndarray, "N"]
+    follower: Int[np.ndarray, "N"]
+    follower_gap_m: Float64[np.ndarray, "N"]
+
+
+def find_stretches(graph: LaneGraph) -> Stretches:
+    """Where lanes may be changed: outside of junctions, over lines that may be crossed, with room to wait."""
+    sides = graph.sides.lane
+    level = np.abs(graph.xyz[graph.first, 2] - graph.xyz[graph.first[sides], 2]) < FLAT_M
+    open_to = graph.may_cross & (sides >= 0) & ~graph.contested & ~graph.contested[sides] & level
+    target = np.where(open_to, sides, -1)
+    room = np.where(open_to, graph.length_m, 0.0)
+    goes_back = np.zeros(room.shape, dtype=np.bool_)
+    pairs = [
+        (side, lane, after)
+        for side, lane in np.argwhere(open_to).tolist()
+        for after in graph.successors[lane, : graph.successor_count[lane]].tolist()
+        if open_to[side, after] and target[side, after] in graph.successors[target[side, lane]]
+    ]
+    for side, _, after in pairs:
+        goes_back[side, after] = True
+    changed = True
+    while changed:
+        changed = False
+        for side, lane, after in pairs:
+            longer = min(graph.length_m[lane] + room[side, after], LONGEST_STRETCH_M)
+            if longer > room[side, lane] + 1e-6:
+                room[side, lane], changed = longer, True
+    return Stretches(target, room, goes_back)
+
+
+def change_length_m(vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
+    """Length of a lane change: `CHANGE_S` at the present speed, but as long as steering can be gentle."""
+    return np.maximum(CHANGE_S * vehicles.speed_mps, SHORTEST_CHANGE_M)
+
+
+def who_may_change(
+    stretches: Stretches,
+    vehicles: Vehicles,
+    fits: Bool[np.ndarray, "N L"],
+    has_to: Bool[np.ndarray, "2 N"],
+) -> Bool[np.ndarray, "2 N"]:
+    """Who may change to the left, to the right, as far as the road goes; `fits` are the lanes for each."""
+    v, lane = vehicles, vehicles.lane
+    need = change_length_m(v) + v.wheelbase_m + v.axle_to_centre_m
+    stops = v.speed_mps**2 / (2 * STOPPING_MPS2)
+    settled = v.changed_m > v.change_length_m + np.where(has_to, 0.0, SETTLED_M)
+    target = stretches.target[:, lane]
+    begun = (v.rear_m > 0) | stretches.goes_back[:, lane]
+    goes_on = stretches.room_m[:, lane] > v.s_m + need + np.where(has_to, NEAREST_M, stops)
+    fitting = (target >= 0) & fits[np.arange(len(lane)), target]
+    return v.active & begun & goes_on & fitting & ((v.shift_m == 0) | settled)
+
+
+def find_gaps(
+    graph: LaneGraph,
+    vehicles: Vehicles,
+    starts_m: Float64[np.ndarray, "N W"],
+    target: Int[np.ndarray, "N"],
+    side: int,
+) -> Gaps:
+    """Ahead and behind in the lanes `target` (-1: not asked for); what overlaps has a negative gap."""
+    lanes = (graph.length_m, graph.sides, graph.successors)
+    return Gaps(*_find_gaps(motion_of(vehicles, starts_m), lanes, target, side))
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _find_gaps(motion, lanes, target, side):
+    length, sides, successors = lanes
+    active, path, starts, front, rear = motion[:5]
+    count = len(active)
+    leader, follower = np.full(count, -1), np.full(count, -1)
+    leader_gap, follower_gap = np.full(count, np.inf), np.full(count, np.inf)
+    if not (target >= 0).any():
+        return leader, leader_gap, follower, follower_gap
+    on = link_occupants(motion, length, sides, np.zeros(count, np.int64))
+    for i in range(count):
+        if target[i] < 0:
+            continue
+        half = 0.5 * (front[i] - rear[i])
+        centre = abreast(path[i, BEHIND], 0.5 * (front[i] + rear[i]), 1 if side == LEFT else -1, sides)
+        lane, start = target[i], 0.0
+        for k in range(BEHIND + 1, WINDOW):
+            entry = on.head[lane]
+            while entry >= 0:
+                j, rear_j = on.who[entry], start + on.rear_m[entry]
+                entry = on.following[entry]
+                is_ahead = rear_j + 0.5 * (front[j] - rear[j]) >= centre
+                if j != i and is_ahead and rear_j - centre - half < leader_gap[i]:
+                    leader[i], leader_gap[i] = j, rear_j - centre - half
+            start += length[lane]
+            if path[i, k] < 0 or start - centre - half > min(leader_gap[i], LOOK_M):
+                break
+            beside, ahead = sides.lane[side, path[i, k]], successors[lane]
+            lane = beside if beside >= 0 and (ahead == beside).any() else ahead[0]
+            if lane < 0:
+                break
+        for j in range(count):
+            if not active[j] or j == i:
+                continue
+            for k in range(BEHIND, WINDOW):
+                lane_j = path[j, k]
+                if lane_j < 0 or starts[j, k] - front[j] > LOOK_M:
+                    break
+                front_j = front[j] - starts[j, k]
+                if lane_j != target[i]:
+                    if k > BEHIND or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
+                        continue
+                    front_j = abreast(lane_j, front_j, motion.beside[j], sides)
+                is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
+                if is_behind and centre - half - front_j < follower_gap[i]:
+                    follower[i], follower_gap[i] = j, centre - half - front_j
+                break
+    return leader, leader_gap, follower, follower_gap
+
+
+def incentive(
+    vehicles: Vehicles, now: Situation, gaps: Gaps, free_mps2: Float64[np.ndarray, "N"]
+) -> Float64[np.ndarray, "N"]:
+    """MOBIL: what N drivers and, by politeness, those behind them would gain, m/s²; -inf where it is unsafe.
+
+    ã_c - a_c + p (ã_n - a_n + ã_o - a_o), Kesting et al. (2007), eq. 2 and 3: c changes, n and o follow in
+    the new and the old lane.
+
+    Args:
+        free_mps2: acceleration on an open road in the new lane.
+    """
+    v, every, length = vehicles, np.arange(len(now.leader)), vehicles.size_lwh[:, 0]
+    n, o = gaps.follower, _followers(now)
+    wanted, halt, free = now.wanted_mps2(v), now.halt_mps2, now.free_mps2
+    own = behind(v, every, free_mps2, gaps.leader, gaps.leader_gap_m)
+    new = behind(v, n, free[n], np.where(n >= 0, every, -1), gaps.follower_gap_m)
+    old = behind(v, o, free[o], now.leader, now.leader_gap_m[o] + length + now.leader_gap_m)
+    gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - wanted[n], 0.0)
+    gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - wanted[o], 0.0)
+    gain = np.minimum(own, halt) - wanted + POLITENESS * (gain_n + gain_o)
+    near = (gaps.leader_gap_m < NEAREST_M) | (gaps.follower_gap_m < NEAREST_M)
+    unsafe = (own < -SAFE_BRAKING_MPS2) | ((n >= 0) & (new < -SAFE_BRAKING_MPS2))
+    return np.where(near | unsafe, -np.inf, gain)
+
+
+def _followers(now: Situation) -> Int[np.ndarray, "N"]:
+    """Who follows each vehicle nearest, -1 for nobody."""
+    follower = np.full(len(now.leader), -1)
+    led = np.flatnonzero(now.leader >= 0)
+    led = led[np.argsort(-now.leader_gap_m[led], kind="stable")]  # the nearest is written last
+    follower[now.leader[led]] = led
+    return follower
+
+
+def choose_change(
+    graph: LaneGraph,
+    stretches: Stretches,
+    vehicles: Vehicles,
+    now: Situation,
+    may: Bool[np.ndarray, "2 N"],
+    urge_mps2: Float64[np.ndarray, "2 N"],
+) -> tuple[int, int] | None:
+    """The vehicle that gains most by a lane change, and to which side; None if nobody gains enough.
+
+    One at a time: no two drivers take the same gap.
+
+    Args:
+        may: who may change to the left, to the right.
+        urge_mps2: what it is worth to them beside acceleration.
+    """
+    if not may.any():
+        return None
+    v = vehicles
+    starts_m = path_starts(graph, v.path)
+    reach = CLEAR_OF_LANE * change_length_m(v) + v.wheelbase_m
+    moves_on = np.where(now.leader >= 0, v.speed_mps[now.leader], 0.0) * reach / np.maximum(v.speed_mps, 1.0)
+    can_pull_out = now.leader_gap_m + moves_on > reach
+    best, least = None, THRESHOLD_MPS2
+    for side in (LEFT, RIGHT):
+        target = np.where(may[side] & can_pull_out, stretches.target[side, v.lane], -1)
+        if not (target >= 0).any():
+            continue
+        gaps = find_gaps(graph, v, starts_m, target, side)
+        wanted = v.haste * np.minimum(v.top_speed_mps, graph.speed(target, v.s_m))
+        free = np.minimum(now.free_mps2, free_acceleration(v.speed_mps, wanted, v.accel_mps2, v.decel_mps2))
+        motorway = graph.limit_mps[v.lane] > MOTORWAY_LIMIT_MPS
+        bias = np.where(motorway, KEEP_RIGHT_MPS2 if side == RIGHT else -KEEP_RIGHT_MPS2, 0.0)
+        gain = np.where(target >= 0, incentive(v, now, gaps, free) + bias + urge_mps2[side], -np.inf)
+        if gain.max() > least:
+            best, least = (int(np.argmax(gain)), side), float(gain.max())
+    return best
+
+
+def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> Vehicles:
+    """The path moves to the neighbour at once; the vehicle follows. The lanes ahead are not known yet."""
+    v, row = vehicles, np.array([who])
+    old, path = v.path[who], np.full(WINDOW, -1)
+    path[BEHIND] = graph.sides.lane[side, old[BEHIND]]
+    for column in range(BEHIND - 1, -1, -1):
+        before = graph.predecessors[path[column + 1]] if path[column + 1] >= 0 else np.array([-1])
+        beside = graph.sides.lane[side, old[column]] if old[column] >= 0 else -1
+        path[column] = beside if beside >= 0 and beside in before else before[0]
+    s_m = abreast(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
+    here = graph.position(old[BEHIND : BEHIND + 1], v.s_m[row])[0]
+    there = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]
+    apart_m = float(np.hypot(*(here - there)[:2]))
+    changed = {
+        "path": path,
+        "s_m": s_m,
+        "granted": 0,
+        "asked_s": np.inf,
+        "has_stopped": False,
+        "shift_m": apart_m if side == RIGHT else -apart_m,
+        "change_length_m": change_length_m(v)[who],
+        "changed_m": -v.wheelbase_m[who],
+    }
+    values = {}
+    for name, value in changed.items():
+        values[name] = getattr(v, name).copy()
+        values[name][who] = value
+    return dataclasses.replace(v, **values)
