@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from rich.progress import track
@@ -19,6 +19,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
+from foredrive.towns.labels.captions import caption
 from foredrive.towns.labels.semantics import (
     CategoryOfTrack,
     camera_labels,
@@ -26,6 +27,8 @@ from foredrive.towns.labels.semantics import (
     lidar_labels,
     z_depth,
 )
+from foredrive.towns.labels.situation import Narrator
+from foredrive.towns.labels.visibility import is_seen
 from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
@@ -119,7 +122,8 @@ def record(
     drive = Drive(traffic, seconds)
     maps = write_map(_map_objects(town), town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
-    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, labels, seed)
+    narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
+    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, labels, narrator, seed)
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
         for frame in track(frames, description=f"recording {name}", total=count):
@@ -137,7 +141,12 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
 
 
 def _frames(
-    world: World, moments: Iterator[Moment], sensors: SensorSuite, labels: LabelKinds, seed: int
+    world: World,
+    moments: Iterator[Moment],
+    sensors: SensorSuite,
+    labels: LabelKinds,
+    narrator: Narrator,
+    seed: int,
 ) -> Iterator[Frame]:
     for index, moment in enumerate(moments):
         seen = world.render(
@@ -151,6 +160,7 @@ def _frames(
         everyone = [*moment.actors, *world.parked]
         near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
         returned = seen.beam_ids[seen.sweep.returned.numpy()]
+        visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
         spec = labels.occupancy
         yield Frame(
             t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
@@ -162,9 +172,26 @@ def _frames(
             boxes=boxes_of(near, moment.T_world_ego),
             occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
             lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
-            visibility=world.visibility(near, sensors, moment.T_world_ego, seen),
+            visibility=visibility,
+            caption=_caption(narrator, moment, near, visibility, seen, sensors.rig, seed + index)
+            if labels.captions
+            else None,
             **_ray_labels(seen, everyone, sensors, labels),
         )
+
+
+def _caption(
+    narrator: Narrator,
+    moment: Moment,
+    near: list[ActorState],
+    visibility: Float[np.ndarray, "M"],
+    seen: SensorFrame,
+    rig: CameraRig,
+    seed: int,
+) -> str:
+    range_m = np.stack(list(seen.pixel_range_m.values()))
+    situation = narrator.situation(moment, near, visibility, lambda xyz: is_seen(xyz, rig, range_m))
+    return caption(situation, seed)
 
 
 def _ray_labels(

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
+from foredrive.scene import CameraRig
 from foredrive.towns.actors import ActorState
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
@@ -12,6 +13,8 @@ from foredrive.towns.sensing.capture import SensorSuite
 RAYS_PER_CAMERA = 1024
 """A road user that fills more of an image is judged by an even grid of about this many of its pixels."""
 NEAR_M = 0.1
+THING_M = 0.5
+"""A thing may reach this far towards the camera from its middle."""
 _CORNERS = np.array([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -23,9 +26,9 @@ def visibility(
 ) -> Float32[np.ndarray, "M"]:
     """Share of each road user's silhouette, over all images, that is seen: 0 hidden to 1 in full view.
 
-    The silhouette is that of its shape alone, by the same rays as the images': what lies beyond the images'
-    borders does not count, and one that fills no pixel's centre has 0. nuScenes' visibility levels are this
-    share cut at .4, .6 and .8.
+    The silhouette is that of its shape alone at the frame's time, by the images' own rays: what lies beyond
+    the images' borders does not count, and one that fills no pixel's centre has 0. nuScenes' visibility
+    levels are this share cut at .4, .6 and .8.
 
     Args:
         pixel_ids: the track id that each pixel shows.
@@ -37,7 +40,8 @@ def visibility(
     rows: list[int] = np.flatnonzero(seen).tolist()
     T_ego_unit = np.linalg.inv(T_world_ego) @ np.array([unit_to_world(actors[m][0]) for m in rows])
     windows = _windows(T_ego_unit, sensors)
-    flat_ids, (origin, direction) = pixel_ids.ravel(), sensors.pixel_rays
+    flat_ids = pixel_ids.ravel()
+    origin, direction = sensors.pixel_rays[:2]
     for m, T, of_cameras in zip(rows, np.linalg.inv(T_ego_unit), windows, strict=True):
         actor, shape = actors[m]
         pixels, weight = _pixels(of_cameras, sensors.rig.size_hw)
@@ -47,6 +51,29 @@ def visibility(
         if filled.any():
             out[m] = (filled * (flat_ids[pixels] == actor.track_id)).sum() / filled.sum()
     return out
+
+
+def is_seen(
+    point_ego: Float64[np.ndarray, "3"], rig: CameraRig, range_m: Float32[np.ndarray, "C H W"]
+) -> bool:
+    """Whether a small thing is in an image with nothing before it.
+
+    Args:
+        range_m: how far off what each pixel shows is.
+    """
+    height, width = rig.size_hw
+    poses, matrices = rig.T_ego_cam.double().numpy(), rig.K.double().numpy()
+    for T_ego_cam, K, ranges in zip(poses, matrices, range_m, strict=True):
+        in_cam = T_ego_cam[:3, :3].T @ (point_ego - T_ego_cam[:3, 3])
+        if in_cam[2] < NEAR_M:
+            continue
+        u, v = (K @ in_cam)[:2] / in_cam[2]
+        if 0 <= u < width and 0 <= v < height:
+            row, column = int(v), int(u)
+            around = ranges[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+            if around.max() > np.linalg.norm(in_cam) - THING_M:
+                return True
+    return False
 
 
 def _windows(T_ego_unit: Float64[np.ndarray, "M 4 4"], sensors: SensorSuite) -> Int64[np.ndarray, "M C 4"]:

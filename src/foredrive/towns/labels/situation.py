@@ -1,0 +1,251 @@
+"""Facts for captions: where the vehicle is, what it does, and who is around it."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float, Float64, Int
+from scipy.spatial import cKDTree
+
+from foredrive.scene import Category, Command
+from foredrive.towns.actors import ActorState
+from foredrive.towns.conditions import Conditions
+from foredrive.towns.labels.captions import SEEN, Doing, Place, Situation, Thing
+from foredrive.towns.map.town_map import StripKind, TownMap
+from foredrive.towns.traffic.expert import Moment
+from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
+from foredrive.towns.traffic.lights import Light
+from foredrive.towns.traffic.routes import Route
+
+STANDING_MPS = 0.3
+TURNING_RADPS = 0.05
+CHANGING_MPS = 0.5
+GENTLE_MPS2 = 1.0
+LEADER_M, LEADER_ASIDE_M = 30.0, 1.6
+FOLLOWED_M = 25.0
+MIDDLE_M = 0.8
+"""About half the height of a vehicle: the way lies on the road."""
+BUMPER_M = 3.0
+LIGHT_M = 45.0
+PASSES_OVER_M, BELOW_M = 4.0, 5.0
+RING_M = (40.0, 250.0)
+RING_RADIUS_M = 60.0
+"""A lane that turns less than one of this radius is part of no roundabout, if it is longer than `SHORT_M`."""
+SHORT_M = 12.0
+RING_LANES = 40
+RING_TURN_RAD = 1.5 * np.pi
+"""Short of a full circle by what is lost where lanes meet."""
+
+
+class Places:
+    """Tells what kind of place a point of a town is."""
+
+    def __init__(self, town: TownMap, lanes: LaneGraph) -> None:
+        self._lanes = lanes
+        self._of_lane = [_place_of(lanes, lane) for lane in range(len(lanes.ids))]
+        for lane in _ring_lanes(lanes):
+            self._of_lane[lane] = Place.ROUNDABOUT
+        self._samples = cKDTree(lanes.xyz)
+        self._lane_of_sample = np.repeat(np.arange(len(lanes.ids)), lanes.count)
+        self._over, self._under = _crossed_levels(lanes.xyz)
+        self._roads = shapely.STRtree([strip.polygon for strip in town.strips_of(StripKind.DRIVING)])
+
+    def place(self, xyz: Float64[np.ndarray, "3"]) -> Place:
+        """Of a point on the road."""
+        sample = int(self._samples.query(xyz)[1])
+        if self._over[sample]:
+            return Place.BRIDGE
+        if self._under[sample]:
+            return Place.UNDERPASS
+        return self._of_lane[int(self._lane_of_sample[sample])]
+
+    def on_road(self, xy: Float64[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
+        """Which points lie on a driving lane, seen from above."""
+        out = np.zeros(len(xy), dtype=np.bool_)
+        out[self._roads.query(shapely.points(xy), predicate="within")[0]] = True
+        return out
+
+
+class Narrator:
+    """Gathers what there is to tell of the moments of one drive."""
+
+    def __init__(
+        self,
+        town: TownMap,
+        lanes: LaneGraph,
+        route: Route,
+        conditions: Conditions,
+        signal_xyz: dict[int, Float64[np.ndarray, "3"]],
+    ) -> None:
+        self._places, self._lanes, self._route, self._conditions = (
+            Places(town, lanes),
+            lanes,
+            route,
+            conditions,
+        )
+        self._signal_xyz = signal_xyz
+        self._line = route.polyline(lanes)
+        self._arc_m = np.concatenate([[0.0], np.linalg.norm(np.diff(self._line, axis=0), axis=1).cumsum()])
+        length = lanes.length_m[route.lanes]
+        self._begins_m = np.cumsum(length) - length - route.start_m
+        self._passed = 0
+        self._aside: tuple[float, float] | None = None
+
+    def situation(
+        self,
+        moment: Moment,
+        actors: Sequence[ActorState],
+        visibility: Float[np.ndarray, "M"],
+        sees: Callable[[Float64[np.ndarray, "3"]], bool],
+    ) -> Situation:
+        """The moments come in the order of time.
+
+        Args:
+            actors: those around the vehicle, with how much of each is seen.
+            sees: whether the cameras see a point (ego frame).
+        """
+        T_ego_world = np.linalg.inv(moment.T_world_ego)
+        R, at = T_ego_world[:3, :3], moment.T_world_ego[:3, 3]
+        centre = np.array([actor.centre_m for actor in actors]).reshape(-1, 3)
+        in_ego = centre @ R.T + T_ego_world[:3, 3]
+        on_road = self._places.on_road(centre[:, :2])
+        things = [_thing(*each, R) for each in zip(actors, in_ego, visibility, on_road, strict=True)]
+        window = slice(self._passed, self._passed + 200)
+        self._passed += int(np.linalg.norm(self._line[window] - at, axis=1).argmin())
+        aside_mps = self._aside_speed(moment)
+        beside = at - self._line[self._passed]  # the lane beside the route's, while overtaking
+        leader, gap_m = self._leader(actors, centre - beside, visibility)
+        return Situation(
+            conditions=self._conditions,
+            place=self._places.place(at),
+            doing=self._doing(moment, leader, gap_m, aside_mps),
+            speed_mps=float(moment.twist_ego[0]),
+            things=things,
+            leader=None if leader is None else leader.category,
+            light=self._light(moment, lambda xyz: sees(R @ xyz + T_ego_world[:3, 3])),
+        )
+
+    def _leader(
+        self,
+        actors: Sequence[ActorState],
+        centre: Float64[np.ndarray, "M 3"],
+        visibility: Float[np.ndarray, "M"],
+    ) -> tuple[ActorState | None, float]:
+        """The next vehicle on the way that is seen, and how far ahead its middle is."""
+        end = int(np.searchsorted(self._arc_m, self._arc_m[self._passed] + LEADER_M))
+        way, arc_m = self._line[self._passed : end], self._arc_m[self._passed : end]
+        if not len(way) or not len(centre):
+            return None, np.inf
+        away_m, index = (np.asarray(found) for found in cKDTree(way).query(centre - [0.0, 0.0, MIDDLE_M]))
+        ahead_m = arc_m[index] - arc_m[0]
+        vehicle = [not (a.parked or a.category is Category.PEDESTRIAN) for a in actors]
+        candidate = vehicle & (away_m < LEADER_ASIDE_M) & (ahead_m > BUMPER_M) & (visibility >= SEEN)
+        if not candidate.any():
+            return None, np.inf
+        best = int(np.where(candidate, ahead_m, np.inf).argmin())
+        return actors[best], float(ahead_m[best])
+
+    def _aside_speed(self, moment: Moment) -> float:
+        """How fast the vehicle moves to the left of its route, m/s; 0 at the first moment."""
+        before, self._aside = self._aside, (moment.t_s, self._aside_m(moment))
+        return 0.0 if before is None else (self._aside[1] - before[1]) / (moment.t_s - before[0])
+
+    def _aside_m(self, moment: Moment) -> float:
+        k = min(self._passed, len(self._line) - 2)
+        ahead, offset = self._line[k + 1] - self._line[k], moment.T_world_ego[:3, 3] - self._line[k]
+        return float(ahead[0] * offset[1] - ahead[1] * offset[0]) / float(np.hypot(*ahead[:2]))
+
+    def _doing(self, moment: Moment, leader: ActorState | None, gap_m: float, aside_mps: float) -> Doing:
+        speed, turn_rate = float(moment.twist_ego[0]), float(moment.twist_ego[5])
+        if speed < STANDING_MPS:
+            return Doing.WAITS
+        row = int(np.searchsorted(self._begins_m, self._arc_m[self._passed], side="right")) - 1
+        command = self._lanes.command(int(self._route.lanes[max(row, 0)]))
+        if command is not Command.STRAIGHT and abs(turn_rate) > TURNING_RADPS:
+            return Doing.TURNS_LEFT if command is Command.LEFT else Doing.TURNS_RIGHT
+        if abs(aside_mps) > CHANGING_MPS:
+            return Doing.CHANGES_LEFT if aside_mps > 0 else Doing.CHANGES_RIGHT
+        acceleration = float(moment.acceleration_ego_mps2[0])
+        if acceleration < -GENTLE_MPS2:
+            return Doing.SLOWS
+        if leader is not None and gap_m < FOLLOWED_M and np.linalg.norm(leader.velocity_mps) > STANDING_MPS:
+            return Doing.FOLLOWS
+        return Doing.SPEEDS_UP if acceleration > GENTLE_MPS2 else Doing.DRIVES
+
+    def _light(self, moment: Moment, sees: Callable[[Float64[np.ndarray, "3"]], bool]) -> Light:
+        """What the next light on the way shows, if its lamps are in view."""
+        axle_m = float(self._arc_m[self._passed])
+        for lane, begin_m in zip(self._route.lanes, self._begins_m, strict=True):
+            zone = int(self._lanes.zone[lane])
+            if begin_m > axle_m + LIGHT_M:
+                break
+            if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
+                return Light(int(moment.lights[zone])) if sees(self._signal_xyz[zone]) else Light.NONE
+        return Light.NONE
+
+
+def _thing(
+    actor: ActorState,
+    xyz: Float64[np.ndarray, "3"],
+    seen: float,
+    on_road: bool,
+    R: Float64[np.ndarray, "3 3"],
+) -> Thing:
+    heading = R @ [np.cos(actor.yaw), np.sin(actor.yaw), 0.0]
+    return Thing(
+        category=actor.category,
+        xy_m=xyz[:2],
+        velocity_mps=(R @ actor.velocity_mps)[:2],
+        yaw=float(np.arctan2(heading[1], heading[0])),
+        visibility=float(seen),
+        parked=actor.parked,
+        on_road=bool(on_road),
+    )
+
+
+def _place_of(lanes: LaneGraph, lane: int) -> Place:
+    if lanes.limit_mps[lane] > MOTORWAY_LIMIT_MPS:
+        return Place.HIGHWAY
+    return Place.JUNCTION if lanes.junction[lane] >= 0 else Place.STREET
+
+
+def _crossed_levels(
+    xyz: Float64[np.ndarray, "P 3"],
+) -> tuple[Bool[np.ndarray, "P"], Bool[np.ndarray, "P"]]:
+    """Which points of lanes run above another lane, and which below one."""
+    over, under = np.zeros((2, len(xyz)), dtype=np.bool_)
+    if np.ptp(xyz[:, 2]) < PASSES_OVER_M:
+        return over, under
+    pairs = cKDTree(xyz[:, :2]).query_pairs(BELOW_M, output_type="ndarray")
+    rise_m = xyz[pairs[:, 0], 2] - xyz[pairs[:, 1], 2]
+    for high, low in (pairs[rise_m > PASSES_OVER_M].T, pairs[rise_m < -PASSES_OVER_M].T[::-1]):
+        over[high], under[low] = True, True
+    return over, under
+
+
+def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
+    """Lanes of roundabouts: closed ways that turn left all along, and what joins them within a junction."""
+    bends = lanes.turn_rad > np.where(lanes.length_m < SHORT_M, -0.1, lanes.length_m / RING_RADIUS_M)
+    found: set[int] = set()
+    for start in np.flatnonzero(bends & (lanes.length_m >= SHORT_M)).tolist():
+        if start not in found:
+            found.update(_ring_from(lanes, start, bends))
+    rings = np.array(sorted(found), dtype=np.int64)
+    junctions = np.setdiff1d(lanes.junction[rings], [-1])
+    return np.union1d(rings, np.flatnonzero(np.isin(lanes.junction, junctions)))
+
+
+def _ring_from(lanes: LaneGraph, start: int, bends: Bool[np.ndarray, "L"]) -> list[int]:
+    """A ring through a lane, empty if there is none."""
+    ways = [[start]]
+    while ways:
+        way = ways.pop()
+        length_m, turn_rad = float(lanes.length_m[way].sum()), float(lanes.turn_rad[way].sum())
+        if length_m > RING_M[1] or len(way) > RING_LANES:
+            continue
+        for after in lanes.successors[way[-1], : lanes.successor_count[way[-1]]].tolist():
+            if after == start and length_m > RING_M[0] and turn_rad > RING_TURN_RAD:
+                return way
+            if bends[after] and after not in way:
+                ways.append([*way, after])
+    return []
