@@ -121,20 +121,19 @@ class World:
     ) -> SensorFrame:
         """What the sensors see at one time.
 
-        All rows of an image are exposed at that time. Road users stand still during a sweep, while the
-        vehicle moves.
+        The vehicle and the road users move on straight ahead during a sweep, and while an image is exposed.
 
         Args:
             actors: road users without the ego vehicle; those that are parked are passed over.
             twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
-            noise_seed: of range noise and lost beams.
+            noise_seed: of range noise and lost beams, and of the noise in images.
             lights: a `Light` for each of the town's stop zones; None leaves their lamps dark.
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
         moment = self._moment(near, lights)
-        images, seen = capture.see(moment, sensors, T_world_ego)
-        noise = np.random.default_rng(noise_seed)
-        sweep, met = capture.sweep(moment, sensors.lidar, T_world_ego, twist_ego, noise)
+        ego = capture.EgoMotion(T_world_ego, twist_ego)
+        images, seen = capture.see(moment, sensors, ego, np.random.default_rng((noise_seed, 1)))
+        sweep, met = capture.sweep(moment, sensors.lidar, ego, np.random.default_rng(noise_seed))
         names = sensors.rig.names
         shape = (len(names), *sensors.rig.size_hw)
         return SensorFrame(
@@ -187,7 +186,8 @@ class World:
     def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> capture.Moment:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
-        placed = raycast.place(tuple(shape.scene for shape in shapes), T)
+        velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
+        placed = raycast.place(tuple(shape.scene for shape in shapes), T, velocity_mps)
         paint = np.array([self._shapes.paint_of(a) for a in actors], dtype=np.int32).reshape(-1, SLOTS)
         first = np.array([shape.first for shape in shapes], dtype=np.int32)
         scene = shading.Scene(

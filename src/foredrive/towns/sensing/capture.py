@@ -1,22 +1,35 @@
 """What cameras and a lidar sense of a town at one moment."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
+from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
-from foredrive.sensors import SpinningLidar, camera_rays
-from foredrive.towns.sensing import raycast, shading
+from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
+from foredrive.towns.sensing import echoes, raycast, shading
 from foredrive.towns.sensing.light import LightArrays
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
 CREASE_COS = 0.8
 
 Rays = Float32[np.ndarray, "N 3"]
+Times = Float32[np.ndarray, "N"]
+
+
+class EgoRays(NamedTuple):
+    """Rays in the ego frame of the time at which each of them looks."""
+
+    origin: Rays
+    direction: Rays
+    dt_s: Times
+    """Relative to the frame's time."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +42,15 @@ class SensorSuite:
     samples_per_outline_pixel: int = 4
     """A square number. One ray sees a pixel, textures being filtered; where outlines or shadows run through
     it there are this many."""
+    optics: CameraOptics = field(default_factory=CameraOptics)
 
     @cached_property
-    def pixel_rays(self) -> tuple[Rays, Rays]:
-        """Origins and directions of the pixels' central rays in the ego frame: cameras, rows, columns."""
+    def pixel_rays(self) -> EgoRays:
+        """The pixels' central rays: cameras, rows, columns."""
         return _flat_rays(self.rig, 1)
 
     @cached_property
-    def outline_rays(self) -> tuple[Rays, Rays]:
+    def outline_rays(self) -> EgoRays:
         """The same with the rays of an outline pixel next to each other."""
         return _flat_rays(self.rig, self.samples_per_outline_pixel)
 
@@ -47,31 +61,68 @@ class SensorSuite:
         return (1.0 / self.rig.K[:, 0, 0]).repeat_interleave(height * width).numpy()
 
 
-def _flat_rays(rig: CameraRig, samples: int) -> tuple[Rays, Rays]:
+def _flat_rays(rig: CameraRig, samples: int) -> EgoRays:
     rays = camera_rays(rig, samples)
-    return rays.origin_ego.reshape(-1, 3).numpy(), rays.dir_ego.reshape(-1, 3).numpy()
+    origin, direction = rays.origin_ego.reshape(-1, 3).numpy(), rays.dir_ego.reshape(-1, 3).numpy()
+    return EgoRays(origin, direction, rays.dt_s.flatten().numpy())
+
+
+class WorldRays(NamedTuple):
+    """Rays in the world frame."""
+
+    origin: Rays
+    direction: Rays
+    dt_s: Times | None
+    """When each looks, relative to the frame's time; None: all at that time."""
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """Where the vehicle is at the frame's time, and how it moves about then."""
+
+    T_world_ego: Float64[np.ndarray, "4 4"]
+    twist_ego: Float[np.ndarray, "6"]
+    """Velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes."""
+
+    def now(self, origin: Rays, direction: Rays, dt_s: Times | None = None) -> WorldRays:
+        """Rays given in the ego frame of the frame's time."""
+        R = np.ascontiguousarray(self.T_world_ego[:3, :3].T, dtype=np.float32)
+        return WorldRays(origin @ R + self.T_world_ego[:3, 3].astype(np.float32), direction @ R, dt_s)
+
+    def then(self, rays: EgoRays) -> WorldRays:
+        """Rays given in the ego frame of the time at which each of them looks."""
+        if not self.twist_ego.any():
+            return self.now(*rays)
+        dt_s, row = np.unique(rays.dt_s, return_inverse=True)
+        T_now_then = exp_se3(torch.from_numpy(dt_s[:, None].astype(np.float64) * self.twist_ego)).numpy()
+        T = (self.T_world_ego @ T_now_then)[:, :3].astype(np.float32)[row]
+        origin = np.einsum("nij,nj->ni", T[..., :3], rays.origin) + T[..., 3]
+        return WorldRays(origin, np.einsum("nij,nj->ni", T[..., :3], rays.direction), rays.dt_s)
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A town with its road users where they are at one time."""
+    """A town with its road users where they are at one time, and how they move about then."""
 
     scene: shading.Scene
     static: raycast.TriangleScene
     placed: raycast.PlacedShapes
     light: LightArrays
 
-    def cast(self, origin: Rays, direction: Rays) -> shading.Hits:
+    def cast(self, rays: WorldRays) -> shading.Hits:
         """Nearest hits."""
-        return raycast.cast(self.static, self.placed, origin, direction)
+        return raycast.cast(self.static, self.placed, *rays)
 
-    def sunlit(self, found: shading.Surfaces, hits: shading.Hits) -> Bool[np.ndarray, "N"]:
+    def sunlit(
+        self, found: shading.Surfaces, hits: shading.Hits, dt_s: Times | None
+    ) -> Bool[np.ndarray, "N"]:
         """Which hits the sun shines on."""
         start = np.empty_like(found.xyz)
         facing = shading.sun_rays(found, hits.t, self.light.sun, start)
         to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
         lit = np.zeros(len(hits.t), dtype=np.bool_)
-        lit[facing] = ~raycast.occluded(self.static, self.placed, start[: len(facing)], to_sun)
+        when = None if dt_s is None else dt_s[facing]
+        lit[facing] = ~raycast.occluded(self.static, self.placed, start[: len(facing)], to_sun, when)
         return lit
 
 
@@ -97,51 +148,113 @@ def _note(seen: Seen, part: slice, hits: shading.Hits, look: Int32[np.ndarray, "
     seen.range_m[part] = np.where(look == shading.MISS, np.inf, hits.t)
 
 
+class Film:
+    """What falls on the pixels of all cameras, on its way to 8-bit images."""
+
+    def __init__(self, optics: CameraOptics, metered: float, count: int) -> None:
+        self._optics, self._exposure = optics, metered * 2.0**optics.exposure_ev
+        self._rgb = np.empty((count, 3), np.uint8)
+        noisy = not math.isinf(optics.white_electrons)
+        self._linear = np.empty((count, 3), np.float32) if noisy else None
+
+    def expose(self, pixels: slice | Int64[np.ndarray, "n"], radiance: Rays, samples: int) -> None:
+        """Let in the light of pixels, of `samples` rays each."""
+        if self._linear is None:
+            self._rgb[pixels] = shading.develop(radiance, self._exposure, samples)
+        else:
+            self._linear[pixels] = self._exposure * radiance.reshape(-1, samples, 3).mean(1)
+
+    def develop(self, rng: np.random.Generator) -> UInt8[np.ndarray, "P 3"]:
+        """The pixels' colours, with the sensor's noise if it has any."""
+        if self._linear is None:
+            return self._rgb
+        return shading.develop(self._optics.with_noise(self._linear, rng), 1.0, 1)
+
+
 def see(
-    moment: Moment, sensors: SensorSuite, T_world_ego: Float64[np.ndarray, "4 4"]
+    moment: Moment, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
-    """Images of all cameras, and what each pixel's central ray met [C·H·W]."""
+    """Images of all cameras, and what each pixel's central ray met [C·H·W] in the middle of its exposure.
+
+    Each row is seen from where the vehicle is at the time of its readout, with the road users where they are
+    then: they move on straight ahead.
+    """
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
-    rgb = np.empty((count, 3), np.uint8)
-    seen = _nothing_seen(count)
+    seen, film = _nothing_seen(count), Film(sensors.optics, moment.light.exposure, count)
+    if sensors.optics.shutter_s > 0:
+        _see_blurred(moment, sensors, ego, film, seen)
+    else:
+        _see_sharp(moment, sensors, ego, film, seen)
+    return film.develop(rng).reshape(*shape, 3), seen
+
+
+def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+    """One ray for each pixel, then several where outlines run."""
+    count, samples = len(seen.look), sensors.samples_per_outline_pixel
+    rolling = bool(sensors.rig.readout_s.any())
     lit, normal = np.empty(count, np.bool_), np.empty((count, 3), np.float32)
+
+    def to_world(rays: EgoRays, rows: slice | Int64[np.ndarray, "n"]) -> WorldRays:
+        chosen = EgoRays(*(column[rows] for column in rays))
+        return ego.then(chosen) if rolling else ego.now(chosen.origin, chosen.direction)
 
     def first_look(start: int, stop: int) -> None:
         part = slice(start, stop)
-        rays = _to_world(T_world_ego, sensors.pixel_rays[0][part], sensors.pixel_rays[1][part])
-        radiance, hits, found, lit[part] = _look(moment, *rays, sensors.pixel_rad[part])
-        rgb[part] = shading.develop(radiance, moment.light.exposure, 1)
+        rays = to_world(sensors.pixel_rays, part)
+        radiance, hits, found, lit[part] = _look(moment, rays, sensors.pixel_rad[part])
+        film.expose(part, radiance, 1)
         _note(seen, part, hits, found.look)
         normal[part] = found.normal
 
     in_parallel(first_look, count, PIXEL_GRAIN)
-    samples = sensors.samples_per_outline_pixel
     if samples == 1:
-        return rgb.reshape(*shape, 3), seen
-    kind = np.stack([seen.look, seen.actor, lit], axis=-1).reshape(*shape, 3)
-    pixels = np.flatnonzero(_outlines(kind, normal.reshape(*shape, 3)))
+        return
+    kind = np.stack([seen.look, seen.actor, lit], axis=-1)
+    shape = (len(sensors.rig.names), *sensors.rig.size_hw, 3)
+    pixels = np.flatnonzero(_outlines(kind.reshape(shape), normal.reshape(shape)))
 
     def closer_look(start: int, stop: int) -> None:
         some = pixels[start:stop]
         rows = (some[:, None] * samples + np.arange(samples)).ravel()
-        rays = _to_world(T_world_ego, sensors.outline_rays[0][rows], sensors.outline_rays[1][rows])
+        rays = to_world(sensors.outline_rays, rows)
         ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
-        radiance, *_ = _look(moment, *rays, ray_rad)
-        rgb[some] = shading.develop(radiance, moment.light.exposure, samples)
+        radiance, *_ = _look(moment, rays, ray_rad)
+        film.expose(some, radiance, samples)
 
     in_parallel(closer_look, len(pixels), PIXEL_GRAIN // samples)
-    return rgb.reshape(*shape, 3), seen
+
+
+def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+    """The mean of the light at several instants, each through another part of the pixel."""
+    optics, samples = sensors.optics, sensors.samples_per_outline_pixel
+
+    def job(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        rays = ego.then(EgoRays(*(column[part] for column in sensors.pixel_rays)))
+        hits = moment.cast(rays)
+        ray_rad = sensors.pixel_rad[part]
+        found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
+        _note(seen, part, hits, found.look)
+        total = np.zeros((stop - start, 3), np.float32)
+        for k, dt_s in enumerate(optics.sub_exposure_dt_s):
+            origin, direction, row_dt_s = sensors.outline_rays
+            rows = slice(start * samples + k % samples, stop * samples, samples)
+            rays = ego.then(EgoRays(origin[rows], direction[rows], row_dt_s[rows] + np.float32(dt_s)))
+            total += _look(moment, rays, ray_rad)[0]
+        film.expose(part, total / np.float32(optics.sub_exposures), 1)
+
+    in_parallel(job, len(seen.look), PIXEL_GRAIN)
 
 
 def _look(
-    moment: Moment, origin: Rays, direction: Rays, ray_rad: Float32[np.ndarray, "N"]
+    moment: Moment, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
 ) -> tuple[Rays, shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
     """Radiance along rays, and what they met."""
-    hits = moment.cast(origin, direction)
-    found = shading.surfaces(moment.scene, hits, origin, direction, ray_rad)
-    lit = moment.sunlit(found, hits)
-    radiance = shading.shade(moment.scene.looks, found, hits.t, direction, lit, moment.light)
+    hits = moment.cast(rays)
+    found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
+    lit = moment.sunlit(found, hits, rays.dt_s)
+    radiance = shading.shade(moment.scene.looks, found, hits.t, rays.direction, lit, moment.light)
     return radiance, hits, found, lit
 
 
@@ -161,37 +274,42 @@ def _outlines(
 
 
 def sweep(
-    moment: Moment,
-    lidar: SpinningLidar,
-    T_world_ego: Float64[np.ndarray, "4 4"],
-    twist_ego: Float[np.ndarray, "6"],
-    rng: np.random.Generator,
+    moment: Moment, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[LidarSweep, Seen]:
-    """One revolution, and what its beams met.
+    """One revolution, and what its beams met; road users move on straight ahead meanwhile.
 
     A beam that is not returned although it met something is free up to there.
     """
-    beams = lidar.beams(torch.from_numpy(np.asarray(twist_ego, dtype=np.float32)))
-    origin_ego, dir_ego = beams.origin_ego.numpy(), beams.dir_ego.numpy()
-    count = len(dir_ego)
+    beams = lidar.beams(torch.from_numpy(np.asarray(ego.twist_ego, dtype=np.float32)))
+    rays, n = lidar.footprints(beams), lidar.rays_per_beam
+    origin_ego, dir_ego, dt_s = rays.origin_ego.numpy(), rays.dir_ego.numpy(), rays.dt_s.numpy()
+    count = len(beams.dt_s)
     chance = rng.random((count, 2), dtype=np.float32)
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
-    seen = _nothing_seen(count)
-    beam_rad = np.full(count, 2 * np.pi / lidar.azimuth_steps, dtype=np.float32)
+    seen, far_m = _nothing_seen(count), np.float32(lidar.max_range_m)
+    beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps if n == 1 else lidar.divergence_rad / n**0.5)
 
     def job(start: int, stop: int) -> None:
-        part = slice(start, stop)
-        origin, direction = _to_world(T_world_ego, origin_ego[part], dir_ego[part])
-        hits = moment.cast(origin, direction)
-        found = shading.surfaces(moment.scene, hits, origin, direction, beam_rad[part])
-        range_m[part], returned[part], intensity[part] = shading.lidar_returns(
-            moment.scene.looks, found, hits.t, np.float32(lidar.max_range_m), chance[part]
-        )
-        _note(seen, part, hits, found.look)
+        part, rows = slice(start, stop), slice(start * n, stop * n)
+        rays = ego.now(origin_ego[rows], dir_ego[rows], dt_s[rows])
+        hits = moment.cast(rays)
+        ray_rad = np.full(len(hits.t), beam_rad)
+        found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
+        odds = chance[part]
+        if n > 1:
+            t = np.where(found.look == shading.MISS, np.inf, hits.t).reshape(-1, n)
+            group, share = echoes.group_echoes(t, lidar.pulse_m)
+            odds = echoes.chance_of_shares(odds, share)
+        look, echo = found.look, shading.lidar_returns(moment.scene.looks, found, hits.t, far_m, odds)
+        if n > 1:
+            echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
+            hits, look = shading.Hits(*(column[picked] for column in hits)), look[picked]
+        range_m[part], returned[part], intensity[part] = echo
+        _note(seen, part, hits, look)
 
-    in_parallel(job, count, BEAM_GRAIN)
+    in_parallel(job, count, BEAM_GRAIN // n)
     returned &= range_m >= lidar.min_range_m
     range_m = np.where(returned, (range_m + noise_m).clip(min=0.0), range_m)
     return LidarSweep(
@@ -204,8 +322,3 @@ def sweep(
         beam=lidar.channel,
         valid=torch.ones(count, dtype=torch.bool),
     ), seen
-
-
-def _to_world(T_world_ego: Float64[np.ndarray, "4 4"], origin: Rays, direction: Rays) -> tuple[Rays, Rays]:
-    R = np.ascontiguousarray(T_world_ego[:3, :3].T, dtype=np.float32)
-    return origin @ R + T_world_ego[:3, 3].astype(np.float32), direction @ R
