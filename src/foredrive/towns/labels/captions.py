@@ -165,7 +165,7 @@ def _where(place: Place, words: _Words) -> str:
 def _action(situation: Situation, words: _Words) -> str:
     leader = _NOUNS[situation.leader][0] if situation.leader is not None else ""
     speed = f"{5 * max(1, round(situation.speed_mps * 3.6 / 5))} km/h"
-    we = words.pick("the ego vehicle", "the car", "the vehicle")
+    we = words.pick("the ego vehicle", "the ego car")
     match situation.doing:
         case Doing.TURNS_LEFT | Doing.TURNS_RIGHT:
             return f"{we} {situation.doing}"
@@ -240,7 +240,7 @@ def _traffic(seen: Sequence[Thing], leader: Category | None, words: _Words) -> l
     for sector, where in (
         ("left", words.pick("on the left", "to the left")),
         ("right", words.pick("on the right", "to the right")),
-        ("behind", words.pick("behind", "in the rear")),
+        ("behind", "behind"),
     ):
         there = [t for t in vehicles if _sector(t) == sector]
         if there:
@@ -252,13 +252,15 @@ def _traffic(seen: Sequence[Thing], leader: Category | None, words: _Words) -> l
 
 def _is_oncoming(thing: Thing) -> bool:
     moves = float(np.hypot(*thing.velocity_mps)) > MOVING_MPS
-    return moves and np.cos(thing.yaw) < ONCOMING_COS
+    return moves and bool(np.cos(thing.yaw) < ONCOMING_COS)
 
 
 def _crosses(thing: Thing) -> bool:
-    vx, vy = thing.velocity_mps
+    vx, vy = thing.velocity_mps.tolist()
     walks_across = abs(vy) > WALKING_MPS and abs(vy) > abs(vx)
-    return thing.category is Category.PEDESTRIAN and thing.on_road and walks_across and thing.xy_m[0] > 0
+    return (
+        thing.category is Category.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
+    )
 
 
 def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:

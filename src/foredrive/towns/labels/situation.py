@@ -27,6 +27,8 @@ MIDDLE_M = 0.8
 """About half the height of a vehicle: the way lies on the road."""
 BUMPER_M = 3.0
 LIGHT_M = 45.0
+LAMPS_M = 50.0
+"""Further off a lamp is but a part of a pixel."""
 PASSES_OVER_M, BELOW_M = 4.0, 5.0
 RING_M = (40.0, 250.0)
 RING_RADIUS_M = 60.0
@@ -122,7 +124,7 @@ class Narrator:
             speed_mps=float(moment.twist_ego[0]),
             things=things,
             leader=None if leader is None else leader.category,
-            light=self._light(moment, lambda xyz: sees(R @ xyz + T_ego_world[:3, 3])),
+            light=self._light(moment, T_ego_world, sees),
         )
 
     def _leader(
@@ -172,15 +174,22 @@ class Narrator:
             return Doing.FOLLOWS
         return Doing.SPEEDS_UP if acceleration > GENTLE_MPS2 else Doing.DRIVES
 
-    def _light(self, moment: Moment, sees: Callable[[Float64[np.ndarray, "3"]], bool]) -> Light:
+    def _light(
+        self,
+        moment: Moment,
+        T_ego_world: Float64[np.ndarray, "4 4"],
+        sees: Callable[[Float64[np.ndarray, "3"]], bool],
+    ) -> Light:
         """What the next light on the way shows, if its lamps are in view."""
         axle_m = float(self._arc_m[self._passed])
         for lane, begin_m in zip(self._route.lanes, self._begins_m, strict=True):
-            zone = int(self._lanes.zone[lane])
             if begin_m > axle_m + LIGHT_M:
                 break
+            zone = int(self._lanes.zone[lane])
             if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
-                return Light(int(moment.lights[zone])) if sees(self._signal_xyz[zone]) else Light.NONE
+                lamps = T_ego_world[:3, :3] @ self._signal_xyz[zone] + T_ego_world[:3, 3]
+                in_view = np.linalg.norm(lamps) < LAMPS_M and sees(lamps)
+                return Light(int(moment.lights[zone])) if in_view else Light.NONE
         return Light.NONE
 
 

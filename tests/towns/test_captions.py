@@ -1,0 +1,105 @@
+"""Captions say what hand-built scenes hold, and nothing that cannot be seen."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from foredrive.scene import Category
+from foredrive.towns.conditions import CONDITIONS, Conditions
+from foredrive.towns.labels.captions import Doing, Place, Situation, Thing, caption
+from foredrive.towns.traffic.lights import Light
+
+SEEDS = range(24)
+
+
+def thing(category: Category, x: float, y: float, **changes: object) -> Thing:
+    standing = Thing(category, np.array([x, y], dtype=np.float64), np.zeros(2), 0.0, visibility=1.0)
+    return dataclasses.replace(standing, **changes)
+
+
+def situation(*things: Thing, **changes: object) -> Situation:
+    plain = Situation(Conditions(), Place.STREET, Doing.DRIVES, 10.0, things)
+    return dataclasses.replace(plain, **changes)
+
+
+WALKER = thing(Category.PEDESTRIAN, 12.0, -4.0, velocity_mps=np.array([0.0, 1.4]), on_road=True)
+RAINY_NIGHT = situation(
+    thing(Category.CAR, 20.0, 0.0),
+    thing(Category.CAR, 30.0, 3.0),
+    WALKER,
+    conditions=Conditions(hour=23.0, clouds=1.0, rain_mmph=30.0),
+    light=Light.RED,
+    doing=Doing.SLOWS,
+)
+
+
+def test_a_scene_in_words() -> None:
+    for seed in SEEDS:
+        text = caption(RAINY_NIGHT, seed).lower()
+        assert re.match(r"(at |a drive by )?night, heavy rain, ", text), text
+        assert re.search(r"two cars (ahead|in front)\.", text), text
+        assert re.search(r"a pedestrian (crosses|crosses the road|walks across) from the right\.", text), text
+        assert re.search(r"light is red|light shows red|a red traffic light", text), text
+
+
+def test_language_varies_with_the_seed_alone() -> None:
+    texts = [caption(RAINY_NIGHT, seed) for seed in SEEDS]
+    assert len(set(texts)) > 10
+    assert texts == [caption(RAINY_NIGHT, seed) for seed in SEEDS]
+    assert all(text.endswith(".") and text[0].isupper() and "  " not in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("scene", "says", "never"),
+    [
+        (situation(thing(Category.CAR, 20, 0, visibility=0.3)), "nearby", "car ahead|car in front"),
+        (situation(thing(Category.BUS, 60, 0)), "nearby", "bus"),
+        (situation(thing(Category.BUS, 40, 0), conditions=Conditions(visibility_m=50.0)), "dense fog", "bus"),
+        (situation(thing(Category.CAR, 0, 9)), "a car (on|to) the left", "ahead|right"),
+        (situation(thing(Category.TRUCK, -12, 0)), "a truck behind", "ahead"),
+        (
+            situation(thing(Category.CAR, 25, 3, yaw=np.pi, velocity_mps=np.array([-9.0, 0.0]))),
+            "an oncoming car",
+            "ahead",
+        ),
+        (situation(thing(Category.CAR, 15, -4, parked=True)), "a parked car on the right", "nearby|ahead"),
+        (
+            situation(thing(Category.CAR, 15, -4, parked=True), thing(Category.CAR, 15, 4, parked=True)),
+            "two parked cars on both sides",
+            "ahead",
+        ),
+        (situation(thing(Category.PEDESTRIAN, 12, -6)), "a pedestrian .*on the right", "cross"),
+        (
+            situation(dataclasses.replace(WALKER, velocity_mps=np.array([0.0, -1.4]))),
+            "from the left",
+            "from the right",
+        ),
+        (situation(dataclasses.replace(WALKER, on_road=False)), "a pedestrian", "cross|across"),
+        (
+            situation(doing=Doing.WAITS, light=Light.RED, speed_mps=0.0),
+            "waits at (the|a) red light",
+            "light is|light shows|km/h",
+        ),
+        (
+            situation(doing=Doing.FOLLOWS, leader=Category.BUS, speed_mps=8.4),
+            "follows a bus at (about|some) 30 km/h",
+            "nearby",
+        ),
+        (situation(doing=Doing.TURNS_LEFT, place=Place.JUNCTION), "turns left", "right"),
+        (situation(place=Place.ROUNDABOUT), "roundabout", "junction"),
+        (situation(conditions=CONDITIONS["dusk"]), "dusk", "night|noon"),
+        (situation(conditions=Conditions(wetness=0.8)), "road is wet|wet road", "rain"),
+    ],
+)
+def test_facts(scene: Situation, says: str, never: str) -> None:
+    for seed in SEEDS:
+        text = caption(scene, seed).lower()
+        assert re.search(says, text), text
+        assert not re.search(rf"\b({never})\b", text), text
+
+
+def test_many_are_counted_by_kind() -> None:
+    crowd = [thing(Category.CAR, 10.0 + 2 * i, 0.0) for i in range(3)] + [thing(Category.BICYCLE, 9.0, 1.0)]
+    assert re.search("three cars and a cyclist (ahead|in front)", caption(situation(*crowd), 0).lower())
