@@ -11,7 +11,9 @@ from py123d.api import SceneFilter, get_filtered_scenes
 from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
 from py123d.datatypes import LidarID
 
+from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.log_writer import Frame, FullOccupancy, LogWriter
+from foredrive.data.logs import Log, find_logs
 from foredrive.data.modalities import occupancy_metadata, pack_occupancy, unpack_beams, unpack_occupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
@@ -42,6 +44,19 @@ def test_py123d_finds_and_reads_the_log(tmp_path: Path) -> None:
         world.ego_pose(0.3) @ specs[0].T_ego_cam,
         atol=1e-9,
     )
+
+
+def test_a_rolling_shutter_is_noted(tmp_path: Path) -> None:
+    """123D itself reads the cameras as ever."""
+    specs = [
+        dataclasses.replace(spec, readout_s=s) for spec, s in zip(world.cameras(), (0.03, 0.0), strict=True)
+    ]
+    world.write(tmp_path, frames=2, specs=specs)
+    log = Log(find_logs(tmp_path)[0])
+    cameras = pinhole_cameras(log)
+    frames = {name: read_camera(log, 1, camera, (48, 96), False) for name, camera in cameras.items()}
+    assert {name: frame.readout_s for name, frame in frames.items()} == {"ahead": 0.03, "left": 0.0}
+    np.testing.assert_allclose(frames["ahead"].T_ego_cam, specs[0].T_ego_cam, atol=1e-6)
 
 
 def test_the_sweep_comes_back_with_its_misses(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Cameras as 123D describes them: their ids, geometry, and the label images that share it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -36,11 +37,36 @@ class CameraSpec:
     """px, pixel centres at +0.5."""
     T_ego_cam: Float[np.ndarray, "4 4"]
     size_hw: tuple[int, int]
+    readout_s: float = 0.0
+    """From the first row's exposure to the last's, the middle one's being at the frame's time; 0: global
+    shutter."""
 
 
-def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> PinholeCameraMetadata:
+class RollingCameraMetadata(PinholeCameraMetadata):
+    """123D's description of a pinhole camera and, which 123D passes over, how long its readout takes."""
+
+    __slots__ = ("readout_s",)
+
+    def __init__(self, readout_s: float, **described: Any) -> None:
+        super().__init__(**described)
+        self.readout_s = readout_s
+
+    @classmethod
+    def from_dict(cls, data_dict: dict[str, Any]) -> "RollingCameraMetadata":
+        """From a log's metadata; without a readout time the shutter is global."""
+        known = PinholeCameraMetadata.from_dict(data_dict)
+        described = {slot[1:]: getattr(known, slot) for slot in PinholeCameraMetadata.__slots__}
+        return cls(data_dict.get("readout_s", 0.0), **described)
+
+    def to_dict(self) -> dict[str, Any]:
+        """123D's dictionary with the readout time."""
+        return {**super().to_dict(), "readout_s": self.readout_s}
+
+
+def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetadata:
     """123D's description of a camera."""
-    return PinholeCameraMetadata(
+    return RollingCameraMetadata(
+        spec.readout_s,
         camera_name=spec.name,
         camera_id=camera_id,
         intrinsics=PinholeIntrinsics.from_camera_matrix(spec.K.astype(np.float64)),

@@ -11,11 +11,13 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from PIL import Image, UnidentifiedImageError
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
+from py123d.api.utils.arrow_metadata_utils import get_metadata_from_arrow_schema
 from py123d.common.runtime import get_dataset_paths
 from py123d.datatypes import ModalityType, PinholeCameraMetadata
 from torch import Tensor
 
 from foredrive.data.arrow_files import column_array, fixed_lists, pose_matrices, reading
+from foredrive.data.camera_streams import RollingCameraMetadata
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 
@@ -24,7 +26,8 @@ _log = logging.getLogger(__name__)
 _ROWS_EXPOSED_S = {"pandaset": (-0.03, 0.01)}
 """When the first and the last image row are exposed, relative to the time that the data set gives the image.
 PandaSet: neurad-studio's PandaSetDataParserConfig.rolling_shutter_offsets; in a moving log, lidar intensity
-against image brightness bears them out row by row. Data sets not listed: all rows at the given time."""
+against image brightness bears them out row by row. Data sets not listed: all rows at the given time, or about
+it where the log itself has a readout time."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def read_camera(
                 image = _resize(_open_image(log, frame, metadata, data), image_hw)
     dist = metadata.distortion
     ideal = metadata.is_undistorted or dist is None
-    first_s, last_s = _rows_exposed_s(log)
+    first_s, last_s = _rows_exposed_s(log, metadata.modality_key)
     return CameraFrame(
         image=image,
         K=_scaled_intrinsics(metadata, image_hw),
@@ -92,8 +95,15 @@ def read_camera(
     )
 
 
-def _rows_exposed_s(log: Log) -> tuple[float, float]:
-    return _ROWS_EXPOSED_S.get(log.metadata.dataset, (0.0, 0.0))
+@functools.lru_cache(maxsize=1024)
+def _rows_exposed_s(log: Log, modality_key: str) -> tuple[float, float]:
+    if log.metadata.dataset in _ROWS_EXPOSED_S:
+        return _ROWS_EXPOSED_S[log.metadata.dataset]
+    table = get_modality_table(log.path.folder, modality_key)
+    if table is None:
+        return (0.0, 0.0)
+    readout_s = get_metadata_from_arrow_schema(table.schema, RollingCameraMetadata).readout_s
+    return (-0.5 * readout_s, 0.5 * readout_s)
 
 
 @functools.lru_cache(maxsize=64)
@@ -113,7 +123,7 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
     logged = column_array(table, f"{modality_key}.camera_to_global_se3")
     T_world_cam = pose_matrices(fixed_lists(logged, 7)[rows])
     T_stamped = log.poses_at(stamp_us)[0]
-    T_exposed = log.poses_at(stamp_us + 0.5e6 * sum(_rows_exposed_s(log)))[0]
+    T_exposed = log.poses_at(stamp_us + 0.5e6 * sum(_rows_exposed_s(log, modality_key)))[0]
     unlogged = logged.is_null().to_numpy(zero_copy_only=False)[rows]
     T_world_cam[unlogged] = T_stamped[unlogged] @ mounted
     T_ego_cam[frames] = (

@@ -248,6 +248,6 @@ def _distance_m(actor: ActorState, moment: Moment) -> float:
 
 def _specs(rig: CameraRig) -> list[CameraSpec]:
     return [
-        CameraSpec(name, rig.K[i].numpy(), rig.T_ego_cam[i].numpy(), rig.size_hw)
+        CameraSpec(name, rig.K[i].numpy(), rig.T_ego_cam[i].numpy(), rig.size_hw, float(rig.readout_s[i]))
         for i, name in enumerate(rig.names)
     ]
