@@ -1,7 +1,8 @@
 """The privileged driver: it follows a route as vehicle 0 of the traffic, and everybody reacts to it.
 
 It plans its speed as all drivers do, from the exact state of the others, the lights and the curves ahead
-(car_following, right_of_way), and steers so that the rear axle stays on the lane's centreline.
+(car_following, right_of_way), changes lanes for its route and to pass slow vehicles (lane_changes), and
+steers so that the rear axle stays on its path.
 """
 
 import dataclasses
@@ -12,12 +13,14 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from foredrive.data.log_writer import EGO_VEHICLE
+from foredrive.errors import InputError
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.traffic.fleet import Starts, place
 from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.recovery import Sway, step_sway
 from foredrive.towns.traffic.routes import Route, draw_route
-from foredrive.towns.traffic.traffic import Traffic, TrafficState
+from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import Vehicles, empty_slots, vehicle_poses
 
 LONGEST_STEP_S = 0.1
@@ -47,20 +50,29 @@ class Moment:
 
 
 class Drive:
-    """One drive of the expert in one town: a route and the moments along it.
+    """One drive of the expert in one town: a route and the moments along it; `state` is the traffic's now.
 
     Args:
         traffic: the town's traffic; its seed decides the route, too.
         seconds: how long the drive will be, so that the route is long enough and turns within it.
+        steering_noise: standard deviation, rad, of what disturbs the steering now and then (.02 pushes the
+            vehicle some decimetres off its lane's middle); the expert steers back. 0: it drives flawlessly.
+
+    Raises:
+        InputError: the noise is negative.
     """
 
-    def __init__(self, traffic: Traffic, seconds: float) -> None:
+    def __init__(self, traffic: Traffic, seconds: float, steering_noise: float = 0.0) -> None:
+        if not steering_noise >= 0:
+            raise InputError(f"the steering noise is 0 rad or more, got {steering_noise:g}")
         self._traffic = traffic
         self._planned = plan_route(traffic.lanes, traffic.starts, traffic.seed, seconds)
-        self._state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
+        self.state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
         while not self._is_settled():
-            self._state = traffic.step(self._state, LONGEST_STEP_S)
+            self.state = traffic.step(self.state, LONGEST_STEP_S)
         self.route = self._remaining()
+        self._steering_noise, self._sway = steering_noise, Sway()
+        self._rng = np.random.default_rng((traffic.seed, 4))
 
     def moments(self, count: int, dt_s: float) -> Iterator[Moment]:
         """`count` moments of the drive, `dt_s` apart."""
@@ -68,32 +80,49 @@ class Drive:
         for index in range(count):
             if index:
                 for _ in range(steps):
-                    self._state = self._traffic.step(self._state, dt_s / steps)
+                    self._step(dt_s / steps)
             yield self._moment(index * dt_s)
 
+    def _step(self, dt_s: float) -> None:
+        self.state = self._traffic.step(self.state, dt_s)
+        if self._steering_noise > 0:
+            speed, wheelbase = (float(x[0]) for x in (self._ego.speed_mps, self._ego.wheelbase_m))
+            self._sway = step_sway(self._sway, speed, wheelbase, self._steering_noise, dt_s, self._rng)
+
+    @property
+    def _ego(self) -> Vehicles:
+        return Vehicles(**{name: value[:1] for name, value in vars(self.state.vehicles).items()})
+
     def _is_settled(self) -> bool:
-        moving = self._state.vehicles.speed_mps[0] > MOVING_MPS
-        return self._state.time_s > (SETTLE_S if moving else LONGEST_SETTLE_S)
+        moving = self.state.vehicles.speed_mps[0] > MOVING_MPS
+        return self.state.time_s > (SETTLE_S if moving else LONGEST_SETTLE_S)
 
     def _remaining(self) -> Route:
         """The route from where the ego vehicle is now."""
-        axle_m = float(self._state.vehicles.s_m[0] - self._state.vehicles.axle_to_centre_m[0])
-        return Route(self._planned.lanes[self._state.route_passed :], max(0.0, axle_m))
+        axle_m = float(self.state.vehicles.s_m[0] - self.state.vehicles.axle_to_centre_m[0])
+        to_come = slice(self.state.route_passed, None)
+        entered = self._planned.entered[to_come].copy()
+        entered[0] = self._planned.lanes[to_come][0] if self._is_on_route() else entered[0]
+        return Route(self._planned.lanes[to_come], max(0.0, axle_m), entered)
+
+    def _is_on_route(self) -> bool:
+        return bool(self.state.vehicles.lane[0] == self._planned.lanes[self.state.route_passed])
 
     def _moment(self, t_s: float) -> Moment:
-        ego = _only_ego(self._state)
+        ego = self._ego
         T_world_ego = _axle_pose(self._traffic, ego)
         speed = float(ego.speed_mps[0])
-        soon = dataclasses.replace(ego, s_m=ego.s_m + speed * TURN_RATE_STEP_S)
+        soon = ego.moved(np.array([speed * TURN_RATE_STEP_S]))
         turned = np.linalg.inv(T_world_ego) @ _axle_pose(self._traffic, soon)
         turn_rate = float(np.arctan2(turned[1, 0], turned[0, 0])) / TURN_RATE_STEP_S
+        turn_rate += speed * self._sway.curvature
         return Moment(
             t_s=t_s,
-            T_world_ego=T_world_ego,
+            T_world_ego=T_world_ego @ _beside(self._sway),
             twist_ego=np.array([speed, 0.0, 0.0, 0.0, 0.0, turn_rate]),
             acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), speed * turn_rate, 0.0]),
-            actors=self._traffic.actors(self._state),
-            lights=self._traffic.zone_lights(self._state.time_s),
+            actors=self._traffic.actors(self.state),
+            lights=self._traffic.zone_lights(self.state.time_s),
         )
 
 
@@ -128,8 +157,11 @@ def _ego_vehicle(traffic: Traffic, route: Route) -> Vehicles:
     return place(traffic.lanes, driver, route.lanes[:1], np.array([route.start_m]))
 
 
-def _only_ego(state: TrafficState) -> Vehicles:
-    return Vehicles(**{name: value[:1] for name, value in vars(state.vehicles).items()})
+def _beside(sway: Sway) -> Float64[np.ndarray, "4 4"]:
+    """The ego frame in that of the path."""
+    T, cos, sin = np.eye(4), np.cos(sway.yaw_rad), np.sin(sway.yaw_rad)
+    T[:2, :2], T[1, 3] = [[cos, -sin], [sin, cos]], sway.aside_m
+    return T
 
 
 def _axle_pose(traffic: Traffic, ego: Vehicles) -> Float64[np.ndarray, "4 4"]:

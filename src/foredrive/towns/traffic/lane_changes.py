@@ -27,6 +27,11 @@ NEAREST_M = 2.0
 SETTLED_M = 60.0
 """Drivers stay in a lane for this long before they change again, unless they have to."""
 LONGEST_STRETCH_M = 600.0
+URGENT_S = 12.0
+"""Whoever has to leave a lane wants to do it this long before its end, or `SETTLED_M` before."""
+HAS_TO_MPS2 = 4.0
+LIKES_TO_MPS2 = 0.5
+"""What it is worth to be in the lane of one's route, towards its end and far from it."""
 FLAT_M = 0.3
 """Lanes further apart in height are not side by side."""
 
@@ -195,6 +200,24 @@ def _followers(now: Situation) -> Int[np.ndarray, "N"]:
     led = led[np.argsort(-now.leader_gap_m[led], kind="stable")]  # the nearest is written last
     follower[now.leader[led]] = led
     return follower
+
+
+def room_to_change_m(
+    graph: LaneGraph, stretches: Stretches, vehicles: Vehicles, lane: int
+) -> tuple[int, float] | None:
+    """To which side vehicle 0 has to go to be in `lane`, and how far it can drive before it has to begin.
+
+    None: it is there, or there is no way.
+    """
+    here = int(vehicles.lane[0])
+    for side in (LEFT, RIGHT):
+        beside = here
+        while beside >= 0 and beside != lane:
+            beside = int(graph.sides.lane[side, beside])
+        if beside == lane and beside != here:
+            need = SHORTEST_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + NEAREST_M
+            return side, float(stretches.room_m[side, here] - vehicles.s_m[0] - need)
+    return None
 
 
 def choose_change(

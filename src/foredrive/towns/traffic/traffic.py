@@ -4,14 +4,24 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
 from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
-from foredrive.towns.traffic.lane_changes import begin_change, choose_change, find_stretches, who_may_change
+from foredrive.towns.traffic.lane_changes import (
+    HAS_TO_MPS2,
+    LIKES_TO_MPS2,
+    SETTLED_M,
+    URGENT_S,
+    begin_change,
+    choose_change,
+    find_stretches,
+    room_to_change_m,
+    who_may_change,
+)
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
@@ -57,9 +67,8 @@ class TrafficState:
     people: Pedestrians
     next_track_id: int
     route: Int[np.ndarray, "R"]
-    """Lanes that vehicle 0 follows; empty if it wanders like the others."""
-    route_known: int
-    """How many lanes of the route are in the path of vehicle 0 by now."""
+    """Lanes in which vehicle 0 has to be at the end of each stretch of its way; empty if it wanders like the
+    others."""
     route_passed: int
     """How many it has left behind."""
 
@@ -96,7 +105,8 @@ class Traffic:
 
         Args:
             ego: a placed vehicle to be vehicle 0; without one, traffic fills the whole town.
-            route: the lanes that vehicle 0 follows, its own first; after the last it wanders.
+            route: where vehicle 0 has to be at the end of each stretch, beginning with the one it is on;
+                after the last it wanders.
         """
         rng = np.random.default_rng((self.seed, 1))
         lanes = np.zeros(0, dtype=np.int64) if route is None else route
@@ -107,7 +117,6 @@ class Traffic:
             people=empty_pavement(self._people_count),
             next_track_id=1,
             route=lanes,
-            route_known=1,
             route_passed=0,
         )
         if ego is not None:
@@ -128,6 +137,9 @@ class Traffic:
         way = claim_junctions(self.lanes, v, starts_m, leader, leader_gap, green, state.time_s)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
+        to_route = self._to_route(state)
+        if to_route is not None:
+            halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
         ahead = see_ahead(self.lanes, v, starts_m, leader, leader_gap, halt_gap)
         halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
         v = dataclasses.replace(
@@ -202,17 +214,40 @@ class Traffic:
         """Let the one driver who gains most by it change lanes."""
         v = state.vehicles
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
-        urge = np.zeros((2, len(v.active)))
-        may = who_may_change(self._stretches, v, fits, urge > 0)
+        urge = self._route_urge(state)
+        may = who_may_change(self._stretches, v, fits, urge >= HAS_TO_MPS2)
         change = choose_change(self.lanes, self._stretches, v, ahead, may, urge)
         if change is None:
             return state
         changed = begin_change(self.lanes, v, *change)
         return self._know_path(dataclasses.replace(state, vehicles=changed), rng)
 
+    def _route_urge(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
+        """What lane changes are worth to vehicle 0 for its route."""
+        v, urge = state.vehicles, np.zeros((2, len(state.vehicles.active)))
+        if state.route_passed >= len(state.route):
+            return urge
+        enough_m = SETTLED_M + URGENT_S * v.speed_mps[0]
+        to_route = self._to_route(state)
+        if to_route is not None:
+            side, room_m = to_route
+            urge[side, 0] = LIKES_TO_MPS2 if room_m > enough_m else HAS_TO_MPS2
+            urge[1 - side, 0] = -np.inf
+        else:
+            room_m = self._stretches.room_m[:, v.lane[0]] - v.s_m[0]
+            urge[:, 0] = np.where(room_m > 2 * enough_m, 0.0, -np.inf)
+        return urge
+
+    def _to_route(self, state: TrafficState) -> tuple[int, float] | None:
+        """To which side vehicle 0 has to change for its route, and how far ahead it can still begin."""
+        if state.route_passed >= len(state.route):
+            return None
+        wanted = int(state.route[state.route_passed])
+        return room_to_change_m(self.lanes, self._stretches, state.vehicles, wanted)
+
     def _know_path(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Fill in the lanes ahead that are not known yet: the route's, or a random turn."""
-        v, path, known = state.vehicles, state.vehicles.path.copy(), state.route_known
+        v, path = state.vehicles, state.vehicles.path.copy()
         fits = self._for_large | ~is_large(v)[:, None]
         for column in range(BEHIND + 1, path.shape[1]):
             rows = np.flatnonzero(v.active & (path[:, column] < 0))
@@ -223,10 +258,22 @@ class Traffic:
             cumulated = np.cumsum(weight, axis=1)
             u = rng.random((len(rows), 1)) * cumulated[:, -1:]
             path[rows, column] = options[np.arange(len(rows)), np.argmax(cumulated > u, axis=1)]
-            if rows[0] == 0 and known < len(state.route):
-                path[0, column] = state.route[known]
-                known += 1
-        return dataclasses.replace(state, vehicles=dataclasses.replace(v, path=path), route_known=known)
+            stretch = state.route_passed + column - BEHIND
+            if rows[0] == 0 and stretch < len(state.route):
+                before, drawn = int(path[0, column - 1]), int(path[0, column])
+                path[0, column] = self._towards(before, int(state.route[stretch]), drawn)
+        return dataclasses.replace(state, vehicles=dataclasses.replace(v, path=path))
+
+    def _towards(self, lane: int, wanted: int, otherwise: int) -> int:
+        """The lane after one that is `wanted`, or one beside it."""
+        options = self.lanes.successors[lane, : self.lanes.successor_count[lane]].tolist()
+        for side in self.lanes.sides.lane:
+            beside = wanted
+            while beside >= 0 and beside not in options:
+                beside = int(side[beside])
+            if beside >= 0:
+                return beside
+        return otherwise
 
     def _change_lanes_at_ends(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         while True:

@@ -1,0 +1,71 @@
+"""Recoveries: the steering is disturbed for a while, and the expert steers back to its path.
+
+A policy that imitates flawless driving never sees how to get back (Codevilla et al. 2018, sec. IV-C). The
+disturbance is temporally correlated noise on the steering wheel, an Ornstein-Uhlenbeck process.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CORRELATION_S = 0.8
+DISTURBED_S = 1.6
+RECOVERY_S = 5.0
+"""From the end of one disturbance to the next, at least; as long again on average."""
+RETURN_M, RETURN_S = 4.0, 0.8
+"""The expert steers back within a few times 4 m, and a few times .8 s."""
+STEEPEST_PER_M = 0.12
+"""Curvature that steering adds at most."""
+LATERAL_MPS2 = 2.5
+DISTURBING = 0.4
+"""The disturbance adds no more than this part of what the expert has to steer back."""
+FARTHEST_M = 0.8
+"""Where a disturbance would push the vehicle further than this in a moment, the expert takes over."""
+
+
+@dataclass(frozen=True)
+class Sway:
+    """Where the vehicle is beside its path, and what disturbs it."""
+
+    aside_m: float = 0.0
+    """Rear axle to the left of the path."""
+    yaw_rad: float = 0.0
+    """Heading to the left of that of the path."""
+    curvature: float = 0.0
+    """Of the way driven, less that of the path, 1/m."""
+    noise: float = 0.0
+    """Angle of the steering that is not the driver's, rad."""
+    next_s: float = 2.0
+    """Time until the next disturbance begins; negative while there is one."""
+
+
+def step_sway(
+    sway: Sway, speed_mps: float, wheelbase_m: float, noise_rad: float, dt_s: float, rng: np.random.Generator
+) -> Sway:
+    """The sway one step later: a kinematic bicycle along its path, steered by feedback of offset and heading.
+
+    d aside = v sin(yaw) dt and d yaw = v κ dt, with κ = tan(noise) / wheelbase while it is disturbed, then
+    κ = -aside / ℓ² - 2 yaw / ℓ: critically damped over the length ℓ. Noise: dx = -x dt / τ + σ √(2 / τ) dW,
+    exact for the step.
+
+    Args:
+        noise_rad: standard deviation σ of the disturbance.
+    """
+    next_s = sway.next_s - dt_s if speed_mps > 1.0 or sway.next_s < 0 else sway.next_s
+    if next_s < -DISTURBED_S:
+        next_s = RECOVERY_S + float(rng.exponential(RECOVERY_S))
+    kept = np.exp(-dt_s / CORRELATION_S)
+    kick = noise_rad * np.sqrt(1 - kept**2) * float(rng.standard_normal())
+    noise = float(sway.noise * kept + (kick if next_s < 0 else 0.0))
+    length = RETURN_M + RETURN_S * speed_mps
+    most = min(STEEPEST_PER_M, LATERAL_MPS2 / max(speed_mps, 1.0) ** 2)
+    if next_s < 0 and abs(sway.aside_m + length * sway.yaw_rad) < FARTHEST_M:
+        wanted = np.clip(np.tan(noise) / wheelbase_m, -DISTURBING * most, DISTURBING * most)
+    else:
+        wanted = -sway.aside_m / length**2 - 2 * sway.yaw_rad / length
+    # The wheel turns over some tenths of a second.
+    curvature = sway.curvature + (np.clip(wanted, -most, most) - sway.curvature) * (1 - np.exp(-dt_s / 0.2))
+    distance = speed_mps * dt_s
+    yaw = sway.yaw_rad + distance * curvature
+    aside = sway.aside_m + distance * np.sin(0.5 * (sway.yaw_rad + yaw))
+    return Sway(float(aside), float(yaw), float(curvature), noise, next_s)
