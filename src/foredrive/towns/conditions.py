@@ -26,7 +26,7 @@ class Conditions:
     wetness: float = 0.0
     """Of the ground, 0 dry to 1 under water; a rainy drive is on wet ground whatever stands here."""
     visibility_m: float = CLEAR_VISIBILITY_M
-    """Meteorological optical range: at this distance 5 % of the contrast is left. Fog is below 1000 m."""
+    """By Koschmieder: at this distance 2 % of the contrast is left. Fog is below 1000 m."""
 
     def __post_init__(self) -> None:
         for name, low, high in (

@@ -1,7 +1,7 @@
 """A town to be seen: all that stands in it, and what the recording vehicle senses there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,33 +12,45 @@ from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions, draw_daylight
 from foredrive.towns.labels.occupancy import full_occupancy
-from foredrive.towns.labels.semantics import SKY
+from foredrive.towns.labels.semantics import NOBODY, SKY
 from foredrive.towns.labels.visibility import visibility
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.place.actor_looks import MeshLooks
 from foredrive.towns.place.assets import Assets, AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.buildings import build_buildings
 from foredrive.towns.place.looks import LookArrays, LookTable, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
-from foredrive.towns.place.props import SignalHead, ThinThings, build_posts, build_street_lamps, join_thin
+from foredrive.towns.place.props import (
+    SignalHead,
+    StreetLamps,
+    ThinThings,
+    build_posts,
+    build_street_lamps,
+    join_thin,
+)
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.terrain import build_terrain, make_terrain
 from foredrive.towns.place.vegetation import build_vegetation
-from foredrive.towns.sensing import capture, raycast, shading
+from foredrive.towns.sensing import capture, lens, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.columns import TownColumns, faces_of, wall_intervals
-from foredrive.towns.sensing.light import make_light
+from foredrive.towns.sensing.lamps import gather_lamps
+from foredrive.towns.sensing.light import Rgb, drive_lit, is_dark, make_light
 from foredrive.towns.traffic.lights import Light
 
-NOBODY = -1
 ACTOR_REACH_M = 200.0
 """Road users further from the vehicle are not drawn."""
 ACTOR_RADIUS_M = 8.0
 LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
-LAMP_LIT_RGB = ((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45))
+LAMP_LIT = srgb_to_linear(((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45)))
+HEADLIGHT_LIT, TAIL_LIT, STREET_LAMP_LIT = srgb_to_linear(
+    ((1.0, 0.98, 0.95), (0.75, 0.03, 0.02), (1.0, 0.93, 0.80))
+)
+"""Of what shines, by linear colour."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +73,24 @@ class SensorFrame:
 
 
 @dataclass(frozen=True)
+class VehicleLights:
+    """Looks of the lights of vehicles that drive, and of those that stand parked."""
+
+    front: int
+    rear: int
+    front_off: int
+    rear_off: int
+
+    @classmethod
+    def of(cls, table: LookTable) -> "VehicleLights":
+        """Looks of the shapes' lights, and a second one for each."""
+        looks = MeshLooks(table)
+        front, rear = looks.front_light, looks.rear_light
+        off = [table.add(replace(table.looks[look], params=(0.0, 1.0))) for look in (front, rear)]
+        return cls(front, rear, *off)
+
+
+@dataclass(frozen=True)
 class StaticWorld:
     """What does not move in a town."""
 
@@ -70,6 +100,8 @@ class StaticWorld:
     parked: tuple[ActorState, ...]
     heads: tuple[SignalHead, ...]
     thin: ThinThings
+    lamps: StreetLamps
+    vehicle_lights: VehicleLights
 
 
 class World:
@@ -130,9 +162,10 @@ class World:
             lights: a `Light` for each of the town's stop zones; None leaves their lamps dark.
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
-        moment = self._moment(near, lights)
+        moment = self._moment(near, lights, T_world_ego)
         ego = capture.EgoMotion(T_world_ego, twist_ego)
         images, seen = capture.see(moment, sensors, ego, np.random.default_rng((noise_seed, 1)))
+        images = self._through_air_and_lens(images, sensors, noise_seed)
         sweep, met = capture.sweep(moment, sensors.lidar, ego, np.random.default_rng(noise_seed))
         names = sensors.rig.names
         shape = (len(names), *sensors.rig.size_hw)
@@ -183,7 +216,12 @@ class World:
             for head in self.static.heads
         }
 
-    def _moment(self, actors: list[ActorState], lights: Int[np.ndarray, "Z"] | None) -> capture.Moment:
+    def _moment(
+        self,
+        actors: list[ActorState],
+        lights: Int[np.ndarray, "Z"] | None,
+        T_world_ego: Float64[np.ndarray, "4 4"],
+    ) -> capture.Moment:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
@@ -196,17 +234,48 @@ class World:
             actors=shading.ActorArrays(placed.T_world_unit, first, paint),
             looks=self._lit_looks(lights),
         )
-        return capture.Moment(scene, self._scene, placed, self.light)
+        light = self.light
+        if is_dark(self.conditions):
+            light = light._replace(lamps=gather_lamps(self.static.lamps.xyz, actors, T_world_ego))
+        return capture.Moment(scene, self._scene, placed, light)
+
+    def _through_air_and_lens(
+        self, images: UInt8[np.ndarray, "C H W 3"], sensors: SensorSuite, noise_seed: int
+    ) -> UInt8[np.ndarray, "C H W 3"]:
+        """Images with glare by night, and with rain."""
+        if is_dark(self.conditions):
+            images = np.stack([lens.add_glare(image) for image in images])
+        if self.conditions.rain_mmph == 0.0:
+            return images
+        rng = np.random.default_rng((noise_seed, 2))
+        rgb = shading.develop(self.light.haze_rgb[None], self.light.exposure, 1)[0]
+        focal_px = sensors.rig.K[:, 0, 0].tolist()
+        drops = [
+            lens.add_rain(image, self.conditions, focal, rgb, camera, rng)
+            for camera, (image, focal) in enumerate(zip(images, focal_px, strict=True))
+        ]
+        return np.stack(drops)
 
     def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
-        if lights is None:
+        """Looks with the lamps that shine."""
+        shining: dict[int, Rgb] = {}
+        if drive_lit(self.conditions):
+            shining |= {
+                self.static.vehicle_lights.front: HEADLIGHT_LIT,
+                self.static.vehicle_lights.rear: TAIL_LIT,
+            }
+        if is_dark(self.conditions):
+            shining[self.static.lamps.look] = STREET_LAMP_LIT
+        if lights is not None:
+            for head in self.static.heads:
+                for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, LAMP_LIT, strict=True):
+                    if lights[head.zone] == shown:
+                        shining[lamp] = rgb
+        if not shining:
             return self._looks
         texture, albedo = self._looks.texture.copy(), self._looks.albedo.copy()
-        lit = srgb_to_linear(LAMP_LIT_RGB)
-        for head in self.static.heads:
-            for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, lit, strict=True):
-                if lights[head.zone] == shown:
-                    texture[lamp], albedo[lamp] = Texture.GLOW, rgb
+        texture[list(shining)] = Texture.GLOW
+        albedo[list(shining)] = np.array(list(shining.values()))
         return self._looks._replace(texture=texture, albedo=albedo)
 
     def _surfaces(self, seen: capture.Seen) -> Int[np.ndarray, "N"]:
@@ -242,7 +311,8 @@ def build_static(
     lamps = build_street_lamps(site, table, rng)
     plants, trunks = build_vegetation(site, assets, table, rng)
     place = join([place, lamps.mesh, plants])
-    vehicles = [_standing(car, shapes) for car in parked]
+    vehicle_lights = VehicleLights.of(table)
+    vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
     track = [np.full(len(place.look), NOBODY, dtype=np.int32)]
     track += [np.full(len(v.look), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)]
     return StaticWorld(
@@ -251,15 +321,19 @@ def build_static(
         parked=parked,
         heads=posts.heads,
         thin=join_thin([posts.thin, lamps.thin, trunks]),
+        lamps=lamps.lamps,
+        vehicle_lights=vehicle_lights,
     )
 
 
-def _standing(car: ActorState, shapes: ShapeLibrary) -> Mesh:
-    """A parked car as a part of the town."""
+def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> Mesh:
+    """A parked car as a part of the town; its lights are off."""
     shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car)
     moved = shape.transformed(unit_to_world(car))
     slot = np.clip(-1 - moved.look, 0, SLOTS - 1)
     look = np.where(moved.look < 0, paint[slot], moved.look)
+    look = np.where(look == lights.front, lights.front_off, look)
+    look = np.where(look == lights.rear, lights.rear_off, look)
     return Mesh(moved.xyz, moved.uvw, look.astype(np.int32))
 
 

@@ -14,6 +14,8 @@ from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
 from foredrive.towns.sensing import echoes, raycast, shading
+from foredrive.towns.sensing import wet as wet_ground
+from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import LightArrays
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
@@ -124,6 +126,24 @@ class Moment:
         when = None if dt_s is None else dt_s[facing]
         lit[facing] = ~raycast.occluded(self.static, self.placed, start[: len(facing)], to_sun, when)
         return lit
+
+    def mirrored(
+        self, found: shading.Surfaces, hits: shading.Hits, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
+    ) -> Float32[np.ndarray, "M 3"]:
+        """What water on the ground mirrors, -1 where there is none; no rows where all is dry."""
+        if self.light.air.wetness == 0.0:
+            return np.empty((0, 3), np.float32)
+        out = np.full((len(hits.t), 3), -1.0, np.float32)
+        origin, direction = np.empty_like(out), np.empty_like(out)
+        wetness, looks = self.light.air.wetness, self.scene.looks
+        wet = wet_ground.mirror_rays(looks, found, hits.t, rays.direction, wetness, origin, direction)
+        dt_s = None if rays.dt_s is None else rays.dt_s[wet]
+        onward = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
+        met = self.cast(onward)
+        there = shading.surfaces(self.scene, met, onward.origin, onward.direction, ray_rad[wet])
+        lit = self.sunlit(there, met, dt_s)
+        out[wet] = shading.shade(looks, there, met.t, onward.direction, lit, self.light, out[:0])
+        return out
 
 
 @dataclass(frozen=True)
@@ -254,7 +274,8 @@ def _look(
     hits = moment.cast(rays)
     found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
     lit = moment.sunlit(found, hits, rays.dt_s)
-    radiance = shading.shade(moment.scene.looks, found, hits.t, rays.direction, lit, moment.light)
+    mirrored = moment.mirrored(found, hits, rays, ray_rad)
+    radiance = shading.shade(moment.scene.looks, found, hits.t, rays.direction, lit, moment.light, mirrored)
     return radiance, hits, found, lit
 
 
@@ -288,7 +309,8 @@ def sweep(
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
-    seen, far_m = _nothing_seen(count), np.float32(lidar.max_range_m)
+    seen, air, far_m = _nothing_seen(count), moment.light.air, np.float32(lidar.max_range_m)
+    clutter = rng.random((count if air.backscatter_per_m_sr > 0 else 0, 4), dtype=np.float32)
     beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps if n == 1 else lidar.divergence_rad / n**0.5)
 
     def job(start: int, stop: int) -> None:
@@ -302,12 +324,15 @@ def sweep(
             t = np.where(found.look == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
             odds = echoes.chance_of_shares(odds, share)
-        look, echo = found.look, shading.lidar_returns(moment.scene.looks, found, hits.t, far_m, odds)
+        look, echo = found.look, lidar_returns(moment.scene.looks, found, hits.t, far_m, odds, air)
         if n > 1:
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
             hits, look = shading.Hits(*(column[picked] for column in hits)), look[picked]
         range_m[part], returned[part], intensity[part] = echo
         _note(seen, part, hits, look)
+        if len(clutter):
+            of_air = air_returns(air, clutter[part], far_m, range_m[part], returned[part], intensity[part])
+            seen.triangle[part][of_air], seen.look[part][of_air] = shading.MISS, shading.MISS
 
     in_parallel(job, count, BEAM_GRAIN // n)
     returned &= range_m >= lidar.min_range_m

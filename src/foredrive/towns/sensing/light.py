@@ -1,34 +1,73 @@
-"""Daylight: where the sun stands and how bright sky, haze and ground are."""
+"""The light of a time of day and a weather: sun, sky, haze, and how cameras expose for it."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
 
 from foredrive.towns.conditions import Conditions
+from foredrive.towns.sensing.air import CONTRAST_LOST, AirArrays, make_air
+from foredrive.towns.sensing.lamps import NO_LAMPS, UNIT_LUX, LampArrays
+from foredrive.towns.sensing.sky import FOG_TOP_M
 
 Rgb = Float32[np.ndarray, "3"]
 
+NOON_ELEVATION_DEG = 60.0
+SUN_OUTSIDE_RGB = (1.60, 1.62, 1.60)
+"""Before the air takes its share."""
+AIR_DEPTH_RGB = (0.19, 0.23, 0.31)
+"""Optical depth of somewhat hazy air at the zenith."""
+_ELEVATION_DEG = (-18.0, -12.0, -6.0, 0.0, 5.0, 15.0, 30.0, 60.0)
+_SKY_LUX = (1e-3, 8e-3, 3.4, 450.0, 4e3, 1.2e4, 2.3e4, 3.1e4)
+"""Of a clear sky on level ground (twilight: Explanatory Supplement to the Astronomical Almanac, 1992)."""
+TOWN_GLOW_LUX, TOWN_GLOW_CLOUDED_LUX = 0.12, 0.5
+"""What the sky above a lit town sends back at night."""
+STREET_LUX = 5.0
+"""Of a lit street and the dark about it, which cameras expose for at night."""
+GREY_SKY_METERED = 0.18
+"""By how much cameras darken what stands before a sky that is brighter than all else."""
+LIT_STREET_AMBIENT_LUX = 0.9
+"""What lit roads and walls scatter about them."""
+LAMPS_BELOW_LUX, HEADLIGHTS_BELOW_LUX = 500.0, 9e3
+HEADLIGHTS_BELOW_M = 3000.0
+"""Drivers turn their lights on when they see no further."""
+NOON_WHITE, NOON_EXPOSURE = 1.6, 0.78
+ADAPTATION = 0.82
+"""1 would show every night as bright as day."""
+
 
 class LightArrays(NamedTuple):
-    """Linear radiances, white diffuse in full sun being about 1."""
+    """Linear radiances in units of a white diffuse surface under `UNIT_LUX`."""
 
     sun: Rgb
-    """Unit direction towards the sun."""
+    """Unit direction towards the sun; zeros where it casts no shadows."""
     sun_rgb: Rgb
+    sunward: Rgb
+    """Unit direction towards the brightest part of the sky."""
+    glow_rgb: Rgb
+    """Of the sky about the sun."""
     zenith: Rgb
     horizon: Rgb
     cloud_rgb: Rgb
+    clouds: float
+    """0 clear, 1 overcast."""
     sky_rgb: Rgb
     """Light from above that falls on a level surface in the shade."""
     bounce_rgb: Rgb
     """Light from below."""
+    street_rgb: Rgb
+    """What level rays are taken to meet in a mirror."""
     haze_rgb: Rgb
-    visibility_m: float
-    """At this distance haze hides all but 1/e."""
-    clouds: float
-    """0 clear, 1 overcast."""
+    air: AirArrays
+    lamps: LampArrays
+    """Of streets and vehicles; none by day."""
+    lit_windows: float
+    """Share of the windows behind which somebody has the light on."""
+    glow: float
+    """Radiance of what shines by itself and is white: bright on the image, by day and by night."""
     exposure: float
+    """Of the cameras."""
 
 
 def sun_direction(hour: float, east_rad: float) -> Rgb:
@@ -37,31 +76,134 @@ def sun_direction(hour: float, east_rad: float) -> Rgb:
     At noon it stands 60° high in the south, as on an equinox at 30° north. `east_rad` is where east lies,
     counter-clockwise from the world's x.
     """
-    angle, highest = np.pi * (hour - 6.0) / 12.0, np.deg2rad(60.0)
+    angle, highest = np.pi * (hour - 6.0) / 12.0, np.deg2rad(NOON_ELEVATION_DEG)
     east, south = np.cos(angle), np.sin(angle) * np.cos(highest)
     cos, sin = np.cos(east_rad), np.sin(east_rad)
     xyz = (east * cos + south * sin, east * sin - south * cos, np.sin(angle) * np.sin(highest))
     return np.array(xyz, dtype=np.float32)
 
 
+class _Daylight(NamedTuple):
+    elevation_deg: float
+    beam: Rgb
+    """The sun, before clouds and fog."""
+    through: float
+    """Share of it that gets through them."""
+    sky: float
+    """What falls from the sky on level ground."""
+    white: float
+    """Radiance of level white ground."""
+
+
+def _daylight(conditions: Conditions) -> _Daylight:
+    """Light of sun and sky.
+
+    Clouds dim both together by 1 - 0.75 N^3.4 (Kasten & Czeplak, Solar Energy 24, 1980); more than half of
+    them begin to hide the sun.
+    """
+    height = float(sun_direction(conditions.hour, 0.0)[2])
+    elevation_deg, clouds = math.degrees(math.asin(height)), conditions.clouds
+    beam = _sun_rgb(elevation_deg)
+    level = float(beam[1]) * max(height, 0.0)
+    clear_sky = 10 ** float(np.interp(elevation_deg, _ELEVATION_DEG, np.log10(_SKY_LUX))) / UNIT_LUX
+    through = min(max((0.9 - clouds) / 0.3, 0.0), 1.0)
+    through *= math.exp(-CONTRAST_LOST / conditions.visibility_m * FOG_TOP_M / max(height, 0.05))
+    through = through if through > 0.02 else 0.0
+    dimmed = (1.0 - 0.75 * clouds**3.4) * (level + clear_sky)
+    sky = (1.0 - clouds) * clear_sky + clouds * max(dimmed - through * level, 0.3 * clear_sky)
+    return _Daylight(elevation_deg, beam, through, sky, through * level + sky)
+
+
+def daylight_lux(conditions: Conditions) -> float:
+    """What sun and sky shed on level ground."""
+    return _daylight(conditions).white * UNIT_LUX
+
+
 def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
-    """The light of a time of day under a sky."""
-    sun = sun_direction(conditions.hour, east_rad)
-    warm = 1.0 - float(sun[2])
-
-    def rgb(r: float, g: float, b: float) -> Rgb:
-        return np.array([r, g, b], dtype=np.float32)
-
+    """The light of a time of day under a sky, before any lamps are lit."""
+    toward, clouds = sun_direction(conditions.hour, east_rad), conditions.clouds
+    fall = _daylight(conditions)
+    beam, sky, through, white_lux = fall.beam, fall.sky, fall.through, fall.white * UNIT_LUX
+    level_sun = beam * max(float(toward[2]), 0.0)
+    town = TOWN_GLOW_LUX + clouds * (TOWN_GLOW_CLOUDED_LUX - TOWN_GLOW_LUX)
+    white_lux = UNIT_LUX * (through * float(level_sun[1]) + sky)
+    dark = white_lux < LAMPS_BELOW_LUX
+    night = _rgb(1.0, 0.80, 0.62) * np.float32((town + LIT_STREET_AMBIENT_LUX) / UNIT_LUX if dark else 0.0)
+    white = (white_lux + (STREET_LUX if dark else 0.0)) / UNIT_LUX
+    exposure = NOON_EXPOSURE * (NOON_WHITE / white) ** ADAPTATION
+    exposure *= 1.0 - (0.0 if dark else GREY_SKY_METERED * clouds**2)
+    colours = _sky_colours(fall.elevation_deg, clouds)
+    glow_lux = _rgb(0.92, 0.80, 0.74) * np.float32(town / UNIT_LUX if dark else 0.0)
+    veiled = (_rgb(0.46, 0.50, 0.55) + colours.sky) * np.float32(0.5 * sky) + through * 0.2 * level_sun
     return LightArrays(
-        sun=sun,
-        sun_rgb=rgb(1.30, 1.25 - 0.12 * warm, 1.14 - 0.30 * warm),
-        zenith=rgb(0.14, 0.28, 0.60),
-        horizon=rgb(0.62, 0.72, 0.83),
-        cloud_rgb=rgb(0.95, 0.96, 0.98),
-        sky_rgb=rgb(0.42, 0.48, 0.57),
-        bounce_rgb=rgb(0.27, 0.26, 0.235),
-        haze_rgb=rgb(0.66, 0.73, 0.81),
-        visibility_m=1000.0,
-        clouds=conditions.clouds,
-        exposure=0.78,
+        sun=toward * np.float32(through > 0.0),
+        sun_rgb=beam * np.float32(through),
+        sunward=toward,
+        glow_rgb=colours.glow * np.float32(sky / 0.48) + np.float32(0.12) * beam * np.float32(through),
+        zenith=colours.zenith * np.float32(sky / 0.48) + np.float32(0.5) * glow_lux * _rgb(0.8, 0.9, 1.25),
+        horizon=colours.horizon * np.float32(sky / 0.48) + np.float32(1.6) * glow_lux,
+        cloud_rgb=colours.cloud * np.float32(sky / 0.48) + glow_lux,
+        clouds=clouds,
+        sky_rgb=colours.sky * np.float32(sky) + night,
+        bounce_rgb=_rgb(0.168, 0.160, 0.145) * np.float32(white_lux / UNIT_LUX) + np.float32(0.6) * night,
+        street_rgb=_rgb(0.19, 0.19, 0.183) * np.float32(white_lux / UNIT_LUX) + np.float32(0.3) * night,
+        haze_rgb=veiled.astype(np.float32) + np.float32(1.5) * night,
+        air=make_air(conditions),
+        lamps=NO_LAMPS,
+        lit_windows=0.35 if dark else 0.0,
+        glow=2.5 * NOON_EXPOSURE / exposure,
+        exposure=exposure,
     )
+
+
+def is_dark(conditions: Conditions) -> bool:
+    """Whether street lamps are on."""
+    return daylight_lux(conditions) < LAMPS_BELOW_LUX
+
+
+def drive_lit(conditions: Conditions) -> bool:
+    """Whether drivers have their lights on."""
+    hidden = conditions.rain_mmph > 0.0 or conditions.visibility_m < HEADLIGHTS_BELOW_M
+    return hidden or daylight_lux(conditions) < HEADLIGHTS_BELOW_LUX
+
+
+class _SkyColours(NamedTuple):
+    zenith: Rgb
+    horizon: Rgb
+    cloud: Rgb
+    glow: Rgb
+    sky: Rgb
+
+
+def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
+    """Colours as of a sky of noon's brightness: blue by day, warm where a low sun is, grey under clouds.
+
+    An overcast sky is three times as bright at the zenith as at the horizon (CIE standard overcast sky).
+    """
+    low = min(max(1.0 - elevation_deg / 18.0, 0.0), 1.0)
+    grey = min(max((clouds - 0.45) / 0.5, 0.0), 1.0)
+
+    def mix(day: Rgb, evening: Rgb, overcast: Rgb) -> Rgb:
+        clear = (1.0 - low) * day + low * evening
+        return ((1.0 - grey) * clear + grey * overcast).astype(np.float32)
+
+    return _SkyColours(
+        zenith=mix(_rgb(0.14, 0.28, 0.60), _rgb(0.20, 0.28, 0.52), _rgb(0.57, 0.60, 0.64)),
+        horizon=mix(_rgb(0.62, 0.72, 0.83), _rgb(0.95, 0.62, 0.44), _rgb(0.38, 0.40, 0.43)),
+        cloud=mix(_rgb(0.95, 0.96, 0.98), _rgb(0.80, 0.68, 0.66), _rgb(0.46, 0.48, 0.51)),
+        glow=mix(_rgb(0.0, 0.0, 0.0), _rgb(2.2, 1.0, 0.35), _rgb(0.0, 0.0, 0.0)),
+        sky=mix(_rgb(0.88, 1.00, 1.19), _rgb(0.98, 0.98, 1.08), _rgb(0.97, 1.00, 1.04)),
+    )
+
+
+def _sun_rgb(elevation_deg: float) -> Rgb:
+    """The sun through the air, whose mass is that of Kasten & Young (Applied Optics 28, 1989)."""
+    if elevation_deg < -0.5:
+        return _rgb(0.0, 0.0, 0.0)
+    height = max(elevation_deg, 0.0)
+    air_mass = 1.0 / (math.sin(math.radians(height)) + 0.50572 * (height + 6.07995) ** -1.6364)
+    return (np.array(SUN_OUTSIDE_RGB) * np.exp(-air_mass * np.array(AIR_DEPTH_RGB))).astype(np.float32)
+
+
+def _rgb(r: float, g: float, b: float) -> Rgb:
+    return np.array([r, g, b], dtype=np.float32)

@@ -308,6 +308,7 @@ def _facade(p, look, x, y, uvw, extent, i, out):
     for c in range(3):
         out[c] = out[c] * rest + wood * frame + GLASS_RGB[c] * bright * glass + ACCENT_RGB[row, c] * accent
     out[3] = glass
+    out[5] = behind if number > 0 else 0.0
 
 
 @_kernel
@@ -360,13 +361,14 @@ def texture(looks, look, xyz, uvw, extent, i, out):
         xyz: [N 3] positions, m.
         uvw: [N 3] texture coordinates.
         extent: [N 4] extent of a pixel's footprint in the texture coordinates, and on the surface, m.
-        out: [5] filled with red, green, blue (linear), share of glass, share of paint.
+        out: [6] filled with red, green, blue (linear), share of glass, share of paint, and a random number in
+            0..1 that the window has to itself; 0 where there is none or too many.
     """
     kind, p = looks.texture[look], looks.params
     x, y = xyz[i, 0], xyz[i, 1]
     for c in range(3):
         out[c] = looks.albedo[look, c]
-    out[3] = out[4] = 0.0
+    out[3] = out[4] = out[5] = 0.0
     if kind == _ROAD:
         _road(p, look, x, y, uvw, extent, i, out)
     elif kind == _FACADE:

@@ -1,4 +1,4 @@
-"""From hits to colours and to lidar returns, by numba kernels that release the GIL."""
+"""From hits to colours, by numba kernels that release the GIL."""
 
 import math
 from typing import NamedTuple, no_type_check
@@ -8,20 +8,25 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from foredrive.towns.place.looks import LookArrays, Texture
-from foredrive.towns.sensing.patterns import PAINT_REFLECTIVITY, noise, texture
+from foredrive.towns.sensing.lamps import lamp_light
+from foredrive.towns.sensing.patterns import texture
+from foredrive.towns.sensing.sky import sky
+from foredrive.towns.sensing.wet import (
+    LEVEL_COS,
+    WATER_MIRROR,
+    WET_DARKENING,
+    WET_SHINE,
+    is_paved,
+    water_film,
+    water_mirror,
+)
 
 MISS = -1
 SHADOW_OFFSET_M = 4e-3
-GLASS_LOSS = 0.8
-"""Share of a lidar pulse that a window lets through or mirrors away."""
-LIDAR_REFERENCE_M = 45.0
-"""At this distance half of the pulses from a surface of 2 % reflectivity, met head-on, are lost."""
-LIDAR_THRESHOLD = 0.02
-FOLIAGE_DEPTH_M = 0.25
-STREET_RGB = (0.30, 0.30, 0.29)
-"""What level rays are taken to meet in a mirror."""
+WINDOW_RGB = (0.50, 0.33, 0.17)
+"""Of a room with the light on, beside what shines on its own."""
 
-_FOLIAGE, _GLOW = int(Texture.FOLIAGE), int(Texture.GLOW)
+_FACADE, _FOLIAGE, _GLOW = int(Texture.FACADE), int(Texture.FOLIAGE), int(Texture.GLOW)
 _ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
 """8-bit values of display brightness by its 12-bit linear value."""
 
@@ -193,36 +198,21 @@ def sun_rays(found, t, sun, out_origin):
 
 @_kernel
 @no_type_check
-def _sky(light, dx, dy, dz, out):
-    """Radiance of the sky: a gradient, a glow about the sun, thin clouds."""
-    up = max(dz, 0.0)
-    blend = 1.0 - (1.0 - up) ** 5
-    glow = max(dx * light.sun[0] + dy * light.sun[1] + dz * light.sun[2], 0.0)
-    halo = 0.25 * glow**6 + 0.6 * glow**64
-    disc = 8.0 if glow > 0.9999 else 0.0
-    cloud = 0.0
-    if dz > 0.02:
-        x, y = dx / (dz + 0.12) * 1.3, dy / (dz + 0.12) * 1.3
-        n = noise(x, y, 0.0, 81)
-        n += 0.5 * noise(2.1 * x, 2.1 * y, 0.0, 82) + 0.25 * noise(4.3 * x, 4.3 * y, 0.0, 83)
-        cloud = min(max(1.1 * n + 1.6 * light.clouds - 0.8, 0.0), 1.0) * min(1.0, 6.0 * dz)
-    for c in range(3):
-        clear = light.horizon[c] * (1.0 - blend) + light.zenith[c] * blend
-        clear += light.sun_rgb[c] * (0.12 * halo + disc)
-        out[c] = clear * (1.0 - cloud) + cloud * light.cloud_rgb[c]
+def shade(looks, found, t, direction, lit, light, mirrored):
+    """Radiance [N 3] along rays.
 
-
-@_kernel
-@no_type_check
-def shade(looks, found, t, direction, lit, light):
-    """Radiance [N 3] along rays; `lit` says which hits the sun shines on."""
+    Args:
+        lit: which hits the sun shines on.
+        mirrored: [N 3] radiance that comes from where water mirrors to, or [0 3] to take the sky's.
+    """
     out = np.empty((len(t), 3), np.float32)
-    colour, mirror = np.empty(5, np.float32), np.empty(3, np.float32)
+    colour, mirror, lamp = np.empty(6, np.float32), np.empty(3, np.float32), np.zeros(6, np.float32)
+    by_lamps, wetness = len(light.lamps.near) > 0, light.air.wetness
     for i in range(len(t)):
         look = found.look[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         if look == MISS:
-            _sky(light, dx, dy, dz, colour)
+            sky(light, dx, dy, dz, colour)
             out[i, 0], out[i, 1], out[i, 2] = colour[0], colour[1], colour[2]
             continue
         texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
@@ -235,20 +225,38 @@ def shade(looks, found, t, direction, lit, light):
         gloss = min(1.0, looks.gloss[look] + 0.35 * glass)
         if gloss > 0.0:
             gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
+        film = 0.0
+        if wetness > 0.0 and nz > LEVEL_COS and is_paved(looks.surface[look]):
+            film = water_film(wetness, looks.surface[look], found.xyz, found.extent, i)
+            gloss = max(gloss, film * water_mirror(cosine))
+            for c in range(3):
+                colour[c] *= 1.0 - WET_DARKENING * min(2.0 * wetness, 1.0)
+        if film > 0.0 and len(mirrored) > 0 and mirrored[i, 0] >= 0.0:
+            mirror[0], mirror[1], mirror[2] = mirrored[i, 0], mirrored[i, 1], mirrored[i, 2]
+        elif gloss > 0.0:
             rise = dz + 2 * cosine * nz
-            _sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(rise, 0.05), mirror)
+            sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(rise, 0.05), mirror)
             open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
             for c in range(3):
-                mirror[c] = open_sky * min(mirror[c], 3.0) + (1.0 - open_sky) * STREET_RGB[c]
+                mirror[c] = open_sky * min(mirror[c], 3.0) + (1.0 - open_sky) * light.street_rgb[c]
+        if by_lamps:
+            x, y, z = found.xyz[i, 0], found.xyz[i, 1], found.xyz[i, 2]
+            lamp_light(light.lamps, x, y, z, nx, ny, nz, dx, dy, dz, WET_SHINE if film > 0.0 else 0.0, lamp)
         up = 0.5 + 0.5 * nz
-        haze = 1.0 - math.exp(-t[i] / light.visibility_m)
+        haze = 1.0 - math.exp(-t[i] * light.air.extinction_per_m)
+        window = 0.0
+        if glass > 0.0 and light.lit_windows > 0.0 and kind == _FACADE:
+            window = light.lit_windows  # the mean of many
+            if colour[5] > 0.0:
+                window = 0.2 + 0.8 * colour[5] if colour[5] * 7.3 % 1.0 < light.lit_windows else 0.0
         for c in range(3):
             ambient = light.sky_rgb[c] * up + light.bounce_rgb[c] * (1.0 - up)
-            radiance = colour[c] * (light.sun_rgb[c] * direct + ambient)
+            radiance = colour[c] * (light.sun_rgb[c] * direct + ambient + lamp[c])
             if kind == _GLOW:
-                radiance = 2.5 * colour[c]
+                radiance = light.glow * colour[c]
             if gloss > 0.0:
-                radiance = radiance * (1.0 - gloss) + gloss * mirror[c]
+                radiance = radiance * (1.0 - gloss) + gloss * mirror[c] + film * lamp[3 + c] * WATER_MIRROR
+            radiance += window * glass * light.glow * WINDOW_RGB[c]
             out[i, c] = radiance * (1.0 - haze) + haze * light.haze_rgb[c]
     return out
 
@@ -268,42 +276,3 @@ def develop(radiance, exposure, samples):
                 total += min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
             out[pixel, c] = _ENCODED[int(total / samples * 4095.0)]
     return out
-
-
-@_kernel
-@no_type_check
-def lidar_returns(looks, found, t, max_range_m, chance):
-    """Which beams return, how strongly and from where.
-
-    The echo of a surface of reflectivity ρ met at an angle θ falls with ρ cos θ / r²; it is lost with a
-    probability that rises as the echo falls to the detector's threshold.
-
-    Args:
-        chance: [N 2] uniform random numbers: for the loss, and for the depth within foliage.
-
-    Returns:
-        range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1
-        (range-compensated).
-    """
-    count = len(t)
-    range_m = np.empty(count, np.float32)
-    returned = np.zeros(count, np.bool_)
-    intensity = np.zeros(count, np.float32)
-    colour = np.empty(5, np.float32)
-    for i in range(count):
-        look = found.look[i]
-        range_m[i] = max_range_m
-        if look == MISS or t[i] > max_range_m:
-            continue
-        texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
-        glass, paint, cosine = colour[3], colour[4], found.cosine[i]
-        reflectivity = looks.reflectivity[look] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
-        reflectivity *= 1.0 - GLASS_LOSS * glass
-        range_m[i] = t[i]
-        echo = reflectivity * cosine * (LIDAR_REFERENCE_M / max(t[i], 1.0)) ** 2
-        if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
-            returned[i] = True
-            intensity[i] = min(reflectivity * (0.35 + 0.65 * cosine), 1.0)
-            if looks.texture[look] == _FOLIAGE:
-                range_m[i] += FOLIAGE_DEPTH_M * chance[i, 1]
-    return range_m, returned, intensity

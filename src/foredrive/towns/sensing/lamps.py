@@ -1,0 +1,194 @@
+"""Light of street lamps and vehicles: who shines where, and what falls on a point."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int32
+
+from foredrive.data.log_writer import EGO_VEHICLE
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+
+UNIT_LUX = 65_000.0
+"""A white diffuse surface under it has radiance 1."""
+STREET, HEAD, TAIL = 0, 1, 2
+STREET_CD = 3200.0
+"""Straight down and all the way out to where it is cut off."""
+STREET_RGB, HEAD_RGB, TAIL_RGB = (1.0, 0.80, 0.55), (1.0, 0.94, 0.84), (1.0, 0.06, 0.03)
+HEAD_CD = 40_000.0
+"""Brightest part of a pair of dipped headlights (UN Regulation 112 asks for 10 to 44 klx·m² each)."""
+TAIL_CD = 20.0
+DIPPED_RAD = math.radians(1.2)
+HEAD_SPREAD_RAD, HEAD_DEPTH_RAD = math.radians(23.0), math.radians(3.6)
+ABOVE_CUT_OFF = 0.012
+REACH_M = (26.0, 70.0, 9.0)
+"""Of the kinds of lamps; beyond there is nothing worth the time."""
+CELL_M, CELLS = 10.0, 40
+"""The grid about the vehicle in which lamps are looked up."""
+LIT_CATEGORIES = (Category.CAR, Category.TRUCK, Category.BUS, Category.MOTORCYCLE)
+
+
+class LampArrays(NamedTuple):
+    """K lamps and, for each cell of a grid, those that reach it."""
+
+    xyz: Float32[np.ndarray, "K 3"]
+    heading: Float32[np.ndarray, "K 2"]
+    """Unit vector that a headlight or tail light points along."""
+    rgb: Float32[np.ndarray, "K 3"]
+    """Intensity over `UNIT_LUX`, m²."""
+    kind: Int32[np.ndarray, "K"]
+    origin_xy: Float64[np.ndarray, "2"]
+    first: Int32[np.ndarray, "cells+1"]
+    """Where the lamps of each cell start in `near`."""
+    near: Int32[np.ndarray, "n"]
+
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+
+
+def gather_lamps(
+    street_xyz: Float[np.ndarray, "S 3"],
+    actors: Sequence[ActorState],
+    T_world_ego: Float64[np.ndarray, "4 4"],
+) -> LampArrays:
+    """Lamps near the vehicle: those of the street, of those who drive, and its own."""
+    centre = T_world_ego[:2, 3]
+    origin = centre - 0.5 * CELL_M * CELLS
+    close = (np.abs(street_xyz[:, :2] - centre) < 0.5 * CELL_M * CELLS + REACH_M[STREET]).all(1)
+    lamps: list[tuple[Sequence[float], Sequence[float], int]] = [
+        (xyz, (0.0, 0.0), STREET) for xyz in street_xyz[close].tolist()
+    ]
+    ahead, length = T_world_ego[:3, 0], EGO_VEHICLE.length
+    middle = T_world_ego[:3, 3] + EGO_VEHICLE.rear_axle_to_center_longitudinal * ahead
+    middle = middle + 0.65 * T_world_ego[:3, 2]
+    lamps += _pair(middle, float(np.arctan2(ahead[1], ahead[0])), length)
+    for actor in actors:
+        if actor.category in LIT_CATEGORIES:
+            height = -0.5 * actor.size_lwh[2] + min(0.5 * actor.size_lwh[2], 0.75)
+            middle = actor.centre_m + np.array([0.0, 0.0, height])
+            lamps += _pair(middle, actor.yaw, float(actor.size_lwh[0]))
+    xyz = np.array([lamp[0] for lamp in lamps], dtype=np.float32)
+    heading = np.array([lamp[1] for lamp in lamps], dtype=np.float32)
+    kind = np.array([lamp[2] for lamp in lamps], dtype=np.int32)
+    power = np.array([STREET_CD, HEAD_CD, TAIL_CD])[:, None] * [STREET_RGB, HEAD_RGB, TAIL_RGB] / UNIT_LUX
+    first, near = _into_cells(xyz, kind, heading, origin, np.array(REACH_M))
+    return LampArrays(xyz, heading, power[kind].astype(np.float32), kind, origin, first, near)
+
+
+def _pair(
+    middle: Float[np.ndarray, "3"], yaw: float, length: float
+) -> list[tuple[Sequence[float], Sequence[float], int]]:
+    """Head and tail lights of a vehicle, each pair as one lamp."""
+    heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    front, rear = middle + 0.52 * length * heading, middle - 0.52 * length * heading
+    return [
+        (front.tolist(), heading[:2].tolist(), HEAD),
+        (rear.tolist(), (-heading[:2]).tolist(), TAIL),
+    ]
+
+
+@_kernel
+@no_type_check
+def _into_cells(xyz, kind, heading, origin, reach_m):
+    """Lists of the lamps that reach each cell; headlights and tail lights do so ahead of themselves."""
+    counts = np.zeros(CELLS * CELLS + 1, np.int32)
+    near = np.empty(0, np.int32)
+    half = 0.7072 * CELL_M
+    for fill in range(2):
+        for k in range(len(xyz)):
+            r = reach_m[kind[k]]
+            x, y = xyz[k, 0] - origin[0], xyz[k, 1] - origin[1]
+            for row in range(max(int((y - r) // CELL_M), 0), min(int((y + r) // CELL_M) + 1, CELLS)):
+                for column in range(max(int((x - r) // CELL_M), 0), min(int((x + r) // CELL_M) + 1, CELLS)):
+                    cx, cy = (column + 0.5) * CELL_M - x, (row + 0.5) * CELL_M - y
+                    if cx * cx + cy * cy > (r + half) ** 2:
+                        continue
+                    if kind[k] != STREET:
+                        along = cx * heading[k, 0] + cy * heading[k, 1]
+                        aside = abs(cx * heading[k, 1] - cy * heading[k, 0])
+                        if along < -half or aside > along + 2.0 * half:
+                            continue
+                    cell = row * CELLS + column
+                    if fill:
+                        near[counts[cell]] = k
+                        counts[cell] += 1
+                    else:
+                        counts[cell + 1] += 1
+        if not fill:
+            counts = np.cumsum(counts).astype(np.int32)
+            near = np.empty(counts[-1], np.int32)
+    first = np.empty_like(counts)  # filling moved each cell's start to its end
+    first[0] = 0
+    first[1:] = counts[:-1]
+    return first, near
+
+
+@_kernel
+@no_type_check
+def _beam(kind, hx, hy, lx, ly, lz):
+    """Share of a lamp's intensity that leaves it along the unit vector (lx, ly, lz)."""
+    if kind == STREET:  # cut off at 78° from straight down
+        return min(max(5.0 * (-lz - 0.2), 0.0), 1.0)
+    ahead = lx * hx + ly * hy
+    if ahead <= 0.05:
+        return 0.0
+    if kind == TAIL:
+        return ahead
+    aside = math.atan2(lx * hy - ly * hx, ahead) / HEAD_SPREAD_RAD
+    up = (math.asin(min(max(lz, -1.0), 1.0)) + DIPPED_RAD) / HEAD_DEPTH_RAD
+    # a soft edge, and stray light above it
+    high = max(math.exp(-((up * 6.0) ** 2)), ABOVE_CUT_OFF) if up > 0.0 else math.exp(up * 0.9)
+    return high * math.exp(-aside * aside)
+
+
+@_kernel
+@no_type_check
+def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
+    """What lamps send to a point.
+
+    Args:
+        lamps: `LampArrays`.
+        x, nx, dx: and the like: the point, its unit normal, and the unit direction in which it is looked at.
+        shine: exponent of the mirrored highlight (Blinn-Phong); 0 for none.
+        out: [6] filled with irradiance as the radiance of a white surface, then the highlight's radiance
+            as for a surface that mirrors all.
+    """
+    for c in range(6):
+        out[c] = 0.0
+    column, row = (x - lamps.origin_xy[0]) // CELL_M, (y - lamps.origin_xy[1]) // CELL_M
+    if not (0 <= column < CELLS and 0 <= row < CELLS):
+        return
+    cell = int(row) * CELLS + int(column)
+    for item in range(lamps.first[cell], lamps.first[cell + 1]):
+        k = lamps.near[item]
+        lx, ly, lz = x - lamps.xyz[k, 0], y - lamps.xyz[k, 1], z - lamps.xyz[k, 2]
+        square = max(lx * lx + ly * ly + lz * lz, 0.05)
+        scale = 1.0 / math.sqrt(square)
+        lx, ly, lz = lx * scale, ly * scale, lz * scale
+        facing = -(nx * lx + ny * ly + nz * lz)
+        if facing <= 0.0:
+            continue
+        sent = _beam(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
+        if shine > 0.0:
+            hx, hy, hz = -lx - dx, -ly - dy, -lz - dz
+            length = math.sqrt(hx * hx + hy * hy + hz * hz)
+            middle = max((nx * hx + ny * hy + nz * hz) / max(length, 1e-6), 0.0)
+            lobe = (shine + 8.0) / 8.0 * middle**shine
+            for c in range(3):
+                out[3 + c] += lamps.rgb[k, c] * sent * lobe
+        for c in range(3):
+            out[c] += lamps.rgb[k, c] * sent * facing
+
+
+NO_LAMPS = LampArrays(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 2), np.float32),
+    np.zeros((0, 3), np.float32),
+    np.zeros(0, np.int32),
+    np.zeros(2),
+    np.zeros(CELLS * CELLS + 1, np.int32),
+    np.zeros(0, np.int32),
+)

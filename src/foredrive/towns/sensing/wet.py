@@ -1,0 +1,91 @@
+"""Water on the ground: where it stands and what it does to light."""
+
+import math
+from typing import no_type_check
+
+import numba
+import numpy as np
+
+from foredrive.towns.place.looks import Surface
+from foredrive.towns.sensing.patterns import noise
+
+LEVEL_COS = 0.9
+"""Water stands on what is this level."""
+WATER_MIRROR = 0.02
+"""Share of light that water mirrors head-on (Fresnel, n = 1.33)."""
+WET_DARKENING = 0.5
+"""Of porous ground: light is caught below the film (Lekner & Dorf, Applied Optics 27, 1988)."""
+WET_SHINE = 120.0
+"""How sharp lamps are mirrored, as a Blinn-Phong exponent."""
+PUDDLE_M = 4.0
+THIN_FILM = 0.4
+RIPPLES = 0.008
+FAINTEST_MIRROR = 0.015
+_ROAD, _SIDEWALK = int(Surface.ROAD), int(Surface.SIDEWALK)
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+
+
+@_kernel
+@no_type_check
+def is_paved(surface):
+    """Whether water gathers on a `Surface`."""
+    return surface in (_ROAD, _SIDEWALK)
+
+
+@_kernel
+@no_type_check
+def water_film(wetness, surface, xyz, extent, i):
+    """Share of paved ground at the i-th hit that is under water, 0 to 1: puddles, and a thin film between.
+
+    Walkways slope and drain: there are no puddles.
+    """
+    x, y, size = xyz[i, 0], xyz[i, 1], extent[i, 3]
+    film = THIN_FILM * wetness * wetness * (1.0 + 0.4 * noise(x * 2.0, y * 2.0, size * 2.0, 93))
+    if surface != _ROAD:
+        return 0.6 * film
+    deep = noise(x / PUDDLE_M, y / PUDDLE_M, size / PUDDLE_M, 91)
+    deep += 0.4 * noise(x * 0.9, y * 0.9, size * 0.9, 92)
+    puddle = min(max(5.0 * (deep + 0.9 * wetness - 1.15), 0.0), 1.0)
+    return film + (1.0 - film) * puddle
+
+
+@_kernel
+@no_type_check
+def water_mirror(cosine):
+    """Share of light that water mirrors (Schlick's approximation of Fresnel's equations, 1994)."""
+    return WATER_MIRROR + (1.0 - WATER_MIRROR) * (1.0 - cosine) ** 5
+
+
+@_kernel
+@no_type_check
+def mirror_rays(looks, found, t, direction, wetness, out_origin, out_direction):
+    """Indices of the hits whose water mirrors enough to be followed; the rest is filled with those rays.
+
+    Ripples turn each ray a little.
+    """
+    index = np.empty(len(t), np.int64)
+    count = 0
+    for i in range(len(t)):
+        look, nz = found.look[i], found.normal[i, 2]
+        if look < 0 or nz < LEVEL_COS or not is_paved(looks.surface[look]):
+            continue
+        film = water_film(wetness, looks.surface[look], found.xyz, found.extent, i)
+        if film * water_mirror(found.cosine[i]) < FAINTEST_MIRROR:
+            continue
+        x, y, size = found.xyz[i, 0], found.xyz[i, 1], found.extent[i, 3]
+        rx = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 94)
+        ry = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 95)
+        nx, ny = found.normal[i, 0] + rx, found.normal[i, 1] + ry
+        scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        along = dx * nx + dy * ny + dz * nz
+        out_direction[count, 0] = dx - 2.0 * along * nx
+        out_direction[count, 1] = dy - 2.0 * along * ny
+        out_direction[count, 2] = max(dz - 2.0 * along * nz, 1e-3)
+        out_origin[count, 0], out_origin[count, 1] = x, y
+        out_origin[count, 2] = found.xyz[i, 2] + 0.01 + 0.02 * size
+        index[count] = i
+        count += 1
+    return index[:count]
