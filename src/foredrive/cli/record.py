@@ -1,39 +1,128 @@
 """`foredrive record`."""
 
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from foredrive.recipes.recording import Recorded
+    from foredrive.towns.campaign import DrivePlan
+
+SHEET = "contact_sheet.png"
+FAILURES_SHOWN = 3
+Range = Annotated[str, tyro.conf.arg(metavar="N|FIRST..LAST")]
+
 
 def record(
-    town: str,
+    town: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TOWN [TOWN ...]")],
     out: Path,
     seconds: float = 20.0,
     seed: int = 0,
+    seeds: Annotated[str | None, tyro.conf.arg(metavar="N|FIRST..LAST")] = None,
     rate: Annotated[float, tyro.conf.arg(metavar="HZ")] = 10.0,
     image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256),
-    vehicles: int = 30,
-    people: int = 20,
+    vehicles: Range = "30",
+    people: Range = "20",
+    conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
+    workers: int = 0,
+    ray: bool = False,
 ) -> None:
-    """Record a drive through a town as a 123D log with exact labels.
+    """Record drives through towns as 123D logs with exact labels.
+
+    One drive is recorded here and now. Several, of several towns, conditions or seeds, are recorded side by
+    side; logs that lie there whole are skipped, and a contact sheet shows what there is at the end.
 
     Args:
         town: Town01 to Town07 or Town10HD; Town05 is held out for testing.
-        out: 123D data root; the log and the town's map are written into it.
-        seconds: Length of the drive, s.
+        out: 123D data root; logs and the towns' maps are written into it.
+        seconds: Length of each drive, s.
         seed: Decides the buildings, the route, the traffic and all noise; the same seed gives the same bytes.
+        seeds: Instead of one seed FIRST..LAST, or how many drives in each town under each of the conditions:
+            then seeds are chosen whose routes turn left, turn right and go straight equally often.
         rate: Frames per second.
         image_size: Size of the six cameras' images, px.
-        vehicles: How many vehicles share the road near the ego vehicle.
+        vehicles: How many vehicles share the road near the ego vehicle; drawn from a range for each drive.
         people: How many pedestrians do, where the town has walkways.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog, every drive under each;
+            any: one for each drive, evenly; none: a bright day.
+        workers: How many drives are recorded at a time; 0 is one for each core.
+        ray: Record on Ray: on the cluster at RAY_ADDRESS, or on one started here.
     """
-    from foredrive.towns.recorder import Crowd
-    from foredrive.towns.recorder import record as record_drive
-    from foredrive.towns.sensing.capture import SensorSuite
-    from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+    from foredrive.recipes.recording import record_drives, record_plan
+    from foredrive.towns.campaign import Campaign, plan_drives
 
-    sensors = SensorSuite(camera_rig(image_size), roof_lidar())
-    log = record_drive(town, seconds, seed, out, rate, sensors, Crowd(vehicles, people))
-    print(f"wrote {log.folder}")
-    print(f"look: foredrive view {log.folder} --save {log.folder.name}.png")
+    campaign = Campaign(
+        towns=town,
+        seeds=(seed,) if seeds is None else _seeds(seeds),
+        conditions=conditions,
+        vehicles=_range("vehicles", vehicles),
+        people=_range("people", people),
+        seconds=seconds,
+        rate_hz=rate,
+    )
+    plans = plan_drives(campaign)
+    if len(plans) == 1 and not ray:
+        log = record_plan(plans[0], out, image_size)
+        print(f"wrote {log.folder}")
+        print(f"look: foredrive view {log.folder} --save {log.folder.name}.png")
+        return
+    with _progress(len(plans)) as tick:
+        cores = len(os.sched_getaffinity(0))
+        done = record_drives(plans, out, image_size, workers or cores, on_ray=ray, tick=tick)
+    _tell(done, plans, out)
+
+
+def _tell(done: "Recorded", plans: "list[DrivePlan]", out: Path) -> None:
+    """What was recorded, with pictures; at last what was not.
+
+    Raises:
+        InputError: some drives failed.
+    """
+    from foredrive.view.contact_sheet import write_contact_sheet
+
+    print(f"recorded {len(done.logs) - done.skipped} drives, {done.skipped} were there already")
+    if done.logs:
+        write_contact_sheet(out / SHEET, [(log, _caption(plan)) for plan, log in done.logs.items()])
+        print(f"look: {out / SHEET}")
+    if done.failed:
+        told = [f"{plan.log_name} ({reason})" for plan, reason in done.failed.items()]
+        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
+        shown = ", ".join(told[:FAILURES_SHOWN])
+        raise InputError(f"{len(told)} of {len(plans)} drives failed: {shown}{more}")
+
+
+def _caption(plan: "DrivePlan") -> str:
+    return f"{plan.conditions or 'daylight'}\n{plan.vehicles} vehicles, {plan.people} people"
+
+
+@contextmanager
+def _progress(total: int) -> "Iterator[Callable[[], None]]":
+    """A bar over all drives; yields what moves it on by one."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress("recording drives", *columns) as progress:
+        bar = progress.add_task("", total=total)
+        yield lambda: progress.advance(bar)
+
+
+def _seeds(text: str) -> tuple[int, ...] | int:
+    """A range of seeds, or how many."""
+    first, last = _range("seeds", text)
+    return tuple(range(first, last + 1)) if ".." in text else first
+
+
+def _range(what: str, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", text)
+    if found is None or (found[2] is not None and int(found[2]) < int(found[1])):
+        raise InputError(f"{what}: a number or a range such as 1..8, got {text!r}")
+    return int(found[1]), int(found[2] or found[1])

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.colors import to_rgb
 
-from foredrive.scene import Category, MapKind
+from foredrive.scene import Category, Command, MapKind
 
 GROUND = "#11151c"
 """Background of every picture."""
@@ -59,7 +59,7 @@ NEAREST_M, FARTHEST_M = 3.0, 80.0
 """Ends of the logarithmic range scale."""
 
 
-def label(kind: Category | MapKind) -> str:
+def label(kind: Category | MapKind | Command) -> str:
     """A kind's name for a legend: TRAFFIC_CONE -> traffic cone."""
     return kind.name.lower().replace("_", " ")
 

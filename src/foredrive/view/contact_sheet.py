@@ -1,0 +1,181 @@
+"""Many drives on one page: of each a few pictures of the front camera and its way through the town."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from foredrive.data import LogPath
+from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.commands import command_at
+from foredrive.data.logs import Log
+from foredrive.data.maps import RADIUS_M, read_map_patch
+from foredrive.files import atomic_path
+from foredrive.scene import Command, MapKind, MapPatch
+from foredrive.view import palette
+
+DPI = 100
+THUMBNAIL_HW = (126, 224)
+THUMBNAILS = 5
+GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
+MOST_ROWS = 60
+"""Of more drives as many are shown, evenly chosen."""
+AROUND_M = 30.0
+SMALLEST_M = 50.0
+"""The view from above shows this much on each side of the path, and at least so much to each side."""
+MAP_LINES = {MapKind.LANE_BOUNDARY: 0.5, MapKind.ROAD_EDGE: 0.9}
+HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
+
+
+def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> None:
+    """Write the page as a PNG: a row for each drive, in the order given.
+
+    Args:
+        path: the picture; it appears whole or not at all.
+        drives: logs, and what to say of each beside its name and what it commands.
+
+    Raises:
+        InputError: on a log that cannot be read.
+    """
+    figure = draw_contact_sheet(drives)
+    with atomic_path(path) as scratch:
+        figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
+
+
+def draw_contact_sheet(drives: Sequence[tuple[LogPath, str]]) -> Figure:
+    """The page as a figure."""
+    chosen = np.linspace(0, len(drives) - 1, min(len(drives), MOST_ROWS)).round().astype(int).tolist()
+    (cell_h, cell_w), row_h = THUMBNAIL_HW, THUMBNAIL_HW[0] + GAP_PX
+    width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
+    height = HEAD_PX + len(chosen) * row_h
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
+
+    def place(x: int, y: int, w: int, h: int) -> Axes:
+        """Axes at pixels from the upper left corner."""
+        return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
+
+    commanded: Counter[str] = Counter()
+    for row, index in enumerate(chosen):
+        y, (path, caption) = HEAD_PX + row * row_h, drives[index]
+        log = Log(path)
+        commands = _commands(log)
+        commanded += commands
+        _write_text(place(2 * GAP_PX, y, TEXT_PX - 2 * GAP_PX, cell_h), log, caption, commands)
+        for column, frame in enumerate(_spread(len(log))):
+            _show_front(place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
+        draw_way(place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
+    shown = (
+        f"{len(drives)} drives" if len(chosen) == len(drives) else f"{len(chosen)} of {len(drives)} drives"
+    )
+    figure.text(
+        2 * GAP_PX / width,
+        1 - HEAD_PX / 2 / height,
+        f"{shown}    {_shares(commanded)}",
+        color=palette.INK,
+        fontsize=14,
+        va="center",
+    )
+    return figure
+
+
+def _spread(frames: int) -> list[int]:
+    """Frames from the first to the last, evenly."""
+    return np.linspace(0, frames - 1, min(frames, THUMBNAILS)).round().astype(int).tolist()
+
+
+def _commands(log: Log) -> Counter[str]:
+    """How many frames have which command."""
+    found: Counter[str] = Counter()
+    for frame in range(len(log)):
+        command, _ = command_at(log, frame, log.driven_future(frame, HORIZON_STEPS, HORIZON_DT_S))
+        if command is not None:
+            found[palette.label(command)] += 1
+    return found
+
+
+def _shares(commands: Counter[str]) -> str:
+    total = max(commands.total(), 1)
+    kinds = [palette.label(kind) for kind in Command if commands[palette.label(kind)]]
+    return "   ".join(f"{kind} {100 * commands[kind] / total:.0f} %" for kind in kinds)
+
+
+def _write_text(ax: Axes, log: Log, caption: str, commands: Counter[str]) -> None:
+    ax.set_axis_off()
+    length_m = float(np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1).sum())
+    duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
+    name = log.path.folder.name
+    ax.text(0, 1, name, color=palette.INK, fontsize=min(12.0, 230 / len(name)), va="top", weight="bold")
+    told = f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
+    ax.text(0, 0.80, told, color=palette.FAINT, fontsize=9.5, va="top", linespacing=1.5)
+
+
+def _show_front(ax: Axes, log: Log, frame: int) -> None:
+    ax.imshow(_front_image(log, frame), interpolation="none", aspect="auto")
+    ax.set_axis_off()
+    ax.text(
+        0.02,
+        0.96,
+        f"{(log.t_us[frame] - log.t_us[0]) * 1e-6:.1f} s",
+        transform=ax.transAxes,
+        color=palette.INK,
+        fontsize=8,
+        va="top",
+        bbox={"facecolor": palette.GROUND, "alpha": 0.6, "edgecolor": "none", "pad": 2},
+    )
+
+
+def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
+    """The camera that looks ahead; a bare panel if the log has none."""
+    cameras = pinhole_cameras(log)
+    if cameras:
+        image = read_camera(log, frame, next(iter(cameras.values())), THUMBNAIL_HW, with_image=True).image
+        if image is not None:
+            return image.permute(1, 2, 0).numpy()
+    return np.full((*THUMBNAIL_HW, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
+
+
+def draw_way(ax: Axes, log: Log) -> None:
+    """The driven path over the map, north up, a dot at its start."""
+    xy = log.T_world_ego[:, :2, 3]
+    low, high = xy.min(axis=0) - AROUND_M, xy.max(axis=0) + AROUND_M
+    half = max(float((high - low).max()) / 2, SMALLEST_M)
+    centre = (low + high) / 2
+    ax.set_facecolor(palette.PANEL)
+    ax.set(
+        xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal"
+    )
+    ax.set_xticks([])
+    ax.set_yticks([])
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    for frame in _every(xy, RADIUS_M):
+        patch = read_map_patch(log, frame)
+        for kind, width in MAP_LINES.items():
+            lines = _lines_world(patch, kind, log.T_world_ego[frame])
+            ax.add_collection(LineCollection(lines, color=palette.MAP_COLOURS[kind], linewidth=width))
+    ax.plot(*xy.T, color=palette.EXPERT, linewidth=2.2, solid_capstyle="round", zorder=3)
+    ax.plot(*xy[0], "o", color=palette.EGO, markersize=5, zorder=4)
+
+
+def _every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
+    """The first frame, the last, and those that are `step_m` of driving apart."""
+    driven_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=-1))])
+    at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
+    return sorted({*at.tolist(), len(xy) - 1})
+
+
+def _lines_world(
+    patch: MapPatch, kind: MapKind, T_world_ego: Float[np.ndarray, "4 4"]
+) -> list[Float[np.ndarray, "V 2"]]:
+    T = torch.from_numpy(T_world_ego)
+    lines = []
+    for index in (patch.kind == kind).nonzero()[:, 0].tolist():
+        line = patch.vertices[index][patch.valid[index]].double()
+        lines.append((line @ T[:3, :3].T + T[:3, 3])[:, :2].numpy())
+    return lines

@@ -1,0 +1,121 @@
+"""A campaign is one list of drives: always the same, no name twice, commands evened out."""
+
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from foredrive.errors import InputError
+from foredrive.scene import Command
+from foredrive.towns.campaign import (
+    ANY_CONDITIONS,
+    Campaign,
+    DrivePlan,
+    choose_balanced,
+    plan_drives,
+    route_commands,
+)
+from foredrive.towns.conditions import CONDITIONS
+
+RANGES = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(lambda ends: (min(ends), max(ends)))
+
+
+def spread(commands: Counter[Command]) -> int:
+    counts = [commands[command] for command in (Command.LEFT, Command.RIGHT, Command.STRAIGHT)]
+    return max(counts) - min(counts)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seeds=st.lists(st.integers(0, 1000), min_size=1, max_size=6).map(tuple),
+    conditions=st.one_of(
+        st.just((ANY_CONDITIONS,)), st.lists(st.sampled_from(sorted(CONDITIONS)), max_size=4).map(tuple)
+    ),
+    vehicles=RANGES,
+    people=RANGES,
+)
+def test_a_plan_is_always_the_same_and_no_name_comes_twice(
+    seeds: tuple[int, ...], conditions: tuple[str, ...], vehicles: tuple[int, int], people: tuple[int, int]
+) -> None:
+    campaign = Campaign(("Town02",), seeds, conditions, vehicles, people)
+    plans = plan_drives(campaign)
+    assert plans == plan_drives(campaign)
+    assert len({plan.log_name for plan in plans}) == len(plans)
+    dealt = 1 if conditions == (ANY_CONDITIONS,) else max(1, len(set(conditions)))
+    assert len(plans) == len(set(seeds)) * dealt
+    for plan in plans:
+        assert vehicles[0] <= plan.vehicles <= vehicles[1]
+        assert people[0] <= plan.people <= people[1]
+
+
+def test_names_tell_what_was_asked_for() -> None:
+    plan = DrivePlan("Town01", 3, None, 30, 20, 20.0, 10.0)
+    assert plan.log_name == "Town01_seed3"
+    assert DrivePlan("Town01", 3, "night", 30, 20, 20.0, 10.0).log_name == "Town01_seed3_night"
+    assert DrivePlan("Town01", 3, "night", 45, 10, 20.0, 10.0).log_name == "Town01_seed3_night_45v10p"
+
+
+def test_every_town_is_driven_under_all_conditions_with_every_seed() -> None:
+    plans = plan_drives(Campaign(("Town02", "Town01"), (4, 5), ("night", "rain")))
+    assert [(plan.town, plan.conditions, plan.seed) for plan in plans] == [
+        (town, conditions, seed)
+        for town in ("Town02", "Town01")
+        for conditions in ("night", "rain")
+        for seed in (4, 5)
+    ]
+
+
+def test_any_conditions_are_dealt_evenly() -> None:
+    plans = plan_drives(Campaign(("Town02",), tuple(range(2 * len(CONDITIONS) + 1)), (ANY_CONDITIONS,)))
+    times = Counter(plan.conditions for plan in plans)
+    assert set(times) == set(CONDITIONS)
+    assert sorted(times.values()) == [2] * (len(CONDITIONS) - 1) + [3]
+
+
+def test_chosen_seeds_turn_left_and_right_and_go_straight_alike() -> None:
+    plans = plan_drives(Campaign(("Town02",), 4, ("clear", "night")))
+    assert Counter(plan.conditions for plan in plans) == {"clear": 4, "night": 4}
+    assert len({plan.seed for plan in plans}) == 8
+    routes = route_commands("Town02", 20.0, [plan.seed for plan in plans])
+    commands = sum(routes, Counter())
+    assert spread(commands) <= 1
+    assert commands.total() >= 8
+
+
+def test_the_rarest_command_decides() -> None:
+    left, right = Counter([Command.LEFT]), Counter([Command.RIGHT])
+    routes = [left, left, right, left + right]
+    assert choose_balanced(routes, 1, Counter()) == [3]
+    assert choose_balanced(routes, 2, Counter({Command.LEFT: 1})) == [2, 3]
+    assert choose_balanced(routes, 4, Counter()) == [3, 0, 2, 1]
+
+
+@given(
+    routes=st.lists(
+        st.lists(st.sampled_from(list(Command)), max_size=6).map(Counter), min_size=4, max_size=30
+    )
+)
+def test_no_route_is_chosen_twice(routes: list[Counter[Command]]) -> None:
+    chosen = choose_balanced(routes, 4, Counter())
+    assert len(set(chosen)) == 4
+    assert chosen == choose_balanced(routes, 4, Counter())
+    assert set(chosen) <= set(range(len(routes)))
+
+
+@pytest.mark.parametrize(
+    ("ranges", "says"),
+    [
+        ({"towns": ("Town99",)}, "one of Town01"),
+        ({"conditions": ("hail",)}, "no conditions are named hail"),
+        ({"conditions": (ANY_CONDITIONS, "night")}, "no conditions are named any"),
+        ({"seeds": ()}, "nothing to record"),
+        ({"seeds": 0}, "nothing to record"),
+        ({"seconds": 0.0}, "more than 0 s"),
+        ({"rate_hz": 1000.0}, "frame rate"),
+        ({"vehicles": (5, 3)}, "vehicles range"),
+    ],
+)
+def test_impossible_ranges_are_named(ranges: dict[str, object], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        plan_drives(Campaign(**({"towns": ("Town02",), "seeds": (1,)} | ranges)))  # type: ignore[arg-type]
