@@ -111,7 +111,8 @@ class Narrator:
         centre = np.array([actor.centre_m for actor in actors]).reshape(-1, 3)
         in_ego = centre @ R.T + T_ego_world[:3, 3]
         on_road = self._places.on_road(centre[:, :2])
-        things = [_thing(*each, R) for each in zip(actors, in_ego, visibility, on_road, strict=True)]
+        seen = zip(actors, in_ego, visibility.tolist(), on_road.tolist(), strict=True)
+        things = [_thing(*each, R) for each in seen]
         window = slice(self._passed, self._passed + 200)
         self._passed += int(np.linalg.norm(self._line[window] - at, axis=1).argmin())
         aside_mps = self._aside_speed(moment)
@@ -206,9 +207,9 @@ def _thing(
         xy_m=xyz[:2],
         velocity_mps=(R @ actor.velocity_mps)[:2],
         yaw=float(np.arctan2(heading[1], heading[0])),
-        visibility=float(seen),
+        visibility=seen,
         parked=actor.parked,
-        on_road=bool(on_road),
+        on_road=on_road,
     )
 
 
