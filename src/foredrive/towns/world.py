@@ -32,6 +32,7 @@ from foredrive.towns.place.props import (
 )
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
+from foredrive.towns.place.street_furniture import build_street_furniture
 from foredrive.towns.place.terrain import build_terrain, make_terrain
 from foredrive.towns.place.vegetation import build_vegetation
 from foredrive.towns.sensing import capture, lens, raycast, shading
@@ -308,9 +309,10 @@ def build_static(
             build_buildings(site, town.name, assets, table, rng),
         ]
     )
+    furniture, details = build_street_furniture(town, site, table, rng)
     lamps = build_street_lamps(site, table, rng)
     plants, trunks = build_vegetation(site, assets, table, rng)
-    place = join([place, lamps.mesh, plants])
+    place = join([place, furniture, lamps.mesh, plants])
     vehicle_lights = VehicleLights.of(table)
     vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
     track = [np.full(len(place.look), NOBODY, dtype=np.int32)]
@@ -320,7 +322,7 @@ def build_static(
         track=np.concatenate(track),
         parked=parked,
         heads=posts.heads,
-        thin=join_thin([posts.thin, lamps.thin, trunks]),
+        thin=join_thin([posts.thin, details, lamps.thin, trunks]),
         lamps=lamps.lamps,
         vehicle_lights=vehicle_lights,
     )

@@ -13,6 +13,7 @@ from foredrive.towns.place.mesh import (
     Mesh,
     Vector,
     box,
+    boxes,
     frustum,
     hexahedron,
     join,
@@ -118,14 +119,17 @@ class BuildingMaker:
         """A hedge or a fence between two local points of the same y."""
         (x0, y), (x1, _) = ends
         if kind == "hedge":
-            top = base + HEDGE_M
-            return plot.placed(box((x0, y - 0.25, base - 0.4), (x1, y + 0.25, top), self._hedge))
+            ends_z = base - 0.4, base + HEDGE_M
+            return self._box(plot, (0.5 * (x0 + x1), y), (x1 - x0, 0.5), ends_z, self._hedge)
         parts = [
             box((x0, y - 0.02, base + z), (x1, y + 0.02, base + z + 0.1), self._wood) for z in (0.25, 0.75)
         ]
-        for x in np.arange(x0, x1, 0.3):
-            tall, half = (FENCE_M, 0.045) if round((x - x0) / 0.3) % 6 else (FENCE_M + 0.1, 0.06)
-            parts.append(box((x - half, y - 0.05, base - 0.3), (x + half, y - 0.02, base + tall), self._wood))
+        x = np.arange(x0, x1, 0.3)
+        post = np.arange(len(x)) % 6 == 0
+        half, top = np.where(post, 0.06, 0.045), base + np.where(post, FENCE_M + 0.1, FENCE_M)
+        low = np.column_stack([x - half, np.full_like(x, y - 0.05), np.full_like(x, base - 0.3)])
+        high = np.column_stack([x + half, np.full_like(x, y - 0.02), top])
+        parts.append(boxes(low, high, self._wood))
         return plot.placed(join(parts))
 
     def _choose(self, options: tuple[Rgb, ...]) -> Rgb:
@@ -158,10 +162,9 @@ class BuildingMaker:
         """One or two storeys under a gabled or hipped roof, with a chimney and a porch."""
         rng = self.rng
         storeys, ground_m, storey_m = int(rng.integers(1, 3)), 2.9, 2.8
-        windows = self.assets.windows[0]
         facade = self._facade(
             self._wall(WallKind.STONE),
-            windows,
+            self.assets.windows[0],
             GroundFloor.DOORS,
             (storey_m, 2.9, ground_m - 0.1),
             (0.42, 0.5),
@@ -299,16 +302,25 @@ class BuildingMaker:
         if rng.random() < 0.5:
             rail = self._plain(self._choose(self.assets.awnings), 0.4)
         half = 0.46 * facade.bay_m
-        parts = []
-        for x in centres[int(rng.integers(0, 2)) :: int(rng.integers(2, 4))]:
-            for row in range(storeys - 1):
-                z = base + facade.ground_m + row * facade.storey_m
-                y = -BALCONY_M
-                parts.append(box((x - half, y, z - 0.1), (x + half, 0.05, z + 0.08), slab))
-                parts.append(box((x - half, y, z + 0.12), (x + half, y + 0.05, z + 1.0), rail))
-                for side in (x - half, x + half - 0.05):
-                    parts.append(box((side, y + 0.05, z + 0.12), (side + 0.05, 0.05, z + 1.0), rail))
-        return [plot.placed(join(parts))] if parts else []
+        some = centres[int(rng.integers(0, 2)) :: int(rng.integers(2, 4))]
+        floors = base + facade.ground_m + np.arange(storeys - 1) * facade.storey_m
+        x, z = (a.ravel() for a in np.meshgrid(some, floors))
+
+        def part(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, look: int) -> Mesh:
+            low, high = (
+                np.column_stack([x + dx, np.full_like(x, y), z + dz])
+                for dx, y, dz in ((x0, y0, z0), (x1, y1, z1))
+            )
+            return boxes(low, high, look)
+
+        y = -BALCONY_M
+        parts = [
+            part(-half, y, -0.1, half, 0.05, 0.08, slab),
+            part(-half, y, 0.12, half, y + 0.05, 1.0, rail),
+            part(-half, y + 0.05, 0.12, 0.05 - half, 0.05, 1.0, rail),
+            part(half - 0.05, y + 0.05, 0.12, half, 0.05, 1.0, rail),
+        ]
+        return [plot.placed(join(parts))]
 
     def _roof_boxes(self, plot: Plot, z: float, look: int, count: int) -> list[Mesh]:
         """Stairs, lifts and air conditioning on a flat roof."""

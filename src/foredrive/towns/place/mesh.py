@@ -144,6 +144,14 @@ def box(lower: Vector, upper: Vector, look: int) -> Mesh:
     )
 
 
+def boxes(lower: Float[np.ndarray, "B 3"], upper: Float[np.ndarray, "B 3"], look: int) -> Mesh:
+    """Many axis-aligned boxes."""
+    ends = np.stack([lower, upper])
+    which = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    corners = ends[which, :, np.arange(3)].transpose(2, 0, 1)
+    return quads(corners[:, np.array(_HEX_FACES)].reshape(-1, 4, 3), look)
+
+
 _HEX_FACES = ((3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
@@ -153,8 +161,8 @@ def hexahedron(bottom: Sequence[Vector], top: Sequence[Vector], looks: Sequence[
     Args:
         looks: of the bottom, the top, then the sides from corner 0–1 on.
     """
-    corners = np.array([*bottom, *top])
-    return join([quads(corners[list(f)][None], n) for f, n in zip(_HEX_FACES, looks, strict=True)])
+    mesh = quads(np.array([*bottom, *top], dtype=float)[np.array(_HEX_FACES)], 0)
+    return Mesh(mesh.xyz, mesh.uvw, np.repeat(np.array(looks, dtype=np.int32), 2))
 
 
 def frustum(bottom: Vector, top: Vector, radii: tuple[float, float], sides: int, look: int) -> Mesh:
@@ -167,7 +175,11 @@ def frustum(bottom: Vector, top: Vector, radii: tuple[float, float], sides: int,
     angle = np.arange(sides + 1) * (2 * np.pi / sides)
     circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
     low, high = base + radii[0] * circle, tip + radii[1] * circle
-    side = quads(np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1), look)
-    cap_low = np.stack([np.broadcast_to(base, (sides, 3)), low[1:], low[:-1]], axis=1)
-    cap_high = np.stack([np.broadcast_to(tip, (sides, 3)), high[:-1], high[1:]], axis=1)
-    return join([side, triangles(cap_low, look), triangles(cap_high, look)])
+    ends = np.broadcast_to(base, (sides, 3)), np.broadcast_to(tip, (sides, 3))
+    faces = [
+        (low[:-1], low[1:], high[1:]),
+        (low[:-1], high[1:], high[:-1]),
+        (ends[0], low[1:], low[:-1]),
+        (ends[1], high[:-1], high[1:]),
+    ]
+    return triangles(np.concatenate([np.stack(corners, axis=1) for corners in faces]), look)

@@ -1,0 +1,128 @@
+"""Train and test towns are furnished from different assets."""
+
+import numpy as np
+import pytest
+
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, TownMap
+from foredrive.towns.place.actor_looks import MeshLooks
+from foredrive.towns.place.actor_meshes import PEOPLE, SHAPES_OF_KIND, VEHICLES
+from foredrive.towns.place.assets import AssetSet, asset_set_of, assets_of
+from foredrive.towns.place.looks import LookTable, Surface, Texture
+from foredrive.towns.place.styles import STYLES
+from foredrive.towns.sensing.actor_shapes import make_shape_library, unit_to_world
+from foredrive.towns.world import World
+
+SIZES = {
+    Category.CAR: (4.5, 1.8, 1.5),
+    Category.TRUCK: (7.5, 2.4, 3.0),
+    Category.BUS: (10.0, 2.4, 3.0),
+    Category.MOTORCYCLE: (2.1, 0.8, 1.5),
+    Category.BICYCLE: (1.7, 0.6, 1.7),
+    Category.PEDESTRIAN: (0.6, 0.6, 1.75),
+}
+
+
+def actor(category: Category, style: int, **changes: object) -> ActorState:
+    size = np.array(SIZES[category])
+    fields = {
+        "track_id": 1,
+        "category": category,
+        "centre_m": np.array([0.0, 0.0, 0.5 * size[2]]),
+        "yaw": 0.0,
+        "pitch": 0.0,
+        "size_lwh": size,
+        "velocity_mps": np.zeros(3),
+        "style": style,
+        "parked": False,
+    }
+    return ActorState(**{**fields, **changes})
+
+
+def test_held_out_towns_have_the_test_assets() -> None:
+    assert {town for town in TOWNS if asset_set_of(town) is AssetSet.TEST} == set(TEST_TOWNS)
+    assert set(STYLES) == set(TOWNS)
+
+
+def test_no_asset_is_in_both_sets() -> None:
+    train, test, mixed = (vars(assets_of(chosen)) for chosen in AssetSet)
+    for name in train:
+        assert not set(train[name]) & set(test[name]), name
+        assert set(mixed[name]) == set(train[name]) | set(test[name])
+
+
+@pytest.mark.parametrize("chosen", list(AssetSet))
+def test_every_kind_of_road_user_has_a_shape_in_each_set(chosen: AssetSet) -> None:
+    library = make_shape_library(LookTable(), assets_of(chosen))
+    heights = {"low_car": 1.45, "high_car": 1.7}
+    seen = set()
+    for category in SIZES:
+        for height in heights.values() if category is Category.CAR else (SIZES[category][2],):
+            for style in range(6):
+                state = actor(category, style, size_lwh=np.array([*SIZES[category][:2], height]))
+                seen.add(id(library.shape_of(state)))
+                assert len(library.paint_of(state)) == 3
+    assert len(seen) >= 11
+    assert all(any(name in library.shapes for name in names) for names in SHAPES_OF_KIND.values())
+
+
+@pytest.mark.parametrize("name", [*VEHICLES, *PEOPLE])
+def test_shapes_are_sane(name: str) -> None:
+    """No empty triangles, about as large as they should be, mirrored left and right, feet on the ground."""
+    mesh = {**VEHICLES, **PEOPLE}[name](MeshLooks(LookTable()))
+    area = np.linalg.norm(np.cross(mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]), axis=1)
+    assert (area > 1e-7).mean() > 0.98
+    low, high = mesh.xyz.reshape(-1, 3).min(0), mesh.xyz.reshape(-1, 3).max(0)
+    assert low[2] == pytest.approx(0.0, abs=0.03)
+    if name in VEHICLES:
+        assert low[1] == pytest.approx(-high[1], abs=0.03)
+        a, b, c = mesh.xyz.astype(np.float64).transpose(1, 0, 2)
+        volume = (a * np.cross(b, c)).sum() / 6  # of closed parts that face outwards
+        assert volume > 0.08 * np.prod(high - low) * (0.2 if high[1] < 0.6 else 1.0)
+    else:
+        assert 1.6 < high[2] < 1.85
+
+
+def test_shapes_stay_in_their_boxes() -> None:
+    library = make_shape_library(LookTable(), assets_of(AssetSet.MIXED))
+    for category in SIZES:
+        for style in range(4):
+            state = actor(category, style, velocity_mps=np.array([1.2, 0.0, 0.0]))
+            xyz = library.shape_of(state).mesh.transformed(unit_to_world(state)).xyz.reshape(-1, 3)
+            half = 0.5 * state.size_lwh
+            assert (np.abs(xyz - state.centre_m) <= half + 1e-4).all()
+            if category is not Category.PEDESTRIAN:  # those fill it only in mid-stride
+                np.testing.assert_allclose(np.ptp(xyz, axis=0), state.size_lwh, rtol=1e-3)
+
+
+def test_legs_move_with_the_distance_walked() -> None:
+    library = make_shape_library(LookTable(), assets_of(AssetSet.TRAIN))
+    walking = np.array([1.4, 0.0, 0.0])
+    poses = [
+        id(
+            library.shape_of(
+                actor(Category.PEDESTRIAN, 0, centre_m=np.array([x, 0.0, 0.9]), velocity_mps=walking)
+            )
+        )
+        for x in np.arange(0.05, 1.4, 0.175)
+    ]
+    assert len(set(poses)) == 8
+    again = actor(Category.PEDESTRIAN, 0, centre_m=np.array([1.45, 0.0, 0.9]), velocity_mps=walking)
+    assert id(library.shape_of(again)) == poses[0]
+
+
+def test_a_held_out_world_shows_no_look_of_training(world02: World, town02: TownMap) -> None:
+    other = World(town02, seed=3, assets=AssetSet.TEST)
+
+    def seen(world: World, *surfaces: Surface) -> set[tuple[float, ...]]:
+        looks = world._looks
+        used = np.unique(world.static.mesh.look)
+        patterned = np.isin(looks.texture[used], (Texture.FACADE, Texture.FOLIAGE, Texture.TILES))
+        used = used[patterned & np.isin(looks.surface[used], surfaces)]
+        kinds = np.where(looks.texture[used] == Texture.FACADE, looks.params[used, 8] + 1, 0)
+        return {(k, *rgb) for k, rgb in zip(kinds.tolist(), looks.albedo[used].tolist(), strict=True)}
+
+    for surface in (Surface.BUILDING, Surface.VEGETATION):
+        assert len(seen(world02, surface)) > 3
+        assert not seen(world02, surface) & seen(other, surface)
