@@ -28,3 +28,10 @@ def test_no_noise_by_default_and_the_same_noise_from_one_seed() -> None:
 def test_sub_exposures_fill_the_shutter_time() -> None:
     times = CameraOptics(shutter_s=0.02, sub_exposures=4).sub_exposure_dt_s
     assert times == pytest.approx((-0.0075, -0.0025, 0.0025, 0.0075))
+
+
+def test_what_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 sub-exposures"):
+        CameraOptics(shutter_s=0.01, sub_exposures=0)
+    with pytest.raises(ValueError, match="above 0"):
+        CameraOptics(gain=0.0)

@@ -22,7 +22,8 @@ class SpinningLidar:
     has been seen by then: straight ahead was seen half a period before. `lidar_models` has real ones.
 
     Raises:
-        ValueError: a table with another number of channels, or lasers that fire longer than a column takes.
+        ValueError: a table with another number of channels, lasers that fire longer than a column takes, no
+            rays for a beam.
     """
 
     elevation_rad: tuple[float, ...]
@@ -51,6 +52,8 @@ class SpinningLidar:
     """Which of a beam's echoes is returned."""
 
     def __post_init__(self) -> None:
+        if self.rays_per_beam < 1:
+            raise ValueError(f"{self.rays_per_beam} rays for a beam, at least 1 is needed")
         for table in (self.firing_s, self.azimuth_offset_rad):
             if table is not None and len(table) != len(self.elevation_rad):
                 raise ValueError(f"{len(self.elevation_rad)} channels, but a table of {len(table)}")
