@@ -108,8 +108,7 @@ def test_legs_move_with_the_distance_walked() -> None:
         for x in np.arange(0.05, 1.4, 0.175)
     ]
     assert len(set(poses)) == 8
-    again = actor(Category.PEDESTRIAN, 0, centre_m=np.array([1.45, 0.0, 0.9]), velocity_mps=walking)
-    assert id(library.shape_of(again)) == poses[0]
+    assert pose(1.45) == poses[0]
 
 
 def test_a_held_out_world_shows_no_look_of_training(world02: World, town02: TownMap) -> None:

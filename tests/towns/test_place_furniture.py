@@ -29,7 +29,8 @@ def volume(xyz: np.ndarray) -> float:
 def motorway() -> TownMap:
     """400 m of one fast lane, 4 m wide, without walkways."""
     line = np.stack([np.linspace(0.0, 400.0, 201), np.zeros(201), np.zeros(201)], axis=-1)
-    left, right = line + [0.0, 2.0, 0.0], line - [0.0, 2.0, 0.0]
+    aside = np.array([0.0, 2.0, 0.0])
+    left, right = line + aside, line - aside
     strip = Strip("1", StripKind.DRIVING, 0, None, left, right, (), ())
     lane = Lane(
         "1", "1", None, line, left, right, 30.0, (), (), None, None, MarkingKind.NONE, MarkingKind.NONE
@@ -85,7 +86,7 @@ def test_things_keep_off_each_other(site: Site) -> None:
 
 
 def test_thin_points_lie_on_the_town(world02: World) -> None:
-    """Every point that stands for a thin thing is close to a triangle of posts, signs, plants or structures."""
+    """Every point that stands for a thin thing is close to a triangle of something that can be thin."""
     mesh, thin = world02.static.mesh, world02.static.thin
     chosen = np.random.default_rng(0).choice(len(thin.xyz), 400, replace=False)
     solid = np.isin(
