@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -94,3 +96,18 @@ def test_tables_that_do_not_fit_are_refused() -> None:
         SpinningLidar((0.0, 0.1), 360, 10.0, 1.0, 60.0, 0.0, torch.eye(4), firing_s=(0.0,))
     with pytest.raises(ValueError, match="fire longer than"):
         SpinningLidar((0.0, 0.1), 1000, 10.0, 1.0, 60.0, 0.0, torch.eye(4), firing_s=(0.0, 2e-4))
+
+
+@pytest.mark.real
+def test_a_real_hdl32e_looks_where_ours_does(real_data: Path) -> None:
+    """The upper rings of nuScenes' lidar; the lower ones end on the car's roof or too near to tell."""
+    sweep = next((real_data / "nuscenes" / "keyframe").glob("*LIDAR_TOP*.pcd.bin"))
+    points = np.fromfile(sweep, np.float32).reshape(-1, 5)
+    range_m, ring = np.linalg.norm(points[:, :3], axis=1), points[:, 4]
+    elevation_deg = np.rad2deg(np.arcsin(points[:, 2] / range_m.clip(1e-6)))
+    far = range_m > 5.0
+    ours = hdl32e(torch.eye(4), rate_hz=20.0)
+    for k in range(12, 32):
+        measured = np.median(elevation_deg[far & (ring == k)])
+        assert measured == pytest.approx(math.degrees(ours.elevation_rad[k]), abs=0.06)
+    assert abs((ring == 20).sum() - ours.azimuth_steps) <= 1
