@@ -1,6 +1,7 @@
 """A town to be seen: all that stands in it, and what the recording vehicle senses there."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -124,7 +125,9 @@ class World:
         chosen = assets_of(assets or asset_set_of(town.name))
         self.town = town
         self.conditions = conditions or draw_daylight(weather_rng)
-        self.light = make_light(self.conditions, east_rad=float(weather_rng.uniform(0.0, 2.0 * np.pi)))
+        self._east_rad = float(weather_rng.uniform(0.0, 2.0 * np.pi))
+        self.light = make_light(self.conditions, self._east_rad)
+        self._lens_seed = int(weather_rng.integers(1 << 30))
         self._shapes = make_shape_library(table, chosen)
         self.static = build_static(town, table, self._shapes, chosen, rng)
         self._looks = table.arrays()
@@ -132,6 +135,12 @@ class World:
         faces = faces_of(self.static.mesh, self._looks.surface)
         top_m = float(self.static.mesh.xyz[..., 2].max()) + 1.0
         self._columns = TownColumns(self._scene, faces, top_m, wall_intervals(self.static.mesh, faces))
+
+    def under(self, conditions: Conditions) -> "World":
+        """The same town in another light; what stands there is shared, not grown again."""
+        other = copy(self)
+        other.conditions, other.light = conditions, make_light(conditions, self._east_rad)
+        return other
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
@@ -252,7 +261,7 @@ class World:
         rgb = shading.develop(self.light.haze_rgb[None], self.light.exposure, 1)[0]
         focal_px = sensors.rig.K[:, 0, 0].tolist()
         drops = [
-            lens.add_rain(image, self.conditions, focal, rgb, camera, rng)
+            lens.add_rain(image, self.conditions, focal, rgb, self._lens_seed + camera, rng)
             for camera, (image, focal) in enumerate(zip(images, focal_px, strict=True))
         ]
         return np.stack(drops)

@@ -23,7 +23,7 @@ _SKY_LUX = (1e-3, 8e-3, 3.4, 450.0, 4e3, 1.2e4, 2.3e4, 3.1e4)
 """Of a clear sky on level ground (twilight: Explanatory Supplement to the Astronomical Almanac, 1992)."""
 TOWN_GLOW_LUX, TOWN_GLOW_CLOUDED_LUX = 0.12, 0.5
 """What the sky above a lit town sends back at night."""
-STREET_LUX = 5.0
+STREET_LUX = 6.5
 """Of a lit street and the dark about it, which cameras expose for at night."""
 GREY_SKY_METERED = 0.18
 """By how much cameras darken what stands before a sky that is brighter than all else."""

@@ -23,7 +23,7 @@ from foredrive.towns.sensing.wet import (
 
 MISS = -1
 SHADOW_OFFSET_M = 4e-3
-WINDOW_RGB = (0.50, 0.33, 0.17)
+WINDOW_RGB = (0.36, 0.24, 0.12)
 """Of a room with the light on, beside what shines on its own."""
 
 _FACADE, _FOLIAGE, _GLOW = int(Texture.FACADE), int(Texture.FOLIAGE), int(Texture.GLOW)

@@ -18,7 +18,7 @@ WET_DARKENING = 0.5
 WET_SHINE = 120.0
 """How sharp lamps are mirrored, as a Blinn-Phong exponent."""
 PUDDLE_M = 4.0
-THIN_FILM = 0.4
+THIN_FILM = 0.28
 RIPPLES = 0.008
 FAINTEST_MIRROR = 0.015
 _ROAD, _SIDEWALK = int(Surface.ROAD), int(Surface.SIDEWALK)
@@ -46,7 +46,7 @@ def water_film(wetness, surface, xyz, extent, i):
         return 0.6 * film
     deep = noise(x / PUDDLE_M, y / PUDDLE_M, size / PUDDLE_M, 91)
     deep += 0.4 * noise(x * 0.9, y * 0.9, size * 0.9, 92)
-    puddle = min(max(5.0 * (deep + 0.9 * wetness - 1.15), 0.0), 1.0)
+    puddle = min(max(5.0 * (deep + 0.9 * wetness - 1.3), 0.0), 1.0)
     return film + (1.0 - film) * puddle
 
 
