@@ -1,6 +1,5 @@
 """Meshes of street furniture: in metres, x along the traffic, the road to the left, standing on z = 0."""
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -203,7 +202,7 @@ def _board(
     return Thing(join(parts), (0.4, 0.5 * wide + 0.1), tuple(thin))
 
 
-POWER_POLE_M, CROSSARM_M = 9.0, 1.1
+POWER_POLE_M, CROSSARM_M, WIRE_M = 9.0, 1.1, 0.025
 
 
 def _power_pole(looks: FurnitureLooks) -> Thing:
@@ -226,8 +225,9 @@ def wires(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], look: int)
     for y in (-CROSSARM_M, 0.0, CROSSARM_M):
         line = start + share * (end - start) + y * left
         line[:, 2] += POWER_POLE_M - 0.2 - 3.2 * (share * (1.0 - share))[:, 0]
-        for a, b in itertools.pairwise(line):
-            parts.append(frustum(tuple(a), tuple(b), (0.025, 0.025), 3, look))
+        edges = [line + WIRE_M * side for side in (left, np.array([0.0, 0.0, 1.0]), -left)]
+        for a, b in zip(edges, edges[1:] + edges[:1], strict=True):
+            parts.append(quads(np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1), look))
     return join(parts)
 
 
