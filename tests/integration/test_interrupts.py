@@ -99,6 +99,21 @@ def test_record(tmp_path: Path) -> None:
     assert "logs/town_train/Town02_seed0/sync.arrow" in all_files(tmp_path)
 
 
+def test_a_campaign_of_recordings(tmp_path: Path) -> None:
+    arguments = ("record", "--town", "Town02", "--seeds", "1..3", "--seconds", "1", "--rate", "2")
+    arguments = (*arguments, "--image-size", "36", "64", "--workers", "2", "--out", tmp_path)
+    interrupt(there(tmp_path, "logs/*Town02_seed3.*.part/*"), *arguments)
+    assert no_scratch(tmp_path)
+    whole = {file.parent for file in tmp_path.rglob("sync.arrow")}
+    assert 1 <= len(whole) <= 2
+    assert not (tmp_path / "contact_sheet.png").exists()
+    written = {file: file.stat().st_mtime_ns for log in whole for file in log.iterdir()}
+    finish(*arguments)
+    assert {file: file.stat().st_mtime_ns for file in written} == written
+    assert len(list(tmp_path.rglob("sync.arrow"))) == 3
+    assert (tmp_path / "contact_sheet.png").is_file()
+
+
 @pytest.mark.real
 def test_convert(real_data: Path, tmp_path: Path) -> None:
     interrupt(

@@ -130,6 +130,7 @@ def is_recorded(plan: DrivePlan, out: Path, image_hw: tuple[int, int]) -> bool:
 
 def _reason(plan: DrivePlan, error: BaseException) -> str:
     """Why a drive failed; what is no drive's own fault is raised."""
+    error = getattr(error, "cause", None) or error  # Ray wraps it, with its traceback as text
     if isinstance(error, OSError) or not isinstance(error, Exception):
         raise error
     if isinstance(error, InputError):

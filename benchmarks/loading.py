@@ -1,0 +1,97 @@
+"""How fast clips of recorded towns come from disk at nemo_tiny's sizes, and whether memory stays flat.
+
+A town is recorded first, at 10 Hz as `foredrive record` does it; labels and shrunk images are then made on a
+first pass that is not counted, as training makes them in its first epoch: `foredrive bench loading`.
+"""
+
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from torch.utils.data import DataLoader
+
+from foredrive.data import ClipDataset, collate
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import find_recipe
+from foredrive.scene import Example
+from foredrive.towns.recorder import record
+from foredrive.training.interrupts import start_fork_server
+
+TOWN, SECONDS = "Town02", 30.0
+WORKERS, BATCH_SIZE, CLIPS = 2, 4, 5000
+COUNTED_FROM = 0.2
+"""Memory is compared from this share of the clips on: before, caches of the libraries fill."""
+
+
+def measure(seed: int) -> dict[str, float]:
+    """Clips per second over all clips; growth of what this process and its workers hold, MiB."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = record(TOWN, SECONDS, seed, Path(folder))
+        dataset = ClipDataset([log], find_recipe("nemo_tiny").clips, Path(folder, "cache"))
+        for index in range(len(dataset)):
+            dataset[index]
+        loaded, memory_mib = 0, []
+        started = time.perf_counter()
+        for batch in _batches(dataset):
+            loaded += len(batch.key)
+            memory_mib.append((loaded, _memory_mib()))
+            if loaded >= CLIPS:
+                break
+        took_s = time.perf_counter() - started
+    settled_mib = next(mib for count, mib in memory_mib if count >= COUNTED_FROM * CLIPS)
+    return {
+        "clips_per_s": loaded / took_s,
+        "rss_mib": memory_mib[-1][1],
+        "rss_growth_mib": memory_mib[-1][1] - settled_mib,
+    }
+
+
+def _batches(dataset: ClipDataset) -> Iterator[Example]:
+    """Epoch after epoch from the same workers."""
+    start_fork_server(preload=type(dataset).__module__)
+    loader = DataLoader(
+        dataset,
+        batch_size=BATCH_SIZE,
+        shuffle=True,
+        collate_fn=collate,
+        num_workers=WORKERS,
+        multiprocessing_context="forkserver",
+        persistent_workers=True,
+    )
+    for _ in itertools.count():
+        yield from loader
+
+
+def _memory_mib() -> float:
+    """Resident memory of this process and all below it."""
+    parents = {}
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parents[int(status.parent.name)] = int(fields[1])
+    family = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in family} - family:
+        family |= more
+    return sum(_resident_mib(pid) for pid in family)
+
+
+def _resident_mib(pid: int) -> float:
+    """What a process holds; pages that several share count in parts."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
+
+
+BENCHMARK = Benchmark(
+    question="How many clips per second do two workers load at nemo_tiny's sizes, and is their memory flat?",
+    arms={"nemo_tiny": measure},
+    seeds=(0,),
+    config={"town": TOWN, "seconds": SECONDS, "workers": WORKERS, "batch_size": BATCH_SIZE, "clips": CLIPS},
+)

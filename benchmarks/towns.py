@@ -1,0 +1,167 @@
+"""How fast towns are sensed and recorded, whether memory stays flat, and where the time goes.
+
+Six cameras of 144×256 px and 32×720 beams among 60 road users: `foredrive bench towns`.
+"""
+
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from types import FrameType
+
+import torch
+
+from foredrive.evaluation import Benchmark
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.recorder import Crowd, record
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.world import World
+
+TOWN, VEHICLES, PEOPLE, RATE_HZ = "Town05", 40, 20, 2.0
+FRAMES = 60
+LONG_RUN_S = 3600.0
+"""Length of the drive that memory is watched over."""
+SETTLED_FROM, ENDS_FROM = 0.1, 0.9
+"""Memory at the end of a run is compared with that after this share of it; before, caches fill."""
+SAMPLE_S = 0.005
+
+PARTS = (
+    ("traffic", "expert.py", None),
+    ("jpeg", "jpeg", None),
+    ("arrow", "log_writer.py", "write"),
+    ("labels", "occupancy.py", None),
+    ("labels", "visibility.py", None),
+    ("labels", "semantics.py", None),
+    ("labels", "captions.py", None),
+    ("lidar", "capture.py", "sweep"),
+    ("casting", "raycast.py", None),
+    ("shading", "capture.py", None),
+)
+"""Name of a part, file and function that stand for it; the first that a stack holds takes the sample."""
+
+
+def sensors(seed: int) -> dict[str, float]:
+    """Key frames per second without labels and disk."""
+    town = load_town_map(TOWN)
+    world, traffic = World(town, seed), Traffic(town, seed, VEHICLES + 1, PEOPLE)
+    moments = list(Drive(traffic, FRAMES / RATE_HZ).moments(FRAMES + 1, 1 / RATE_HZ))
+    suite = _suite()
+
+    def render(first: int, last: int) -> float:
+        started = time.perf_counter()
+        for index, m in enumerate(moments[first:last]):
+            world.render(m.actors, suite, m.T_world_ego, m.twist_ego, noise_seed=index, lights=m.lights)
+        return time.perf_counter() - started
+
+    render(0, 1)  # compiles
+    return {
+        "sensor_hz": FRAMES / render(1, FRAMES + 1),
+        "road_users": sum(len(m.actors) for m in moments) / len(moments),
+        "threads": torch.get_num_threads(),
+    }
+
+
+def disk(seed: int) -> dict[str, float]:
+    """Key frames per second into a log with all that `foredrive record` writes, and the start before them."""
+    _record(seed, 1)  # compiles
+    took_s = {frames: _record(seed, frames) for frames in (FRAMES // 4, FRAMES)}
+    write_hz = (FRAMES - FRAMES // 4) / (took_s[FRAMES] - took_s[FRAMES // 4])
+    return {"write_hz": write_hz, "start_s": took_s[FRAMES] - FRAMES / write_hz}
+
+
+def memory(seed: int) -> dict[str, float]:
+    """Resident memory over one long drive."""
+    with _sampled(1.0, _resident_mib) as samples:
+        _record(seed, round(LONG_RUN_S * RATE_HZ))
+    settled = samples[int(SETTLED_FROM * len(samples)) : int(2 * SETTLED_FROM * len(samples)) + 1]
+    end = median(samples[int(ENDS_FROM * len(samples)) :])
+    return {"rss_mib": end, "rss_growth_mib": end - median(settled)}
+
+
+def profile(seed: int) -> dict[str, float]:
+    """Share of the time that recording spends on each part, on one thread."""
+    _record(seed, 1)  # compiles
+    threads, main = torch.get_num_threads(), threading.main_thread().ident
+    torch.set_num_threads(1)
+    try:
+        with _sampled(SAMPLE_S, lambda: _part(sys._current_frames()[main])) as samples:
+            _record(seed, FRAMES)
+    finally:
+        torch.set_num_threads(threads)
+    while samples and samples[0] == "start":
+        samples.pop(0)
+    found = Counter(part for part in samples if part != "start")
+    names = dict.fromkeys([name for name, _, _ in PARTS] + ["rest"])
+    return {f"{name}_share": found[name] / found.total() for name in names}
+
+
+def _record(seed: int, frames: int) -> float:
+    """Seconds that a recording takes."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        record(TOWN, frames / RATE_HZ, seed, Path(folder), RATE_HZ, _suite(), Crowd(VEHICLES, PEOPLE))
+    return time.perf_counter() - started
+
+
+def _suite() -> SensorSuite:
+    return SensorSuite(camera_rig((144, 256)), roof_lidar())
+
+
+@contextmanager
+def _sampled(every_s, take) -> Iterator[list]:
+    """What `take` finds while the block runs."""
+    samples, over = [], threading.Event()
+
+    def watch() -> None:
+        while not over.wait(every_s):
+            samples.append(take())
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield samples
+    finally:
+        over.set()
+        thread.join()
+
+
+def _part(frame: FrameType | None) -> str:
+    """What a stack works on."""
+    stack = []
+    while frame is not None:
+        stack.append((Path(frame.f_code.co_filename).name, frame.f_code.co_name))
+        frame = frame.f_back
+    if not any(call in (("recorder.py", "_frames"), ("log_writer.py", "write")) for call in stack):
+        return "start"
+    for part, file, function in PARTS:
+        if any(file in name and function in (None, called) for name, called in stack):
+            return part
+    return "rest"
+
+
+def _resident_mib() -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
+
+
+BENCHMARK = Benchmark(
+    question="How many key frames per second does a town give, is memory flat, and where does the time go?",
+    arms={"sensors": sensors, "disk": disk, "memory": memory, "profile": profile},
+    seeds=(0,),
+    config={
+        "town": TOWN,
+        "vehicles": VEHICLES,
+        "people": PEOPLE,
+        "rate_hz": RATE_HZ,
+        "frames": FRAMES,
+        "long_run_s": LONG_RUN_S,
+    },
+)
