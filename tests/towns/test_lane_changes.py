@@ -153,7 +153,7 @@ def test_who_is_ahead_and_behind_is_found_over_the_ends_of_lanes(graph: LaneGrap
 def chosen(graph: LaneGraph, v: Vehicles, urge: np.ndarray | None = None) -> tuple[int, int] | None:
     stretches, count = find_stretches(graph), len(v.active)
     urge = np.zeros((2, count)) if urge is None else urge
-    may = who_may_change(stretches, v, np.ones((count, 4), dtype=bool), urge > 0)
+    may = who_may_change(graph, stretches, v, np.ones((count, 4), dtype=bool), urge > 0)
     return choose_change(graph, stretches, v, seen(graph, v, [1.0] * count), may, urge)
 
 

@@ -88,6 +88,7 @@ def change_length_m(vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
 
 
 def who_may_change(
+    graph: LaneGraph,
     stretches: Stretches,
     vehicles: Vehicles,
     fits: Bool[np.ndarray, "N L"],
@@ -100,7 +101,11 @@ def who_may_change(
     settled = v.changed_m > v.change_length_m + np.where(has_to, 0.0, SETTLED_M)
     target = stretches.target[:, lane]
     begun = (v.rear_m > 0) | stretches.goes_back[:, lane]
-    goes_on = stretches.room_m[:, lane] > v.s_m + need + np.where(has_to, NEAREST_M, stops)
+    ahead = v.path[:, BEHIND:]
+    onward = (ahead >= 0) & (stretches.target[:, ahead] >= 0)
+    onward[:, :, 1:] &= stretches.goes_back[:, ahead[:, 1:]]
+    room_m = np.sum(np.logical_and.accumulate(onward, axis=2) * graph.length_m[ahead], axis=2)
+    goes_on = room_m > v.s_m + need + np.where(has_to, NEAREST_M, stops)
     fitting = (target >= 0) & fits[np.arange(len(lane)), target]
     return v.active & begun & goes_on & fitting & ((v.shift_m == 0) | settled)
 
@@ -260,7 +265,10 @@ def choose_change(
 
 
 def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> Vehicles:
-    """The path moves to the neighbour at once; the vehicle follows. The lanes ahead are not known yet."""
+    """The path moves to the neighbour at once; the vehicle follows.
+
+    It stays beside the old path for as long as there are lanes; those beyond are not known yet.
+    """
     v, row = vehicles, np.array([who])
     old, path = v.path[who], np.full(WINDOW, -1)
     path[BEHIND] = graph.sides.lane[side, old[BEHIND]]
@@ -268,6 +276,11 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
         before = graph.predecessors[path[column + 1]] if path[column + 1] >= 0 else np.array([-1])
         beside = graph.sides.lane[side, old[column]] if old[column] >= 0 else -1
         path[column] = beside if beside >= 0 and beside in before else before[0]
+    for column in range(BEHIND + 1, WINDOW):
+        beside = graph.sides.lane[side, old[column]] if old[column] >= 0 else -1
+        if beside < 0 or beside not in graph.successors[path[column - 1]]:
+            break
+        path[column] = beside
     s_m = abreast(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
     here = graph.position(old[BEHIND : BEHIND + 1], v.s_m[row])[0]
     there = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]

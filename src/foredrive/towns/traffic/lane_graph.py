@@ -146,7 +146,10 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     lines = [_resample(line) for line in _joined(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
     bends = [_bend(line) for line in lines]
+    control, zone = _guards(town, index, len(lanes))
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
+    # Who comes faster than this to a light cannot stop for it while it is yellow.
+    limit = np.where(control == Control.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
     count = np.array([len(line) for line in lines])
     successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
     predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
@@ -154,7 +157,6 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     groups = [lane.group_id for lane in lanes]
     siblings, conflicts = find_meetings(lines, length, successors, predecessors, junction, groups)
     beside = np.array([[index.get(i or "", -1) for i in (lane.left_id, lane.right_id)] for lane in lanes]).T
-    control, zone = _guards(town, index, len(lanes))
     return LaneGraph(
         ids=tuple(lane.lane_id for lane in lanes),
         xyz=np.concatenate(lines),

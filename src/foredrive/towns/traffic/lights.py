@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.towns.traffic.lane_graph import Control, LaneGraph
 
 GREEN_S = 8.0
-YELLOW_S = 3.0
+YELLOW_S = 4.0
 ALL_RED_S = 1.0
 PHASE_S = GREEN_S + YELLOW_S + ALL_RED_S
 SAME_AXIS_COS = 0.7

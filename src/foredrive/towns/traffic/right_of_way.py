@@ -24,7 +24,7 @@ STANDSTILL_M = 2.0
 EARLY_M = 12.0
 PLANNED_BRAKING_MPS2 = 1.5
 """Right of way is asked for `EARLY_M` before one would have to brake this hard for the line."""
-LIGHT_BRAKING_MPS2 = 2.5
+LIGHT_BRAKING_MPS2 = 3.0
 """Whoever would have to brake harder than this for a yellow light drives on."""
 LEFT_WAITS_S = 2.0
 RIGHT_WAITS_S = 0.5
@@ -72,7 +72,7 @@ def claim_junctions(
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
     near = vehicles.active & (line_gap < reach) & ((~queued & ~inside) | goes_on)
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
-    asks = near & ((green[lane] & stop_made) | goes_on)
+    asks = near & ((_is_green(graph, vehicles.path, column, green) & stop_made) | goes_on)
     asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
     turn = graph.turn_rad[lane]
     waits = np.where(turn > TURN_RAD, LEFT_WAITS_S, np.where(turn < -TURN_RAD, RIGHT_WAITS_S, 0.0))
@@ -119,15 +119,24 @@ def _next_line(
     return first, gap
 
 
+def _is_green(
+    graph: LaneGraph, path: np.ndarray, column: np.ndarray, green: np.ndarray
+) -> Bool[np.ndarray, "N"]:
+    """Whether all lights of a way through a junction let one go; some stand within it."""
+    before = np.arange(WINDOW) < column[:, None]
+    on_the_way = np.logical_and.accumulate(before | (graph.contested[path] & (path >= 0)), axis=1) & ~before
+    return ~(on_the_way & ~green[path]).any(axis=1)
+
+
 def _withdraw(
     graph: LaneGraph, vehicles: Vehicles, starts_m: np.ndarray, green: np.ndarray
 ) -> Int[np.ndarray, "N"]:
     """Grants, but for those of vehicles that can still stop for a light which has turned."""
     nothing = np.zeros_like(vehicles.granted)
     column, gap = _next_line(graph, vehicles.path, nothing, starts_m, vehicles.front_m)
-    lane = vehicles.path[np.arange(len(gap)), column]
+    shows_green = _is_green(graph, vehicles.path, column, green)
     can_stop = gap > vehicles.speed_mps**2 / (2 * LIGHT_BRAKING_MPS2) + STANDSTILL_M
-    withdrawn = (column > 0) & ~graph.contested[vehicles.lane] & ~green[lane] & can_stop
+    withdrawn = (column > 0) & ~graph.contested[vehicles.lane] & ~shows_green & can_stop
     return np.where(withdrawn, 0, vehicles.granted)
 
 

@@ -215,7 +215,7 @@ class Traffic:
         v = state.vehicles
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
         urge = self._route_urge(state)
-        may = who_may_change(self._stretches, v, fits, urge >= HAS_TO_MPS2)
+        may = who_may_change(self.lanes, self._stretches, v, fits, urge >= HAS_TO_MPS2)
         change = choose_change(self.lanes, self._stretches, v, ahead, may, urge)
         if change is None:
             return state
