@@ -218,13 +218,15 @@ class World:
         return visibility(shaped, sensors, T_world_ego, np.stack(list(frame.pixel_ids.values())))
 
     @cached_property
-    def signal_xyz(self) -> dict[int, Float64[np.ndarray, "3"]]:
-        """Where the lamps of each traffic light are, by the index of its stop zone."""
+    def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
+        """Points on the lamps of each traffic light, by the index of its stop zone."""
         look, xyz = self.static.mesh.look, self.static.mesh.xyz
-        return {
-            head.zone: xyz[np.isin(look, head.lamps)].mean(axis=(0, 1), dtype=np.float64)
-            for head in self.static.heads
-        }
+        points = {}
+        for head in self.static.heads:
+            middle = xyz[look == head.lamps[1]].mean(axis=1, dtype=np.float64)
+            _, first = np.unique(np.round(middle), axis=0, return_index=True)  # over the road and on the post
+            points[head.zone] = middle[first]
+        return points
 
     def _moment(
         self,

@@ -77,7 +77,7 @@ class Narrator:
         lanes: LaneGraph,
         route: Route,
         conditions: Conditions,
-        signal_xyz: dict[int, Float64[np.ndarray, "3"]],
+        signal_xyz: dict[int, Float64[np.ndarray, "_ 3"]],
     ) -> None:
         self._places, self._lanes, self._route, self._conditions = (
             Places(town, lanes),
@@ -188,8 +188,8 @@ class Narrator:
                 break
             zone = int(self._lanes.zone[lane])
             if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
-                lamps = T_ego_world[:3, :3] @ self._signal_xyz[zone] + T_ego_world[:3, 3]
-                in_view = np.linalg.norm(lamps) < LAMPS_M and sees(lamps)
+                lamps = self._signal_xyz[zone] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+                in_view = any(np.linalg.norm(lamp) < LAMPS_M and sees(lamp) for lamp in lamps)
                 return Light(int(moment.lights[zone])) if in_view else Light.NONE
         return Light.NONE
 
