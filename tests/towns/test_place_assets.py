@@ -98,15 +98,17 @@ def test_shapes_stay_in_their_boxes() -> None:
 
 def test_legs_move_with_the_distance_walked() -> None:
     library = make_shape_library(LookTable(), assets_of(AssetSet.TRAIN))
-    walking = np.array([1.4, 0.0, 0.0])
-    poses = [
-        id(
-            library.shape_of(
-                actor(Category.PEDESTRIAN, 0, centre_m=np.array([x, 0.0, 0.9]), velocity_mps=walking)
-            )
+
+    def pose(x_m: float) -> int:
+        state = actor(
+            Category.PEDESTRIAN,
+            0,
+            centre_m=np.array([x_m, 0.0, 0.9]),
+            velocity_mps=np.array([1.4, 0.0, 0.0]),
         )
-        for x in np.arange(0.05, 1.4, 0.175)
-    ]
+        return id(library.shape_of(state))
+
+    poses = [pose(x_m) for x_m in np.arange(0.05, 1.4, 0.175)]
     assert len(set(poses)) == 8
     assert pose(1.45) == poses[0]
 
