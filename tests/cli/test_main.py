@@ -1,5 +1,6 @@
 """What a user sees when a verb cannot go on: one line and an exit code."""
 
+import signal
 import subprocess
 import sys
 import time
@@ -52,6 +53,20 @@ def test_bad_input_met_by_a_worker_process_is_the_same_line(run: Callable) -> No
             ExceptionWrapper(where="in DataLoader worker process 0").reraise()
 
     assert run(verb) == (2, "foredrive: log/camera.arrow: cannot read frame 3\n")
+
+
+def test_an_interrupt_within_a_destructor_is_not_lost(run: Callable) -> None:
+    class Interrupted:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def verb() -> None:
+        thing = Interrupted()
+        del thing
+        for _ in range(1000):
+            time.sleep(0.001)
+
+    assert run(verb) == (130, "foredrive: interrupted\n")
 
 
 def test_an_interrupt_is_one_line_and_130(run: Callable) -> None:

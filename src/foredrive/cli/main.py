@@ -1,9 +1,11 @@
 """The program `foredrive`: its verbs, and what a user sees when one of them cannot go on."""
 
+import _thread
 import errno
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -56,6 +58,7 @@ def main(args: Sequence[str] | None = None) -> int:
     traceback is shown, because it is a mistake in the program. What the command line itself gets wrong ends
     in SystemExit(2), `--help` in SystemExit(0).
     """
+    hook, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     try:
         tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
@@ -71,7 +74,19 @@ def main(args: Sequence[str] | None = None) -> int:
         if reason is None:
             raise
         return _give_up(reason)
+    finally:
+        sys.unraisablehook = hook
     return 0
+
+
+def _interrupt_again(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Ctrl-C that hits where Python ignores exceptions, such as in a destructor, is not lost."""
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        again = threading.Timer(0.01, _thread.interrupt_main)  # at once it would hit this very function
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _give_up(reason: str) -> int:
