@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES, find_recipe
+from foredrive.recipes import RECIPES, find_recipe, labelled_by
 from foredrive.recipes.config import load_recipe, save_recipe
 
 
@@ -18,6 +18,21 @@ def test_a_recipe_survives_writing_and_reading(name: str, tmp_path: Path) -> Non
     save_recipe(recipe, tmp_path / "config.yaml")
     assert load_recipe(tmp_path / "config.yaml") == recipe
     assert recipe.name == name
+
+
+def test_a_recipe_may_take_its_labels_from_recordings(tmp_path: Path) -> None:
+    plain = find_recipe("nemo_tiny")
+    recorded = labelled_by(plain, "recorded")
+    assert labelled_by(plain, "lidar") == plain
+    assert recorded.clips.occupancy_source == "recorded"
+    assert recorded.name == "nemo_tiny (recorded occupancy)"
+    save_recipe(recorded, tmp_path / "config.yaml")
+    assert load_recipe(tmp_path / "config.yaml") == recorded
+    entries = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    del entries["clips"]["occupancy_source"]  # of a run from before there was a choice
+    entries["name"] = plain.name
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(entries))
+    assert load_recipe(tmp_path / "config.yaml") == plain
 
 
 def without_model(entries: dict[str, Any]) -> None:

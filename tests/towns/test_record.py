@@ -16,10 +16,12 @@ from py123d.geometry import Point2D
 
 from foredrive.data import ClipConfig, ClipDataset, find_logs
 from foredrive.data.boxes import read_boxes
+from foredrive.data.labels import make_labels
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_caption, read_visibility
+from foredrive.data.recorded_labels import recorded_labels
 from foredrive.errors import InputError
 from foredrive.scene import Category, MapKind, VoxelSpec
 from foredrive.towns import recorder
@@ -231,6 +233,23 @@ def test_lidar_returns_carry_the_classes_of_what_they_met(recording: LogPath) ->
         met = features["semantic"][features["instance"] == track]
         assert ((met == int(LidarLabel.PERSON)) == person).all()
     assert (features["instance"][ground] == 0).all()
+
+
+def test_recorded_occupancy_agrees_with_what_lidar_has_met(recording: LogPath) -> None:
+    """On a grid whose voxels have the road in their middle; range noise puts points beside thin things."""
+    log, spec = Log(recording), VoxelSpec((-24.0, -24.0, -1.5), 1.0, (6, 48, 48))
+    met, agreed = 0, 0
+    for frame in range(FRAMES):
+        seen, all_there_is = make_labels(log, frame, spec), recorded_labels(log, frame, spec)
+        assert all_there_is.known.all()
+        met += int(seen.occupied.sum())
+        agreed += int((seen.occupied & all_there_is.occupied).sum())
+        around = torch.nn.functional.max_pool3d(all_there_is.occupied[None].float(), 3, 1, 1)[0] > 0
+        assert not (seen.occupied & ~around).any()
+        moving = seen.occupied & all_there_is.occupied & (seen.flow_mps.norm(dim=0) > 1.0)
+        apart = (seen.flow_mps - all_there_is.flow_mps)[:, moving].norm(dim=0)
+        assert apart.numel() == 0 or apart.median() < 0.05
+    assert agreed > 0.98 * met > 1000
 
 
 def test_every_frame_has_a_caption(recording: LogPath) -> None:

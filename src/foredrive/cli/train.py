@@ -1,7 +1,7 @@
 """`foredrive train`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -13,6 +13,7 @@ def train(
     logs: SomePaths,
     out: Path,
     cache: OptionalPath = None,
+    occupancy: Literal["lidar", "recorded"] = "lidar",
 ) -> None:
     """Train a recipe on logs, or go on with a run that was interrupted.
 
@@ -21,9 +22,12 @@ def train(
         logs: 123D logs, splits or data roots to train on.
         out: Folder of the run. Where it holds this run already, training goes on from the last checkpoint.
         cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
+        occupancy: What voxel labels are made from: what lidar beams met and passed through, or the exact
+            occupancy that towns record, seen or not. The run is evaluated by the same.
     """
-    from foredrive.recipes import find_all_logs, find_recipe, train_run
+    from foredrive.recipes import find_all_logs, find_recipe, labelled_by, train_run
 
-    run = train_run(find_recipe(recipe), find_all_logs(logs), out, cache)
+    chosen = labelled_by(find_recipe(recipe), occupancy)
+    run = train_run(chosen, find_all_logs(logs), out, cache)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

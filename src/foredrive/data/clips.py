@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,10 +16,11 @@ from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.collate import stack_records
 from foredrive.data.commands import command_at
 from foredrive.data.image_store import ImageStore
-from foredrive.data.labels import LabelStore
+from foredrive.data.labels import LabelStore, VoxelLabels
 from foredrive.data.lidar import empty_sweep, read_sweep
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
+from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, VoxelGrid, VoxelSpec
 
@@ -46,6 +48,9 @@ class ClipConfig:
     lidar: bool = False
     """Put the sweeps into the clip."""
     map: bool = False
+    occupancy_source: Literal["lidar", "recorded"] = "lidar"
+    """Where voxel labels come from: what the beams met and passed through, or the exact occupancy with flow
+    that recordings of towns carry, seen or not."""
 
 
 class ClipDataset(Dataset[Example]):
@@ -59,7 +64,8 @@ class ClipDataset(Dataset[Example]):
         cache_dir: folder for voxel labels and shrunk images; None keeps nothing.
 
     Raises:
-        InputError: on a log that cannot be read or is too short for one clip, or a camera that no log has.
+        InputError: on a log that cannot be read, is too short for one clip or lacks the occupancy that is
+            asked for, or a camera that no log has.
     """
 
     command_source: dict[str, int]
@@ -78,6 +84,8 @@ class ClipDataset(Dataset[Example]):
         self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}
         for number, log in enumerate(self._logs):
+            if config.occupancy_source == "recorded":
+                check_recorded_occupancy(log)
             for frames in _clip_frames(log, config):
                 self._clips.append((number, frames))
                 self.command_source[self._command(log, frames[config.past_frames])[1]] += 1
@@ -98,7 +106,7 @@ class ClipDataset(Dataset[Example]):
         """
         number, frames = self._clips[index]
         log = self._logs[number]
-        labels = [self._labels.labels(log, frame) for frame in frames]
+        labels = [self._voxel_labels(log, frame) for frame in frames]
         occupied = torch.stack([label.occupied for label in labels])
         return Example(
             clip=self._clip(number, frames),
@@ -114,6 +122,11 @@ class ClipDataset(Dataset[Example]):
             ),
             key=(f"{log.path.name}@{self.now_us(index)}",),
         )
+
+    def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
+        if self.config.occupancy_source == "recorded":
+            return recorded_labels(log, frame, self.config.voxels)  # read as fast as a kept entry is
+        return self._labels.labels(log, frame)
 
     def _choose_cameras(self) -> tuple[str, ...]:
         if self.config.cameras is None:

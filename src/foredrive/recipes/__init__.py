@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from foredrive.errors import InputError
-from foredrive.recipes.config import Recipe
+from foredrive.recipes.config import Recipe, labelled_by
 from foredrive.recipes.demo import DemoSize, full_demo, quick_demo, run_demo
 from foredrive.recipes.evaluate import Inspection, evaluate_run, inspect_run
 from foredrive.recipes.nemo import nemo_base, nemo_tiny
@@ -34,6 +34,7 @@ __all__ = [
     "find_recipe",
     "full_demo",
     "inspect_run",
+    "labelled_by",
     "open_run",
     "quick_demo",
     "run_demo",

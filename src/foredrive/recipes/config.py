@@ -1,6 +1,6 @@
 """What a recipe holds: values only, so that it can be read, written and compared."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -67,6 +67,14 @@ class Recipe:
     pretrain: Stage
     finetune: Stage
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+
+
+def labelled_by(recipe: Recipe, occupancy_source: Literal["lidar", "recorded"]) -> Recipe:
+    """The recipe with voxel labels of another source; its name tells."""
+    if occupancy_source == recipe.clips.occupancy_source:
+        return recipe
+    clips = replace(recipe.clips, occupancy_source=occupancy_source)
+    return replace(recipe, name=f"{recipe.name} ({occupancy_source} occupancy)", clips=clips)
 
 
 def save_recipe(recipe: Recipe, path: Path) -> None:
