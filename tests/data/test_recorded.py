@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 import synthetic_log as world
 from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
-from py123d.datatypes import DefaultCameraSegmentationLabel, DefaultLidarSegmentationLabel, LidarID
+from py123d.datatypes import (
+    DefaultCameraSegmentationLabel,
+    DefaultLidarSegmentationLabel,
+    LidarID,
+    TrafficLightStatus,
+)
 
 from foredrive.data.log_writer import FullOccupancy, LogWriter
 from foredrive.data.logs import Log, LogPath
-from foredrive.data.recorded import read_caption, read_occupancy, read_visibility
+from foredrive.data.recorded import read_caption, read_occupancy, read_traffic_lights, read_visibility
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
 
@@ -19,6 +24,7 @@ RNG = np.random.default_rng(0)
 HW = (48, 96)
 DEPTH_M = np.where(RNG.random(HW) < 0.2, np.inf, RNG.uniform(0.5, 600.0, HW)).astype(np.float32)
 SEMANTIC = RNG.integers(0, 15, HW).astype(np.uint8)
+LIGHTS = {40: TrafficLightStatus.RED, 7: TrafficLightStatus.GREEN}
 INSTANCE = RNG.integers(0, 2**16, HW).astype(np.uint16)
 
 
@@ -34,6 +40,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
         occupancy=FullOccupancy(spec, np.array([[1, 2, 3]]), np.array([-1]), np.zeros((1, 3), np.float32)),
         visibility=np.array([0.4, 1.0], np.float32),
         caption="Noon, clear, on a street.",
+        traffic_lights=LIGHTS,
         depth_m={"ahead": DEPTH_M},
         semantic={"ahead": SEMANTIC},
         instance={"ahead": INSTANCE},
@@ -53,6 +60,8 @@ def test_rows_of_a_frame_come_back_and_other_frames_have_none(log: Log) -> None:
     assert read_caption(log, 0) == "Noon, clear, on a street."
     assert occupancy is not None
     np.testing.assert_array_equal(occupancy.index_zyx, [[1, 2, 3]])
+    assert read_traffic_lights(log, 0) == LIGHTS
+    assert read_traffic_lights(log, 1) is None
     assert read_visibility(log, 1) is read_caption(log, 1) is read_occupancy(log, 1) is None
 
 

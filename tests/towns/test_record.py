@@ -20,14 +20,18 @@ from foredrive.data.labels import make_labels
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
-from foredrive.data.recorded import read_caption, read_visibility
+from foredrive.data.recorded import read_caption, read_traffic_lights, read_visibility
 from foredrive.data.recorded_labels import recorded_labels
 from foredrive.errors import InputError
 from foredrive.scene import Category, MapKind, VoxelSpec
 from foredrive.towns import recorder
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.lights import Light
+from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
 FRAMES = 5
@@ -139,6 +143,26 @@ def test_boxes_are_around_and_on_the_road(recording: LogPath) -> None:
     vehicle = boxes.category != Category.PEDESTRIAN
     heading = torch.atan2(boxes.velocity[:, 1], boxes.velocity[:, 0])
     assert (heading - boxes.yaw)[moving & vehicle].cos().min() > 0.99
+
+
+def test_traffic_lights_stand_at_the_lanes_that_they_guard(recording: LogPath, town02: TownMap) -> None:
+    """The map's lanes of the recorded ids are those behind the lights, which show what the traffic obeys."""
+    log, traffic = Log(recording), Traffic(town02, 3, 13, 8)
+    api = log.scene.get_map_api()
+    assert api is not None
+    ends = {lane.lane_id: lane.centreline_xyz[[0, -1], :2] for lane in town02.lanes}
+    began_s = Drive(traffic, FRAMES / RATE_HZ).state.time_s
+    for frame in range(FRAMES):
+        recorded = read_traffic_lights(log, frame)
+        assert recorded is not None
+        assert len(recorded) == sum(len(zone.lane_ids) for zone in town02.stop_zones)
+        assert len(set(recorded.values())) > 1
+        shown = traffic.zone_lights(began_s + frame / RATE_HZ).tolist()
+        of_lane = {i: zone for zone, stop in enumerate(town02.stop_zones) for i in stop.lane_ids}
+        for map_id, status in recorded.items():
+            line = api.get_map_object_in_layer(map_id, MapLayer.LANE).centerline.array[[0, -1], :2]
+            (lane,) = (i for i in of_lane if np.abs(ends[i] - line).max() < 0.01)
+            assert status.name == Light(shown[of_lane[lane]]).name
 
 
 def test_lidar_points_tell_hidden_boxes_from_visible_ones(recording: LogPath) -> None:

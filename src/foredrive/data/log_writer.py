@@ -39,6 +39,9 @@ from py123d.datatypes import (
     PinholeCameraMetadata,
     RouteMetadata,
     Timestamp,
+    TrafficLightDetection,
+    TrafficLightDetections,
+    TrafficLightStatus,
 )
 from py123d.datatypes.custom.custom_modality import CustomModality, CustomModalityMetadata
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
@@ -123,6 +126,8 @@ class Frame:
     visibility: Float[np.ndarray, "M"] | None = None
     """Share of each of `boxes` that the cameras see of what they would if nothing hid it, 0 to 1."""
     caption: str | None = None
+    traffic_lights: dict[int, TrafficLightStatus] | None = None
+    """What the lights show, by the ids that the lanes behind their stop lines have in the log's map."""
     depth_m: dict[str, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
     """Along the optical axis, by camera name; infinite for the sky."""
     semantic: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
@@ -220,6 +225,9 @@ class LogWriter:
             modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
         if frame.caption is not None:
             modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
+        if frame.traffic_lights is not None:
+            lights = [TrafficLightDetection(*shown) for shown in sorted(frame.traffic_lights.items())]
+            modalities.append(TrafficLightDetections(lights, Timestamp.from_us(frame.t_us)))
         self._writer.write_sync(ModalitiesSync(Timestamp.from_us(frame.t_us), modalities))
         self._previous = frame
 

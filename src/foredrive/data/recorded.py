@@ -1,6 +1,7 @@
-"""Exact labels that recordings carry beyond 123D's own modalities."""
+"""Exact labels of recordings: what they carry beyond 123D's own modalities, and what traffic lights show."""
 
 from jaxtyping import Float
+from py123d.datatypes import ModalityType, TrafficLightStatus
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor, from_numpy
 
@@ -47,6 +48,18 @@ def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
     with reading(log.file(f"custom.{FULL_OCCUPANCY}"), f"the occupancy at frame {frame}"):
         row = _row(log, frame, FULL_OCCUPANCY)
         return None if row is None else unpack_occupancy(row.data, row.metadata)
+
+
+def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] | None:
+    """What lights show, by the map's id of each lane that begins behind one; None if the log does not tell.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    file = log.file(ModalityType.TRAFFIC_LIGHT_DETECTIONS.serialize())
+    with reading(file, f"the traffic lights at frame {frame}"):
+        shown = log.scene.get_traffic_light_detections_at_iteration(log.iteration(frame))
+        return None if shown is None else {int(light.lane_id): light.status for light in shown}
 
 
 def _row(log: Log, frame: int, kind: str) -> CustomModality | None:

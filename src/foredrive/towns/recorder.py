@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from py123d.datatypes import BaseMapObject, Lane, LaneGroup
+from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
+from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from rich.progress import track
 
@@ -29,10 +30,11 @@ from foredrive.towns.labels.semantics import (
 )
 from foredrive.towns.labels.situation import Narrator
 from foredrive.towns.labels.visibility import is_seen
-from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, load_town_map
+from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
@@ -42,6 +44,11 @@ BOXES_WITHIN_M = 80.0
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
 """NeMo's grid."""
 FASTEST_HZ = 100.0
+STATUS_OF_LIGHT = {
+    Light.RED: TrafficLightStatus.RED,
+    Light.YELLOW: TrafficLightStatus.YELLOW,
+    Light.GREEN: TrafficLightStatus.GREEN,
+}
 
 
 @dataclass(frozen=True)
@@ -140,6 +147,22 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
         yield item
 
 
+def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:
+    """What the lights show, by the ids that the lanes behind them have in the written map.
+
+    Args:
+        lights: a `Light` for each of the town's stop zones.
+    """
+    # The map's writer numbers lanes as the parser yields them, which is their order in the town.
+    id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
+    return {
+        id_of[lane]: STATUS_OF_LIGHT[Light(light)]
+        for zone, light in zip(town.stop_zones, lights.tolist(), strict=True)
+        if light != Light.NONE
+        for lane in zone.lane_ids
+    }
+
+
 def _frames(
     world: World,
     moments: Iterator[Moment],
@@ -176,6 +199,7 @@ def _frames(
             caption=_caption(narrator, moment, near, visibility, seen, sensors.rig, seed + index)
             if labels.captions
             else None,
+            traffic_lights=lights_of_lanes(world.town, moment.lights),
             **_ray_labels(seen, everyone, sensors, labels),
         )
 
