@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import CONDITIONS, Conditions
-from foredrive.towns.labels.captions import Doing, Place, Situation, Thing, caption
+from foredrive.towns.labels.captions import Doing, Kind, Place, Situation, Thing, caption
+from foredrive.towns.labels.situation import kind_of
 from foredrive.towns.traffic.lights import Light
 
 SEEDS = range(24)
 
 
-def thing(category: Category, x: float, y: float, **changes: object) -> Thing:
-    standing = Thing(category, np.array([x, y], dtype=np.float64), np.zeros(2), 0.0, visibility=1.0)
+def thing(kind: Kind, x: float, y: float, **changes: object) -> Thing:
+    standing = Thing(kind, np.array([x, y], dtype=np.float64), np.zeros(2), 0.0, visibility=1.0)
     return dataclasses.replace(standing, **changes)
 
 
@@ -24,10 +26,10 @@ def situation(*things: Thing, **changes: object) -> Situation:
     return dataclasses.replace(plain, **changes)
 
 
-WALKER = thing(Category.PEDESTRIAN, 12.0, -4.0, velocity_mps=np.array([0.0, 1.4]), on_road=True)
+WALKER = thing(Kind.PEDESTRIAN, 12.0, -4.0, velocity_mps=np.array([0.0, 1.4]), on_road=True)
 RAINY_NIGHT = situation(
-    thing(Category.CAR, 20.0, 0.0),
-    thing(Category.CAR, 30.0, 3.0),
+    thing(Kind.CAR, 20.0, 0.0),
+    thing(Kind.CAR, 30.0, 3.0),
     WALKER,
     conditions=Conditions(hour=23.0, clouds=1.0, rain_mmph=30.0),
     light=Light.RED,
@@ -54,27 +56,49 @@ def test_language_varies_with_the_seed_alone() -> None:
 @pytest.mark.parametrize(
     ("scene", "says", "never"),
     [
-        (situation(thing(Category.CAR, 20, 0, visibility=0.3)), "nearby", "car ahead|car in front"),
-        (situation(thing(Category.BUS, 60, 0)), "nearby", "bus"),
-        (situation(thing(Category.BUS, 40, 0), conditions=Conditions(visibility_m=50.0)), "dense fog", "bus"),
-        (situation(thing(Category.CAR, 0, 9)), "a car (on|to) the left", "ahead|right"),
-        (situation(thing(Category.TRUCK, -12, 0)), "a truck behind", "ahead"),
+        (situation(thing(Kind.CAR, 20, 0, visibility=0.3)), "nearby", "car ahead|car in front"),
+        (situation(thing(Kind.BUS, 60, 0)), "nearby", "bus"),
+        (situation(thing(Kind.BUS, 40, 0), conditions=Conditions(visibility_m=50.0)), "dense fog", "bus"),
+        (situation(thing(Kind.CAR, 0, 9)), "a car (on|to) the left", "ahead|right"),
+        (situation(thing(Kind.TRUCK, -12, 0)), "a truck behind", "ahead"),
         (
-            situation(thing(Category.CAR, 25, 3, yaw=np.pi, velocity_mps=np.array([-9.0, 0.0]))),
+            situation(thing(Kind.CAR, 25, 3, yaw=np.pi, velocity_mps=np.array([-9.0, 0.0]))),
             "an oncoming car",
             "ahead",
         ),
-        (situation(thing(Category.CAR, 15, -4, parked=True)), "a parked car on the right", "nearby|ahead"),
         (
-            situation(thing(Category.CAR, 15, -4, parked=True), thing(Category.CAR, 15, 4, parked=True)),
+            situation(thing(Kind.VAN, 25, 3, yaw=1.5, velocity_mps=np.array([0.0, 6.0]))),
+            "a van (crossing|passing across the road) ahead",
+            "in front|oncoming|left",
+        ),
+        (
+            situation(
+                thing(Kind.VAN, 25, 3, yaw=1.5, velocity_mps=np.array([0.0, 6.0])), doing=Doing.TURNS_LEFT
+            ),
+            "a van (ahead|in front)",
+            "across|crossing",
+        ),
+        (situation(thing(Kind.CAR, 15, -4, parked=True)), "a parked car on the right", "nearby|ahead"),
+        (
+            situation(thing(Kind.CAR, 15, -4, parked=True), thing(Kind.CAR, 15, 4, parked=True)),
             "two parked cars on both sides",
             "ahead",
         ),
-        (situation(thing(Category.PEDESTRIAN, 12, -6)), "a pedestrian .*on the right", "cross"),
+        (situation(thing(Kind.PEDESTRIAN, 12, -6)), "a pedestrian .*on the right", "cross"),
         (
             situation(dataclasses.replace(WALKER, velocity_mps=np.array([0.0, -1.4]))),
             "from the left",
             "from the right",
+        ),
+        (
+            situation(thing(Kind.PEDESTRIAN, 12, -6), thing(Kind.PEDESTRIAN, 12, 6)),
+            r"two pedestrians (on the walkways )?on both sides\.",
+            "walkway",
+        ),
+        (
+            situation(doing=Doing.TURNS_LEFT, place=Place.JUNCTION, light=Light.RED),
+            "a red traffic light ahead",
+            "light is|light shows",
         ),
         (situation(dataclasses.replace(WALKER, on_road=False)), "a pedestrian", "cross|across"),
         (
@@ -83,7 +107,7 @@ def test_language_varies_with_the_seed_alone() -> None:
             "light is|light shows|km/h",
         ),
         (
-            situation(doing=Doing.FOLLOWS, leader=Category.BUS, speed_mps=8.4),
+            situation(doing=Doing.FOLLOWS, leader=Kind.BUS, speed_mps=8.4),
             "follows a bus at (about|some) 30 km/h",
             "nearby",
         ),
@@ -101,5 +125,18 @@ def test_facts(scene: Situation, says: str, never: str) -> None:
 
 
 def test_many_are_counted_by_kind() -> None:
-    crowd = [thing(Category.CAR, 10.0 + 2 * i, 0.0) for i in range(3)] + [thing(Category.BICYCLE, 9.0, 1.0)]
+    crowd = [thing(Kind.CAR, 10.0 + 2 * i, 0.0) for i in range(3)] + [thing(Kind.CYCLIST, 9.0, 1.0)]
     assert re.search("three cars and a cyclist (ahead|in front)", caption(situation(*crowd), 0).lower())
+
+
+def test_vans_and_riders_go_by_their_own_names() -> None:
+    def named(category: Category, *size_lwh: float) -> Kind:
+        still = np.zeros(3)
+        return kind_of(ActorState(1, category, still, 0.0, 0.0, np.array(size_lwh), still, 0, parked=False))
+
+    assert named(Category.CAR, 4.5, 1.8, 1.5) is Kind.CAR
+    assert named(Category.CAR, 5.5, 2.0, 2.3) is Kind.VAN
+    assert named(Category.CAR, 5.2, 1.9, 1.5) is Kind.CAR  # long, but low
+    assert named(Category.BICYCLE, 1.7, 0.6, 1.7) is Kind.CYCLIST
+    assert named(Category.MOTORCYCLE, 2.1, 0.8, 1.5) is Kind.MOTORCYCLE
+    assert all(named(category, 5.5, 2.0, 2.3) for category in Category)

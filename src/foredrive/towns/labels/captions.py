@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from foredrive.scene import Category
 from foredrive.towns.conditions import Conditions
 from foredrive.towns.traffic.lights import Light
 
@@ -17,9 +16,10 @@ NEAR_M, AHEAD_M = 30.0, 50.0
 """How far road users beside and behind, and those ahead, are worth words."""
 AHEAD_RAD, BEHIND_RAD = np.deg2rad(35.0), np.deg2rad(125.0)
 MOVING_MPS, WALKING_MPS = 0.5, 0.3
-ONCOMING_COS = -0.8
+ONCOMING_COS, ACROSS_COS = -0.8, 0.5
 FOG_SHARE = 0.7
 """Of the meteorological range: beyond, fog leaves too little contrast."""
+BOTH_SIDES = "on both sides"
 
 
 class Place(enum.StrEnum):
@@ -31,6 +31,29 @@ class Place(enum.StrEnum):
     BRIDGE = "bridge"
     UNDERPASS = "underpass"
     HIGHWAY = "highway"
+
+
+class Kind(enum.StrEnum):
+    """Who or what there is, in one word."""
+
+    CAR = "car"
+    VAN = "van"
+    TRUCK = "truck"
+    BUS = "bus"
+    TRAILER = "trailer"
+    CONSTRUCTION_VEHICLE = "construction vehicle"
+    MOTORCYCLE = "motorcycle"
+    CYCLIST = "cyclist"
+    PEDESTRIAN = "pedestrian"
+    ANIMAL = "animal"
+    TRAFFIC_CONE = "traffic cone"
+    BARRIER = "barrier"
+    OBJECT = "object"
+
+    @property
+    def plural(self) -> str:
+        """Of several."""
+        return f"{self.value}{'es' if self.value.endswith('s') else 's'}"
 
 
 class Doing(enum.StrEnum):
@@ -51,7 +74,7 @@ class Doing(enum.StrEnum):
 class Thing:
     """A road user in the vehicle's ego frame."""
 
-    category: Category
+    kind: Kind
     xy_m: Float[np.ndarray, "2"]
     velocity_mps: Float[np.ndarray, "2"]
     """Over ground, along the ego axes."""
@@ -71,7 +94,7 @@ class Situation:
     doing: Doing
     speed_mps: float
     things: Sequence[Thing]
-    leader: Category | None = None
+    leader: Kind | None = None
     """The vehicle right ahead on the same way, if one is seen."""
     light: Light = Light.NONE
     """What the vehicle's own traffic light shows, if it is in view."""
@@ -84,7 +107,7 @@ def caption(situation: Situation, seed: int) -> str:
     sentences = [
         _setting(situation, words),
         _action(situation, words),
-        *_traffic(seen, situation.leader, words),
+        *_traffic(seen, situation, words),
         *_crossing(seen, words),
         _on_foot(seen, words),
         _parked(seen, words),
@@ -163,7 +186,7 @@ def _where(place: Place, words: _Words) -> str:
 
 
 def _action(situation: Situation, words: _Words) -> str:
-    leader = _NOUNS[situation.leader][0] if situation.leader is not None else ""
+    leader = situation.leader.value if situation.leader is not None else ""
     speed = f"{5 * max(1, round(situation.speed_mps * 3.6 / 5))} km/h"
     we = words.pick("the ego vehicle", "the ego car")
     match situation.doing:
@@ -188,20 +211,6 @@ def _action(situation: Situation, words: _Words) -> str:
     return f"{we} {words.pick('drives', 'goes')} at {words.pick('about', 'some')} {speed}"
 
 
-_NOUNS = {
-    Category.CAR: ("car", "cars"),
-    Category.TRUCK: ("truck", "trucks"),
-    Category.BUS: ("bus", "buses"),
-    Category.TRAILER: ("trailer", "trailers"),
-    Category.CONSTRUCTION_VEHICLE: ("construction vehicle", "construction vehicles"),
-    Category.MOTORCYCLE: ("motorcycle", "motorcycles"),
-    Category.BICYCLE: ("cyclist", "cyclists"),
-    Category.PEDESTRIAN: ("pedestrian", "pedestrians"),
-    Category.ANIMAL: ("animal", "animals"),
-    Category.TRAFFIC_CONE: ("traffic cone", "traffic cones"),
-    Category.BARRIER: ("barrier", "barriers"),
-    Category.OTHER: ("object", "objects"),
-}
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 _COLOURS = {Light.RED: "red", Light.YELLOW: "yellow", Light.GREEN: "green"}
 
@@ -213,12 +222,12 @@ def _a(noun: str) -> str:
 def _counted(things: Sequence[Thing], adjective: str = "") -> str:
     """ "two oncoming cars and a bus"."""
     parts = []
-    for category, (one, many) in _NOUNS.items():
-        count = sum(thing.category is category for thing in things)
+    for kind in Kind:
+        count = sum(thing.kind is kind for thing in things)
         if count == 1:
-            parts.append(_a(f"{adjective}{one}"))
+            parts.append(_a(f"{adjective}{kind.value}"))
         elif count:
-            parts.append(f"{_NUMBERS[count] if count < len(_NUMBERS) else 'many'} {adjective}{many}")
+            parts.append(f"{_NUMBERS[count] if count < len(_NUMBERS) else 'many'} {adjective}{kind.plural}")
     return _listed(parts)
 
 
@@ -226,41 +235,47 @@ def _listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}" if parts else ""
 
 
-def _traffic(seen: Sequence[Thing], leader: Category | None, words: _Words) -> list[str]:
-    """Vehicles in traffic, by where they are."""
-    vehicles = [t for t in seen if not t.parked and t.category is not Category.PEDESTRIAN]
-    phrases = []
-    ahead = [t for t in vehicles if _sector(t) == "ahead"]
-    oncoming = [t for t in ahead if _is_oncoming(t)]
-    others = [t for t in ahead if not _is_oncoming(t)]
-    if others:
-        phrases.append(f"{_counted(others)} {words.pick('ahead', 'in front')}")
-    if oncoming:
-        phrases.append(_counted(oncoming, "oncoming "))
-    for sector, where in (
-        ("left", words.pick("on the left", "to the left")),
-        ("right", words.pick("on the right", "to the right")),
-        ("behind", "behind"),
-    ):
-        there = [t for t in vehicles if _sector(t) == sector]
-        if there:
-            phrases.append(f"{_counted(there)} {where}")
+def _traffic(seen: Sequence[Thing], situation: Situation, words: _Words) -> list[str]:
+    """Vehicles in traffic, by where they are and where they go."""
+    vehicles = [t for t in seen if not t.parked and t.kind is not Kind.PEDESTRIAN]
+    there = {where: [t for t in vehicles if _whereabouts(t, situation) == where] for where in _WHEREABOUTS}
+    phrases = [
+        _counted(things, "oncoming ") if where == "oncoming" else f"{_counted(things)} {words.pick(*ways)}"
+        for (where, ways), things in zip(_WHEREABOUTS.items(), there.values(), strict=True)
+        if things
+    ]
     if phrases:
         return [", ".join(phrases)]
-    return [] if seen or leader is not None else [words.pick("no one else nearby", "no other traffic nearby")]
+    alone = not seen and situation.leader is None
+    return [words.pick("no one else nearby", "no other traffic nearby")] if alone else []
 
 
-def _is_oncoming(thing: Thing) -> bool:
-    moves = float(np.hypot(*thing.velocity_mps)) > MOVING_MPS
-    return moves and bool(np.cos(thing.yaw) < ONCOMING_COS)
+_WHEREABOUTS = {
+    "ahead": ("ahead", "in front"),
+    "across": ("crossing ahead", "passing across the road ahead"),
+    "oncoming": ("",),
+    "left": ("on the left", "to the left"),
+    "right": ("on the right", "to the right"),
+    "behind": ("behind",),
+}
+"""Where vehicles may be, and how that is said."""
+
+
+def _whereabouts(thing: Thing, situation: Situation) -> str:
+    """One of `_WHEREABOUTS`; where the way bends, none of those ahead is said to drive across it."""
+    sector = _sector(thing)
+    if sector != "ahead" or np.hypot(*thing.velocity_mps) <= MOVING_MPS:
+        return sector
+    if np.cos(thing.yaw) < ONCOMING_COS:
+        return "oncoming"
+    bends = situation.place is Place.ROUNDABOUT or situation.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT)
+    return "across" if abs(np.cos(thing.yaw)) < ACROSS_COS and not bends else "ahead"
 
 
 def _crosses(thing: Thing) -> bool:
     vx, vy = thing.velocity_mps.tolist()
     walks_across = abs(vy) > WALKING_MPS and abs(vy) > abs(vx)
-    return (
-        thing.category is Category.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
-    )
+    return thing.kind is Kind.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
 
 
 def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
@@ -278,22 +293,26 @@ def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
 
 def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
     """People who do not cross."""
-    people = [t for t in seen if t.category is Category.PEDESTRIAN and not _crosses(t)]
+    people = [t for t in seen if t.kind is Kind.PEDESTRIAN and not _crosses(t)]
     if not people:
         return ""
-    sides = {"left" if t.xy_m[1] > 0 else "right" for t in people}
-    where = f"on the {sides.pop()}" if len(sides) == 1 else "on both sides"
-    on_walkway = not any(t.on_road for t in people)
-    return f"{_counted(people)} {words.pick('on the walkway, ', '') if on_walkway else ''}{where}"
+    where = _sides(people)
+    if any(t.on_road for t in people):
+        return f"{_counted(people)} {where}"
+    walkway = "on the walkways" if where == BOTH_SIDES else "on the walkway"
+    return f"{_counted(people)} {words.pick(f'{walkway} ', '')}{where}"
 
 
 def _parked(seen: Sequence[Thing], words: _Words) -> str:
     cars = [t for t in seen if t.parked]
     if not cars:
         return ""
-    sides = {"left" if t.xy_m[1] > 0 else "right" for t in cars}
-    where = f"on the {sides.pop()}" if len(sides) == 1 else "on both sides"
-    return f"{_counted(cars, 'parked ')} {where}"
+    return f"{_counted(cars, 'parked ')} {_sides(cars)}"
+
+
+def _sides(things: Sequence[Thing]) -> str:
+    sides = {"left" if t.xy_m[1] > 0 else "right" for t in things}
+    return f"on the {sides.pop()}" if len(sides) == 1 else BOTH_SIDES
 
 
 def _light(situation: Situation, words: _Words) -> str:
@@ -301,6 +320,7 @@ def _light(situation: Situation, words: _Words) -> str:
     waits_there = situation.doing is Doing.WAITS and situation.leader is None and colour != "green"
     if colour is None or waits_there:
         return ""
-    return words.pick(
-        f"the traffic light is {colour}", f"the light shows {colour}", f"{_a(colour)} traffic light ahead"
-    )
+    ahead = f"{_a(colour)} traffic light ahead"
+    if situation.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT):  # not the one that it has just passed
+        return ahead
+    return words.pick(f"the traffic light is {colour}", f"the light shows {colour}", ahead)

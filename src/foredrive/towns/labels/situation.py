@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 from foredrive.scene import Category, Command
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
-from foredrive.towns.labels.captions import SEEN, Doing, Place, Situation, Thing
+from foredrive.towns.labels.captions import SEEN, Doing, Kind, Place, Situation, Thing
 from foredrive.towns.map.town_map import StripKind, TownMap
+from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
 from foredrive.towns.traffic.expert import Moment
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
 from foredrive.towns.traffic.lights import Light
@@ -124,7 +125,7 @@ class Narrator:
             doing=self._doing(moment, leader, gap_m, aside_mps),
             speed_mps=float(moment.twist_ego[0]),
             things=things,
-            leader=None if leader is None else leader.category,
+            leader=None if leader is None else kind_of(leader),
             light=self._light(moment, T_ego_world, sees),
         )
 
@@ -194,6 +195,29 @@ class Narrator:
         return Light.NONE
 
 
+def kind_of(actor: ActorState) -> Kind:
+    """What to call a road user: as it looks, which tells vans from cars."""
+    if actor.category is Category.CAR:
+        length_m, _, height_m = actor.size_lwh
+        return Kind.VAN if length_m > VAN_LENGTH_M and height_m > VAN_HEIGHT_M else Kind.CAR
+    return _KIND_OF_CATEGORY[actor.category]
+
+
+_KIND_OF_CATEGORY = {
+    Category.TRUCK: Kind.TRUCK,
+    Category.BUS: Kind.BUS,
+    Category.TRAILER: Kind.TRAILER,
+    Category.CONSTRUCTION_VEHICLE: Kind.CONSTRUCTION_VEHICLE,
+    Category.MOTORCYCLE: Kind.MOTORCYCLE,
+    Category.BICYCLE: Kind.CYCLIST,
+    Category.PEDESTRIAN: Kind.PEDESTRIAN,
+    Category.ANIMAL: Kind.ANIMAL,
+    Category.TRAFFIC_CONE: Kind.TRAFFIC_CONE,
+    Category.BARRIER: Kind.BARRIER,
+    Category.OTHER: Kind.OBJECT,
+}
+
+
 def _thing(
     actor: ActorState,
     xyz: Float64[np.ndarray, "3"],
@@ -203,7 +227,7 @@ def _thing(
 ) -> Thing:
     heading = R @ [np.cos(actor.yaw), np.sin(actor.yaw), 0.0]
     return Thing(
-        category=actor.category,
+        kind=kind_of(actor),
         xy_m=xyz[:2],
         velocity_mps=(R @ actor.velocity_mps)[:2],
         yaw=float(np.arctan2(heading[1], heading[0])),
