@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Category, MapKind, VoxelSpec
 from foredrive.towns import recorder
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
+from foredrive.towns.recorder import Crowd, LabelKinds, boxes_of, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive
@@ -307,6 +308,40 @@ def test_it_trains_as_any_log_does(recording: LogPath, tmp_path: Path) -> None:
     assert bool(example.clip.image_valid.all())
     assert bool(example.clip.misses_known.all())
     assert bool(example.occupancy.known.any())
+
+
+def test_boxes_move_as_their_velocities_say(town02: TownMap) -> None:
+    """At the time of the frame; only who starts, stops or turns on the spot differs."""
+    dt_s, at, velocity = 0.05, {}, {}
+    traffic = Traffic(town02, 3, 13, 8)
+    for k, moment in enumerate(Drive(traffic, 3.0).moments(60, dt_s)):
+        boxes, R = boxes_of(moment.actors, moment.T_world_ego), moment.T_world_ego[:3, :3]
+        for row, track in enumerate(boxes.track_id.tolist()):
+            at[track, k] = R @ boxes.centre[row].double().numpy() + moment.T_world_ego[:3, 3]
+            velocity[track, k] = R @ [*boxes.velocity[row].tolist(), 0.0]
+    inner = [(track, k) for track, k in at if {(track, k - 1), (track, k + 1)} <= at.keys()]
+    difference = np.array([(at[t, k + 1] - at[t, k - 1]) / (2 * dt_s) for t, k in inner])
+    logged = np.array([velocity[key] for key in inner])
+    apart = np.linalg.norm((difference - logged)[:, :2], axis=1)
+    assert (np.linalg.norm(logged, axis=1) > 0.5).sum() > 200
+    assert np.median(apart) < 0.005
+    assert np.quantile(apart, 0.95) < 0.15
+
+
+@pytest.mark.usefixtures("built_already")
+def test_labels_may_be_left_out(tmp_path: Path) -> None:
+    bare = LabelKinds(occupancy=None, visibility=False, captions=False)
+    sensors = SensorSuite(camera_rig((12, 16)), roof_lidar(channels=4, azimuth_steps=36))
+    log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, Crowd(4, 2), bare))
+    assert read_visibility(log, 0) is read_caption(log, 0) is None
+    assert not list(log.path.folder.glob("custom.[!l]*"))
+    boxes = read_boxes(log, 0)
+    assert boxes is not None
+    assert len(boxes.yaw) > 0
+    told = replace(bare, captions=True)  # which take visibility, but do not leave it there
+    log = Log(record("Town02", 0.5, 3, tmp_path, RATE_HZ, sensors, Crowd(4, 2), told, log_name="told"))
+    assert read_caption(log, 0)
+    assert read_visibility(log, 0) is None
 
 
 def test_splits() -> None:

@@ -92,5 +92,5 @@ def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
         folder,
         rate_hz=RATE_HZ,
         sensors=sensors,
-        labels=LabelKinds(occupancy=None, captions=False),
+        labels=LabelKinds(occupancy=None, visibility=False, captions=False),
     )

@@ -62,10 +62,12 @@ class Crowd:
 
 @dataclass(frozen=True)
 class LabelKinds:
-    """Which exact labels a recording carries, besides boxes with their lidar points and visibility."""
+    """Which exact labels a recording carries, besides boxes with their lidar points, and traffic lights."""
 
     occupancy: VoxelSpec | None = OCCUPANCY
     """Grid of the occupancy with flow, seen or not."""
+    visibility: bool = True
+    """How much of each box the cameras see."""
     depth: bool = False
     """Images."""
     semantic: bool = False
@@ -183,7 +185,11 @@ def _frames(
         everyone = [*moment.actors, *world.parked]
         near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
         returned = seen.beam_ids[seen.sweep.returned.numpy()]
-        visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
+        visibility, text = None, None
+        if labels.visibility or labels.captions:
+            visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
+            if labels.captions:
+                text = _caption(narrator, moment, near, visibility, seen, sensors.rig, seed + index)
         spec = labels.occupancy
         yield Frame(
             t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
@@ -195,10 +201,8 @@ def _frames(
             boxes=boxes_of(near, moment.T_world_ego),
             occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
             lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
-            visibility=visibility,
-            caption=_caption(narrator, moment, near, visibility, seen, sensors.rig, seed + index)
-            if labels.captions
-            else None,
+            visibility=visibility if labels.visibility else None,
+            caption=text,
             traffic_lights=lights_of_lanes(world.town, moment.lights),
             **_ray_labels(seen, everyone, sensors, labels),
         )
