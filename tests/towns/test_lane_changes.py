@@ -21,7 +21,7 @@ from foredrive.towns.traffic.lane_changes import (
     who_may_change,
 )
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
-from foredrive.towns.traffic.leaders import find_leaders
+from foredrive.towns.traffic.leaders import Ahead, find_leaders
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts, vehicle_poses
 
 INNER_M, LANE_M = 200.0, 3.5
@@ -87,8 +87,13 @@ def cars(graph: LaneGraph, where: list[tuple[str, float, float]]) -> Vehicles:
 
 
 def seen(graph: LaneGraph, vehicles: Vehicles, free: list[float]) -> Situation:
-    leader, gap = find_leaders(graph, vehicles, path_starts(graph, vehicles.path))
-    return Situation(np.array(free), leader, gap, np.full(len(free), np.inf))
+    ahead = find_leaders(graph, vehicles, path_starts(graph, vehicles.path))
+    return Situation(np.array(free), ahead, np.full(len(free), np.inf))
+
+
+def following(leader: list[int], gap_m: list[float], free: list[float]) -> Situation:
+    ahead = Ahead(*2 * (np.array(leader), np.array(gap_m)))
+    return Situation(np.array(free), ahead, np.full(len(free), np.inf))
 
 
 def gaps(
@@ -101,7 +106,7 @@ def test_the_incentive_is_mobils_formula(graph: LaneGraph) -> None:
     # 0 follows 1 at the desired gap 2 + 8 · 1.5 = 14 m: a = 0. On the empty left lane it would have a = 1.
     # 2 would follow there with z = 14 / 10: a (1 - z²) = -0.96 instead of 1.
     v = cars(graph, [("outer0", 40, 8.0), ("outer0", 60, 8.0), ("inner0", 30, 8.0)])
-    now = Situation(np.ones(3), np.array([1, -1, -1]), np.array([14.0, np.inf, np.inf]), np.full(3, np.inf))
+    now = following([1, -1, -1], [14.0, np.inf, np.inf], [1.0] * 3)
     found = incentive(
         v, now, gaps(v, [-1] * 3, [np.inf] * 3, [2, -1, -1], [10.0, np.inf, np.inf]), np.ones(3)
     )
@@ -111,7 +116,7 @@ def test_the_incentive_is_mobils_formula(graph: LaneGraph) -> None:
 def test_those_behind_in_the_old_lane_gain(graph: LaneGraph) -> None:
     # 1 follows 0 at its desired gap and would have an open road: 1 m/s² more. 0 itself gains nothing.
     v = cars(graph, [("outer0", 60, 8.0), ("outer0", 40, 8.0)])
-    now = Situation(np.ones(2), np.array([-1, 0]), np.array([np.inf, 14.0]), np.full(2, np.inf))
+    now = following([-1, 0], [np.inf, 14.0], [1.0] * 2)
     nobody = gaps(v, [-1, -1], [np.inf] * 2, [-1, -1], [np.inf] * 2)
     assert incentive(v, now, nobody, np.ones(2))[0] == pytest.approx(POLITENESS * 1.0)
 
@@ -123,14 +128,14 @@ def test_nobody_is_made_to_brake_hard(graph: LaneGraph, gap_m: float, closing_mp
     # Equal speeds at 7 m: 1 - (14 / 7)² = -3, just allowed. Closing in with 6 m/s at 14 m/s over 20 m:
     # s* = 2 + 21 + 14 · 6 / (2 √2) = 52.7 m, a = 1 - 6.9.
     v = cars(graph, [("outer0", 40, 8.0), ("inner0", 30, 8.0 + closing_mps)])
-    now = Situation(np.full(2, 0.5), np.full(2, -1), np.full(2, np.inf), np.full(2, np.inf))
+    now = following([-1] * 2, [np.inf] * 2, [0.5] * 2)
     wanted = gaps(v, [-1, -1], [np.inf] * 2, [1, -1], [gap_m + 1e-6, np.inf])
     assert np.isfinite(incentive(v, now, wanted, np.full(2, 0.5))[0]) == safe
 
 
 def test_nobody_squeezes_in(graph: LaneGraph) -> None:
     v = cars(graph, [("outer0", 40, 0.0), ("inner0", 42, 0.0)])
-    now = Situation(np.ones(2), np.full(2, -1), np.full(2, np.inf), np.full(2, np.inf))
+    now = following([-1] * 2, [np.inf] * 2, [1.0] * 2)
     target = np.array([graph.ids.index("inner0"), -1])
     found = find_gaps(graph, v, path_starts(graph, v.path), target, LEFT)
     assert found.leader[0] == 1

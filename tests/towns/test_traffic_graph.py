@@ -145,7 +145,7 @@ def on_lanes(graph: LaneGraph, where: list[tuple[list[str], float]]) -> Vehicles
 def test_the_leader_is_found_over_the_end_of_a_lane(graph: LaneGraph) -> None:
     length = graph.length_m[graph.ids.index("west")]
     cars = on_lanes(graph, [(["east", "west", "we_1", "east"], length - 6), (["west", "we_1", "east"], 8.0)])
-    leader, gap = find_leaders(graph, cars, path_starts(graph, cars.path))
+    leader, gap, *_ = find_leaders(graph, cars, path_starts(graph, cars.path))
     assert leader.tolist() == [1, -1]
     assert gap[0] == pytest.approx(6 + 8 - 4)
     assert gap[1] == np.inf
@@ -157,7 +157,7 @@ def test_a_car_that_turns_off_leads_until_it_is_clear(graph: LaneGraph, s_m: flo
     cars = on_lanes(
         graph, [(["east", "west", "we_1", "east"], length - 10), (["west", "turn", "north"], s_m)]
     )
-    leader, _ = find_leaders(graph, cars, path_starts(graph, cars.path))
+    leader, *_ = find_leaders(graph, cars, path_starts(graph, cars.path))
     assert (leader[0] == 1) == leads
 
 

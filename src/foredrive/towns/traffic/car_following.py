@@ -58,7 +58,7 @@ def follow_acceleration(
     z = (standstill_m + np.maximum(0.0, dynamic)) / np.maximum(gap_m, 0.05)
     eager = np.maximum(free_mps2, 1e-3)
     too_near = accel_mps2 * (1 - z**2)
-    closing_in = eager * (1 - np.minimum(z, 1) ** (2 * accel_mps2 / eager))
+    closing_in = free_mps2 * (1 - np.minimum(z, 1) ** (2 * accel_mps2 / eager))
     below_wanted = np.where(z >= 1, too_near, closing_in)
     above_wanted = np.where(z >= 1, free_mps2 + too_near, free_mps2)
     return np.where(free_mps2 > 0, below_wanted, above_wanted)

@@ -18,7 +18,7 @@ from foredrive.towns.traffic.car_following import (
     free_acceleration,
 )
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.right_of_way import STANDSTILL_M
+from foredrive.towns.traffic.leaders import STANDSTILL_M, Ahead
 from foredrive.towns.traffic.vehicles import Vehicles, speed_to_drive
 
 LINE_STANDSTILL_M = 1.0
@@ -29,26 +29,22 @@ class Situation(NamedTuple):
 
     free_mps2: Float64[np.ndarray, "N"]
     """Acceleration on an open road."""
-    leader: Int[np.ndarray, "N"]
-    """-1 for none."""
-    leader_gap_m: Float64[np.ndarray, "N"]
+    ahead: Ahead
     halt_mps2: Float64[np.ndarray, "N"]
     """Acceleration towards lines and crossings alone."""
 
     def wanted_mps2(self, vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
         """The acceleration that drivers want."""
-        every = np.arange(len(self.leader))
-        return np.minimum(
-            behind(vehicles, every, self.free_mps2, self.leader, self.leader_gap_m), self.halt_mps2
-        )
+        every, ahead = np.arange(len(self.free_mps2)), self.ahead
+        following = behind(vehicles, every, self.free_mps2, ahead.limiting, ahead.limiting_gap_m)
+        return np.minimum(following, self.halt_mps2)
 
 
 def see_ahead(
     graph: LaneGraph,
     vehicles: Vehicles,
     starts_m: Float64[np.ndarray, "N W"],
-    leader: Int[np.ndarray, "N"],
-    leader_gap_m: Float64[np.ndarray, "N"],
+    ahead: Ahead,
     halt_gap_m: Float64[np.ndarray, "N"],
 ) -> Situation:
     """The situation of drivers who have to halt after a distance (infinite: they need not)."""
@@ -59,7 +55,7 @@ def see_ahead(
     at_line = np.full(len(wanted), LINE_STANDSTILL_M)
     driver = (0.3 * v.time_gap_s, v.accel_mps2, v.decel_mps2)
     halt = follow_acceleration(free, v.speed_mps, v.speed_mps, halt_gap_m, at_line, *driver)
-    return Situation(free, leader, leader_gap_m, halt)
+    return Situation(free, ahead, halt)
 
 
 def behind(

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.towns.traffic.car_following import free_acceleration
 from foredrive.towns.traffic.drivers import Situation, behind
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
-from foredrive.towns.traffic.leaders import LOOK_M, abreast, lane_beside, link_occupants, motion_of
+from foredrive.towns.traffic.leaders import LOOK_M, Ahead, abreast, lane_beside, link_occupants, motion_of
 from foredrive.towns.traffic.vehicles import BEHIND, CLEAR_OF_LANE, WINDOW, Vehicles, path_starts
 
 LEFT, RIGHT = 0, 1
@@ -163,7 +163,8 @@ def _find_gaps(motion, lanes, target, side):
                     break
                 front_j = front[j] - starts[j, k]
                 if lane_j != target[i]:
-                    if k > BEHIND or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
+                    over = k > BEHIND and -front_j > motion.to_clear_m[j]
+                    if over or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
                         continue
                     front_j = abreast(lane_j, front_j, motion.beside[j], sides)
                 is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
@@ -184,12 +185,12 @@ def incentive(
     Args:
         free_mps2: acceleration on an open road in the new lane.
     """
-    v, every, length = vehicles, np.arange(len(now.leader)), vehicles.size_lwh[:, 0]
-    n, o = gaps.follower, _followers(now)
+    v, every, length = vehicles, np.arange(len(free_mps2)), vehicles.size_lwh[:, 0]
+    ahead, n, o = now.ahead, gaps.follower, _followers(now.ahead)
     wanted, halt, free = now.wanted_mps2(v), now.halt_mps2, now.free_mps2
     own = behind(v, every, free_mps2, gaps.leader, gaps.leader_gap_m)
     new = behind(v, n, free[n], np.where(n >= 0, every, -1), gaps.follower_gap_m)
-    old = behind(v, o, free[o], now.leader, now.leader_gap_m[o] + length + now.leader_gap_m)
+    old = behind(v, o, free[o], ahead.leader, ahead.leader_gap_m[o] + length + ahead.leader_gap_m)
     gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - wanted[n], 0.0)
     gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - wanted[o], 0.0)
     gain = np.minimum(own, halt) - wanted + POLITENESS * (gain_n + gain_o)
@@ -198,12 +199,12 @@ def incentive(
     return np.where(near | unsafe, -np.inf, gain)
 
 
-def _followers(now: Situation) -> Int[np.ndarray, "N"]:
+def _followers(ahead: Ahead) -> Int[np.ndarray, "N"]:
     """Who follows each vehicle nearest, -1 for nobody."""
-    follower = np.full(len(now.leader), -1)
-    led = np.flatnonzero(now.leader >= 0)
-    led = led[np.argsort(-now.leader_gap_m[led], kind="stable")]  # the nearest is written last
-    follower[now.leader[led]] = led
+    follower = np.full(len(ahead.leader), -1)
+    led = np.flatnonzero(ahead.leader >= 0)
+    led = led[np.argsort(-ahead.leader_gap_m[led], kind="stable")]  # the nearest is written last
+    follower[ahead.leader[led]] = led
     return follower
 
 
@@ -246,8 +247,9 @@ def choose_change(
     v = vehicles
     starts_m = path_starts(graph, v.path)
     reach = CLEAR_OF_LANE * change_length_m(v) + v.wheelbase_m
-    moves_on = np.where(now.leader >= 0, v.speed_mps[now.leader], 0.0) * reach / np.maximum(v.speed_mps, 1.0)
-    can_pull_out = now.leader_gap_m + moves_on > reach
+    leader = now.ahead.leader
+    moves_on = np.where(leader >= 0, v.speed_mps[leader], 0.0) * reach / np.maximum(v.speed_mps, 1.0)
+    can_pull_out = now.ahead.leader_gap_m + moves_on > reach
     best, least = None, THRESHOLD_MPS2
     for side in (LEFT, RIGHT):
         target = np.where(may[side] & can_pull_out, stretches.target[side, v.lane], -1)

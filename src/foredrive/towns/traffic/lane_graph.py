@@ -7,26 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
-from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from foredrive.scene import Command
 from foredrive.towns.map.town_map import Lane, MarkingKind, StopZoneKind, TownMap
+from foredrive.towns.traffic.centrelines import bends, headings, joined, resampled, speed_profile
 from foredrive.towns.traffic.meetings import Meetings, find_meetings
 
-SAMPLE_M = 0.5
 TURN_RAD = np.deg2rad(30.0)
-SMOOTHED_SAMPLES = 7
 CITY_SPEED_MPS = 13.9
 """The towns' files give most city streets the 55 mph of their OpenDRIVE road type; traffic there keeps to
 50 km/h. Lanes whose limit is above `MOTORWAY_LIMIT_MPS` are driven as posted."""
 MOTORWAY_LIMIT_MPS = 26.0
-LATERAL_MPS2 = 2.0
-"""Comfortable lateral acceleration in curves."""
-SLOWING_MPS2 = 1.5
-"""Comfortable deceleration towards a curve or a lower limit."""
+BEFORE_LIGHT_M = 40.0
+"""From here to a light traffic keeps to `CITY_SPEED_MPS`: whoever comes faster can neither stop for it nor
+pass it while it is yellow."""
 WAITING_ROOM_M = 12.0
-ASIDE_M = 0.5
 NARROWEST_M = 2.8
 CROSSABLE = (
     MarkingKind.NONE,
@@ -143,15 +139,16 @@ class LaneGraph:
 def build_lane_graph(town: TownMap) -> LaneGraph:
     """Lane graph of a town."""
     lanes, index = _whole_connectors(town.lanes)
-    lines = [_resample(line) for line in _joined(lanes, index)]
+    lines = [resampled(line) for line in joined(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
-    bends = [_bend(line) for line in lines]
+    curves = [bends(line) for line in lines]
     control, zone = _guards(town, index, len(lanes))
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
-    # Who comes faster than this to a light cannot stop for it while it is yellow.
-    limit = np.where(control == Control.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
     count = np.array([len(line) for line in lines])
     successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
+    limit = np.where(control == Control.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
+    to_light = _to_light_m(control == Control.LIGHT, length, successors)
+    limits = [_limits(*lane) for lane in zip(limit, length, lines, to_light, strict=True)]
     predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
     junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
     groups = [lane.group_id for lane in lanes]
@@ -160,15 +157,15 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     return LaneGraph(
         ids=tuple(lane.lane_id for lane in lanes),
         xyz=np.concatenate(lines),
-        speed_mps=np.concatenate([_speed(*of_lane) for of_lane in zip(bends, limit, length, strict=True)]),
+        speed_mps=np.concatenate([speed_profile(*lane) for lane in zip(curves, limits, length, strict=True)]),
         first=np.cumsum(count) - count,
         count=count,
         step_m=length / (count - 1),
         length_m=length,
         limit_mps=limit,
         width_m=np.array([lane.width_m for lane in lanes]),
-        tightest_m=np.array([1 / np.abs(bend).max().clip(1e-6) for bend in bends]),
-        turn_rad=np.array([_heading(line)[-1] - _heading(line)[0] for line in lines]),
+        tightest_m=np.array([1 / np.abs(at).max().clip(1e-6) for at in curves]),
+        turn_rad=np.array([headings(line)[-1] - headings(line)[0] for line in lines]),
         successors=_padded(successors),
         successor_count=np.array([len(row) for row in successors]),
         predecessors=_padded(predecessors),
@@ -240,7 +237,7 @@ def _contested(
 ) -> Bool[np.ndarray, "L"]:
     """Extend lanes that are crossed back to where a vehicle can wait with its tail out of the junction."""
     contested = crossed.copy()
-    room_m = length_m.copy()
+    room_m = np.full(len(length_m), WAITING_ROOM_M)  # taken back step by step
     changed = True
     while changed:
         changed = False
@@ -256,54 +253,33 @@ def _contested(
     return contested
 
 
-def _joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
-    """Centrelines, led over to where the next lane begins: where two lanes merge, that may be to the side."""
-    lines = [lane.centreline_xyz for lane in lanes]
-    for i, lane in enumerate(lanes):
-        starts = [lines[index[name]][0] for name in lane.successor_ids]
-        aside = min((start - lines[i][-1] for start in starts), key=np.linalg.norm, default=np.zeros(3))
-        if np.linalg.norm(aside) > ASIDE_M:
-            x = np.linspace(0.0, 1.0, 2 * len(lines[i]))[:, None]
-            every = np.linspace(0.0, len(lines[i]) - 1.0, len(x))
-            fine = np.stack([np.interp(every, np.arange(len(lines[i])), c) for c in lines[i].T], axis=1)
-            lines[i] = fine + x**3 * (10 - 15 * x + 6 * x**2) * aside
-    return lines
-
-
-def _resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
-    s = np.linspace(0.0, along[-1], count)
-    return np.stack([np.interp(s, along, column) for column in line.T], axis=1)
-
-
-def _heading(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "_"]:
-    """Heading of each stretch between two samples, unwrapped."""
-    d = np.diff(line, axis=0)
-    return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
-
-
-def _bend(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    """Curvature at each sample, 1/m, over some metres: the maps' polylines have corners."""
-    if len(line) < 3:
-        return np.zeros(len(line))
-    step_m = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
-    heading = uniform_filter1d(_heading(line), SMOOTHED_SAMPLES, mode="nearest")
-    at_samples = np.interp(np.arange(len(line)) - 0.5, np.arange(len(line) - 1), heading)
-    return np.gradient(at_samples) / step_m
-
-
 def _limit(posted_mps: float | None) -> float:
     posted_mps = posted_mps or CITY_SPEED_MPS
     return posted_mps if posted_mps > MOTORWAY_LIMIT_MPS else min(posted_mps, CITY_SPEED_MPS)
 
 
-def _speed(bend: Float64[np.ndarray, "n"], limit_mps: float, length_m: float) -> Float64[np.ndarray, "n"]:
-    """Speed to drive at each sample: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds backwards."""
-    square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(bend).clip(1e-6))
-    step_m = length_m / (len(bend) - 1)
-    to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(bend))
-    return np.sqrt(np.minimum.accumulate((square + to_end)[::-1])[::-1] - to_end)
+def _to_light_m(
+    has_light: Bool[np.ndarray, "L"], length_m: Float64[np.ndarray, "L"], successors: list[list[int]]
+) -> Float64[np.ndarray, "L"]:
+    """How far it is from the end of each lane to the next light, as far as `BEFORE_LIGHT_M`."""
+    to_light = np.full(len(length_m), np.inf)
+    changed = True
+    while changed:
+        changed = False
+        for lane, onward in enumerate(successors):
+            ways = [0.0 if has_light[n] else length_m[n] + to_light[n] for n in onward]
+            nearest = min(ways, default=np.inf)
+            if nearest < min(to_light[lane], BEFORE_LIGHT_M):
+                to_light[lane], changed = nearest, True
+    return to_light
+
+
+def _limits(
+    limit_mps: float, length_m: float, line: Float64[np.ndarray, "n 3"], to_light_m: float
+) -> Float64[np.ndarray, "n"]:
+    """The limit at each sample of a lane."""
+    before_light = to_light_m + np.linspace(length_m, 0.0, len(line)) < BEFORE_LIGHT_M
+    return np.where(before_light, min(limit_mps, CITY_SPEED_MPS), limit_mps)
 
 
 def _guards(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,18 @@ from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 LOOK_M = 150.0
 PASSING_M = 2.0
+STANDSTILL_M = 2.0
+
+
+class Ahead(NamedTuple):
+    """What N vehicles have ahead of them on their paths: indices (-1: nobody), and gaps bumper to bumper."""
+
+    leader: Int[np.ndarray, "N"]
+    """The nearest one."""
+    leader_gap_m: Float64[np.ndarray, "N"]
+    limiting: Int[np.ndarray, "N"]
+    """The one that makes a driver brake most: during a lane change that may be one further away."""
+    limiting_gap_m: Float64[np.ndarray, "N"]
 
 
 class Motion(NamedTuple):
@@ -56,15 +68,15 @@ def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motio
     )
 
 
-def find_leaders(
-    graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
-) -> tuple[Int[np.ndarray, "N"], Float64[np.ndarray, "N"]]:
-    """Index of the vehicle ahead on each path (-1: none) and the gap to it, m, bumper to bumper.
+def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Ahead:
+    """Who is ahead on each path.
 
     Vehicles that have just turned off onto a sibling lane count for as long as they are in the way. Those
     that change lanes are on both, and keep behind what they would reach before they have left the old one.
     """
-    return _find_leaders(motion_of(vehicles, starts_m), graph.length_m, graph.sides, graph.siblings)
+    driver = (vehicles.time_gap_s, 2 * np.sqrt(vehicles.accel_mps2 * vehicles.decel_mps2))
+    motion = motion_of(vehicles, starts_m)
+    return Ahead(*_find_leaders(motion, driver, graph.length_m, graph.sides, graph.siblings))
 
 
 @numba.njit(cache=True)
@@ -123,15 +135,16 @@ def add_occupant(occupants, lane, vehicle, column, rear_m):
 
 @numba.njit(cache=True)
 @no_type_check
-def _find_leaders(motion, length, sides, siblings):
+def _find_leaders(motion, driver, length, sides, siblings):
     active, path, starts, front, rear = motion[:5]
     count = len(active)
     on = link_occupants(motion, length, sides, np.zeros(count, np.int64))
     leader, gap = np.full(count, -1), np.full(count, np.inf)
+    limiting, limiting_gap = leader.copy(), gap.copy()
     for i in range(count):
         if not active[i]:
             continue
-        centre = 0.5 * (front[i] + rear[i])
+        centre, most = 0.5 * (front[i] + rear[i]), 0.0
         for k in range(BEHIND, WINDOW):
             lane = path[i, k]
             if lane < 0 or starts[i, k] - front[i] > min(gap[i], LOOK_M):
@@ -154,6 +167,20 @@ def _find_leaders(motion, length, sides, siblings):
                     if centre_j < centre or (centre_j == centre and j < i):
                         continue
                     gap_j = starts[i, k] + rear_j - front[i]
-                    if gap_j < gap[i] and not (is_old and gap_j > motion.to_clear_m[i] + PASSING_M):
+                    if is_old and gap_j > motion.to_clear_m[i] + PASSING_M:
+                        continue
+                    if gap_j < gap[i]:
                         leader[i], gap[i] = j, gap_j
-    return leader, gap
+                    braking = _desired_gap_m(i, j, motion.speed_mps, driver) / max(gap_j, 0.05)
+                    if braking > most:
+                        limiting[i], limiting_gap[i], most = j, gap_j, braking
+    return leader, gap, limiting, limiting_gap
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _desired_gap_m(i, j, speed_mps, driver):
+    """The gap that vehicle i wants to j, as in `car_following`; the less it has of it, the more it brakes."""
+    time_gap_s, braking_mps2 = driver
+    closing = speed_mps[i] - speed_mps[j]
+    return STANDSTILL_M + max(0.0, speed_mps[i] * (time_gap_s[i] + closing / braking_mps2[i]))

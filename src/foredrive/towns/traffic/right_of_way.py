@@ -17,15 +17,15 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
-from foredrive.towns.traffic.leaders import add_occupant, link_occupants, motion_of
+from foredrive.towns.traffic.leaders import STANDSTILL_M, Ahead, add_occupant, link_occupants, motion_of
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
-STANDSTILL_M = 2.0
 EARLY_M = 12.0
 PLANNED_BRAKING_MPS2 = 1.5
 """Right of way is asked for `EARLY_M` before one would have to brake this hard for the line."""
 LIGHT_BRAKING_MPS2 = 3.0
 """Whoever would have to brake harder than this for a yellow light drives on."""
+LIGHT_REACTION_S = 0.5
 LEFT_WAITS_S = 2.0
 RIGHT_WAITS_S = 0.5
 """Turning vehicles are served as if they had arrived this much later."""
@@ -57,8 +57,7 @@ def claim_junctions(
     graph: LaneGraph,
     vehicles: Vehicles,
     starts_m: Float64[np.ndarray, "N W"],
-    leader: Int[np.ndarray, "N"],
-    leader_gap_m: Float64[np.ndarray, "N"],
+    ahead: Ahead,
     green: Bool[np.ndarray, "L"],
     time_s: float,
 ) -> RightOfWay:
@@ -67,10 +66,13 @@ def claim_junctions(
     column, line_gap = _next_line(graph, vehicles.path, kept, starts_m, vehicles.front_m)
     lane = vehicles.path[np.arange(len(kept)), column]
     inside = graph.contested[vehicles.lane]
-    goes_on = inside & _is_cut_off(graph, vehicles, kept, column)
-    queued = (leader >= 0) & (leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
+    cut_off = inside & _is_cut_off(graph, vehicles, kept, column)
+    at_light = cut_off & (graph.control[lane] == Control.LIGHT)
+    goes_on = cut_off & ~at_light
+    leader = ahead.leader
+    queued = (leader >= 0) & (ahead.leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
-    near = vehicles.active & (line_gap < reach) & ((~queued & ~inside) | goes_on)
+    near = vehicles.active & (line_gap < reach) & ((~queued & (~inside | at_light)) | goes_on)
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
     asks = near & ((_is_green(graph, vehicles.path, column, green) & stop_made) | goes_on)
     asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
@@ -98,7 +100,8 @@ def claim_junctions(
 def _is_cut_off(
     graph: LaneGraph, vehicles: Vehicles, granted: Int[np.ndarray, "N"], line_column: Int[np.ndarray, "N"]
 ) -> Bool[np.ndarray, "N"]:
-    """Whose way through a junction was longer than the path known when it was granted.
+    """Whose way through a junction goes on beyond what has been granted of it: it was longer than the path
+    known then, or there is a light within it.
 
     All others ask for one junction at a time.
     """
@@ -131,13 +134,26 @@ def _is_green(
 def _withdraw(
     graph: LaneGraph, vehicles: Vehicles, starts_m: np.ndarray, green: np.ndarray
 ) -> Int[np.ndarray, "N"]:
-    """Grants, but for those of vehicles that can still stop for a light which has turned."""
+    """Grants, but for those of vehicles that can still stop for a light which has turned.
+
+    They wait before the junction, or if they are in it already, before the light itself.
+    """
     nothing = np.zeros_like(vehicles.granted)
     column, gap = _next_line(graph, vehicles.path, nothing, starts_m, vehicles.front_m)
-    shows_green = _is_green(graph, vehicles.path, column, green)
-    can_stop = gap > vehicles.speed_mps**2 / (2 * LIGHT_BRAKING_MPS2) + STANDSTILL_M
-    withdrawn = (column > 0) & ~graph.contested[vehicles.lane] & ~shows_green & can_stop
-    return np.where(withdrawn, 0, vehicles.granted)
+    outside = (column > 0) & ~graph.contested[vehicles.lane]
+    forbidden = outside & ~_is_green(graph, vehicles.path, column, green)
+    kept = np.where(forbidden & _can_stop(vehicles, gap), 0, vehicles.granted)
+    to_come = (np.arange(WINDOW) > BEHIND) & (np.arange(WINDOW) <= BEHIND + vehicles.granted[:, None])
+    light = to_come & (vehicles.path >= 0) & ~green[vehicles.path]
+    first = np.argmax(light, axis=1)
+    to_light = starts_m[np.arange(len(first)), first] - vehicles.front_m
+    stops = ~outside & light.any(axis=1) & _can_stop(vehicles, to_light)
+    return np.where(stops, first - 1 - BEHIND, kept)
+
+
+def _can_stop(vehicles: Vehicles, gap_m: Float64[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    needed = vehicles.speed_mps**2 / (2 * LIGHT_BRAKING_MPS2) + LIGHT_REACTION_S * vehicles.speed_mps
+    return (gap_m >= 0) & (gap_m >= needed)
 
 
 @numba.njit(cache=True)

@@ -1,7 +1,6 @@
 """Traffic on a town's lanes and walkways: one pure step from state to state."""
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int
@@ -10,7 +9,7 @@ from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
-from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, draw_fleet, find_starts, is_large, place
+from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, find_starts, is_large
 from foredrive.towns.traffic.lane_changes import (
     HAS_TO_MPS2,
     LIKES_TO_MPS2,
@@ -22,55 +21,19 @@ from foredrive.towns.traffic.lane_changes import (
     room_to_change_m,
     who_may_change,
 )
-from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
-from foredrive.towns.traffic.pedestrians import (
-    Pedestrians,
-    crossing_gap,
-    draw_people,
-    empty_pavement,
-    step_pedestrians,
-)
+from foredrive.towns.traffic.paths import extend_paths
+from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pavement, step_pedestrians
 from foredrive.towns.traffic.right_of_way import claim_junctions
-from foredrive.towns.traffic.vehicles import (
-    BEHIND,
-    Poses,
-    Vehicles,
-    empty_slots,
-    path_starts,
-    vehicle_poses,
-)
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.turnover import Turnover
+from foredrive.towns.traffic.vehicles import BEHIND, Poses, Vehicles, empty_slots, path_starts, vehicle_poses
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
 AT_LINE_M = 4.0
-BORN_BEYOND_M = 95.0
-BORN_WITHIN_M = 140.0
-GONE_BEYOND_M = 160.0
-PEOPLE_BORN_BEYOND_M = 82.0
-PEOPLE_BORN_WITHIN_M = 95.0
-PEOPLE_GONE_BEYOND_M = 110.0
-CLEAR_M = 10.0
-CLEAR_S = 3.5
-"""New vehicles keep `CLEAR_M` from all others, and `CLEAR_S` more from those ahead of and behind them."""
-TRIES = 12
-
-
-@dataclass(frozen=True)
-class TrafficState:
-    """Everything that changes from step to step."""
-
-    time_s: float
-    step_index: int
-    vehicles: Vehicles
-    people: Pedestrians
-    next_track_id: int
-    route: Int[np.ndarray, "R"]
-    """Lanes in which vehicle 0 has to be at the end of each stretch of its way; empty if it wanders like the
-    others."""
-    route_passed: int
-    """How many it has left behind."""
 
 
 class Traffic:
@@ -94,11 +57,9 @@ class Traffic:
         self._zone_count = len(town.stop_zones)
         self._stretches = find_stretches(self.lanes)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
-        self._is_motorway = self.lanes.limit_mps > MOTORWAY_LIMIT_MPS
         self._vehicle_count = vehicle_count
         self._people_count = people_count if len(self.walks.length_m) else 0
-        walkable = np.where(self.walks.is_crossing, 0.0, self.walks.length_m)
-        self._walk_weight = walkable / max(walkable.sum(), 1e-9)
+        self._turnover = Turnover(self.lanes, self.walks, self.starts, self._for_large)
 
     def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
         """Vehicles and people at their start.
@@ -123,24 +84,23 @@ class Traffic:
             vehicles = state.vehicles.replace_rows(np.array([0]), ego)
             state = dataclasses.replace(state, vehicles=vehicles, route=lanes if len(lanes) else ego.lane)
             state = self._know_path(state, rng)
-        state = self._put_vehicles(state, 0.0, self._vehicle_count, rng)
-        return self._put_people(state, 0.0, self._people_count, rng)
+        return self._turnover.fill(state, rng)
 
     def step(self, state: TrafficState, dt_s: float) -> TrafficState:
         """The state one time step later; equal states and steps give equal results."""
         rng = np.random.default_rng((self.seed, 2, state.step_index))
         v = state.vehicles
         starts_m = path_starts(self.lanes, v.path)
-        leader, leader_gap = find_leaders(self.lanes, v, starts_m)
+        ahead = find_leaders(self.lanes, v, starts_m)
         light = self.signals.shows(state.time_s)
         green = (light == Light.NONE) | (light == Light.GREEN)
-        way = claim_junctions(self.lanes, v, starts_m, leader, leader_gap, green, state.time_s)
+        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
         to_route = self._to_route(state)
         if to_route is not None:
             halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
-        ahead = see_ahead(self.lanes, v, starts_m, leader, leader_gap, halt_gap)
+        situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
         halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
         v = dataclasses.replace(
             v,
@@ -157,11 +117,11 @@ class Traffic:
             vehicles=v,
             people=people,
         )
-        state = self._begin_change(state, ahead, rng)
-        vehicles = drive(state.vehicles, ahead.wanted_mps2(v), dt_s)
+        state = self._begin_change(state, situation, rng)
+        vehicles = drive(state.vehicles, situation.wanted_mps2(v), dt_s)
         state = dataclasses.replace(state, vehicles=vehicles)
         state = self._change_lanes_at_ends(state, rng)
-        return self._turn_over(state, rng)
+        return self._turnover.renew(state, rng)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """The `Light` of each of the town's stop zones."""
@@ -210,13 +170,15 @@ class Traffic:
             )
         return out
 
-    def _begin_change(self, state: TrafficState, ahead: Situation, rng: np.random.Generator) -> TrafficState:
+    def _begin_change(
+        self, state: TrafficState, situation: Situation, rng: np.random.Generator
+    ) -> TrafficState:
         """Let the one driver who gains most by it change lanes."""
         v = state.vehicles
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
         urge = self._route_urge(state)
         may = who_may_change(self.lanes, self._stretches, v, fits, urge >= HAS_TO_MPS2)
-        change = choose_change(self.lanes, self._stretches, v, ahead, may, urge)
+        change = choose_change(self.lanes, self._stretches, v, situation, may, urge)
         if change is None:
             return state
         changed = begin_change(self.lanes, v, *change)
@@ -246,34 +208,10 @@ class Traffic:
         return room_to_change_m(self.lanes, self._stretches, state.vehicles, wanted)
 
     def _know_path(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
-        """Fill in the lanes ahead that are not known yet: the route's, or a random turn."""
-        v, path = state.vehicles, state.vehicles.path.copy()
-        fits = self._for_large | ~is_large(v)[:, None]
-        for column in range(BEHIND + 1, path.shape[1]):
-            rows = np.flatnonzero(v.active & (path[:, column] < 0))
-            if not len(rows):
-                continue
-            options = self.lanes.successors[path[rows, column - 1]]
-            weight = (options >= 0) * fits[rows[:, None], options]
-            cumulated = np.cumsum(weight, axis=1)
-            u = rng.random((len(rows), 1)) * cumulated[:, -1:]
-            path[rows, column] = options[np.arange(len(rows)), np.argmax(cumulated > u, axis=1)]
-            stretch = state.route_passed + column - BEHIND
-            if rows[0] == 0 and stretch < len(state.route):
-                before, drawn = int(path[0, column - 1]), int(path[0, column])
-                path[0, column] = self._towards(before, int(state.route[stretch]), drawn)
-        return dataclasses.replace(state, vehicles=dataclasses.replace(v, path=path))
-
-    def _towards(self, lane: int, wanted: int, otherwise: int) -> int:
-        """The lane after one that is `wanted`, or one beside it."""
-        options = self.lanes.successors[lane, : self.lanes.successor_count[lane]].tolist()
-        for side in self.lanes.sides.lane:
-            beside = wanted
-            while beside >= 0 and beside not in options:
-                beside = int(side[beside])
-            if beside >= 0:
-                return beside
-        return otherwise
+        """Fill in the lanes ahead that are not known yet."""
+        to_come = state.route[state.route_passed :]
+        vehicles = extend_paths(self.lanes, self._for_large, state.vehicles, to_come, rng)
+        return dataclasses.replace(state, vehicles=vehicles)
 
     def _change_lanes_at_ends(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         while True:
@@ -294,74 +232,3 @@ class Traffic:
             passed = state.route_passed + bool(over[0])
             state = dataclasses.replace(state, vehicles=moved, route_passed=passed)
             state = self._know_path(state, rng)
-
-    def _turn_over(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
-        """Let what is far from vehicle 0 go, and let others appear out of its sight."""
-        if not len(state.route):
-            return state
-        poses = self.poses(state)
-        far = np.linalg.norm(poses.centre_m - poses.centre_m[0], axis=1) > GONE_BEYOND_M
-        far_off = np.linalg.norm(state.people.xyz - poses.centre_m[0], axis=1) > PEOPLE_GONE_BEYOND_M
-        vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
-        people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
-        state = dataclasses.replace(state, vehicles=vehicles, people=people)
-        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng)
-        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng)
-
-    def _put_vehicles(
-        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
-    ) -> TrafficState:
-        """New vehicles in up to `most` free slots, at least `beyond_m` from vehicle 0 if it is the ego."""
-        rows = np.flatnonzero(~state.vehicles.active)[:most]
-        if not len(rows):
-            return state
-        places = np.arange(len(self.starts.lane))
-        if len(state.route):
-            distance = np.linalg.norm(self.starts.xyz - self.poses(state).centre_m[0], axis=1)
-            places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
-        if not len(places):
-            return state
-        vehicles = state.vehicles
-        for k, row in enumerate(rows):
-            tries = rng.choice(places, TRIES)
-            at = tries[self._is_free(vehicles, tries)][:1]
-            if len(at):
-                lane = self.starts.lane[at]
-                track_id = np.array([state.next_track_id + k])
-                one = draw_fleet(rng, track_id, self._for_large[lane], ~self._is_motorway[lane])
-                vehicles = vehicles.replace_rows(row[None], place(self.lanes, one, lane, self.starts.s_m[at]))
-        state = dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
-        return self._know_path(state, rng)
-
-    def _is_free(self, vehicles: Vehicles, starts: Int[np.ndarray, "k"]) -> np.ndarray:
-        """Which starts are far from all vehicles, and in time from those ahead and behind."""
-        centres = vehicle_poses(self.lanes, vehicles).centre_m[vehicles.active]
-        offset = centres[None] - self.starts.xyz[starts][:, None]
-        forward = self.starts.forward[starts][:, None]
-        along = np.sum(offset * forward, axis=2)
-        aside = np.linalg.norm(offset - along[..., None] * forward, axis=2)
-        speed = self.lanes.speed(self.starts.lane[starts], self.starts.s_m[starts])
-        reach = CLEAR_M + CLEAR_S * speed[:, None]
-        return ~((np.hypot(along, aside) < CLEAR_M) | ((np.abs(along) < reach) & (aside < 3.0))).any(axis=1)
-
-    def _put_people(
-        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
-    ) -> TrafficState:
-        """People in up to `most` free slots."""
-        rows = np.flatnonzero(~state.people.active)[:most]
-        if not len(rows):
-            return state
-        tries = rng.choice(len(self._walk_weight), size=(len(rows), TRIES), p=self._walk_weight)
-        s_m = rng.random(tries.shape) * self.walks.length_m[tries]
-        xyz = self.walks.position(tries.ravel(), s_m.ravel()).reshape(*tries.shape, 3)
-        ok = np.ones(tries.shape, dtype=np.bool_)
-        if len(state.route):
-            distance = np.linalg.norm(xyz - self.poses(state).centre_m[0], axis=2)
-            ok = (distance >= beyond_m) & (distance <= PEOPLE_BORN_WITHIN_M)
-        chosen = np.argmax(ok, axis=1)
-        found = ok.any(axis=1)
-        each = np.arange(len(rows))
-        walk, s = tries[each, chosen][found], s_m[each, chosen][found]
-        ids = state.next_track_id + np.flatnonzero(found)
-        people = state.people.replace_rows(rows[found], draw_people(self.walks, rng, ids, walk, s))
-        return dataclasses.replace(state, people=people, next_track_id=state.next_track_id + len(rows))

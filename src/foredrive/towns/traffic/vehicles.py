@@ -6,12 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.lane_graph import SLOWING_MPS2, LaneGraph
+from foredrive.towns.traffic.centrelines import SLOWING_MPS2
+from foredrive.towns.traffic.lane_graph import LaneGraph
 
 BEHIND = 4
 AHEAD = 11
 CLEAR_OF_LANE = 0.64
 """At this part of a lane change three quarters of the way over are done: others can pass on the old lane."""
+CHANGE_LATERAL_MPS2 = 2.5
+"""A lane change as long as it has been begun is driven no faster than this allows."""
 WINDOW = BEHIND + 1 + AHEAD
 """Lanes of its path that a vehicle knows: some behind (where its rear may still be), its own, some ahead."""
 
@@ -81,6 +84,16 @@ class Vehicles:
         """How far to drive until the lane that one comes from is free."""
         to_go = CLEAR_OF_LANE * self.change_length_m - self.changed_m
         return np.where(self.shift_m != 0, np.maximum(to_go, 0.0), 0.0)
+
+    @property
+    def steerable_mps(self) -> Float64[np.ndarray, "N"]:
+        """How fast the present lane change can be driven, which is as long as it is; infinite without one.
+
+        The quintic of `offset_m` bends most at (3 - √3) / 6 of its length, by 10 / √3 shift / length².
+        """
+        curved = np.where(self.changed_m < self.change_length_m, np.abs(self.shift_m), 0.0)
+        curvature = 10 / np.sqrt(3) * curved / self.change_length_m**2
+        return np.sqrt(CHANGE_LATERAL_MPS2 / np.maximum(curvature, 1e-9))
 
     def offset_m(self, ahead_m: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
         """How far left of the path a point is that lies ahead of the rear axle.
@@ -211,4 +224,5 @@ def speed_to_drive(
     entry = np.where(ahead >= 0, graph.speed_mps[graph.first[ahead]], np.inf)
     to_go = starts_m[:, BEHIND + 1 :] - vehicles.s_m[:, None]
     in_time = np.sqrt(entry**2 + 2 * SLOWING_MPS2 * np.maximum(to_go, 0.0)).min(axis=1)
-    return np.minimum(vehicles.top_speed_mps, vehicles.haste * np.minimum(here, in_time))
+    wanted = np.minimum(vehicles.top_speed_mps, vehicles.haste * np.minimum(here, in_time))
+    return np.minimum(wanted, vehicles.steerable_mps)

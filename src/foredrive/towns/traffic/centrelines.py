@@ -1,0 +1,83 @@
+"""The middles of lanes: without gaps, evenly sampled, how they bend, and how fast that can be driven."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import savgol_filter
+
+from foredrive.towns.map.town_map import Lane
+
+SAMPLE_M = 0.5
+SMOOTHED_SAMPLES = 7
+CUBIC_SAMPLES = 9
+"""Centrelines are smoothed by cubics through this many samples (Savitzky & Golay 1964), a few centimetres."""
+LATERAL_MPS2 = 2.0
+"""Comfortable lateral acceleration in curves."""
+SLOWING_MPS2 = 1.5
+"""Comfortable deceleration towards a curve or a lower limit."""
+ASIDE_M = 0.02
+
+
+def joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
+    """Centrelines without gaps: each is led over to where the next lane begins, and from where the last ends.
+
+    Where two lanes merge, that may be to the side.
+    """
+    lines = [lane.centreline_xyz for lane in lanes]
+    for i, lane in enumerate(lanes):
+        lines[i] = _led_over(lines[i], [lines[index[name]][0] for name in lane.successor_ids])
+    for i, lane in enumerate(lanes):
+        lines[i] = _led_over(lines[i][::-1], [lines[index[name]][-1] for name in lane.predecessor_ids])[::-1]
+    return lines
+
+
+def _led_over(
+    line: Float64[np.ndarray, "n 3"], beginnings: list[Float64[np.ndarray, "3"]]
+) -> Float64[np.ndarray, "_ 3"]:
+    """A line that ends in the nearest of some points."""
+    aside = min((begin - line[-1] for begin in beginnings), key=np.linalg.norm, default=np.zeros(3))
+    if np.linalg.norm(aside) < ASIDE_M:
+        return line
+    x = np.linspace(0.0, 1.0, 2 * len(line))[:, None]
+    every = np.linspace(0.0, len(line) - 1.0, len(x))
+    fine = np.stack([np.interp(every, np.arange(len(line)), c) for c in line.T], axis=1)
+    return fine + x**3 * (10 - 15 * x + 6 * x**2) * aside
+
+
+def resampled(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
+    """The line evenly sampled, at most `SAMPLE_M` apart, and smoothed; its ends stay where they are."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
+    s = np.linspace(0.0, along[-1], count)
+    even = np.stack([np.interp(s, along, column) for column in line.T], axis=1)
+    if count < CUBIC_SAMPLES:
+        return even
+    smooth = savgol_filter(even, CUBIC_SAMPLES, 3, axis=0)  # the maps' polylines have corners, and one a kink
+    smooth[[0, -1]] = even[[0, -1]]
+    return smooth
+
+
+def headings(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "_"]:
+    """Heading of each stretch between two samples, unwrapped."""
+    d = np.diff(line, axis=0)
+    return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+
+
+def bends(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    """Curvature at each sample, 1/m, over some metres: the maps' polylines have corners."""
+    if len(line) < 3:
+        return np.zeros(len(line))
+    step_m = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
+    heading = uniform_filter1d(headings(line), SMOOTHED_SAMPLES, mode="nearest")
+    at_samples = np.interp(np.arange(len(line)) - 0.5, np.arange(len(line) - 1), heading)
+    return np.gradient(at_samples) / step_m
+
+
+def speed_profile(
+    bend: Float64[np.ndarray, "n"], limit_mps: Float64[np.ndarray, "n"], length_m: float
+) -> Float64[np.ndarray, "n"]:
+    """Speed to drive at each sample: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds backwards."""
+    step_m = length_m / (len(bend) - 1)
+    square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(bend).clip(1e-6))
+    to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(bend))
+    return np.sqrt(np.minimum.accumulate((square + to_end)[::-1])[::-1] - to_end)

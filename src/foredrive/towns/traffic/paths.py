@@ -1,0 +1,53 @@
+"""The ways of vehicles: which lane they take at each fork."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from foredrive.towns.traffic.fleet import is_large
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
+
+
+def extend_paths(
+    graph: LaneGraph,
+    for_large: Bool[np.ndarray, "L"],
+    vehicles: Vehicles,
+    route: Int[np.ndarray, "R"],
+    rng: np.random.Generator,
+) -> Vehicles:
+    """Fill in the lanes ahead that are not known yet: the route's, or a random turn.
+
+    Args:
+        for_large: the lanes that large vehicles keep to.
+        route: where vehicle 0 has to be at the end of each stretch, from the one it is on.
+    """
+    v, path = vehicles, vehicles.path.copy()
+    fits = for_large | ~is_large(v)[:, None]
+    for column in range(BEHIND + 1, path.shape[1]):
+        rows = np.flatnonzero(v.active & (path[:, column] < 0))
+        if not len(rows):
+            continue
+        options = graph.successors[path[rows, column - 1]]
+        weight = (options >= 0) * fits[rows[:, None], options]
+        cumulated = np.cumsum(weight, axis=1)
+        u = rng.random((len(rows), 1)) * cumulated[:, -1:]
+        path[rows, column] = options[np.arange(len(rows)), np.argmax(cumulated > u, axis=1)]
+        stretch = column - BEHIND
+        if rows[0] == 0 and stretch < len(route):
+            before, drawn = int(path[0, column - 1]), int(path[0, column])
+            path[0, column] = _towards(graph, before, int(route[stretch]), drawn)
+    return dataclasses.replace(v, path=path)
+
+
+def _towards(graph: LaneGraph, lane: int, wanted: int, otherwise: int) -> int:
+    """The lane after one that is `wanted`, or one beside it."""
+    options = graph.successors[lane, : graph.successor_count[lane]].tolist()
+    for side in graph.sides.lane:
+        beside = wanted
+        while beside >= 0 and beside not in options:
+            beside = int(side[beside])
+        if beside >= 0:
+            return beside
+    return otherwise

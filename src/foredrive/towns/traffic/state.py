@@ -1,0 +1,25 @@
+"""Everything that changes in traffic from step to step."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+
+from foredrive.towns.traffic.pedestrians import Pedestrians
+from foredrive.towns.traffic.vehicles import Vehicles
+
+
+@dataclass(frozen=True)
+class TrafficState:
+    """The state of a town's traffic at one time."""
+
+    time_s: float
+    step_index: int
+    vehicles: Vehicles
+    people: Pedestrians
+    next_track_id: int
+    route: Int[np.ndarray, "R"]
+    """Lanes in which vehicle 0 has to be at the end of each stretch of its way; empty if it wanders like the
+    others."""
+    route_passed: int
+    """How many it has left behind."""

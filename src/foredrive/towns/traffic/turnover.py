@@ -1,0 +1,145 @@
+"""Who comes and who goes: vehicles and people appear and disappear out of the ego vehicle's sight."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from foredrive.towns.traffic.drivers import see_ahead
+from foredrive.towns.traffic.fleet import Starts, draw_fleet, place
+from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
+from foredrive.towns.traffic.leaders import STANDSTILL_M, find_leaders
+from foredrive.towns.traffic.paths import extend_paths
+from foredrive.towns.traffic.pedestrians import draw_people
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.vehicles import Vehicles, path_starts, speed_to_drive, vehicle_poses
+from foredrive.towns.traffic.walkways import WalkGraph
+
+BORN_BEYOND_M = 95.0
+BORN_WITHIN_M = 140.0
+GONE_BEYOND_M = 160.0
+PEOPLE_BORN_BEYOND_M = 82.0
+PEOPLE_BORN_WITHIN_M = 95.0
+PEOPLE_GONE_BEYOND_M = 110.0
+CLEAR_M = 10.0
+CLEAR_S = 3.5
+"""New vehicles keep `CLEAR_M` from all others, and `CLEAR_S` more from those ahead of and behind them."""
+TRIES = 12
+NEWCOMER_BRAKING_MPS2 = 1.0
+"""Nobody starts where it or the one behind it would have to brake harder than this."""
+
+
+class Turnover:
+    """Fills the free slots of a town's traffic."""
+
+    def __init__(
+        self, lanes: LaneGraph, walks: WalkGraph, starts: Starts, for_large: Bool[np.ndarray, "L"]
+    ) -> None:
+        self._lanes, self._walks, self._starts, self._for_large = lanes, walks, starts, for_large
+        self._for_bicycles = lanes.limit_mps <= MOTORWAY_LIMIT_MPS
+        walkable = np.where(walks.is_crossing, 0.0, walks.length_m)
+        self._walk_weight = walkable / max(walkable.sum(), 1e-9)
+
+    def fill(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        """Vehicles and people in all slots, as far as there is room."""
+        state = self._put_vehicles(state, 0.0, len(state.vehicles.active), rng)
+        return self._put_people(state, 0.0, len(state.people.active), rng)
+
+    def renew(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        """Let what is far from the ego vehicle go, and let one vehicle and one person appear out of its
+        sight; without an ego vehicle all stay."""
+        if not len(state.route):
+            return state
+        centre_m = vehicle_poses(self._lanes, state.vehicles).centre_m
+        far = np.linalg.norm(centre_m - centre_m[0], axis=1) > GONE_BEYOND_M
+        far_off = np.linalg.norm(state.people.xyz - centre_m[0], axis=1) > PEOPLE_GONE_BEYOND_M
+        vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
+        people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
+        state = dataclasses.replace(state, vehicles=vehicles, people=people)
+        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng)
+        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng)
+
+    def _put_vehicles(
+        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+    ) -> TrafficState:
+        """New vehicles in up to `most` free slots, at least `beyond_m` from vehicle 0 if it is the ego."""
+        rows = np.flatnonzero(~state.vehicles.active)[:most]
+        places = np.arange(len(self._starts.lane))
+        if len(state.route) and len(rows):
+            ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0]
+            distance = np.linalg.norm(self._starts.xyz - ego_m, axis=1)
+            places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
+        if not len(rows) or not len(places):
+            return state
+        vehicles = state.vehicles
+        for k, row in enumerate(rows.tolist()):
+            tries = rng.choice(places, TRIES)
+            for start in tries[self._is_free(vehicles, tries)].tolist():
+                joined = self._join(vehicles, row, start, state.next_track_id + k, rng)
+                if joined is not None:
+                    vehicles = joined
+                    break
+        return dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
+
+    def _is_free(self, vehicles: Vehicles, starts: Int[np.ndarray, "k"]) -> Bool[np.ndarray, "k"]:
+        """Which starts are far from all vehicles, and in time from those ahead and behind."""
+        centres = vehicle_poses(self._lanes, vehicles).centre_m[vehicles.active]
+        offset = centres[None] - self._starts.xyz[starts][:, None]
+        forward = self._starts.forward[starts][:, None]
+        along = np.sum(offset * forward, axis=2)
+        aside = np.linalg.norm(offset - along[..., None] * forward, axis=2)
+        speed = self._lanes.speed(self._starts.lane[starts], self._starts.s_m[starts])
+        reach = CLEAR_M + CLEAR_S * speed[:, None]
+        clear = (np.hypot(along, aside) >= CLEAR_M) & ((np.abs(along) >= reach) | (aside >= 3.0))
+        return np.asarray(clear.all(axis=1))
+
+    def _join(
+        self, vehicles: Vehicles, row: int, start: int, track_id: int, rng: np.random.Generator
+    ) -> Vehicles | None:
+        """The vehicles with a new one in a slot, no faster than it can brake for what is ahead of it.
+
+        None: somebody would have to brake for another.
+        """
+        lane = self._starts.lane[[start]]
+        one = draw_fleet(rng, np.array([track_id]), self._for_large[lane], self._for_bicycles[lane])
+        one = place(self._lanes, one, lane, self._starts.s_m[[start]])
+        v = vehicles.replace_rows(np.array([row]), one)
+        nowhere = np.zeros(0, dtype=np.int64)
+        v = extend_paths(self._lanes, self._for_large, v, nowhere, rng)
+        starts_m = path_starts(self._lanes, v.path)
+        ahead = find_leaders(self._lanes, v, starts_m)
+        speed = v.speed_mps.copy()
+        speed[row] = min(speed[row], speed_to_drive(self._lanes, v, starts_m)[row])
+        if ahead.leader[row] >= 0:
+            room_m = max(ahead.leader_gap_m[row] - STANDSTILL_M, 0.0)
+            leader_mps = v.speed_mps[ahead.leader[row]]
+            speed[row] = min(speed[row], np.sqrt(leader_mps**2 + 2 * NEWCOMER_BRAKING_MPS2 * room_m))
+        v = dataclasses.replace(v, speed_mps=speed)
+        no_halt = np.full(len(speed), np.inf)
+        wanted = see_ahead(self._lanes, v, starts_m, ahead, no_halt).wanted_mps2(v)
+        concerned = ((ahead.leader == row) | (ahead.limiting == row)) & v.active
+        concerned[row] = True
+        return v if wanted[concerned].min() > -NEWCOMER_BRAKING_MPS2 else None
+
+    def _put_people(
+        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+    ) -> TrafficState:
+        """People in up to `most` free slots."""
+        rows = np.flatnonzero(~state.people.active)[:most]
+        if not len(rows):
+            return state
+        tries = rng.choice(len(self._walk_weight), size=(len(rows), TRIES), p=self._walk_weight)
+        s_m = rng.random(tries.shape) * self._walks.length_m[tries]
+        xyz = self._walks.position(tries.ravel(), s_m.ravel()).reshape(*tries.shape, 3)
+        ok = np.ones(tries.shape, dtype=np.bool_)
+        if len(state.route):
+            ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0]
+            distance = np.linalg.norm(xyz - ego_m, axis=2)
+            ok = (distance >= beyond_m) & (distance <= PEOPLE_BORN_WITHIN_M)
+        chosen = np.argmax(ok, axis=1)
+        found = ok.any(axis=1)
+        each = np.arange(len(rows))
+        walk, s = tries[each, chosen][found], s_m[each, chosen][found]
+        ids = state.next_track_id + np.flatnonzero(found)
+        people = state.people.replace_rows(rows[found], draw_people(self._walks, rng, ids, walk, s))
+        return dataclasses.replace(state, people=people, next_track_id=state.next_track_id + len(rows))
