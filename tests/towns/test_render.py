@@ -213,6 +213,25 @@ def test_lidar_returns_lie_in_occupied_voxels(world02: World, town02: TownMap) -
     assert filled[tuple(index[within, ::-1].T)].mean() > 0.97
 
 
+def test_a_part_of_the_grid_holds_what_the_whole_holds_there(world02: World, town02: TownMap) -> None:
+    """However the vehicle stands: what is out of the part's reach is left out, and nothing else."""
+    T, turn, nose = ego_pose(town02), 0.6, 0.08
+    T[:3, :3] = T[:3, :3] @ [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    T[:3, :3] = T[:3, :3] @ [[np.cos(nose), 0, np.sin(nose)], [0, 1, 0], [-np.sin(nose), 0, np.cos(nose)]]
+    whole = VoxelSpec((-48.0, -48.0, -3.0), 0.5, (16, 192, 192))
+    part = VoxelSpec((20.0, 4.0, -1.0), 0.5, (10, 30, 50))
+    car = actor_at(T, (30.0, 10.0))
+    filled = []
+    for spec in (whole, part):
+        grid = np.full(spec.shape_zyx, np.inf)
+        full = world02.occupancy([car], T, spec)
+        grid[tuple(full.index_zyx.T)] = full.category
+        filled.append(grid)
+    np.testing.assert_array_equal(filled[1], filled[0][4:14, 104:134, 136:186])
+    assert np.isfinite(filled[1]).sum() > 500
+    assert (filled[1] == Category.BARRIER).any()
+
+
 def test_voxels_too_fine_for_the_town_are_refused(world02: World, town02: TownMap) -> None:
     with pytest.raises(InputError, match=r"0\.35 m or more, got 0\.2"):
         world02.occupancy([], ego_pose(town02), VoxelSpec((0.0, 0.0, 0.0), 0.2, (2, 2, 2)))

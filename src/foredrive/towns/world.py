@@ -39,7 +39,7 @@ from foredrive.towns.place.vegetation import build_vegetation
 from foredrive.towns.sensing import capture, lens, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.columns import TownColumns, faces_of, wall_intervals
+from foredrive.towns.sensing.columns import make_columns
 from foredrive.towns.sensing.lamps import gather_lamps
 from foredrive.towns.sensing.light import Rgb, drive_lit, is_dark, make_light
 from foredrive.towns.traffic.lights import Light
@@ -132,9 +132,8 @@ class World:
         self.static = build_static(town, table, self._shapes, chosen, rng)
         self._looks = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
-        faces = faces_of(self.static.mesh, self._looks.surface)
-        top_m = float(self.static.mesh.xyz[..., 2].max()) + 1.0
-        self._columns = TownColumns(self._scene, faces, top_m, wall_intervals(self.static.mesh, faces))
+        static = self.static
+        self._columns = make_columns(static.mesh, self._scene, self._looks.surface, static.thin)
 
     def under(self, conditions: Conditions) -> "World":
         """The same town in another light; what stands there is shared, not grown again."""
@@ -204,7 +203,7 @@ class World:
         moving = [actor for actor in actors if not actor.parked]
         near = [a for a in (*moving, *self.parked) if _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in near]
-        return full_occupancy(self._columns, self.static.thin, shaped, T_world_ego, spec)
+        return full_occupancy(self._columns, shaped, T_world_ego, spec)
 
     def visibility(
         self,

@@ -1,5 +1,6 @@
 """Exact occupancy: every voxel that holds matter, seen or not, with what it is and how it moves."""
 
+import itertools
 from collections.abc import Sequence
 from typing import no_type_check
 
@@ -12,13 +13,11 @@ from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.place.looks import Surface
-from foredrive.towns.place.props import ThinThings
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
-from foredrive.towns.sensing.columns import COLUMN_M, Intervals, TownColumns
+from foredrive.towns.sensing.columns import COLUMN_M, TownColumns
 
 FINEST_VOXEL_M = COLUMN_M * 2**0.5
 """A column of a turned grid must not slip between the town's columns."""
-SAMPLES_PER_VOXEL = 2.0
 
 _PRIORITY = {
     Surface.TERRAIN: 1,
@@ -32,14 +31,13 @@ _PRIORITY = {
     Surface.SIGNAL: 9,
 }
 """What a voxel is that holds several things: the highest."""
-_CODE = np.array([_PRIORITY.get(surface, 0) for surface in Surface])
+_CODE_OF_SURFACE = np.array([_PRIORITY.get(surface, 0) for surface in Surface], dtype=np.int16)
 _SURFACE_OF_CODE = np.array([0, *sorted(_PRIORITY, key=lambda surface: _PRIORITY[surface])])
-_FIRST_ACTOR = 100
+_FIRST_ACTOR = len(_SURFACE_OF_CODE)
 
 
 def full_occupancy(
     town: TownColumns,
-    thin: ThinThings,
     actors: Sequence[tuple[ActorState, Shape]],
     T_world_ego: Float64[np.ndarray, "4 4"],
     spec: VoxelSpec,
@@ -55,70 +53,70 @@ def full_occupancy(
         raise InputError(
             f"towns are sampled for voxels of {FINEST_VOXEL_M:.2f} m or more, got {spec.voxel_m}"
         )
-    T_ego_world = np.linalg.inv(T_world_ego)
-    grid = np.zeros(spec.shape_zyx, dtype=np.int32)
-    to_index = np.diag([1 / spec.voxel_m] * 3 + [1.0])
-    to_index[:3, 3] = -np.array(spec.lower_m) / spec.voxel_m
-    step_m = spec.voxel_m / SAMPLES_PER_VOXEL
-    corners = np.array([spec.lower_m[:2], spec.upper_m[:2]])
-    middle = T_world_ego @ np.array([*corners.mean(axis=0), 0.0, 1.0])
-    for tile in town.around(middle[:2], 0.5 * float(np.linalg.norm(corners[1] - corners[0]))):
-        _fill_static(tile, to_index @ T_ego_world, step_m, grid)
-    x, y, z = thin.xyz.T.astype(np.float32)
-    _fill_static(Intervals(x, y, z, z, thin.surface), to_index @ T_ego_world, step_m, grid)
+    T_index_ego = np.diag([1 / spec.voxel_m] * 3 + [1.0])
+    T_index_ego[:3, 3] = -np.array(spec.lower_m) / spec.voxel_m
+    T_index_world = T_index_ego @ np.linalg.inv(T_world_ego)
+    grid = np.zeros(spec.shape_zyx, dtype=np.int16)
+    ends = zip(spec.lower_m, spec.upper_m, strict=True)
+    corners = np.array([(*corner, 1.0) for corner in itertools.product(*ends)])
+    yaw = float(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
+    for tile in town.below((corners @ T_world_ego.T)[:, :2], yaw):
+        _fill(*tile, _CODE_OF_SURFACE, T_index_world, grid)
     for number, (actor, shape) in enumerate(actors):
-        T = to_index @ T_ego_world @ unit_to_world(actor)
-        step = step_m / float(actor.size_lwh[2])
-        solid = shape.solid
-        code = np.full(len(solid.x), _FIRST_ACTOR + number, dtype=np.int64)
-        _fill(solid.x, solid.y, solid.low, solid.high, code, T, step, grid)
-    return _collect(grid, [actor for actor, _ in actors], T_ego_world, spec)
-
-
-def _fill_static(
-    part: Intervals, T_index_world: Float64[np.ndarray, "4 4"], step_m: float, grid: Int[np.ndarray, "Z Y X"]
-) -> None:
-    _fill(part.x, part.y, part.low, part.high, _CODE[part.surface], T_index_world, step_m, grid)
+        code = np.full(len(Surface), _FIRST_ACTOR + number, dtype=np.int16)
+        _fill(*shape.solid, code, T_index_world @ unit_to_world(actor), grid)
+    return _collect(grid, [actor for actor, _ in actors], T_world_ego, spec)
 
 
 def _collect(
     grid: Int[np.ndarray, "Z Y X"],
     actors: list[ActorState],
-    T_ego_world: Float64[np.ndarray, "4 4"],
+    T_world_ego: Float64[np.ndarray, "4 4"],
     spec: VoxelSpec,
 ) -> FullOccupancy:
-    index = np.argwhere(grid > 0)
-    code = grid[tuple(index.T)]
-    moving = code >= _FIRST_ACTOR
-    surface = _SURFACE_OF_CODE[np.where(moving, 0, code)]
-    kinds = np.array([*(int(actor.category) for actor in actors), 0])
-    velocity = np.array([*(actor.velocity_mps for actor in actors), np.zeros(3)]) @ T_ego_world[:3, :3].T
-    who = np.where(moving, code - _FIRST_ACTOR, len(actors))
+    """The grid's codes as what they stand for."""
+    kind = np.array([*(-1 - _SURFACE_OF_CODE), *(int(actor.category) for actor in actors)])
+    still = np.zeros((_FIRST_ACTOR, 3))
+    velocity_world = np.concatenate([still, *(actor.velocity_mps[None] for actor in actors)])
+    velocity = (velocity_world @ T_world_ego[:3, :3]).astype(np.float32)
+    flat = np.flatnonzero(grid)
+    code = grid.ravel()[flat]
     return FullOccupancy(
         spec=spec,
-        index_zyx=index,
-        category=np.where(moving, kinds[who], -1 - surface),
-        velocity_mps=velocity[who].astype(np.float32),
+        index_zyx=np.stack(np.unravel_index(flat, spec.shape_zyx), axis=-1),
+        category=kind[code],
+        velocity_mps=velocity[code],
     )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _fill(x, y, low, high, code, T, step, grid):
-    """Mark the voxels that vertical intervals run through; T leads to indices, the highest code wins."""
+def _fill(x, y, low, high, surface, code_of_surface, T, grid):
+    """Mark the voxels that upright intervals run through; the highest code wins.
+
+    T leads to indices; along an interval it leans so little that a layer holds two voxels of it at most.
+    """
     depth, height, width = grid.shape
     for i in range(len(x)):
         rest = T[2, 0] * x[i] + T[2, 1] * y[i] + T[2, 3]  # the grid's layers are nearly level: cut to them
         bottom, top = max(low[i], -rest / T[2, 2]), min(high[i], (depth - rest) / T[2, 2])
-        if bottom > top:
+        code = code_of_surface[surface[i]]
+        if bottom > top or code == 0:
             continue
-        count = int(np.ceil((top - bottom) / step)) + 1
-        rise = (top - bottom) / max(count - 1, 1)
-        for k in range(count):
-            z = bottom + k * rise
-            a = int(np.floor(T[0, 0] * x[i] + T[0, 1] * y[i] + T[0, 2] * z + T[0, 3]))
-            b = int(np.floor(T[1, 0] * x[i] + T[1, 1] * y[i] + T[1, 2] * z + T[1, 3]))
-            c = int(np.floor(T[2, 2] * z + rest))
-            inside = 0 <= a < width and 0 <= b < height and 0 <= c < depth
-            if inside and code[i] > grid[c, b, a]:
-                grid[c, b, a] = code[i]
+        ahead = T[0, 0] * x[i] + T[0, 1] * y[i] + T[0, 3]
+        aside = T[1, 0] * x[i] + T[1, 1] * y[i] + T[1, 3]
+        a, b = int(np.floor(ahead + T[0, 2] * bottom)), int(np.floor(aside + T[1, 2] * bottom))
+        a1, b1 = int(np.floor(ahead + T[0, 2] * top)), int(np.floor(aside + T[1, 2] * top))
+        if max(a, a1) < 0 or min(a, a1) >= width or max(b, b1) < 0 or min(b, b1) >= height:
+            continue
+        first, last = int(np.floor(T[2, 2] * bottom + rest)), int(np.floor(T[2, 2] * top + rest))
+        if a == a1 and b == b1:  # upright in the grid, as nearly all are
+            for c in range(max(first, 0), min(last, depth - 1) + 1):
+                if code > grid[c, b, a]:
+                    grid[c, b, a] = code
+            continue
+        for c in range(max(first, 0), min(last, depth - 1) + 1):
+            for z in (max(bottom, (c - rest) / T[2, 2]), min(top, (c + 1 - rest) / T[2, 2])):
+                a, b = int(np.floor(ahead + T[0, 2] * z)), int(np.floor(aside + T[1, 2] * z))
+                if 0 <= a < width and 0 <= b < height and code > grid[c, b, a]:
+                    grid[c, b, a] = code

@@ -1,5 +1,6 @@
 """Solid matter above each spot of a town, as vertical intervals: what exact occupancy is made from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.place.mesh import Mesh
+from foredrive.towns.place.props import ThinThings
 from foredrive.towns.sensing.raycast import TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
@@ -47,25 +49,32 @@ class TownColumns:
     faces: "Faces"
     top_m: float
     """Above everything."""
-    walls: Intervals
-    """Of faces that rays from above do not meet."""
+    unmet: Intervals
+    """Of what rays from above do not meet: upright faces, and things thinner than a column."""
     _tiles: dict[tuple[int, int], Intervals] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        key = np.floor(np.stack([self.walls.x, self.walls.y], axis=1) / TILE_M).astype(int)
+        key = np.floor(np.stack([self.unmet.x, self.unmet.y], axis=1) / TILE_M).astype(int)
         order = np.lexsort(key.T)
         starts = np.flatnonzero(np.diff(key[order], axis=0, prepend=key[order][:1] - 1).any(axis=1))
         rows = np.split(order, starts[1:])
-        self._walls = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
+        self._unmet = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
 
-    def around(self, centre_xy: Float[np.ndarray, "2"], radius_m: float) -> list[Intervals]:
-        """All tiles within a distance."""
-        (i0, j0), (i1, j1) = (np.floor((centre_xy + r) / TILE_M).astype(int) for r in (-radius_m, radius_m))
-        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
-        for key in keys:
-            if key not in self._tiles:
-                self._tiles[key] = self._tile(*key)
-        return [self._tiles[key] for key in keys]
+    def below(self, xy: Float[np.ndarray, "P 2"], yaw: float) -> list[Intervals]:
+        """All tiles that meet the rectangle about some points whose sides stand at an angle to world x."""
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        axes = np.array([[1.0, 0.0], [0.0, 1.0], [cos, sin], [-sin, cos]])
+        low, high = (xy @ axes.T).min(axis=0), (xy @ axes.T).max(axis=0)
+        (i0, j0), (i1, j1) = (np.floor(end[:2] / TILE_M).astype(int) for end in (low, high))
+        keys = np.stack(np.meshgrid(np.arange(i0, i1 + 1), np.arange(j0, j1 + 1)), axis=-1).reshape(-1, 2)
+        middle, reach = (keys + 0.5) * TILE_M @ axes.T, 0.5 * TILE_M * np.abs(axes).sum(axis=1)
+        meets = ((middle + reach >= low) & (middle - reach <= high)).all(axis=1)
+        return [self._kept_tile(i, j) for i, j in keys[meets].tolist()]
+
+    def _kept_tile(self, i: int, j: int) -> Intervals:
+        if (i, j) not in self._tiles:
+            self._tiles[i, j] = self._tile(i, j)
+        return self._tiles[i, j]
 
     def _tile(self, i: int, j: int) -> Intervals:
         count = round(TILE_M / COLUMN_M)
@@ -80,9 +89,28 @@ class TownColumns:
         dy, dx = (a.ravel() for a in np.meshgrid(fine, fine, indexing="ij"))
         fine_x, fine_y = (x[edge][:, None] + dx).ravel(), (y[edge][:, None] + dy).ravel()
         refined, _ = columns(self.scene, self.faces, fine_x, fine_y, self.top_m)
-        rows = self._walls.get((i, j), np.zeros(0, dtype=int))
-        walls = Intervals(*(column[rows] for column in self.walls))
-        return Intervals(*(np.concatenate(parts) for parts in zip(coarse, refined, walls, strict=True)))
+        rows = self._unmet.get((i, j), np.zeros(0, dtype=int))
+        return _join([coarse, refined, Intervals(*(column[rows] for column in self.unmet))])
+
+
+def make_columns(
+    mesh: Mesh, scene: TriangleScene, surface_of_look: Int[np.ndarray, "L"], thin: ThinThings
+) -> TownColumns:
+    """Columns of all that stands in a town.
+
+    Args:
+        scene: the mesh to be cast at.
+        thin: what the columns would miss.
+    """
+    faces = faces_of(mesh, surface_of_look)
+    x, y, z = thin.xyz.T.astype(np.float32)
+    unmet = _join([wall_intervals(mesh, faces), Intervals(x, y, z, z, thin.surface)])
+    return TownColumns(scene, faces, float(mesh.xyz[..., 2].max()) + 1.0, unmet)
+
+
+def _join(parts: Sequence[Intervals]) -> Intervals:
+    x, y, low, high, surface = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Intervals(x, y, low, high, surface.astype(np.int8))
 
 
 @dataclass(frozen=True)
