@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
+from scenes import ACTOR_ID, STILL, actor_at, ego_pose
 
-from foredrive.scene import Category
 from foredrive.sensors import CameraOptics
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
@@ -18,35 +18,15 @@ SIZE = (48, 80)
 FOCAL_PX = 40.0 / math.tan(math.radians(35.0))
 DEPTH_M = 8.0
 """Of the post's front from the front camera."""
-STILL = np.zeros(6)
-POST_ID = 17
-
-
-def ego_pose(town: TownMap) -> np.ndarray:
-    """On the middle of a long straight lane."""
-    lane = max((x for x in town.lanes if x.junction_id is None), key=lambda x: len(x.centreline_xyz))
-    line = lane.centreline_xyz
-    k = len(line) // 2
-    yaw = np.arctan2(*(line[k + 1] - line[k])[1::-1])
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = line[k]
-    return T
 
 
 def post(T_world_ego: np.ndarray, left_mps: float = 0.0, width_m: float = 0.4) -> ActorState:
     """A post straight ahead of the front camera, higher than its image."""
-    R = T_world_ego[:3, :3]
-    return ActorState(
-        track_id=POST_ID,
-        category=Category.BARRIER,  # drawn as its box
-        centre_m=R @ [1.7 + DEPTH_M + 0.1, 0.0, 1.6] + T_world_ego[:3, 3],
-        yaw=float(np.arctan2(R[1, 0], R[0, 0])),
-        pitch=0.0,
+    return actor_at(
+        T_world_ego,
+        (1.7 + DEPTH_M + 0.1, 0.0, 1.6),
         size_lwh=np.array([0.2, width_m, 12.0]),
-        velocity_mps=R @ [0.0, left_mps, 0.0],
-        style=5,
-        parked=False,
+        velocity_mps=T_world_ego[:3, :3] @ [0.0, left_mps, 0.0],
     )
 
 
@@ -71,7 +51,7 @@ def test_a_post_slants_as_far_as_it_moves_while_rows_are_read(
     """Moving left it shifts left in rows that are read later; so it does when the vehicle turns right."""
     T = ego_pose(town02)
     frame = world02.render([post(T, left_mps)], suite(READOUT_S), T, np.array(twist, float), noise_seed=0)
-    rows, columns = np.nonzero(frame.pixel_ids["PCAM_F0"] == POST_ID)
+    rows, columns = np.nonzero(frame.pixel_ids["PCAM_F0"] == ACTOR_ID)
     above_ground = np.arange(34)
     middle = np.array([columns[rows == v].mean() + 0.5 for v in above_ground])
     dt_s = ((above_ground + 0.5) / SIZE[0] - 0.5) * READOUT_S
@@ -138,7 +118,7 @@ def test_a_road_user_moves_during_a_sweep(world02: World, town02: TownMap) -> No
     )
     frame = world02.render([ahead], SensorSuite(camera_rig((2, 2)), lidar), T, STILL, noise_seed=0)
     beam = 360
-    assert frame.beam_ids[beam] == POST_ID
+    assert frame.beam_ids[beam] == ACTOR_ID
     expected = 1.7 + DEPTH_M - 0.94 + 15.0 * float(frame.sweep.dt_s[beam])
     assert float(frame.sweep.dt_s[beam]) == pytest.approx(-0.05, abs=2e-4)
     assert float(frame.sweep.range_m[beam]) == pytest.approx(expected, abs=0.01)

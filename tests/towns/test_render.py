@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
+from scenes import ACTOR_ID, STILL, actor_at, ego_pose
 
 from foredrive.errors import InputError
 from foredrive.geometry.boxes import box_corners
@@ -13,7 +14,6 @@ from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors import SpinningLidar
-from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.capture import SensorSuite
@@ -23,36 +23,6 @@ from foredrive.towns.traffic.lights import Light
 from foredrive.towns.world import NOBODY, World
 
 SIZE = (48, 80)
-STILL = np.zeros(6)
-
-
-def ego_pose(town: TownMap) -> np.ndarray:
-    """On the middle of a long straight lane."""
-    lane = max((x for x in town.lanes if x.junction_id is None), key=lambda x: len(x.centreline_xyz))
-    line = lane.centreline_xyz
-    k = len(line) // 2
-    yaw = np.arctan2(*(line[k + 1] - line[k])[1::-1])
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = line[k]
-    return T
-
-
-def actor_at(T_world_ego: np.ndarray, xy: tuple[float, float], **changes: object) -> ActorState:
-    """A box-shaped road user, its axes those of the ego vehicle."""
-    size = np.array([4.0, 2.0, 1.6])
-    state = ActorState(
-        track_id=17,
-        category=Category.BARRIER,  # drawn as its box
-        centre_m=T_world_ego[:3, :3] @ [*xy, 0.8] + T_world_ego[:3, 3],
-        yaw=float(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0])),
-        pitch=0.0,
-        size_lwh=size,
-        velocity_mps=np.zeros(3),
-        style=5,
-        parked=False,
-    )
-    return dataclasses.replace(state, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -67,23 +37,23 @@ def test_a_beam_meets_a_box_where_it_should(world02: World, town02: TownMap) -> 
     T_ego_lidar[:3, 3] = torch.tensor([1.0, 0.0, 0.8])
     level = SpinningLidar((0.0,), 3600, 10.0, 0.5, 60.0, 0.0, T_ego_lidar)
     frame = world02.render(
-        [actor_at(T, (12.0, 0.0))], SensorSuite(camera_rig((2, 2)), level), T, STILL, noise_seed=0
+        [actor_at(T, (12.0, 0.0, 0.8))], SensorSuite(camera_rig((2, 2)), level), T, STILL, noise_seed=0
     )
     azimuth = torch.atan2(frame.sweep.dir_ego[:, 1], frame.sweep.dir_ego[:, 0])
     ahead = azimuth.abs() < 0.09  # within the rear face, 9 m ahead of the lidar
-    assert (frame.beam_ids[ahead.numpy()] == 17).all()
+    assert (frame.beam_ids[ahead.numpy()] == ACTOR_ID).all()
     torch.testing.assert_close(frame.sweep.range_m[ahead], 9.0 / azimuth[ahead].cos(), atol=1e-3, rtol=0)
     beside = (azimuth.abs() > 0.12) & (azimuth.abs() < 0.5)
-    assert not (frame.beam_ids[beside.numpy()] == 17).any()
+    assert not (frame.beam_ids[beside.numpy()] == ACTOR_ID).any()
 
 
 def test_a_moving_vehicle_measures_points_where_they_are(world02: World, town02: TownMap) -> None:
     T = ego_pose(town02)
     sensors = SensorSuite(camera_rig((2, 2)), dataclasses.replace(roof_lidar(16, 360), range_noise_m=0.0))
-    box = actor_at(T, (12.0, 0.0))
+    box = actor_at(T, (12.0, 0.0, 0.8))
     twist = np.array([15.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     frame = world02.render([box], sensors, T, twist, noise_seed=0)
-    on_box = torch.from_numpy(frame.beam_ids == 17) & frame.sweep.returned
+    on_box = torch.from_numpy(frame.beam_ids == ACTOR_ID) & frame.sweep.returned
     points = frame.sweep.points_ego[on_box]
     assert len(points) > 20
     low, high = torch.tensor([10.0, -1.0, 0.0]), torch.tensor([14.0, 1.0, 1.6])
@@ -95,17 +65,17 @@ def test_pixels_of_an_actor_lie_where_its_box_projects(
     world02: World, town02: TownMap, sensors: SensorSuite
 ) -> None:
     T = ego_pose(town02)
-    frame = world02.render([actor_at(T, (9.0, -1.5))], sensors, T, STILL, noise_seed=0)
+    frame = world02.render([actor_at(T, (9.0, -1.5, 0.8))], sensors, T, STILL, noise_seed=0)
     rig = sensors.rig
     corners = box_corners(torch.tensor([9.0, -1.5, 0.8]), torch.tensor([4.0, 2.0, 1.6]), torch.tensor(0.0))
     uv, _, _ = project(transform_points(inverse_se3(rig.T_ego_cam[0]), corners), rig.K[0], rig.dist[0], SIZE)
     hull = shapely.MultiPoint(uv.numpy()).convex_hull
-    rows, columns = np.nonzero(frame.pixel_ids["PCAM_F0"] == 17)
+    rows, columns = np.nonzero(frame.pixel_ids["PCAM_F0"] == ACTOR_ID)
     inside = shapely.contains_xy(hull.buffer(1e-3), columns + 0.5, rows + 0.5)
     assert inside.all()
     visible = hull.intersection(shapely.box(0, 0, SIZE[1], SIZE[0])).area
     assert len(rows) == pytest.approx(visible, rel=0.1)
-    assert not (frame.pixel_ids["PCAM_B0"] == 17).any()
+    assert not (frame.pixel_ids["PCAM_B0"] == ACTOR_ID).any()
 
 
 def test_misses_are_kept_with_the_range_that_is_free(
@@ -126,7 +96,7 @@ def test_misses_are_kept_with_the_range_that_is_free(
 def test_the_same_input_gives_the_same_bytes(world02: World, town02: TownMap, sensors: SensorSuite) -> None:
     T = ego_pose(town02)
     noisy = dataclasses.replace(sensors, lidar=roof_lidar(16, 180))
-    a, b, c = (world02.render([actor_at(T, (9, 0))], noisy, T, STILL, noise_seed=s) for s in (1, 1, 2))
+    a, b, c = (world02.render([actor_at(T, (9, 0, 0.8))], noisy, T, STILL, noise_seed=s) for s in (1, 1, 2))
     for name, image in a.images.items():
         assert image.tobytes() == b.images[name].tobytes() == c.images[name].tobytes()
     assert torch.equal(a.sweep.range_m, b.sweep.range_m)
@@ -135,8 +105,7 @@ def test_the_same_input_gives_the_same_bytes(world02: World, town02: TownMap, se
 
 def test_actors_cast_shadows(world02: World, town02: TownMap, sensors: SensorSuite) -> None:
     T = ego_pose(town02)
-    high = actor_at(T, (40.0, 0.0))
-    roof = dataclasses.replace(high, centre_m=T[:3, 3] + [0, 0, 60.0], size_lwh=np.array([150.0, 150.0, 0.5]))
+    roof = actor_at(T, (0.0, 0.0, 60.0), size_lwh=np.array([150.0, 150.0, 0.5]))
     bright = world02.render([], sensors, T, STILL, noise_seed=0).images["PCAM_F0"]
     dark = world02.render([roof], sensors, T, STILL, noise_seed=0).images["PCAM_F0"]
     assert dark[-10:].mean() < 0.75 * bright[-10:].mean()
@@ -176,7 +145,7 @@ def test_occupancy_holds_a_known_box(world02: World, town02: TownMap) -> None:
     T = ego_pose(town02)
     spec = VoxelSpec((-12.8, -12.8, -1.3), 0.4, (12, 64, 64))
     velocity = T[:3, :3] @ [3.0, 1.0, 0.0]
-    box = actor_at(T, (7.0, 2.0), velocity_mps=velocity)
+    box = actor_at(T, (7.0, 2.0, 0.8), velocity_mps=velocity)
     full = world02.occupancy([box], T, spec)
     centres = np.array(spec.lower_m) + (full.index_zyx[:, ::-1] + 0.5) * spec.voxel_m
     mine = full.category == Category.BARRIER
@@ -220,7 +189,7 @@ def test_a_part_of_the_grid_holds_what_the_whole_holds_there(world02: World, tow
     T[:3, :3] = T[:3, :3] @ [[np.cos(nose), 0, np.sin(nose)], [0, 1, 0], [-np.sin(nose), 0, np.cos(nose)]]
     whole = VoxelSpec((-48.0, -48.0, -3.0), 0.5, (16, 192, 192))
     part = VoxelSpec((20.0, 4.0, -1.0), 0.5, (10, 30, 50))
-    car = actor_at(T, (30.0, 10.0))
+    car = actor_at(T, (30.0, 10.0, 0.8))
     filled = []
     for spec in (whole, part):
         grid = np.full(spec.shape_zyx, np.inf)

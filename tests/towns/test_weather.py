@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from scenes import STILL, actor_at, ego_pose
 
-from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import CONDITIONS, Conditions, find_conditions
 from foredrive.towns.map.town_map import TownMap
@@ -21,7 +21,6 @@ from foredrive.towns.sensing.shading import Surfaces, shade
 from foredrive.towns.sensing.wet import water_mirror
 from foredrive.towns.world import NOBODY, SensorFrame, World
 
-STILL = np.zeros(6)
 DOWN = np.array([0.0, 0.0, 1.0], np.float32)
 
 
@@ -236,17 +235,6 @@ def test_streaks_and_drops_are_drawn_from_their_seeds() -> None:
     assert changed[0] < changed[1] < 0.9
 
 
-def pose(town: TownMap) -> np.ndarray:
-    lane = max((x for x in town.lanes if x.junction_id is None), key=lambda x: len(x.centreline_xyz))
-    line = lane.centreline_xyz
-    k = len(line) // 2
-    yaw = np.arctan2(*(line[k + 1] - line[k])[1::-1])
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = line[k]
-    return T
-
-
 @pytest.fixture(scope="module")
 def sensors() -> SensorSuite:
     return SensorSuite(camera_rig((48, 80)), roof_lidar(16, 180))
@@ -258,7 +246,7 @@ def under(world02: World, town02: TownMap, sensors: SensorSuite) -> dict[str, Se
     frames = {}
     for name in ("clear", "overcast", "night", "rain", "night_rain", "fog"):
         town = world02.under(find_conditions(name))
-        frames[name] = town.render([], sensors, pose(town02), STILL, noise_seed=5)
+        frames[name] = town.render([], sensors, ego_pose(town02), STILL, noise_seed=5)
     return frames
 
 
@@ -273,18 +261,8 @@ def test_night_is_darker_than_day_but_not_black(under: dict[str, SensorFrame]) -
 
 
 def test_only_the_sun_casts_shadows(world02: World, town02: TownMap, sensors: SensorSuite) -> None:
-    T = pose(town02)
-    roof = ActorState(
-        track_id=1,
-        category=Category.BARRIER,
-        centre_m=T[:3, 3] + [0.0, 0.0, 60.0],
-        yaw=0.0,
-        pitch=0.0,
-        size_lwh=np.array([150.0, 150.0, 0.5]),
-        velocity_mps=np.zeros(3),
-        style=5,
-        parked=False,
-    )
+    T = ego_pose(town02)
+    roof = actor_at(T, (0.0, 0.0, 60.0), size_lwh=np.array([150.0, 150.0, 0.5]))
 
     def road(conditions: str, *actors: ActorState) -> float:
         frame = world02.under(find_conditions(conditions)).render(list(actors), sensors, T, STILL, 0)
@@ -313,7 +291,7 @@ def test_the_same_weather_gives_the_same_bytes(
     world02: World, town02: TownMap, sensors: SensorSuite, under: dict[str, SensorFrame]
 ) -> None:
     town = world02.under(find_conditions("night_rain"))
-    again = town.render([], sensors, pose(town02), STILL, noise_seed=5)
+    again = town.render([], sensors, ego_pose(town02), STILL, noise_seed=5)
     first = under["night_rain"]
     assert all(first.images[name].tobytes() == image.tobytes() for name, image in again.images.items())
     assert first.sweep.range_m.numpy().tobytes() == again.sweep.range_m.numpy().tobytes()

@@ -65,18 +65,8 @@ def hdl32e(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> Spinning
 
     User's manual: a laser fires every 1.152 µs, lower and upper half in turn, a column every 46.08 µs.
     """
-    lowest_deg, step_deg = -92.0 / 3.0, 4.0 / 3.0
-    return SpinningLidar(
-        elevation_rad=_radians(tuple(lowest_deg + step_deg * ring for ring in range(32))),
-        azimuth_steps=round(1e6 / (46.08 * rate_hz)),
-        rate_hz=rate_hz,
-        min_range_m=1.0,
-        max_range_m=100.0,
-        range_noise_m=0.02,
-        T_ego_lidar=T_ego_lidar,
-        firing_s=_in_turn(32, 1.152e-6),
-        divergence_rad=_DIVERGENCE_RAD,
-    )
+    elevation_deg = tuple((-92.0 + 4.0 * ring) / 3.0 for ring in range(32))
+    return _two_halves(elevation_deg, 1.152, 46.08, 0.02, T_ego_lidar, rate_hz)
 
 
 def vlp16(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
@@ -84,15 +74,28 @@ def vlp16(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningL
 
     User's manual: a laser fires every 2.304 µs, lower and upper half in turn, a column every 55.296 µs.
     """
+    elevation_deg = tuple(-15.0 + 2.0 * ring for ring in range(16))
+    return _two_halves(elevation_deg, 2.304, 55.296, 0.03, T_ego_lidar, rate_hz)
+
+
+def _two_halves(
+    elevation_deg: tuple[float, ...],
+    shot_us: float,
+    column_us: float,
+    range_noise_m: float,
+    T_ego_lidar: Float[Tensor, "4 4"],
+    rate_hz: float,
+) -> SpinningLidar:
+    """A Velodyne whose lower and upper lasers fire in turn."""
     return SpinningLidar(
-        elevation_rad=_radians(tuple(-15.0 + 2.0 * ring for ring in range(16))),
-        azimuth_steps=round(1e6 / (55.296 * rate_hz)),
+        elevation_rad=_radians(elevation_deg),
+        azimuth_steps=round(1e6 / (column_us * rate_hz)),
         rate_hz=rate_hz,
         min_range_m=1.0,
         max_range_m=100.0,
-        range_noise_m=0.03,
+        range_noise_m=range_noise_m,
         T_ego_lidar=T_ego_lidar,
-        firing_s=_in_turn(16, 2.304e-6),
+        firing_s=_in_turn(len(elevation_deg), 1e-6 * shot_us),
         divergence_rad=_DIVERGENCE_RAD,
     )
 
