@@ -24,6 +24,8 @@ DPI = 100
 THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
+LARGEST_PT, PT_OF_PX = 12.0, 0.86
+"""All names have one size, such that the longest fits: about as many points as a letter may be wide."""
 MOST_ROWS = 60
 """Of more drives as many are shown, evenly chosen."""
 AROUND_M = 30.0
@@ -60,13 +62,15 @@ def draw_contact_sheet(drives: Sequence[tuple[LogPath, str]]) -> Figure:
         """Axes at pixels from the upper left corner."""
         return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
 
+    longest = max(len(drives[index][0].folder.name) for index in chosen)
+    name_pt = min(LARGEST_PT, PT_OF_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()
     for row, index in enumerate(chosen):
         y, (path, caption) = HEAD_PX + row * row_h, drives[index]
         log = Log(path)
         commands = _commands(log)
         commanded += commands
-        _write_text(place(2 * GAP_PX, y, TEXT_PX - 2 * GAP_PX, cell_h), log, caption, commands)
+        _write_text(place(2 * GAP_PX, y, TEXT_PX - 2 * GAP_PX, cell_h), log, caption, commands, name_pt)
         for column, frame in enumerate(_spread(len(log))):
             _show_front(place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
         draw_way(place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
@@ -76,7 +80,7 @@ def draw_contact_sheet(drives: Sequence[tuple[LogPath, str]]) -> Figure:
     figure.text(
         2 * GAP_PX / width,
         1 - HEAD_PX / 2 / height,
-        f"{shown}    {_shares(commanded)}",
+        f"{shown}    commands: {_shares(commanded)}",
         color=palette.INK,
         fontsize=14,
         va="center",
@@ -105,12 +109,11 @@ def _shares(commands: Counter[str]) -> str:
     return "   ".join(f"{kind} {100 * commands[kind] / total:.0f} %" for kind in kinds)
 
 
-def _write_text(ax: Axes, log: Log, caption: str, commands: Counter[str]) -> None:
+def _write_text(ax: Axes, log: Log, caption: str, commands: Counter[str], name_pt: float) -> None:
     ax.set_axis_off()
     length_m = float(np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1).sum())
     duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
-    name = log.path.folder.name
-    ax.text(0, 1, name, color=palette.INK, fontsize=min(12.0, 230 / len(name)), va="top", weight="bold")
+    ax.text(0, 1, log.path.folder.name, color=palette.INK, fontsize=name_pt, va="top", weight="bold")
     told = f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
     ax.text(0, 0.80, told, color=palette.FAINT, fontsize=9.5, va="top", linespacing=1.5)
 
