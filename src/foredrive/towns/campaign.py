@@ -135,11 +135,14 @@ def _deal_conditions() -> Iterator[str]:
 
 
 def route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Counter[Command]]:
-    """How often the route of a drive says what, for each of some seeds; half a millisecond each."""
+    """How often the route of a drive says what while it is recorded, for each of some seeds (1 ms each)."""
     lanes = build_lane_graph(load_town_map(town))
     starts = find_starts(lanes)
     routes = (plan_route(lanes, starts, seed, seconds) for seed in seeds)
-    return [Counter(route.commands(lanes, driven_m(seconds))) for route in routes]
+    before_m, until_m = driven_m(0.0), driven_m(seconds)  # traffic settles before the first frame
+    return [
+        Counter(route.commands(lanes, until_m)) - Counter(route.commands(lanes, before_m)) for route in routes
+    ]
 
 
 def choose_balanced(routes: Sequence[Counter[Command]], count: int, so_far: Counter[Command]) -> list[int]:
