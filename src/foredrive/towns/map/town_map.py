@@ -169,7 +169,7 @@ class TownMap:
     """Every strip of every cross-section, driving lanes included."""
     crosswalks: tuple[Crosswalk, ...]
     stop_zones: tuple[StopZone, ...]
-    junctions: dict[int, shapely.Polygon]
+    junctions: dict[int, shapely.Polygon | shapely.MultiPolygon]
     """Area of each junction's driving lanes, seen from above."""
 
     def strips_of(self, *kinds: StripKind) -> tuple[Strip, ...]:
@@ -348,7 +348,7 @@ def _stop_zones(helpers: dict[str, Any], signals: dict[int, Any], xodr: XODR) ->
     return zones
 
 
-def _junctions(strips: tuple[Strip, ...]) -> dict[int, shapely.Polygon]:
+def _junctions(strips: tuple[Strip, ...]) -> dict[int, shapely.Polygon | shapely.MultiPolygon]:
     parts: dict[int, list[shapely.Polygon]] = {}
     for strip in strips:
         if strip.junction_id is not None and strip.kind is StripKind.DRIVING:

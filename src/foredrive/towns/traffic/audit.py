@@ -12,6 +12,9 @@ from foredrive.towns.traffic.vehicles import BEHIND, Poses
 LEVEL_M = 2.0
 """What is further apart in height passes over or under."""
 ROAD_MARGIN_M = 0.5
+WALK_MARGIN_M = 1.0
+"""People cut corners where walks meet."""
+CROSSING_REACH_M = 1.5
 SPEEDING = 1.1
 HARD_BRAKING_MPS2 = 6.0
 LATERAL_MPS2 = 5.0
@@ -31,6 +34,7 @@ DRIVABLE = (
 VIOLATIONS = (
     "vehicle_overlaps",
     "person_overlaps",
+    "people_astray",
     "off_road",
     "red_lights",
     "speeding",
@@ -49,6 +53,8 @@ class Audit:
         strips = [strip.polygon.buffer(ROAD_MARGIN_M) for strip in town.strips_of(*DRIVABLE)]
         self._road = shapely.union_all(strips)
         shapely.prepare(self._road)
+        self._walkable = _walkable(town, traffic)
+        shapely.prepare(self._walkable)
         self._found: dict[str, set[tuple[int, ...]]] = {name: set() for name in VIOLATIONS}
         self._moved: dict[int, tuple[float, Float64[np.ndarray, 3]]] = {}
         self._poses: tuple[TrafficState, Poses] | None = None
@@ -117,7 +123,10 @@ class Audit:
         self._note("off_road", off, state)
         people = state.people
         walking = np.flatnonzero(people.active)
-        p, c = tree.query(shapely.points(people.xyz[walking, :2]), predicate="intersects")
+        feet = shapely.points(people.xyz[walking, :2])
+        astray = walking[~shapely.covers(self._walkable, feet)]
+        self._found["people_astray"] |= {(int(i),) for i in people.track_id[astray]}
+        p, c = tree.query(feet, predicate="intersects")
         met = np.abs(people.xyz[walking[p], 2] - z[c]) < LEVEL_M
         ids: Int[np.ndarray, "K 2"] = np.stack([people.track_id[walking[p[met]]], track[c[met]]], axis=1)
         self._found["person_overlaps"] |= {(int(i), int(j)) for i, j in ids}
@@ -134,6 +143,17 @@ class Audit:
             stuck[i] = state.time_s - since > STUCK_S
         self._moved = seen
         self._note("stuck", stuck, state)
+
+
+def _walkable(town: TownMap, traffic: Traffic) -> shapely.Geometry:
+    """Where people may be: walkways, which are never built over, and crossings."""
+    walks = traffic.walks
+    crossings = [
+        shapely.LineString(walks.xyz[walks.first[i] : walks.first[i + 1], :2]).buffer(CROSSING_REACH_M)
+        for i in np.flatnonzero(walks.is_crossing)
+    ]
+    walkways = [strip.polygon.buffer(WALK_MARGIN_M) for strip in town.strips_of(StripKind.SIDEWALK)]
+    return shapely.union_all([*walkways, *crossings])
 
 
 def _outlines(poses: Poses, state: TrafficState, live: Int[np.ndarray, "K"]) -> np.ndarray:
