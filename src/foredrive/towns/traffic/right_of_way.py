@@ -26,6 +26,8 @@ PLANNED_BRAKING_MPS2 = 1.5
 LIGHT_BRAKING_MPS2 = 3.0
 """Whoever would have to brake harder than this for a yellow light drives on."""
 LIGHT_REACTION_S = 0.5
+YIELD_BRAKING_MPS2 = 3.0
+"""Inside, rank does not count for whoever would have to brake harder than this: the other waits."""
 LEFT_WAITS_S = 2.0
 RIGHT_WAITS_S = 0.5
 """Turning vehicles are served as if they had arrived this much later."""
@@ -245,6 +247,7 @@ def _inside_gap(motion, lanes, granted, rank):
     length, sides, _, conflicts = lanes
     on = link_occupants(motion, length, sides, granted)
     gap = np.full(len(granted), np.inf)
+    to_stop = motion.speed_mps**2 / (2 * YIELD_BRAKING_MPS2)
     for i in range(len(granted)):
         if not motion.active[i]:
             continue
@@ -256,9 +259,10 @@ def _inside_gap(motion, lanes, granted, rank):
                 while entry >= 0:
                     j, at, rear_j = on.who[entry], on.where[entry], on.rear_m[entry]
                     entry = on.following[entry]
-                    is_there = rear_j + front[j] - rear[j] > conflicts.other_enter_m[m] + INSIDE_M
+                    to_go_j = conflicts.other_enter_m[m] + INSIDE_M - (rear_j + front[j] - rear[j])
                     in_the_way = j != i and rear_j < conflicts.other_clear_m[m]
-                    goes_first = in_the_way and (is_there or rank[j] < rank[i])
+                    yields = rank[j] < rank[i] and to_go >= to_stop[i]
+                    goes_first = in_the_way and (to_go_j < to_stop[j] or yields)
                     if goes_first and not _is_behind(j, at, i, path, starts, rear):
                         gap[i] = to_go
     return gap
