@@ -12,7 +12,7 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture
 from foredrive.towns.sensing import lens
 from foredrive.towns.sensing.air import make_air, rain_extinction_per_m
-from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.capture import NOT_KNOWN, SensorSuite
 from foredrive.towns.sensing.lamps import UNIT_LUX, gather_lamps, lamp_light
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import daylight_lux, drive_lit, is_dark, make_light, sun_direction
@@ -62,7 +62,7 @@ def seen_through(conditions: Conditions, range_m: float) -> np.ndarray:
     direction = np.array([[1.0, 0.0, 0.0]], np.float32)
     t, unlit = np.array([range_m], np.float32), np.zeros(1, np.bool_)
     found = met(1, np.array([-1.0, 0.0, 0.0]))
-    return shade(WALL, found, t, direction, unlit, light, np.empty((0, 3), np.float32))[0]
+    return shade(WALL, found, t, direction, unlit, light, NOT_KNOWN, NOT_KNOWN)[0]
 
 
 def test_the_sun_rises_and_sets() -> None:
@@ -210,7 +210,7 @@ def test_wet_roads_mirror_what_is_over_there() -> None:
 
     def road(wetness: float) -> np.ndarray:
         light = make_light(Conditions(clouds=1.0, wetness=wetness), 0.0)
-        return shade(ROAD, met(count, DOWN, cosine), t, direction, unlit, light, red)
+        return shade(ROAD, met(count, DOWN, cosine), t, direction, unlit, light, red, NOT_KNOWN)
 
     dry, damp, flooded = (road(w) for w in (0.0, 0.4, 1.0))
     redness = [float((r[:, 0] - r[:, 1]).mean()) for r in (dry, damp, flooded)]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -78,6 +79,19 @@ class SpinningLidar:
         Returns:
             Rays [N] in the ego frame at the end of the revolution; dt_s runs from -1/rate to 0.
         """
+        dt_s, direction = self._firing
+        T_end_then = exp_se3(dt_s[..., None] * twist_ego)  # ego frame at firing -> at the end
+        T = T_end_then @ self.T_ego_lidar
+        origin = transform_points(T, torch.zeros_like(direction))
+        return TimedRays(
+            origin_ego=origin.reshape(-1, 3),
+            dir_ego=rotate_vectors(T, direction).reshape(-1, 3),
+            dt_s=dt_s.expand(-1, len(self.elevation_rad)).reshape(-1),
+        )
+
+    @cached_property
+    def _firing(self) -> tuple[Float[Tensor, "columns moments"], Float[Tensor, "columns moments _ 3"]]:
+        """When beams are fired, relative to the end of the revolution, and where to in the lidar frame."""
         steps = torch.arange(self.azimuth_steps)
         dt_s = (((steps + 1) / self.azimuth_steps - 1) / self.rate_hz)[:, None]
         azimuth = (math.pi - (steps + 0.5) * (2 * math.pi / self.azimuth_steps))[:, None]
@@ -98,15 +112,7 @@ class SpinningLidar:
             dim=-1,
         )  # [columns, channels, 3], lidar frame
         moments = dt_s.shape[1]  # of a column: 1, or one for each channel
-        direction = direction.reshape(self.azimuth_steps, moments, -1, 3)
-        T_end_then = exp_se3(dt_s[..., None] * twist_ego)  # ego frame at firing -> at the end
-        T = T_end_then @ self.T_ego_lidar
-        origin = transform_points(T, torch.zeros_like(direction))
-        return TimedRays(
-            origin_ego=origin.reshape(-1, 3),
-            dir_ego=rotate_vectors(T, direction).reshape(-1, 3),
-            dt_s=dt_s.expand(-1, len(elevation)).reshape(-1),
-        )
+        return dt_s, direction.reshape(self.azimuth_steps, moments, -1, 3)
 
     def footprints(self, beams: TimedRays) -> TimedRays:
         """The rays of all beams [N · rays_per_beam], those of a beam next to each other.

@@ -42,6 +42,7 @@ from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.columns import make_columns
 from foredrive.towns.sensing.lamps import gather_lamps
 from foredrive.towns.sensing.light import Rgb, drive_lit, is_dark, make_light
+from foredrive.towns.sensing.seen import Seen, surface_ids, track_ids
 from foredrive.towns.traffic.lights import Light
 
 ACTOR_REACH_M = 200.0
@@ -236,7 +237,7 @@ class World:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
-        placed = raycast.place(tuple(shape.scene for shape in shapes), T, velocity_mps)
+        placed = raycast.PlacedShapes(tuple(shape.scene for shape in shapes), T, velocity_mps)
         paint = np.array([self._shapes.paint_of(a) for a in actors], dtype=np.int32).reshape(-1, SLOTS)
         first = np.array([shape.first for shape in shapes], dtype=np.int32)
         scene = shading.Scene(
@@ -248,7 +249,7 @@ class World:
         light = self.light
         if is_dark(self.conditions):
             light = light._replace(lamps=gather_lamps(self.static.lamps.xyz, actors, T_world_ego))
-        return capture.Moment(scene, self._scene, placed, light)
+        return capture.Moment(scene, raycast.Surroundings(self._scene, placed), light)
 
     def _through_air_and_lens(
         self, images: UInt8[np.ndarray, "C H W 3"], sensors: SensorSuite, noise_seed: int
@@ -289,15 +290,12 @@ class World:
         albedo[list(shining)] = np.array(list(shining.values()))
         return self._looks._replace(texture=texture, albedo=albedo)
 
-    def _surfaces(self, seen: capture.Seen) -> Int[np.ndarray, "N"]:
-        surface = self._looks.surface.astype(np.int8)
-        return np.where(seen.look == shading.MISS, np.int8(SKY), surface[seen.look])
+    def _surfaces(self, seen: Seen) -> Int[np.ndarray, "N"]:
+        return surface_ids(seen, self._looks.surface, SKY)
 
-    def _track_ids(self, seen: capture.Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
-        track = np.array([*(actor.track_id for actor in actors), NOBODY], dtype=np.int64)
-        static = self.static.track[np.maximum(seen.triangle, 0)]
-        owner = np.where(seen.actor >= 0, track[seen.actor], static)
-        return np.where(seen.triangle == shading.MISS, NOBODY, owner)
+    def _track_ids(self, seen: Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
+        of_actor = np.array([actor.track_id for actor in actors], dtype=np.int64)
+        return track_ids(seen, of_actor, self.static.track, NOBODY)
 
 
 def build_static(

@@ -1,6 +1,7 @@
 """Shapes of road users, each in the unit box about the origin, x ahead: stretched to size when placed."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -75,9 +76,15 @@ class ShapeLibrary:
             palettes = ("bus", "bus", "bus")
         else:
             palettes = ("car", "cargo", "car")
-        mixed = np.random.default_rng(actor.style).random(SLOTS)
-        chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in zip(palettes, mixed, strict=True)]
+        mixed = zip(palettes, _mixed(actor.style), strict=True)
+        chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in mixed]
         return np.array(chosen, dtype=np.int32)
+
+
+@lru_cache(maxsize=4096)
+def _mixed(style: int) -> tuple[float, ...]:
+    """Uniform random numbers, one for each paint slot."""
+    return tuple(np.random.default_rng(style).random(SLOTS).tolist())
 
 
 def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:

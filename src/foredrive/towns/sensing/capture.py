@@ -7,19 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
-from foredrive.towns.sensing import echoes, raycast, shading
+from foredrive.towns.sensing import echoes, shading
 from foredrive.towns.sensing import wet as wet_ground
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import LightArrays
+from foredrive.towns.sensing.outlines import Looked, outlines, same_as_centre
+from foredrive.towns.sensing.raycast import Surroundings
+from foredrive.towns.sensing.seen import Seen, note, nothing_seen
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
-CREASE_COS = 0.8
+
+NOT_KNOWN = np.empty((0, 3), np.float32)
 
 Rays = Float32[np.ndarray, "N 3"]
 Times = Float32[np.ndarray, "N"]
@@ -86,15 +90,16 @@ class EgoMotion:
     twist_ego: Float[np.ndarray, "6"]
     """Velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes."""
 
-    def now(self, origin: Rays, direction: Rays, dt_s: Times | None = None) -> WorldRays:
-        """Rays given in the ego frame of the frame's time."""
-        R = np.ascontiguousarray(self.T_world_ego[:3, :3].T, dtype=np.float32)
-        return WorldRays(origin @ R + self.T_world_ego[:3, 3].astype(np.float32), direction @ R, dt_s)
+    def now(self, rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
+        """Some of many rays given in the ego frame of the frame's time; all look at that time."""
+        T = np.ascontiguousarray(self.T_world_ego[:3], dtype=np.float32)
+        origin, direction = shading.move_rays(T, rays.origin, rays.direction, rows)
+        return WorldRays(origin, direction, None)
 
     def then(self, rays: EgoRays) -> WorldRays:
         """Rays given in the ego frame of the time at which each of them looks."""
         if not self.twist_ego.any():
-            return self.now(*rays)
+            return self.now(rays, np.arange(len(rays.dt_s)))._replace(dt_s=rays.dt_s)
         dt_s, row = np.unique(rays.dt_s, return_inverse=True)
         T_now_then = exp_se3(torch.from_numpy(dt_s[:, None].astype(np.float64) * self.twist_ego)).numpy()
         T = (self.T_world_ego @ T_now_then)[:, :3].astype(np.float32)[row]
@@ -107,13 +112,34 @@ class Moment:
     """A town with its road users where they are at one time, and how they move about then."""
 
     scene: shading.Scene
-    static: raycast.TriangleScene
-    placed: raycast.PlacedShapes
+    surroundings: Surroundings
     light: LightArrays
 
     def cast(self, rays: WorldRays) -> shading.Hits:
         """Nearest hits."""
-        return raycast.cast(self.static, self.placed, *rays)
+        return self.surroundings.cast(*rays)
+
+    def look(
+        self, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
+    ) -> tuple[shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
+        """What rays meet, and whether the sun shines there. `ray_rad` is the angle between neighbours."""
+        hits = self.cast(rays)
+        found = shading.surfaces(self.scene, hits, rays.origin, rays.direction, ray_rad)
+        return hits, found, self.sunlit(found, hits, rays.dt_s)
+
+    def radiance(
+        self,
+        hits: shading.Hits,
+        found: shading.Surfaces,
+        lit: Bool[np.ndarray, "N"],
+        rays: WorldRays,
+        ray_rad: Float32[np.ndarray, "N"],
+        known: Float32[np.ndarray, "M 3"] = NOT_KNOWN,
+    ) -> Rays:
+        """Radiance along rays. Where `known` is not negative it is that; it may have no rows."""
+        mirrored = self.mirrored(found, hits, rays, ray_rad)
+        looks, light = self.scene.looks, self.light
+        return shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
 
     def sunlit(
         self, found: shading.Surfaces, hits: shading.Hits, dt_s: Times | None
@@ -124,7 +150,7 @@ class Moment:
         to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
         lit = np.zeros(len(hits.t), dtype=np.bool_)
         when = None if dt_s is None else dt_s[facing]
-        lit[facing] = ~raycast.occluded(self.static, self.placed, start[: len(facing)], to_sun, when)
+        lit[facing] = ~self.surroundings.occluded(start[: len(facing)], to_sun, when)
         return lit
 
     def mirrored(
@@ -132,40 +158,16 @@ class Moment:
     ) -> Float32[np.ndarray, "M 3"]:
         """What water on the ground mirrors, -1 where there is none; no rows where all is dry."""
         if self.light.air.wetness == 0.0:
-            return np.empty((0, 3), np.float32)
+            return NOT_KNOWN
         out = np.full((len(hits.t), 3), -1.0, np.float32)
         origin, direction = np.empty_like(out), np.empty_like(out)
         wetness, looks = self.light.air.wetness, self.scene.looks
         wet = wet_ground.mirror_rays(looks, found, hits.t, rays.direction, wetness, origin, direction)
         dt_s = None if rays.dt_s is None else rays.dt_s[wet]
         onward = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
-        met = self.cast(onward)
-        there = shading.surfaces(self.scene, met, onward.origin, onward.direction, ray_rad[wet])
-        lit = self.sunlit(there, met, dt_s)
-        out[wet] = shading.shade(looks, there, met.t, onward.direction, lit, self.light, out[:0])
+        met, there, lit = self.look(onward, ray_rad[wet])
+        out[wet] = shading.shade(looks, there, met.t, onward.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN)
         return out
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What rays met: which triangle of which actor, as in `shading.Hits`."""
-
-    triangle: Int32[np.ndarray, "N"]
-    actor: Int32[np.ndarray, "N"]
-    look: Int32[np.ndarray, "N"]
-    """`shading.MISS` where a ray met nothing."""
-    range_m: Float32[np.ndarray, "N"]
-    """Along the ray; infinite where it met nothing."""
-
-
-def _nothing_seen(count: int) -> Seen:
-    triangle, actor, look = (np.empty(count, np.int32) for _ in range(3))
-    return Seen(triangle, actor, look, np.empty(count, np.float32))
-
-
-def _note(seen: Seen, part: slice, hits: shading.Hits, look: Int32[np.ndarray, "n"]) -> None:
-    seen.triangle[part], seen.actor[part], seen.look[part] = hits.triangle, hits.actor, look
-    seen.range_m[part] = np.where(look == shading.MISS, np.inf, hits.t)
 
 
 class Film:
@@ -184,6 +186,11 @@ class Film:
         else:
             self._linear[pixels] = self._exposure * radiance.reshape(-1, samples, 3).mean(1)
 
+    @property
+    def shown(self) -> UInt8[np.ndarray, "P 3"]:
+        """The pixels' colours so far, without the sensor's noise."""
+        return self._rgb if self._linear is None else shading.develop(self._linear, 1.0, 1)
+
     def develop(self, rng: np.random.Generator) -> UInt8[np.ndarray, "P 3"]:
         """The pixels' colours, with the sensor's noise if it has any."""
         if self._linear is None:
@@ -201,7 +208,7 @@ def see(
     """
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
-    seen, film = _nothing_seen(count), Film(sensors.optics, moment.light.exposure, count)
+    seen, film = nothing_seen(count), Film(sensors.optics, moment.light.exposure, count)
     if sensors.optics.shutter_s > 0:
         _see_blurred(moment, sensors, ego, film, seen)
     else:
@@ -213,34 +220,35 @@ def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film,
     """One ray for each pixel, then several where outlines run."""
     count, samples = len(seen.look), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
-    lit, normal = np.empty(count, np.bool_), np.empty((count, 3), np.float32)
+    rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    known = Looked(rgb, normal, np.empty(count, np.bool_))
 
-    def to_world(rays: EgoRays, rows: slice | Int64[np.ndarray, "n"]) -> WorldRays:
-        chosen = EgoRays(*(column[rows] for column in rays))
-        return ego.then(chosen) if rolling else ego.now(chosen.origin, chosen.direction)
+    def to_world(rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
+        return ego.then(EgoRays(*(column[rows] for column in rays))) if rolling else ego.now(rays, rows)
 
     def first_look(start: int, stop: int) -> None:
         part = slice(start, stop)
-        rays = to_world(sensors.pixel_rays, part)
-        radiance, hits, found, lit[part] = _look(moment, rays, sensors.pixel_rad[part])
+        rays = to_world(sensors.pixel_rays, np.arange(start, stop))
+        hits, found, lit = moment.look(rays, sensors.pixel_rad[part])
+        radiance = moment.radiance(hits, found, lit, rays, sensors.pixel_rad[part])
         film.expose(part, radiance, 1)
-        _note(seen, part, hits, found.look)
-        normal[part] = found.normal
+        note(seen, part, hits, found.look)
+        known.radiance[part], known.normal[part], known.lit[part] = radiance, found.normal, lit
 
     in_parallel(first_look, count, PIXEL_GRAIN)
     if samples == 1:
         return
-    kind = np.stack([seen.look, seen.actor, lit], axis=-1)
-    shape = (len(sensors.rig.names), *sensors.rig.size_hw, 3)
-    pixels = np.flatnonzero(_outlines(kind.reshape(shape), normal.reshape(shape)))
+    shape = (len(sensors.rig.names), *sensors.rig.size_hw)
+    pixels = np.flatnonzero(outlines(seen, known, film.shown, shape))
 
     def closer_look(start: int, stop: int) -> None:
         some = pixels[start:stop]
         rows = (some[:, None] * samples + np.arange(samples)).ravel()
         rays = to_world(sensors.outline_rays, rows)
         ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
-        radiance, *_ = _look(moment, rays, ray_rad)
-        film.expose(some, radiance, samples)
+        hits, found, lit = moment.look(rays, ray_rad)
+        same = same_as_centre(some, samples, found, hits.actor, lit, seen, known)
+        film.expose(some, moment.radiance(hits, found, lit, rays, ray_rad, same), samples)
 
     in_parallel(closer_look, len(pixels), PIXEL_GRAIN // samples)
 
@@ -255,43 +263,16 @@ def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Fil
         hits = moment.cast(rays)
         ray_rad = sensors.pixel_rad[part]
         found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
-        _note(seen, part, hits, found.look)
+        note(seen, part, hits, found.look)
         total = np.zeros((stop - start, 3), np.float32)
         for k, dt_s in enumerate(optics.sub_exposure_dt_s):
             origin, direction, row_dt_s = sensors.outline_rays
             rows = slice(start * samples + k % samples, stop * samples, samples)
             rays = ego.then(EgoRays(origin[rows], direction[rows], row_dt_s[rows] + np.float32(dt_s)))
-            total += _look(moment, rays, ray_rad)[0]
+            total += moment.radiance(*moment.look(rays, ray_rad), rays, ray_rad)
         film.expose(part, total / np.float32(optics.sub_exposures), 1)
 
     in_parallel(job, len(seen.look), PIXEL_GRAIN)
-
-
-def _look(
-    moment: Moment, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
-) -> tuple[Rays, shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
-    """Radiance along rays, and what they met."""
-    hits = moment.cast(rays)
-    found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
-    lit = moment.sunlit(found, hits, rays.dt_s)
-    mirrored = moment.mirrored(found, hits, rays, ray_rad)
-    radiance = shading.shade(moment.scene.looks, found, hits.t, rays.direction, lit, moment.light, mirrored)
-    return radiance, hits, found, lit
-
-
-def _outlines(
-    kind: Int32[np.ndarray, "C H W 3"], normal: Float32[np.ndarray, "C H W 3"]
-) -> Bool[np.ndarray, "C H W"]:
-    """Pixels that differ from a neighbour in what they show, in light and shadow, or in their slope."""
-    outline = np.zeros(kind.shape[:3], dtype=np.bool_)
-    for axis in (1, 2):
-        low = (slice(None), *(slice(None, -1) if a == axis else slice(None) for a in (1, 2)))
-        high = (slice(None), *(slice(1, None) if a == axis else slice(None) for a in (1, 2)))
-        differs = (kind[low] != kind[high]).any(-1)
-        differs |= (kind[low][..., 0] >= 0) & ((normal[low] * normal[high]).sum(-1) < CREASE_COS)
-        outline[low] |= differs
-        outline[high] |= differs
-    return outline
 
 
 def sweep(
@@ -303,19 +284,19 @@ def sweep(
     """
     beams = lidar.beams(torch.from_numpy(np.asarray(ego.twist_ego, dtype=np.float32)))
     rays, n = lidar.footprints(beams), lidar.rays_per_beam
-    origin_ego, dir_ego, dt_s = rays.origin_ego.numpy(), rays.dir_ego.numpy(), rays.dt_s.numpy()
+    ego_rays = EgoRays(rays.origin_ego.numpy(), rays.dir_ego.numpy(), rays.dt_s.numpy())
     count = len(beams.dt_s)
     chance = rng.random((count, 2), dtype=np.float32)
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
-    seen, air, far_m = _nothing_seen(count), moment.light.air, np.float32(lidar.max_range_m)
+    seen, air, far_m = nothing_seen(count), moment.light.air, np.float32(lidar.max_range_m)
     clutter = rng.random((count if air.backscatter_per_m_sr > 0 else 0, 4), dtype=np.float32)
     beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps if n == 1 else lidar.divergence_rad / n**0.5)
 
     def job(start: int, stop: int) -> None:
-        part, rows = slice(start, stop), slice(start * n, stop * n)
-        rays = ego.now(origin_ego[rows], dir_ego[rows], dt_s[rows])
+        part, rows = slice(start, stop), np.arange(start * n, stop * n)
+        rays = ego.now(ego_rays, rows)._replace(dt_s=ego_rays.dt_s[rows])
         hits = moment.cast(rays)
         ray_rad = np.full(len(hits.t), beam_rad)
         found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
@@ -329,7 +310,7 @@ def sweep(
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
             hits, look = shading.Hits(*(column[picked] for column in hits)), look[picked]
         range_m[part], returned[part], intensity[part] = echo
-        _note(seen, part, hits, look)
+        note(seen, part, hits, look)
         if len(clutter):
             of_air = air_returns(air, clutter[part], far_m, range_m[part], returned[part], intensity[part])
             seen.triangle[part][of_air], seen.look[part][of_air] = shading.MISS, shading.MISS

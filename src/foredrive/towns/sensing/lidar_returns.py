@@ -7,7 +7,7 @@ import numba
 import numpy as np
 
 from foredrive.towns.place.looks import Texture
-from foredrive.towns.sensing.patterns import PAINT_REFLECTIVITY, texture
+from foredrive.towns.sensing.patterns import PAINT_REFLECTIVITY, TEXTURE_WORDS, texture
 from foredrive.towns.sensing.wet import LEVEL_COS, is_paved, water_film
 
 MISS = -1
@@ -50,7 +50,7 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
     range_m = np.empty(count, np.float32)
     returned = np.zeros(count, np.bool_)
     intensity = np.zeros(count, np.float32)
-    colour = np.empty(6, np.float32)
+    colour = np.empty(TEXTURE_WORDS, np.float32)
     for i in range(count):
         look = found.look[i]
         range_m[i] = max_range_m

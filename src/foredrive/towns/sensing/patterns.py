@@ -43,6 +43,9 @@ ACCENT_RGB = np.array(
 )
 """Linear reflectance of doors, shutters and shop signs."""
 KERB_STONE_M = 0.16
+TEXTURED = 6
+TEXTURE_WORDS = TEXTURED + 4
+"""Of the array that a texture is written to."""
 
 _ROAD, _SLABS, _GRASS = int(Texture.ROAD), int(Texture.SLABS), int(Texture.GRASS)
 _FACADE, _TILES, _FOLIAGE = int(Texture.FACADE), int(Texture.TILES), int(Texture.FOLIAGE)
@@ -56,7 +59,7 @@ _SHOPS, _GATES = int(GroundFloor.SHOPS), int(GroundFloor.GATES)
 _LINE_NONE, _LINE_BROKEN = int(LinePattern.NONE), int(LinePattern.BROKEN)
 _LINE_DOUBLE, _LINE_DOUBLE_BROKEN = int(LinePattern.DOUBLE_SOLID), int(LinePattern.DOUBLE_BROKEN)
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
 
 @_kernel
@@ -297,7 +300,7 @@ def _facade(p, look, x, y, uvw, extent, i, out):
     if int(p[look, 7]) != _GATES:
         tint *= 1.0 + 0.25 * band(v, p[look, 4] - 0.12, p[look, 4] + 0.12, dv)
         tint *= 1.0 - 0.22 * band(v, -2.0, 0.45, dv)
-    part = np.empty(4, np.float32)
+    part = out[TEXTURED:]
     number = _openings(p, look, u, v, w, du, dv, part)
     glass, frame, accent = part[0], part[1], part[2]
     behind = lattice(number, look, 9)
@@ -361,8 +364,9 @@ def texture(looks, look, xyz, uvw, extent, i, out):
         xyz: [N 3] positions, m.
         uvw: [N 3] texture coordinates.
         extent: [N 4] extent of a pixel's footprint in the texture coordinates, and on the surface, m.
-        out: [6] filled with red, green, blue (linear), share of glass, share of paint, and a random number in
-            0..1 that the window has to itself; 0 where there is none or too many.
+        out: [`TEXTURE_WORDS`]; the first six are filled with red, green, blue (linear), share of glass, share
+            of paint, and a random number in 0..1 that the window has to itself, 0 where there is none or too
+            many. The others are room to work in.
     """
     kind, p = looks.texture[look], looks.params
     x, y = xyz[i, 0], xyz[i, 1]

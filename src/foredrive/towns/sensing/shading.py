@@ -9,8 +9,8 @@ from jaxtyping import Float32, Int32
 
 from foredrive.towns.place.looks import LookArrays, Texture
 from foredrive.towns.sensing.lamps import lamp_light
-from foredrive.towns.sensing.patterns import texture
-from foredrive.towns.sensing.sky import sky
+from foredrive.towns.sensing.patterns import TEXTURE_WORDS, texture
+from foredrive.towns.sensing.sky import blurred_sky, sky
 from foredrive.towns.sensing.wet import (
     LEVEL_COS,
     WATER_MIRROR,
@@ -25,6 +25,9 @@ MISS = -1
 SHADOW_OFFSET_M = 4e-3
 WINDOW_RGB = (0.36, 0.24, 0.12)
 """Of a room with the light on, beside what shines on its own."""
+
+CLEAR_MIRROR = 0.25
+"""What mirrors less of the light than this is too rough to show clouds."""
 
 _FACADE, _FOLIAGE, _GLOW = int(Texture.FACADE), int(Texture.FOLIAGE), int(Texture.GLOW)
 _ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
@@ -89,6 +92,21 @@ class Surfaces(NamedTuple):
 
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+
+
+@_kernel
+@no_type_check
+def move_rays(T, origin, direction, rows):
+    """Origins and directions [n 3] of some of N rays in the frame that T [3 4] leads to."""
+    origins, directions = np.empty((len(rows), 3), np.float32), np.empty((len(rows), 3), np.float32)
+    for i in range(len(rows)):
+        row = rows[i]
+        x, y, z = origin[row, 0], origin[row, 1], origin[row, 2]
+        dx, dy, dz = direction[row, 0], direction[row, 1], direction[row, 2]
+        for a in range(3):
+            origins[i, a] = T[a, 0] * x + T[a, 1] * y + T[a, 2] * z + T[a, 3]
+            directions[i, a] = T[a, 0] * dx + T[a, 1] * dy + T[a, 2] * dz
+    return origins, directions
 
 
 def surfaces(
@@ -198,17 +216,22 @@ def sun_rays(found, t, sun, out_origin):
 
 @_kernel
 @no_type_check
-def shade(looks, found, t, direction, lit, light, mirrored):
+def shade(looks, found, t, direction, lit, light, mirrored, known):
     """Radiance [N 3] along rays.
 
     Args:
         lit: which hits the sun shines on.
         mirrored: [N 3] radiance that comes from where water mirrors to, or [0 3] to take the sky's.
+        known: [N 3] radiance of rays that need no more work, -1 for the others; or [0 3].
     """
     out = np.empty((len(t), 3), np.float32)
-    colour, mirror, lamp = np.empty(6, np.float32), np.empty(3, np.float32), np.zeros(6, np.float32)
+    colour, lamp = np.empty(TEXTURE_WORDS, np.float32), np.zeros(6, np.float32)
+    mirror = np.empty(3, np.float32)
     by_lamps, wetness = len(light.lamps.near) > 0, light.air.wetness
     for i in range(len(t)):
+        if len(known) > 0 and known[i, 0] >= 0.0:
+            out[i, 0], out[i, 1], out[i, 2] = known[i, 0], known[i, 1], known[i, 2]
+            continue
         look = found.look[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         if look == MISS:
@@ -235,7 +258,11 @@ def shade(looks, found, t, direction, lit, light, mirrored):
             mirror[0], mirror[1], mirror[2] = mirrored[i, 0], mirrored[i, 1], mirrored[i, 2]
         elif gloss > 0.0:
             rise = dz + 2 * cosine * nz
-            sky(light, dx + 2 * cosine * nx, dy + 2 * cosine * ny, max(rise, 0.05), mirror)
+            upward, mx, my = max(rise, 0.05), dx + 2 * cosine * nx, dy + 2 * cosine * ny
+            if gloss > CLEAR_MIRROR:
+                sky(light, mx, my, upward, mirror)
+            else:
+                blurred_sky(light, mx, my, upward, mirror)
             open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
             for c in range(3):
                 mirror[c] = open_sky * min(mirror[c], 3.0) + (1.0 - open_sky) * light.street_rgb[c]

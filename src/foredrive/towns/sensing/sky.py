@@ -10,18 +10,13 @@ from foredrive.towns.sensing.patterns import noise
 FOG_TOP_M = 100.0
 """Fog, rain and haze reach this high."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
 
 @_kernel
 @no_type_check
 def sky(light, dx, dy, dz, out):
     """Fill out [3] with a gradient, a glow about the sun, clouds, and the haze before all of it."""
-    up = max(dz, 0.0)
-    blend = 1.0 - (1.0 - up) ** 5
-    near = max(dx * light.sunward[0] + dy * light.sunward[1] + dz * light.sunward[2], 0.0)
-    halo = 0.25 * near**6 + 0.6 * near**64
-    disc = 8.0 if near > 0.9999 else 0.0
     cloud = 0.0
     if dz > 0.02:
         x, y = dx / (dz + 0.12) * 1.3, dy / (dz + 0.12) * 1.3
@@ -29,6 +24,24 @@ def sky(light, dx, dy, dz, out):
         n += 0.5 * noise(2.1 * x, 2.1 * y, 0.0, 82) + 0.25 * noise(4.3 * x, 4.3 * y, 0.0, 83)
         cloud = min(max(1.1 * n + 1.6 * light.clouds - 0.8, 0.0), 1.0) * min(1.0, 6.0 * dz)
         cloud *= 1.0 - 0.25 * max(0.0, n) * light.clouds
+    _air_and_sun(light, dx, dy, dz, cloud, out)
+
+
+@_kernel
+@no_type_check
+def blurred_sky(light, dx, dy, dz, out):
+    """Fill out [3] with what a rough mirror shows of the sky: its clouds run into one veil."""
+    _air_and_sun(light, dx, dy, dz, light.clouds * min(1.0, 6.0 * dz), out)
+
+
+@_kernel
+@no_type_check
+def _air_and_sun(light, dx, dy, dz, cloud, out):
+    up = max(dz, 0.0)
+    blend = 1.0 - (1.0 - up) ** 5
+    near = max(dx * light.sunward[0] + dy * light.sunward[1] + dz * light.sunward[2], 0.0)
+    halo = 0.25 * near**6 + 0.6 * near**64
+    disc = 8.0 if near > 0.9999 else 0.0
     veil = 1.0 - math.exp(-light.air.extinction_per_m * FOG_TOP_M / max(dz, 0.02))
     for c in range(3):
         clear = light.horizon[c] * (1.0 - blend) + light.zenith[c] * blend

@@ -1,0 +1,81 @@
+"""Where one ray is too few for a pixel, and what several need not find out again."""
+
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from foredrive.towns.sensing.shading import MISS
+
+CREASE_COS = 0.8
+CONTRAST = 12
+"""Of 255: what stands out less from its neighbour needs no smooth edge."""
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+class Looked(NamedTuple):
+    """What the central rays of P pixels found."""
+
+    radiance: Float32[np.ndarray, "P 3"]
+    normal: Float32[np.ndarray, "P 3"]
+    lit: Bool[np.ndarray, "P"]
+    """Whether the sun shines there."""
+
+
+@_kernel
+@no_type_check
+def outlines(seen, centre, rgb, shape):
+    """Pixels [C·H·W] on an edge that can be seen: of a thing, of a shadow, or where a surface bends.
+
+    Args:
+        seen: look and actor of each pixel.
+        centre: `Looked`.
+        rgb: [C·H·W 3] 8-bit colours.
+        shape: C, H, W.
+    """
+    cameras, height, width = shape
+    out = np.zeros(cameras * height * width, np.bool_)
+    for i in range(len(out)):
+        for step in (1, width):
+            j = i + step
+            inside = (i % width) + 1 < width if step == 1 else (i // width) % height + 1 < height
+            if not inside:
+                continue
+            edge = seen.look[i] != seen.look[j] or seen.actor[i] != seen.actor[j]
+            if not edge and seen.look[i] != MISS:
+                edge = centre.lit[i] != centre.lit[j] or _bends(centre.normal, i, centre.normal, j)
+            if edge:
+                for c in range(3):
+                    if abs(np.int32(rgb[i, c]) - np.int32(rgb[j, c])) > CONTRAST:
+                        out[i] = out[j] = True
+    return out
+
+
+@_kernel
+@no_type_check
+def same_as_centre(pixels, samples, found, actor, lit, seen, centre):
+    """Radiance [n·samples 3] of rays that find what their pixel's central ray found, -1 for the others.
+
+    Textures are filtered over the pixel already: only what differs is worth another look.
+
+    Args:
+        pixels: [n], each of which has `samples` rays.
+        found: the rays' `Surfaces`; `actor` and `lit` likewise.
+    """
+    out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
+    for i in range(len(out)):
+        pixel = pixels[i // samples]
+        same = found.look[i] == seen.look[pixel] and actor[i] == seen.actor[pixel]
+        if same and found.look[i] != MISS:
+            same = lit[i] == centre.lit[pixel] and not _bends(found.normal, i, centre.normal, pixel)
+        if same:
+            out[i] = centre.radiance[pixel]
+    return out
+
+
+@_kernel
+@no_type_check
+def _bends(a, i, b, j):
+    return a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] < CREASE_COS
