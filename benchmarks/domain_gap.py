@@ -62,8 +62,7 @@ def real() -> Iterator[Sensed]:
         dataset = ClipDataset(logs, config, cache_dir=None)
         for index in np.linspace(0, len(dataset) - 1, FRAMES).astype(int).tolist():
             clip = dataset[index].clip
-            images = (clip.images[clip.now].permute(0, 2, 3, 1) * 255).round().byte()
-            yield Sensed(clip.sweeps[clip.now], images.numpy())
+            yield Sensed(clip.sweeps[clip.now], clip.images[clip.now].permute(0, 2, 3, 1).numpy())
 
 
 def town(name: str, conditions: str, seed: int) -> Iterator[Sensed]:
@@ -96,7 +95,7 @@ def statistics(frames: Iterator[Sensed]) -> dict[str, float]:
         "lidar.drop_pct": 100 * (1 - float(np.mean(points)) / BEAMS),
     }
     names = ("below_-14deg", "-14_to_-6deg", "-6_to_2deg", "above_2deg")
-    figures |= {f"lidar.{n}_pct": 100 * s / share.sum() for n, s in zip(names, share, strict=True)}
+    figures |= {f"lidar.{n}_pct": 100 * float(s / share.sum()) for n, s in zip(names, share, strict=True)}
     for q in (10, 25, 50, 75, 90):
         figures[f"lidar.range_p{q}_m"] = float(np.percentile(range_m, q))
         figures[f"lidar.intensity_p{q}"] = float(np.percentile(intensity, q))
@@ -128,8 +127,13 @@ BENCHMARK = Benchmark(
     arms={"pandaset_002": lambda seed: statistics(real())}
     | {
         f"{name}_{conditions}": functools.partial(_town_figures, name, conditions)
-        for name in ("Town03", "Town05", "Town10HD")
-        for conditions in ("clear", "dusk")
+        for name, conditions in (
+            ("Town03", "clear"),
+            ("Town05", "clear"),
+            ("Town10HD", "clear"),
+            ("Town05", "dusk"),
+            ("Town05", "rain"),
+        )
     },
     seeds=(0,),
     config={"frames": FRAMES, "size_hw": list(SIZE_HW)},

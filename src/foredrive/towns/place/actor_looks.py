@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.looks import RETROREFLECTIVE, Look, LookTable, Surface, Texture
 
 BODY, SECOND, THIRD = -1, -2, -3
 """Look numbers that an actor's own paint replaces."""
@@ -24,7 +24,7 @@ class MeshLooks:
         self.dark = add(Texture.PLAIN, (0.12, 0.12, 0.13), 0.12, 0.0)
         self.front_light = add(Texture.PLAIN, (0.95, 0.95, 0.92), 0.9, 0.15)
         self.rear_light = add(Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08)
-        self.plate = add(Texture.PLAIN, (0.90, 0.90, 0.85), 1.0, 0.0)
+        self.plate = add(Texture.PLAIN, (0.90, 0.90, 0.85), RETROREFLECTIVE, 0.0)
         self.orange = add(Texture.PLAIN, (0.95, 0.35, 0.08), 0.8, 0.0)
         self.hair = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.16, 0.11, 0.08), 0.2))
         self.helmet = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.12, 0.12, 0.13), 0.12))

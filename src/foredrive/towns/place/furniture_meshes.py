@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.looks import RETROREFLECTIVE, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, box, boxes, frustum, join, quads
 from foredrive.towns.place.props import POLE_SAMPLE_M
 
@@ -55,10 +55,10 @@ class FurnitureLooks:
         self.pole = add(Surface.POLE, (0.42, 0.43, 0.44), 0.45, 0.03)
         self.mast = self.table.add(Look(Surface.POLE, Texture.PLAIN, (0.33, 0.26, 0.20), 0.3, params=(1.5,)))
         self.wire = add(Surface.POLE, (0.08, 0.08, 0.08), 0.15)
-        self.sign_white = add(Surface.SIGN, (0.92, 0.92, 0.92), 1.0)
-        self.sign_red = add(Surface.SIGN, (0.75, 0.09, 0.09), 1.0)
-        self.sign_blue = add(Surface.SIGN, (0.06, 0.20, 0.52), 1.0)
-        self.sign_green = add(Surface.SIGN, (0.05, 0.32, 0.18), 1.0)
+        self.sign_white = add(Surface.SIGN, (0.92, 0.92, 0.92), RETROREFLECTIVE)
+        self.sign_red = add(Surface.SIGN, (0.75, 0.09, 0.09), RETROREFLECTIVE)
+        self.sign_blue = add(Surface.SIGN, (0.06, 0.20, 0.52), RETROREFLECTIVE)
+        self.sign_green = add(Surface.SIGN, (0.05, 0.32, 0.18), RETROREFLECTIVE)
         self.sign_black = add(Surface.SIGN, (0.07, 0.07, 0.07), 0.3)
         posters = ((0.75, 0.22, 0.20), (0.18, 0.42, 0.66), (0.90, 0.80, 0.45), (0.86, 0.86, 0.84))
         self.posters = [add(Surface.SIGN, rgb, 0.5) for rgb in posters]

@@ -107,6 +107,8 @@ class GroundFloor(enum.IntEnum):
 
 
 PARAMETERS = 9
+RETROREFLECTIVE = 3.0
+"""Reflectivity of road signs and number plates, seen from where the light comes."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class Look:
     rgb: tuple[float, float, float]
     """Reflectance as sRGB would show it under white light, 0 to 1."""
     reflectivity: float
-    """Of the lidar's infra-red light, 0 to 1."""
+    """Of the lidar's infra-red light, 0 to 1; more for what throws it back to where it came from."""
     gloss: float = 0.0
     """Share of the sky that is mirrored head-on, 0 to 1."""
     params: tuple[float, ...] = ()

@@ -16,6 +16,9 @@ GLASS_LOSS = 0.8
 LIDAR_REFERENCE_M = 45.0
 """At this distance half of the pulses from a surface of 2 % reflectivity, met head-on, are lost."""
 LIDAR_THRESHOLD = 0.02
+INTENSITY_OF_WHITE = 100.0 / 255.0
+RETROREFLECTED = 0.3
+"""How little it matters to painted lines, which hold glass beads, at what angle they are met."""
 FOLIAGE_DEPTH_M = 0.25
 WET_LIDAR_LOSS, FILM_LIDAR_LOSS = 0.35, 0.75
 """Of what a dry surface would send back: soaked, and below a film of water."""
@@ -43,8 +46,9 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
         chance: [N 2] uniform random numbers: for the loss, and for the depth within foliage.
 
     Returns:
-        range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1
-        (range-compensated).
+        range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1: what a
+        white matt surface met head-on would have to reflect to look as bright, in percent of 255, as the
+        makers of real lidars calibrate it. Only what throws light back where it came from exceeds 100/255.
     """
     count = len(t)
     range_m = np.empty(count, np.float32)
@@ -71,7 +75,9 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
         echo = reflectivity * cosine * dimmed * (LIDAR_REFERENCE_M / max(t[i], 1.0)) ** 2
         if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
             returned[i] = True
-            intensity[i] = min(reflectivity * (0.35 + 0.65 * cosine) * dimmed, 1.0)
+            back = 1.0 if looks.reflectivity[look] > 1.0 else RETROREFLECTED * paint
+            facing = cosine + (1.0 - cosine) * back
+            intensity[i] = min(INTENSITY_OF_WHITE * reflectivity * facing * dimmed, 1.0)
             if looks.texture[look] == _FOLIAGE:
                 range_m[i] += FOLIAGE_DEPTH_M * chance[i, 1]
     return range_m, returned, intensity
@@ -111,8 +117,9 @@ def air_returns(air, chance, max_range_m, range_m, returned, intensity):
         echo = there * (LIDAR_REFERENCE_M / r) ** 2
         if chance[i, 3] > echo / (echo + LIDAR_THRESHOLD):
             continue
-        if returned[i] and intensity[i] * (LIDAR_REFERENCE_M / max(range_m[i], 1.0)) ** 2 > echo:
+        of_surface = intensity[i] / INTENSITY_OF_WHITE * (LIDAR_REFERENCE_M / max(range_m[i], 1.0)) ** 2
+        if returned[i] and of_surface > echo:
             continue
         from_air[i] = returned[i] = True
-        range_m[i], intensity[i] = r, min(there, 1.0)
+        range_m[i], intensity[i] = r, min(INTENSITY_OF_WHITE * there, 1.0)
     return from_air

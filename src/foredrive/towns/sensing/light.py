@@ -32,7 +32,7 @@ LIT_STREET_AMBIENT_LUX = 0.9
 LAMPS_BELOW_LUX, HEADLIGHTS_BELOW_LUX = 500.0, 9e3
 HEADLIGHTS_BELOW_M = 3000.0
 """Drivers turn their lights on when they see no further."""
-NOON_WHITE, NOON_EXPOSURE = 1.6, 0.78
+NOON_WHITE, NOON_EXPOSURE = 1.6, 0.6
 ADAPTATION = 0.82
 """1 would show every night as bright as day."""
 
