@@ -66,6 +66,31 @@ def test_motion_is_that_of_a_car(driven: tuple[Traffic, Drive, list[Moment]]) ->
     assert (np.abs(turn_rate[fast]) / speed[fast]).max() < 1 / 3.2
 
 
+def test_velocities_and_turn_rates_are_those_of_the_poses(town02: TownMap) -> None:
+    dt_s, count = 0.05, 400
+    traffic = Traffic(town02, 1, vehicle_count=20, people_count=0)
+    moments = list(Drive(traffic, 20.0, steering_noise=0.02).moments(count, dt_s))
+    T = np.array([moment.T_world_ego for moment in moments])
+    twist = np.array([moment.twist_ego for moment in moments[1:-1]])
+    driven_mps = np.einsum("nji,nj->ni", T[1:-1, :3, :3], T[2:, :3, 3] - T[:-2, :3, 3]) / (2 * dt_s)
+    turned = np.linalg.inv(T[:-2]) @ T[2:]
+    yaw_radps = np.arctan2(turned[:, 1, 0], turned[:, 0, 0]) / (2 * dt_s)
+    assert np.abs(driven_mps[:, 1]).max() > 0.5  # it does drive curves
+    assert np.quantile(np.linalg.norm(twist[:, :3] - driven_mps, axis=1), 0.95) < 0.1
+    assert np.quantile(np.abs(twist[:, 5] - yaw_radps), 0.95) < 0.02
+    off_mps, across_mps = [], []
+    for before, now, after in zip(moments[:-2:5], moments[1:-1:5], moments[2::5], strict=True):
+        at = [{a.track_id: a.centre_m for a in moment.actors} for moment in (before, after)]
+        for actor in now.actors:
+            if all(actor.track_id in centres for centres in at):
+                centre_mps = (at[1][actor.track_id] - at[0][actor.track_id]) / (2 * dt_s)
+                off_mps.append(np.linalg.norm(actor.velocity_mps - centre_mps))
+                left = np.array([-np.sin(actor.yaw), np.cos(actor.yaw), 0.0])
+                across_mps.append(abs(left @ centre_mps))
+    assert np.max(across_mps) > 0.3
+    assert np.quantile(off_mps, 0.95) < 0.1
+
+
 def test_the_drive_gets_somewhere_and_turns(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
     moments = driven[2]
     speed = np.array([moment.twist_ego[0] for moment in moments])

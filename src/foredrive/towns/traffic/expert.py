@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int
+from scipy.spatial.transform import Rotation
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.errors import InputError
@@ -21,7 +22,14 @@ from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.recovery import Sway, step_sway
 from foredrive.towns.traffic.routes import Route, draw_route
 from foredrive.towns.traffic.traffic import Traffic
-from foredrive.towns.traffic.vehicles import Vehicles, empty_slots, vehicle_poses
+from foredrive.towns.traffic.vehicles import (
+    MOTION_S,
+    Poses,
+    Vehicles,
+    empty_slots,
+    motion,
+    vehicle_poses,
+)
 
 LONGEST_STEP_S = 0.1
 SETTLE_S = 6.0
@@ -30,7 +38,6 @@ MOVING_MPS = 3.0
 """A drive begins once traffic has left its first, unlikely state and the ego vehicle moves."""
 AVERAGE_MPS = 7.0
 BEYOND_M = 60.0
-TURN_RATE_STEP_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,10 @@ class Moment:
     t_s: float
     T_world_ego: Float64[np.ndarray, "4 4"]
     twist_ego: Float64[np.ndarray, "6"]
-    """Velocity (m/s), then turn rate (rad/s), in the ego axes."""
+    """Velocity (m/s) of the ego frame's origin, then turn rate (rad/s), in the ego axes.
+
+    In curves the velocity points to the side, as the heading is that of the chord between the axles.
+    """
     acceleration_ego_mps2: Float64[np.ndarray, "3"]
     """Along the road by the engine and the brakes, to the side by the curve; gravity is not in it."""
     actors: list[ActorState]
@@ -110,20 +120,27 @@ class Drive:
 
     def _moment(self, t_s: float) -> Moment:
         ego = self._ego
-        T_world_ego = _axle_pose(self._traffic, ego)
-        speed = float(ego.speed_mps[0])
-        soon = ego.moved(np.array([speed * TURN_RATE_STEP_S]))
-        turned = np.linalg.inv(T_world_ego) @ _axle_pose(self._traffic, soon)
-        turn_rate = float(np.arctan2(turned[1, 0], turned[0, 0])) / TURN_RATE_STEP_S
-        turn_rate += speed * self._sway.curvature
+        T_world_ego = _axle_pose(vehicle_poses(self._traffic.lanes, ego)) @ _beside(self._sway)
+        twist = self._twist(T_world_ego)
         return Moment(
             t_s=t_s,
-            T_world_ego=T_world_ego @ _beside(self._sway),
-            twist_ego=np.array([speed, 0.0, 0.0, 0.0, 0.0, turn_rate]),
-            acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), speed * turn_rate, 0.0]),
+            T_world_ego=T_world_ego,
+            twist_ego=twist,
+            acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), twist[0] * twist[5], 0.0]),
             actors=self._traffic.actors(self.state),
             lights=self._traffic.zone_lights(self.state.time_s),
         )
+
+    def _twist(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
+        """How the ego frame moves, exactly 0 while it stands."""
+        half_m = 0.5 * MOTION_S * float(self._ego.speed_mps[0])
+        if half_m == 0:
+            return np.zeros(6)
+        paths = zip(motion(self._traffic.lanes, self._ego), (-half_m, half_m), strict=True)
+        before, after = (_axle_pose(poses) @ _beside(self._sway.moved(d)) for poses, d in paths)
+        moved_ego = T_world_ego[:3, :3].T @ (after[:3, 3] - before[:3, 3])
+        turned = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
+        return np.concatenate([moved_ego, turned]) / MOTION_S
 
 
 def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> Route:
@@ -164,9 +181,8 @@ def _beside(sway: Sway) -> Float64[np.ndarray, "4 4"]:
     return T
 
 
-def _axle_pose(traffic: Traffic, ego: Vehicles) -> Float64[np.ndarray, "4 4"]:
+def _axle_pose(poses: Poses) -> Float64[np.ndarray, "4 4"]:
     """The ego frame: on the road below the rear axle, x forward along the slope."""
-    poses = vehicle_poses(traffic.lanes, ego)
     forward = poses.forward[0]
     left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
     T = np.eye(4)

@@ -4,6 +4,7 @@ A policy that imitates flawless driving never sees how to get back (Codevilla et
 disturbance is temporally correlated noise on the steering wheel, an Ornstein-Uhlenbeck process.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,12 @@ class Sway:
     next_s: float = 2.0
     """Time until the next disturbance begins; negative while there is one."""
 
+    def moved(self, distance_m: float) -> "Sway":
+        """Further along as steered now; backwards where negative."""
+        yaw_rad = self.yaw_rad + distance_m * self.curvature
+        aside_m = self.aside_m + distance_m * float(np.sin(0.5 * (self.yaw_rad + yaw_rad)))
+        return dataclasses.replace(self, aside_m=aside_m, yaw_rad=yaw_rad)
+
 
 def step_sway(
     sway: Sway, speed_mps: float, wheelbase_m: float, noise_rad: float, dt_s: float, rng: np.random.Generator
@@ -65,7 +72,5 @@ def step_sway(
         wanted = -sway.aside_m / length**2 - 2 * sway.yaw_rad / length
     # The wheel turns over some tenths of a second.
     curvature = sway.curvature + (np.clip(wanted, -most, most) - sway.curvature) * (1 - np.exp(-dt_s / 0.2))
-    distance = speed_mps * dt_s
-    yaw = sway.yaw_rad + distance * curvature
-    aside = sway.aside_m + distance * np.sin(0.5 * (sway.yaw_rad + yaw))
-    return Sway(float(aside), float(yaw), float(curvature), noise, next_s)
+    steered = dataclasses.replace(sway, curvature=float(curvature), noise=noise, next_s=next_s)
+    return steered.moved(speed_mps * dt_s)

@@ -29,7 +29,16 @@ from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pavement, st
 from foredrive.towns.traffic.right_of_way import claim_junctions
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.turnover import Turnover
-from foredrive.towns.traffic.vehicles import BEHIND, Poses, Vehicles, empty_slots, path_starts, vehicle_poses
+from foredrive.towns.traffic.vehicles import (
+    BEHIND,
+    MOTION_S,
+    Poses,
+    Vehicles,
+    empty_slots,
+    motion,
+    path_starts,
+    vehicle_poses,
+)
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
@@ -137,6 +146,8 @@ class Traffic:
     def actors(self, state: TrafficState, skip_ego: bool = True) -> list[ActorState]:
         """All road users; vehicle 0 is left out where it is the ego vehicle."""
         v, poses = state.vehicles, self.poses(state)
+        before, after = motion(self.lanes, v)
+        velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
         ego = skip_ego and len(state.route) > 0
         out = [
             ActorState(
@@ -146,7 +157,7 @@ class Traffic:
                 yaw=float(poses.yaw[i]),
                 pitch=float(poses.pitch[i]),
                 size_lwh=v.size_lwh[i],
-                velocity_mps=v.speed_mps[i] * poses.forward[i],
+                velocity_mps=velocity_mps[i],
                 style=int(v.style[i]),
                 parked=False,
             )

@@ -15,6 +15,8 @@ CLEAR_OF_LANE = 0.64
 """At this part of a lane change three quarters of the way over are done: others can pass on the old lane."""
 CHANGE_LATERAL_MPS2 = 2.5
 """A lane change as long as it has been begun is driven no faster than this allows."""
+MOTION_S = 0.05
+"""Velocities are taken over this long: in less, the samples of the centrelines would show."""
 WINDOW = BEHIND + 1 + AHEAD
 """Lanes of its path that a vehicle knows: some behind (where its rear may still be), its own, some ahead."""
 
@@ -208,6 +210,12 @@ def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
     for whole, part in zip(out, (axle, centre, forward), strict=True):
         whole[live] = part
     return Poses(*out)
+
+
+def motion(graph: LaneGraph, vehicles: Vehicles) -> tuple[Poses, Poses]:
+    """Poses half of `MOTION_S` earlier and later at the present speeds: the difference is how bodies move."""
+    half_m = 0.5 * MOTION_S * vehicles.speed_mps
+    return vehicle_poses(graph, vehicles.moved(-half_m)), vehicle_poses(graph, vehicles.moved(half_m))
 
 
 def _left_of(forward: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
