@@ -159,6 +159,17 @@ def test_the_command_comes_from_a_provided_route(tmp_path: Path) -> None:
     assert [int(clips[i].clip.command) for i in range(5)] == expected
 
 
+@pytest.mark.parametrize("aside_m", [3.5, -3.5])
+def test_beside_a_straight_route_the_command_is_straight(tmp_path: Path, aside_m: float) -> None:
+    route = world.WORLD_OFFSET + np.array([[0.0, 0, 0], [90, 0, 0]])
+    path = find_logs(world.write(tmp_path, frames=41, route_xyz=route))[0]
+    overtaking = lambda rows: [[r[0], r[1] + aside_m, *r[2:]] for r in rows]  # noqa: E731
+    rewrite_column(path.folder / "ego_state_se3.arrow", "ego_state_se3.imu_se3", overtaking)
+    clips = ClipDataset([path], config(past_frames=0, future_frames=0, now_stride_s=1.0), None)
+    assert clips.command_source["route"] == 5
+    assert [int(clips[i].clip.command) for i in range(5)] == [Command.STRAIGHT] * 5
+
+
 def test_the_command_comes_from_the_driven_future_without_a_route(tmp_path: Path) -> None:
     path = find_logs(world.write(tmp_path, frames=41))[0]
     sideways = lambda rows: [[r[0], r[1] - 0.05 * i, *r[2:]] for i, r in enumerate(rows)]  # noqa: E731

@@ -1,6 +1,7 @@
 """The driving command at a frame: from the log's route, or else from the driven future."""
 
 import numpy as np
+from jaxtyping import Float64
 from py123d.datatypes import ModalityType, RouteMetadata
 
 from foredrive.data.arrow_files import reading
@@ -11,6 +12,8 @@ LATERAL_M = 2.0
 """nuScenes convention (ST-P3, UniAD, VAD): further to the side than this is a turn."""
 LOOKAHEAD_M = 20.0
 """How far ahead the route is asked: about three seconds of city driving."""
+HEADING_OVER_M = 2.0
+"""The route's heading is that of a chord this long: routes are polylines."""
 
 
 def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None, str]:
@@ -38,7 +41,7 @@ def _command(lateral_m: float) -> Command:
 
 
 def _route_offset_m(log: Log, frame: int) -> float | None:
-    """How far left of the ego heading the route lies LOOKAHEAD_M ahead; None without a provided route."""
+    """How far left the route bears from where the ego is beside it; None without a provided route."""
     metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
     if not isinstance(metadata, RouteMetadata) or metadata.source != "provided":
         return None
@@ -46,6 +49,23 @@ def _route_offset_m(log: Log, frame: int) -> float | None:
         progress_m = log.scene.get_route_progress_at_iteration(log.iteration(frame))
         if progress_m is None:
             return None
-        arc_m, xyz = metadata.polyline_arc_m, metadata.polyline_xyz
-        ahead = [np.interp(progress_m + LOOKAHEAD_M, arc_m, xyz[:, axis]) for axis in range(3)]
-        return float((np.linalg.inv(log.T_world_ego[frame]) @ [*ahead, 1.0])[1])
+        return route_offset_m(metadata.polyline_arc_m, metadata.polyline_xyz[:, :2], progress_m)
+
+
+def route_offset_m(
+    arc_m: Float64[np.ndarray, "K"], xy: Float64[np.ndarray, "K 2"], progress_m: float
+) -> float:
+    """How far left of the route's heading at `progress_m` the route is LOOKAHEAD_M later, m.
+
+    Measured along the route alone: where the vehicle is beside it, overtaking or swaying, is no turn.
+
+    Args:
+        arc_m: arc length of each point of the route.
+        progress_m: arc length of the ego's projection on it.
+    """
+    half_m = 0.5 * HEADING_OVER_M
+    at_m = np.clip(progress_m, arc_m[0] + half_m, arc_m[-1] - half_m)
+    along_m = [at_m - half_m, at_m + half_m, progress_m, progress_m + LOOKAHEAD_M]
+    behind, ahead, here, there = np.stack([np.interp(along_m, arc_m, axis) for axis in xy.T], axis=1)
+    (dx, dy), (x, y) = ahead - behind, there - here
+    return float((dx * y - dy * x) / max(np.hypot(dx, dy), 1e-9))

@@ -1,0 +1,38 @@
+"""The command is read from the route alone."""
+
+import numpy as np
+import pytest
+
+from foredrive.data.commands import LATERAL_M, route_offset_m
+
+
+def arc_m(xy: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
+
+
+def along(heading_rad: float, turn_m: float, turned_rad: float) -> np.ndarray:
+    """A route of 100 m, a point per metre, that turns after `turn_m`."""
+    heading = np.where(np.arange(100) < turn_m, heading_rad, heading_rad + turned_rad)
+    steps = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 2.0, -3.0])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_turn_is_as_far_aside_as_it_is_driven(heading_rad: float, side: int) -> None:
+    route = along(heading_rad, 50.0, side * np.pi / 2)
+    expected = {20.0: 0.0, 30.0: 0.0, 31.5: 1.5, 40.0: 10.0, 49.0: 19.0, 52.0: 0.0}
+    for progress_m, aside_m in expected.items():
+        assert route_offset_m(arc_m(route), route, progress_m) == pytest.approx(side * aside_m, abs=1e-6)
+
+
+@pytest.mark.parametrize("progress_m", [0.0, 0.4, 95.0, 100.0])
+def test_a_route_that_begins_or_ends_is_straight(progress_m: float) -> None:
+    route = along(1.0, 200.0, 0.0)
+    assert route_offset_m(arc_m(route), route, progress_m) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_jitter_of_the_points_is_no_turn() -> None:
+    route = along(0.5, 200.0, 0.0) + np.random.default_rng(0).normal(scale=0.03, size=(101, 2))
+    arc = arc_m(route)
+    assert max(abs(route_offset_m(arc, route, p)) for p in np.arange(0, 80, 0.7)) < LATERAL_M
