@@ -139,7 +139,9 @@ def _part(frame: FrameType | None) -> str:
     while frame is not None:
         stack.append((Path(frame.f_code.co_filename).name, frame.f_code.co_name))
         frame = frame.f_back
-    if not any(call in (("recorder.py", "_frames"), ("log_writer.py", "write")) for call in stack):
+    if not any(file == "recorder.py" and called in ("_sensed", "_frame") for file, called in stack) and (
+        ("log_writer.py", "write") not in stack
+    ):
         return "start"
     for part, file, function in PARTS:
         if any(file in name and function in (None, called) for name, called in stack):

@@ -5,11 +5,14 @@ and leaves a forked child process alive.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import TypeVar
 
 import torch
+
+T = TypeVar("T")
 
 RANGES_PER_THREAD = 4
 """Some slack for cores that are busy with something else."""
@@ -26,6 +29,19 @@ def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> 
         return
     for done in [_pool(threads).submit(job, start, min(start + step, count)) for start in starts]:
         done.result()
+
+
+def one_ahead(items: Iterator[T]) -> Iterator[T]:
+    """The same items, each made on another thread while the one before is worked on; with one thread, no."""
+    if torch.get_num_threads() == 1:
+        yield from items
+        return
+    end = object()
+    with ThreadPoolExecutor(1, thread_name_prefix="foredrive-ahead") as worker:
+        coming = worker.submit(next, items, end)
+        while (item := coming.result()) is not end:
+            coming = worker.submit(next, items, end)
+            yield item  # type: ignore[misc]  # not the end
 
 
 @lru_cache(maxsize=1)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.logs import LogPath
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
+from foredrive.ops.threads import one_ahead
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
@@ -132,11 +133,11 @@ def record(
     maps = write_map(_map_objects(town), town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
-    frames = _frames(world, drive.moments(count, 1 / rate_hz), sensors, labels, narrator, seed)
+    sensed = one_ahead(_sensed(world, drive.moments(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
-        for frame in track(frames, description=f"recording {name}", total=count):
-            writer.write(frame)
+        for moment in track(sensed, description=f"recording {name}", total=count):
+            writer.write(_frame(world, moment, sensors, labels, narrator))
     return LogPath(writer.folder, maps)
 
 
@@ -165,14 +166,18 @@ def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, Tr
     }
 
 
-def _frames(
-    world: World,
-    moments: Iterator[Moment],
-    sensors: SensorSuite,
-    labels: LabelKinds,
-    narrator: Narrator,
-    seed: int,
-) -> Iterator[Frame]:
+class SensedMoment(NamedTuple):
+    """A moment of a drive and what the sensors make of it."""
+
+    moment: Moment
+    seen: SensorFrame
+    seed: int
+    """Of what is random about the frame."""
+
+
+def _sensed(
+    world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int
+) -> Iterator[SensedMoment]:
     for index, moment in enumerate(moments):
         seen = world.render(
             moment.actors,
@@ -182,30 +187,38 @@ def _frames(
             noise_seed=np.random.SeedSequence((seed, index)).generate_state(1)[0].item(),
             lights=moment.lights,
         )
-        everyone = [*moment.actors, *world.parked]
-        near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
-        returned = seen.beam_ids[seen.sweep.returned.numpy()]
-        visibility, text = None, None
-        if labels.visibility or labels.captions:
-            visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
-            if labels.captions:
-                text = _caption(narrator, moment, near, visibility, seen, sensors.rig, seed + index)
-        spec = labels.occupancy
-        yield Frame(
-            t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
-            T_world_ego=moment.T_world_ego,
-            velocity_ego_mps=moment.twist_ego[:3],
-            acceleration_ego_mps2=moment.acceleration_ego_mps2,
-            images=seen.images,
-            sweep=seen.sweep,
-            boxes=boxes_of(near, moment.T_world_ego),
-            occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
-            lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
-            visibility=visibility if labels.visibility else None,
-            caption=text,
-            traffic_lights=lights_of_lanes(world.town, moment.lights),
-            **_ray_labels(seen, everyone, sensors, labels),
-        )
+        yield SensedMoment(moment, seen, seed + index)
+
+
+def _frame(
+    world: World, sensed: SensedMoment, sensors: SensorSuite, labels: LabelKinds, narrator: Narrator
+) -> Frame:
+    """All that is recorded of a moment."""
+    moment, seen, seed = sensed
+    everyone = [*moment.actors, *world.parked]
+    near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
+    returned = seen.beam_ids[seen.sweep.returned.numpy()]
+    visibility, text = None, None
+    if labels.visibility or labels.captions:
+        visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
+        if labels.captions:
+            text = _caption(narrator, moment, near, visibility, seen, sensors.rig, seed)
+    spec = labels.occupancy
+    return Frame(
+        t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
+        T_world_ego=moment.T_world_ego,
+        velocity_ego_mps=moment.twist_ego[:3],
+        acceleration_ego_mps2=moment.acceleration_ego_mps2,
+        images=seen.images,
+        sweep=seen.sweep,
+        boxes=boxes_of(near, moment.T_world_ego),
+        occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
+        lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
+        visibility=visibility if labels.visibility else None,
+        caption=text,
+        traffic_lights=lights_of_lanes(world.town, moment.lights),
+        **_ray_labels(seen, everyone, sensors, labels),
+    )
 
 
 def _caption(
