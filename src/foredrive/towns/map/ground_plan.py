@@ -6,6 +6,7 @@ piece of the highest rank: lanes before shoulders before walkways. Levels (a roa
 
 import itertools
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -111,6 +112,7 @@ class BorderHeights:
         return self.raised[self.tree.query(xy)[1]]
 
 
+@lru_cache(maxsize=1)  # a town is often grown from several seeds in a row
 def make_ground_plan(town: TownMap) -> GroundPlan:
     """Cut a town's strips into pieces, clip them, and fill its junctions."""
     parts = [part for strip in town.strips for part in _cut(strip)]

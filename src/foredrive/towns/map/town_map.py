@@ -159,7 +159,7 @@ class StopZone:
     """Direction of travel of the traffic that has to obey, rad: the signal faces the other way."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # itself alone: what is derived from it is kept by it
 class TownMap:
     """A town's road network in the world frame (m, z up), the drives on the right."""
 

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -136,6 +137,7 @@ class LaneGraph:
         return Command.LEFT if self.turn_rad[lane] > 0 else Command.RIGHT
 
 
+@lru_cache(maxsize=1)  # several drives in a row are often in one town
 def build_lane_graph(town: TownMap) -> LaneGraph:
     """Lane graph of a town."""
     lanes, index = _whole_connectors(town.lanes)
