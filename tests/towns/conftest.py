@@ -1,4 +1,7 @@
-"""The smallest town, built once."""
+"""The towns, each built once."""
+
+import functools
+from collections.abc import Callable
 
 import pytest
 
@@ -8,8 +11,14 @@ from foredrive.towns.world import World
 
 
 @pytest.fixture(scope="session")
-def town02() -> TownMap:
-    return load_town_map("Town02")
+def town_of() -> Callable[[str], TownMap]:
+    """The map of a town by its name; all of them together take some tens of MB."""
+    return functools.cache(load_town_map)
+
+
+@pytest.fixture(scope="session")
+def town02(town_of: Callable[[str], TownMap]) -> TownMap:
+    return town_of("Town02")
 
 
 @pytest.fixture(scope="session")

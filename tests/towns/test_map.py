@@ -1,5 +1,7 @@
 """Town maps."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -52,9 +54,9 @@ def test_a_stop_zone_says_which_way_its_traffic_drives(town02: TownMap) -> None:
             assert step @ ahead > 0.9 * np.linalg.norm(step)
 
 
-def test_heights_follow_the_road_where_later_lane_sections_begin() -> None:
+def test_heights_follow_the_road_where_later_lane_sections_begin(town_of: Callable[[str], TownMap]) -> None:
     """Left and right border of a lane are level, in a town on hills and with bridges."""
-    town = load_town_map("Town04")
+    town = town_of("Town04")
     between = [strip for strip in town.strips if strip.junction_id is None]
     tilt = max(np.abs(s.left_xyz[:, 2] - s.right_xyz[:, 2]).max() for s in between)
     assert tilt < 1e-6
