@@ -23,6 +23,8 @@ SIZE_HW = (216, 384)
 SEED = 4
 GAP = 6
 REACH_M = 50.0
+BRIGHTER = 2.55
+"""White is what a white matt surface returns; signs and plates return more."""
 
 
 def see(town: str, conditions: Conditions, at_s: float = 6.0) -> tuple[SensorFrame, Moment]:
@@ -55,7 +57,7 @@ def sheet(cells: Sequence[tuple[str, np.ndarray]], columns: int) -> Image.Image:
 def from_above(sweep: LidarSweep, side_px: int) -> np.ndarray:
     """Returns from above, by intensity; forward is up."""
     xyz = (sweep.origin_ego + sweep.range_m[:, None] * sweep.dir_ego)[sweep.returned].numpy()
-    colour = _colours(np.sqrt(sweep.intensity[sweep.returned].numpy()))
+    colour = _colours(np.sqrt(np.minimum(sweep.intensity[sweep.returned].numpy() * BRIGHTER, 1.0)))
     picture = np.full((side_px, side_px, 3), 16, np.uint8)
     rows = ((REACH_M - xyz[:, 0]) / (2 * REACH_M) * side_px).astype(int)
     cols = ((REACH_M - xyz[:, 1]) / (2 * REACH_M) * side_px).astype(int)

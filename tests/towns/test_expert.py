@@ -1,10 +1,12 @@
 """The expert drives as a vehicle can, where it should, and as one among others."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from foredrive.data.log_writer import EGO_VEHICLE
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.expert import Drive, Moment
 from foredrive.towns.traffic.traffic import Traffic
 
@@ -20,9 +22,11 @@ def drive(
 
 
 @pytest.fixture(scope="module", params=[("Town02", 1), ("Town07", 2)], ids=str)
-def driven(request: pytest.FixtureRequest) -> tuple[Traffic, Drive, list[Moment]]:
+def driven(
+    request: pytest.FixtureRequest, town_of: Callable[[str], TownMap]
+) -> tuple[Traffic, Drive, list[Moment]]:
     name, seed = request.param
-    return drive(load_town_map(name), seed, seconds=20.0)
+    return drive(town_of(name), seed, seconds=20.0)
 
 
 def test_the_rear_axle_is_on_the_route(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
@@ -114,8 +118,8 @@ def test_nobody_touches_the_ego_vehicle(driven: tuple[Traffic, Drive, list[Momen
                 assert np.hypot(at[0] - 1.65, at[1]) > 0.9
 
 
-def test_traffic_appears_and_disappears_out_of_sight() -> None:
-    _, _, moments = drive(load_town_map("Town07"), seed=3, seconds=15.0, vehicles=25)
+def test_traffic_appears_and_disappears_out_of_sight(town_of: Callable[[str], TownMap]) -> None:
+    _, _, moments = drive(town_of("Town07"), seed=3, seconds=15.0, vehicles=25)
     seen: dict[int, int] = {}
     for index, moment in enumerate(moments):
         ego = moment.T_world_ego[:3, 3]

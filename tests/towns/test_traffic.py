@@ -1,14 +1,14 @@
 """What has to hold at every moment of minutes of traffic."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import shapely
 
 from foredrive.scene import Category
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.car_following import HARDEST_BRAKING_MPS2
 from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, Light
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
@@ -33,8 +33,8 @@ class Watched:
 
 
 @pytest.fixture(scope="module", params=["Town02", "Town07"])
-def watched(request: pytest.FixtureRequest) -> Watched:
-    town = load_town_map(request.param)
+def watched(request: pytest.FixtureRequest, town_of: Callable[[str], TownMap]) -> Watched:
+    town = town_of(request.param)
     traffic = Traffic(town, seed=5, vehicle_count=28, people_count=25)
     states = [traffic.start()]
     for _ in range(round(MINUTES * 60 / DT_S)):

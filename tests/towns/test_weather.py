@@ -130,7 +130,7 @@ def test_only_air_with_something_in_it_sends_beams_back(
     range_m = np.full(count, 100.0, np.float32)
     returned, intensity = np.zeros(count, np.bool_), np.zeros(count, np.float32)
     chance = np.random.default_rng(2).random((count, 4), dtype=np.float32)
-    of_air = air_returns(make_air(conditions), chance, np.float32(100.0), range_m, returned, intensity)
+    of_air = air_returns(make_air(conditions), chance, 0.75, np.float32(100.0), range_m, returned, intensity)
     assert low <= of_air.mean() <= high
     assert (returned == of_air).all()
     assert (range_m[of_air] < 12.0).all()
@@ -146,7 +146,7 @@ def test_a_strong_surface_outshines_the_air() -> None:
         range_m, returned = np.full(count, 15.0, np.float32), np.ones(count, np.bool_)
         intensity = np.full(count, strength, np.float32)
         air = make_air(Conditions(visibility_m=150.0))
-        shares.append(air_returns(air, chance, np.float32(100.0), range_m, returned, intensity).mean())
+        shares.append(air_returns(air, chance, 0.75, np.float32(100.0), range_m, returned, intensity).mean())
     assert shares[1] < 0.2 * shares[0]
 
 

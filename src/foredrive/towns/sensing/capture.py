@@ -312,7 +312,8 @@ def sweep(
         range_m[part], returned[part], intensity[part] = echo
         note(seen, part, hits, look)
         if len(clutter):
-            of_air = air_returns(air, clutter[part], far_m, range_m[part], returned[part], intensity[part])
+            surfaces = range_m[part], returned[part], intensity[part]
+            of_air = air_returns(air, clutter[part], lidar.pulse_m, far_m, *surfaces)
             seen.triangle[part][of_air], seen.look[part][of_air] = shading.MISS, shading.MISS
 
     in_parallel(job, count, BEAM_GRAIN // n)

@@ -22,8 +22,6 @@ RETROREFLECTED = 0.3
 FOLIAGE_DEPTH_M = 0.25
 WET_LIDAR_LOSS, FILM_LIDAR_LOSS = 0.35, 0.75
 """Of what a dry surface would send back: soaked, and below a film of water."""
-PULSE_M = 0.75
-"""Half the length of a pulse of 5 ns."""
 NEAREST_CLUTTER_M, CLUTTER_DEPTH_M = 1.2, 9.0
 """Nearer, the laser does not overlap with what the detector sees; further, clutter is too weak."""
 DROP_MMPH = 150.0
@@ -85,7 +83,7 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
 
 @_kernel
 @no_type_check
-def air_returns(air, chance, max_range_m, range_m, returned, intensity):
+def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity):
     """Replace returns by those that fog and rain send back before the surface; the stronger echo counts.
 
     A pulse whose length in the air is 2 ΔR meets at r what looks like a surface of reflectivity π β ΔR, with
@@ -95,6 +93,7 @@ def air_returns(air, chance, max_range_m, range_m, returned, intensity):
     Args:
         air: `AirArrays`.
         chance: [N 4] uniform random numbers.
+        pulse_m: ΔR.
         range_m: [N] and `returned`, `intensity`: of the surfaces, changed in place.
 
     Returns:
@@ -105,7 +104,7 @@ def air_returns(air, chance, max_range_m, range_m, returned, intensity):
     if air.backscatter_per_m_sr <= 0.0:
         return from_air
     share = 1.0 - math.exp(-air.drops / DROP_MMPH) if air.drops > 0.0 else 1.0
-    reflectivity = math.pi * air.backscatter_per_m_sr * PULSE_M / share
+    reflectivity = math.pi * air.backscatter_per_m_sr * pulse_m / share
     for i in range(count):
         if chance[i, 0] > share:
             continue
