@@ -62,7 +62,7 @@ def test_every_kind_of_road_user_has_a_shape_in_each_set(chosen: AssetSet) -> No
             for style in range(6):
                 state = actor(category, style, size_lwh=np.array([*SIZES[category][:2], height]))
                 seen.add(id(library.shape_of(state)))
-                assert len(library.paint_of(state)) == 3
+                assert len(library.paint_of(state, rear_light=7)) == 4
     assert len(seen) >= 11
     assert all(any(name in library.shapes for name in names) for names in SHAPES_OF_KIND.values())
 

@@ -14,6 +14,7 @@ from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors import SpinningLidar
+from foredrive.towns.conditions import find_conditions
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.capture import SensorSuite
@@ -222,3 +223,20 @@ def test_filtered_bands_keep_their_share() -> None:
     assert bands(3.2, 1.0, 0.25, 1e-6) == pytest.approx(1.0)
     assert bands(3.5, 1.0, 0.25, 1e-6) == pytest.approx(0.0)
     assert bands(7.77, 1.0, 0.25, 40.0) == pytest.approx(0.25, abs=0.01)
+
+
+def test_brake_lights_shine_by_day_and_by_night(world02: World, town02: TownMap) -> None:
+    T = ego_pose(town02)
+    sensors = SensorSuite(camera_rig((108, 192)), roof_lidar(channels=4, azimuth_steps=60))
+    for town in (world02, world02.under(find_conditions("night"))):
+        car = actor_at(T, (11.0, 0.0, 0.8), category=Category.CAR, size_lwh=np.array([4.5, 1.9, 1.5]))
+        rolls, brakes = (
+            town.render([dataclasses.replace(car, braking=b)], sensors, T, STILL, noise_seed=0)
+            for b in (False, True)
+        )
+        change = brakes.images["PCAM_F0"].astype(int) - rolls.images["PCAM_F0"]
+        changed = np.argwhere(change[..., 0] > 30)
+        assert len(changed) >= 4
+        assert np.ptp(changed[:, 1]) > 5 * np.ptp(changed[:, 0])  # one to the left, one to the right
+        assert (change[..., 0] >= change[..., 1]).mean() > 0.99
+        assert (rolls.pixel_ids["PCAM_F0"] == brakes.pixel_ids["PCAM_F0"]).all()

@@ -29,3 +29,5 @@ class ActorState:
     """Seed of the shape and the colour; constant over the drive."""
     parked: bool
     """True for a vehicle that stands for the whole drive and belongs to the place, not to the traffic."""
+    braking: bool = False
+    """Whether its brake lights are on."""

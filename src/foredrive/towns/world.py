@@ -20,7 +20,7 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.actor_looks import MeshLooks
 from foredrive.towns.place.assets import Assets, AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.buildings import build_buildings
-from foredrive.towns.place.looks import LookArrays, LookTable, Texture, srgb_to_linear
+from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
 from foredrive.towns.place.props import (
@@ -50,8 +50,8 @@ ACTOR_REACH_M = 200.0
 ACTOR_RADIUS_M = 8.0
 LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
 LAMP_LIT = srgb_to_linear(((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45)))
-HEADLIGHT_LIT, TAIL_LIT, STREET_LAMP_LIT = srgb_to_linear(
-    ((1.0, 0.98, 0.95), (0.75, 0.03, 0.02), (1.0, 0.93, 0.80))
+HEADLIGHT_LIT, TAIL_LIT, BRAKE_LIT, STREET_LAMP_LIT = srgb_to_linear(
+    ((1.0, 0.98, 0.95), (0.42, 0.02, 0.01), (1.0, 0.10, 0.07), (1.0, 0.93, 0.80))
 )
 """Of what shines, by linear colour."""
 
@@ -77,20 +77,22 @@ class SensorFrame:
 
 @dataclass(frozen=True)
 class VehicleLights:
-    """Looks of the lights of vehicles that drive, and of those that stand parked."""
+    """Looks of the lights of vehicles that drive, that brake, and that stand parked."""
 
     front: int
     rear: int
+    brake: int
     front_off: int
     rear_off: int
 
     @classmethod
     def of(cls, table: LookTable) -> "VehicleLights":
         """Looks of the shapes' lights, and a second one for each."""
-        looks = MeshLooks(table)
-        front, rear = looks.front_light, looks.rear_light
+        front = MeshLooks(table).front_light
+        rear = table.add(Look(Surface.VEHICLE, Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08))
+        brake = table.add(replace(table.looks[rear], params=(0.0, 2.0)))
         off = [table.add(replace(table.looks[look], params=(0.0, 1.0))) for look in (front, rear)]
-        return cls(front, rear, *off)
+        return cls(front, rear, brake, *off)
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,9 @@ class World:
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
         placed = raycast.PlacedShapes(tuple(shape.scene for shape in shapes), T, velocity_mps)
-        paint = np.array([self._shapes.paint_of(a) for a in actors], dtype=np.int32).reshape(-1, SLOTS)
+        rear = self.static.vehicle_lights
+        paints = [self._shapes.paint_of(a, rear.brake if a.braking else rear.rear) for a in actors]
+        paint = np.array(paints, dtype=np.int32).reshape(-1, SLOTS)
         first = np.array([shape.first for shape in shapes], dtype=np.int32)
         scene = shading.Scene(
             static=_soup(self.static.mesh),
@@ -270,7 +274,7 @@ class World:
 
     def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
         """Looks with the lamps that shine."""
-        shining: dict[int, Rgb] = {}
+        shining: dict[int, Rgb] = {self.static.vehicle_lights.brake: BRAKE_LIT}
         if drive_lit(self.conditions):
             shining |= {
                 self.static.vehicle_lights.front: HEADLIGHT_LIT,
@@ -283,8 +287,6 @@ class World:
                 for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, LAMP_LIT, strict=True):
                     if lights[head.zone] == shown:
                         shining[lamp] = rgb
-        if not shining:
-            return self._looks
         texture, albedo = self._looks.texture.copy(), self._looks.albedo.copy()
         texture[list(shining)] = Texture.GLOW
         albedo[list(shining)] = np.array(list(shining.values()))
@@ -338,12 +340,11 @@ def build_static(
 
 def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> Mesh:
     """A parked car as a part of the town; its lights are off."""
-    shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car)
+    shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car, lights.rear_off)
     moved = shape.transformed(unit_to_world(car))
     slot = np.clip(-1 - moved.look, 0, SLOTS - 1)
     look = np.where(moved.look < 0, paint[slot], moved.look)
     look = np.where(look == lights.front, lights.front_off, look)
-    look = np.where(look == lights.rear, lights.rear_off, look)
     return Mesh(moved.xyz, moved.uvw, look.astype(np.int32))
 
 

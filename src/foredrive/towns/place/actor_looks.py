@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from foredrive.towns.place.looks import RETROREFLECTIVE, Look, LookTable, Surface, Texture
 
-BODY, SECOND, THIRD = -1, -2, -3
-"""Look numbers that an actor's own paint replaces."""
+BODY, SECOND, THIRD, REAR_LIGHT = -1, -2, -3, -4
+"""Look numbers that an actor's own paint, and what its rear lights show, replace."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class MeshLooks:
         self.hub = add(Texture.PLAIN, (0.55, 0.56, 0.57), 0.5, 0.1)
         self.dark = add(Texture.PLAIN, (0.12, 0.12, 0.13), 0.12, 0.0)
         self.front_light = add(Texture.PLAIN, (0.95, 0.95, 0.92), 0.9, 0.15)
-        self.rear_light = add(Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08)
+        self.rear_light = REAR_LIGHT
         self.plate = add(Texture.PLAIN, (0.90, 0.90, 0.85), RETROREFLECTIVE, 0.0)
         self.orange = add(Texture.PLAIN, (0.95, 0.35, 0.08), 0.8, 0.0)
         self.hair = self.table.add(Look(Surface.PEDESTRIAN, Texture.PLAIN, (0.16, 0.11, 0.08), 0.2))

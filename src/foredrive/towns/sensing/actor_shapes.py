@@ -18,7 +18,8 @@ from foredrive.towns.sensing.columns import Intervals
 from foredrive.towns.sensing.raycast import TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
-SLOTS = 3
+PAINTS, SLOTS = 3, 4
+"""Of the slots that shapes leave open, the last is that of the rear lights."""
 SOLID_CELL_M = 0.15
 """Shapes are sampled about this finely for occupancy."""
 _USUAL_SIZE_M = {
@@ -68,8 +69,8 @@ class ShapeLibrary:
         options = [name for name in SHAPES_OF_KIND[kind] if name in self.shapes]
         return self.shapes[options[actor.style % len(options)]]
 
-    def paint_of(self, actor: ActorState) -> Int32[np.ndarray, "3"]:
-        """Looks for the three paint slots."""
+    def paint_of(self, actor: ActorState, rear_light: int) -> Int32[np.ndarray, "4"]:
+        """Looks for the paint slots; `rear_light` is that for the lights at the rear."""
         if actor.category is Category.PEDESTRIAN or actor.category in (Category.BICYCLE, Category.MOTORCYCLE):
             palettes = ("clothes", "clothes", "skin")
         elif actor.category is Category.BUS:
@@ -78,13 +79,13 @@ class ShapeLibrary:
             palettes = ("car", "cargo", "car")
         mixed = zip(palettes, _mixed(actor.style), strict=True)
         chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in mixed]
-        return np.array(chosen, dtype=np.int32)
+        return np.array([*chosen, rear_light], dtype=np.int32)
 
 
 @lru_cache(maxsize=4096)
 def _mixed(style: int) -> tuple[float, ...]:
     """Uniform random numbers, one for each paint slot."""
-    return tuple(np.random.default_rng(style).random(SLOTS).tolist())
+    return tuple(np.random.default_rng(style).random(PAINTS).tolist())
 
 
 def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:

@@ -43,6 +43,8 @@ from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
 AT_LINE_M = 4.0
+BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
+"""Drivers have a foot on the brake when they slow down by more than the engine does, and when they stand."""
 
 
 class Traffic:
@@ -148,6 +150,8 @@ class Traffic:
         v, poses = state.vehicles, self.poses(state)
         before, after = motion(self.lanes, v)
         velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
+        slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDS_MPS)
+        braking = slows & (v.category != Category.BICYCLE)
         ego = skip_ego and len(state.route) > 0
         out = [
             ActorState(
@@ -160,6 +164,7 @@ class Traffic:
                 velocity_mps=velocity_mps[i],
                 style=int(v.style[i]),
                 parked=False,
+                braking=bool(braking[i]),
             )
             for i in np.flatnonzero(v.active)
             if i > 0 or not ego
