@@ -1,0 +1,137 @@
+"""Sums over associations: equal to enumeration, bounded where not exact, located where zero."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from foredrive.errors import InputError
+from foredrive.sets.associations import sum_associations
+from foredrive.sets.component import sum_component
+
+
+def enumerate_associations(
+    log_pair: np.ndarray, log_absent: np.ndarray, log_background: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """The logarithm of the sum and the probability of every pair, by listing all associations."""
+    m, n = log_pair.shape
+    logs, pairs = [], []
+    for choice in itertools.product(range(-1, m), repeat=n):
+        taken = [i for i in choice if i >= 0]
+        if len(set(taken)) < len(taken):
+            continue
+        log = sum(log_background[j] if i < 0 else log_pair[i, j] for j, i in enumerate(choice))
+        logs.append(log + sum(log_absent[i] for i in range(m) if i not in taken))
+        pair = np.zeros((m, n))
+        pair[taken, [j for j, i in enumerate(choice) if i >= 0]] = 1
+        pairs.append(pair)
+    top = max(logs)
+    if top == -np.inf:
+        return -np.inf, np.full((m, n), np.nan)
+    weight = np.exp(np.array(logs) - top)
+    return top + np.log(weight.sum()), np.tensordot(weight / weight.sum(), np.array(pairs), 1)
+
+
+def random_scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Up to 5 detections and 4 objects on a line; some are certain, have no background or fit nothing."""
+    m, n = rng.integers(0, 6), rng.integers(0, 5)
+    spread = rng.choice([1.0, 5.0, 30.0])
+    at, true = rng.normal(0, spread, m), rng.normal(0, spread, n)
+    log_pair = -0.5 * (at[:, None] - true) ** 2 + np.log(rng.uniform(0.01, 1, (m, 1)))
+    log_pair[rng.random((m, n)) < 0.1] = -np.inf
+    log_absent = np.log1p(-rng.uniform(0, 1, m))
+    log_absent[rng.random(m) < 0.05] = -np.inf
+    log_background = rng.uniform(-12, 0, n)
+    log_background[rng.random(n) < 0.1] = -np.inf
+    return log_pair, log_absent, log_background
+
+
+def test_equal_to_enumeration_in_2000_scenes() -> None:
+    rng = np.random.default_rng(0)
+    impossible = 0
+    for _ in range(2000):
+        scene = random_scene(rng)
+        expected, pair = enumerate_associations(*scene)
+        result = sum_associations(*scene)
+        faults = len(result.impossible_detections) + len(result.impossible_objects)
+        assert (faults > 0) == (expected == -np.inf)
+        impossible += faults > 0
+        if faults == 0:
+            assert result.log_lower == pytest.approx(expected, abs=1e-9)
+            assert result.log_lower <= expected + 1e-12 <= result.log_upper + 1e-11
+            np.testing.assert_allclose(result.pair, pair, atol=1e-9)
+    assert 100 < impossible < 1900
+
+
+def test_the_best_associations_bound_the_sum_from_below_and_the_gap_from_above() -> None:
+    rng = np.random.default_rng(1)
+    missing: dict[int, list[float]] = {1: [], 3: [], 10_000: []}
+    for _ in range(200):
+        scene = random_scene(rng)
+        expected, pair = enumerate_associations(*scene)
+        if expected == -np.inf:
+            continue
+        for k in missing:
+            for result in (sum_component(*scene, k, 0), sum_associations(*scene, k=k, max_states=0)):
+                assert result.log_lower - 1e-9 <= expected <= result.log_upper + 1e-9
+        for k, missed in missing.items():
+            result = sum_component(*scene, k, 0)
+            missed.append(expected - result.log_lower)
+            if k == 10_000:  # all there are
+                assert result.log_upper == pytest.approx(expected, abs=1e-9)
+                assert result.log_lower == pytest.approx(expected, abs=1e-9)
+                np.testing.assert_allclose(result.pair, pair, atol=1e-9)
+    assert np.mean(missing[1]) > np.mean(missing[3]) > np.mean(missing[10_000])
+
+
+def test_gating_takes_off_no_more_than_it_says() -> None:
+    rng = np.random.default_rng(2)
+    lost = []
+    for _ in range(300):
+        scene = random_scene(rng)
+        exact = sum_associations(*scene, gate_nats=1e-300)
+        gated = sum_associations(*scene, gate_nats=0.3)
+        if exact.log_lower > -np.inf:
+            lost.append(exact.log_lower - gated.log_lower)
+            assert -1e-9 <= lost[-1] <= gated.log_upper - gated.log_lower + 1e-9
+            assert gated.log_upper - gated.log_lower <= 0.3 + 1e-9
+    assert max(lost) > 1e-3
+
+
+def test_distant_clusters_are_summed_exactly_however_many_they_are() -> None:
+    """60 copies of one scene, far from each other, are 60 times its logarithm."""
+    log_pair = np.log(np.array([[0.5, 0.2], [0.3, 0.4], [0.1, 0.6]]))
+    log_absent, log_background = np.log([0.3, 0.5, 0.2]), np.log([0.01, 0.02])
+    one, _ = enumerate_associations(log_pair, log_absent, log_background)
+    apart = np.where(np.kron(np.eye(60), np.ones((3, 2))) > 0, np.tile(log_pair, (60, 60)), -np.inf)
+    result = sum_associations(apart, np.tile(log_absent, 60), np.tile(log_background, 60))
+    assert result.log_lower == pytest.approx(60 * one, abs=1e-9)
+    assert result.log_upper == pytest.approx(60 * one, abs=1e-9)
+
+
+def test_what_is_impossible_is_named() -> None:
+    """Two certain detections of one object: one has none. Another object is explained by nothing."""
+    certain, far = -np.inf, -np.inf
+    result = sum_associations(
+        np.array([[-1.0, far], [-2.0, far], [far, far]]),
+        np.array([certain, certain, -0.1]),
+        np.array([-3.0, far]),
+    )
+    assert result.log_lower == result.log_upper == -np.inf
+    assert result.impossible_detections.tolist() == [1]  # detection 0 fits better
+    assert result.impossible_objects.tolist() == [1]
+    assert result.best.tolist() == [0, -1]
+
+
+def test_a_certain_detection_is_never_traded_for_a_likelier_pair() -> None:
+    """However unlikely the only object of a certain detection is: without it, the set is impossible."""
+    result = sum_associations(np.array([[-1e6], [0.0]]), np.array([-np.inf, -1.0]), np.array([-2.0]))
+    assert result.log_lower == pytest.approx(-1e6 - 1.0, abs=1e-9)
+    assert result.best.tolist() == [0]
+
+
+def test_wrong_weights_are_named() -> None:
+    with pytest.raises(InputError, match=r"pair .*\(0, 1\) is nan"):
+        sum_associations(np.array([[0.0, np.nan]]), np.zeros(1), np.zeros(2))
+    with pytest.raises(InputError, match=r"background object \(1,\) is inf"):
+        sum_associations(np.zeros((1, 2)), np.zeros(1), np.array([0.0, np.inf]))
