@@ -81,12 +81,13 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """What a process holds; pages that several share count in parts."""
+    """What a process holds, files' pages aside; pages that several share count in parts."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
         return 0.0
-    return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
+    held = {line.split(":")[0]: int(line.split()[1]) for line in lines[1:]}
+    return (held["Pss_Anon"] + held["Pss_Shmem"]) / 1024
 
 
 BENCHMARK = Benchmark(

@@ -151,7 +151,7 @@ def _part(frame: FrameType | None) -> str:
 
 def _resident_mib() -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
+    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon:")) / 1024
 
 
 BENCHMARK = Benchmark(
