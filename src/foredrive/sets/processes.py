@@ -1,0 +1,200 @@
+"""Random finite sets of labelled boxes: multi-Bernoulli, Poisson, and the union of the two."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.scene.record import Record
+from foredrive.sets.boxes import BoxDensity, LabelledBoxes, require
+
+_ROUNDING = 1e-4  # of probabilities that were computed in float32
+
+
+@dataclass(frozen=True)
+class MultiBernoulli(Record):
+    """M objects that may exist, independently of one another (thesis eq. 3.9 and 3.10).
+
+    Existence is kept as two logarithms: 1 - r loses all digits where r is close to 1. Raises `InputError` for
+    logarithms of what is no probability.
+    """
+
+    log_existence: Float[Tensor, "*b M"]
+    """log r."""
+    log_absence: Float[Tensor, "*b M"]
+    """log(1 - r)."""
+    log_class: Float[Tensor, "*b M K"]
+    """Log-probability of each class, given existence."""
+    boxes: BoxDensity
+
+    def __post_init__(self) -> None:
+        require("existence", self.log_existence <= _ROUNDING)
+        require("absence", self.log_absence <= _ROUNDING)
+        total = torch.logaddexp(self.log_existence, self.log_absence)
+        require("existence (which adds up to 1 with absence)", total.abs() <= _ROUNDING)
+        require("class distribution", self.log_class.logsumexp(-1).abs() <= _ROUNDING)
+
+    @classmethod
+    def from_softmax(cls, logits: Float[Tensor, "*b M K_1"], boxes: BoxDensity) -> "MultiBernoulli":
+        """From a detector with one softmax over the classes and, last, no object (DETR)."""
+        log_prob = logits.double().log_softmax(-1)
+        log_existence = log_prob[..., :-1].logsumexp(-1)
+        return cls(log_existence, log_prob[..., -1], log_prob[..., :-1] - log_existence[..., None], boxes)
+
+    @classmethod
+    def from_sigmoid(cls, logits: Float[Tensor, "*b M K"], boxes: BoxDensity) -> "MultiBernoulli":
+        """With a sigmoid per class (RetinaNet): r is the largest, classes are in proportion."""
+        top = logits.double().amax(-1)
+        log_score = torch.nn.functional.logsigmoid(logits.double())
+        log_class = log_score - log_score.logsumexp(-1, keepdim=True)
+        return cls(
+            torch.nn.functional.logsigmoid(top), torch.nn.functional.logsigmoid(-top), log_class, boxes
+        )
+
+    def log_label(self, objects: LabelledBoxes) -> Float[Tensor, "*b M N"]:
+        """Log-probability that each object exists with its label."""
+        label = _checked(objects.label, self.log_class.shape[-1])
+        index = label[..., None, :].expand(*self.log_class.shape[:-1], label.shape[-1])
+        return self.log_existence.double()[..., None] + self.log_class.double().gather(-1, index)
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set; of one frame only."""
+        exists = torch.as_tensor(rng.random(len(self.log_existence)) < self.log_existence.exp().cpu().numpy())
+        state, yaw = self.boxes.sample(rng)
+        label = _sample_labels(self.log_class, rng)
+        return LabelledBoxes(label, state, yaw)[exists]
+
+
+@runtime_checkable
+class PoissonProcess(Protocol):
+    """Objects that come independently, any number of them (thesis eq. 3.11)."""
+
+    @property
+    def expected_count(self) -> Float[Tensor, ""]:
+        """∫λ."""
+        ...
+
+    def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
+        """Log λ at each object, float64."""
+        ...
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set."""
+        ...
+
+
+@dataclass(frozen=True)
+class UniformPoisson(Record):
+    """Objects spread evenly over a box of states and, if they have one, over all headings."""
+
+    rate: Float[Tensor, "K"]
+    """Expected number of objects of each class."""
+    lower: Float[Tensor, "D"]
+    upper: Float[Tensor, "D"]
+    has_yaw: bool = False
+
+    def __post_init__(self) -> None:
+        if not bool((self.lower < self.upper).all()):
+            raise InputError("the region of a uniform Poisson process is empty")
+        if not bool((self.rate.isfinite() & (self.rate >= 0)).all()):
+            raise InputError("rates of a uniform Poisson process must be finite and not negative")
+
+    @property
+    def expected_count(self) -> Float[Tensor, ""]:
+        """∫λ."""
+        return self.rate.double().sum()
+
+    def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
+        """Log λ at each object, float64; -inf outside the region."""
+        label = _checked(objects.label, len(self.rate))
+        log_volume = (self.upper - self.lower).double().log().sum()
+        log_volume = log_volume + (math.log(2 * math.pi) if self.has_yaw else 0.0)
+        inside = ((objects.state >= self.lower) & (objects.state <= self.upper)).all(-1)
+        return torch.where(inside, self.rate.double().log()[label] - log_volume, -math.inf)
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set."""
+        counts = rng.poisson(self.rate.cpu().numpy())
+        label = torch.as_tensor(np.repeat(np.arange(len(counts)), counts))
+        unit = torch.as_tensor(rng.random((len(label), len(self.lower))))
+        lower, upper = self.lower.double().cpu(), self.upper.double().cpu()
+        yaw = torch.as_tensor(rng.uniform(-math.pi, math.pi, len(label))) if self.has_yaw else None
+        return LabelledBoxes(label, lower + unit * (upper - lower), yaw)
+
+
+@dataclass(frozen=True)
+class MixturePoisson(Record):
+    """Objects that come around M places: λ(y) = Σ_i rate_i p_i(y)."""
+
+    log_rate: Float[Tensor, "M"]
+    """Logarithm of the expected number of objects of each component."""
+    log_class: Float[Tensor, "M K"]
+    boxes: BoxDensity
+
+    @property
+    def expected_count(self) -> Float[Tensor, ""]:
+        """∫λ."""
+        return self.log_rate.double().exp().sum()
+
+    def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
+        """Log λ at each object, float64."""
+        label = _checked(objects.label, self.log_class.shape[-1])
+        log_class = self.log_class.double()[:, label]
+        return (self.log_rate.double()[:, None] + log_class + self.boxes.log_prob(objects)).logsumexp(0)
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set."""
+        counts = torch.as_tensor(rng.poisson(self.log_rate.double().exp().cpu().numpy()))
+        which = torch.arange(len(counts)).repeat_interleave(counts)
+        state, yaw = self.boxes[which].sample(rng)
+        return LabelledBoxes(_sample_labels(self.log_class[which], rng), state, yaw)
+
+
+@dataclass(frozen=True)
+class PoissonMultiBernoulli:
+    """The union of a multi-Bernoulli and a Poisson process (thesis eq. 3.12), or the former alone."""
+
+    detected: MultiBernoulli
+    background: PoissonProcess | None = None
+
+    @classmethod
+    def from_detections(cls, detections: MultiBernoulli, confidence: float = 0.1) -> "PoissonMultiBernoulli":
+        """Detections of one frame; those with r ≤ `confidence` become the Poisson process (Paper A)."""
+        low = detections.log_existence <= math.log(confidence)
+        few = detections[low]
+        return cls(detections[~low], MixturePoisson(few.log_existence, few.log_class, few.boxes))
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set."""
+        found = self.detected.sample(rng)
+        if self.background is None:
+            return found
+        other = self.background.sample(rng)
+        yaw = None if found.yaw is None or other.yaw is None else torch.cat([found.yaw, other.yaw])
+        return LabelledBoxes(
+            torch.cat([found.label, other.label]), torch.cat([found.state, other.state]), yaw
+        )
+
+
+def poisson_log_prob(process: PoissonProcess, objects: LabelledBoxes) -> Float[Tensor, ""]:
+    """Log-density of a set of objects under a Poisson process (thesis eq. 3.11)."""
+    return process.log_intensity(objects).sum() - process.expected_count
+
+
+def _checked(label: Tensor, classes: int) -> Tensor:
+    wrong = ((label < 0) | (label >= classes)).nonzero()
+    if len(wrong):
+        at = tuple(wrong[0].tolist())
+        raise InputError(f"object {at} has label {int(label[at])}, of {classes} classes")
+    return label.long()
+
+
+def _sample_labels(log_class: Float[Tensor, "M K"], rng: np.random.Generator) -> Tensor:
+    cumulative = log_class.double().exp().cpu().cumsum(-1)
+    draw = torch.as_tensor(rng.random(len(cumulative)))[:, None] * cumulative[:, -1:]
+    return (draw >= cumulative).sum(-1).clamp_max(log_class.shape[-1] - 1)
