@@ -109,6 +109,20 @@ def test_distant_clusters_are_summed_exactly_however_many_they_are() -> None:
     assert result.log_upper == pytest.approx(60 * one, abs=1e-9)
 
 
+def test_without_background_clusters_fall_apart_as_well() -> None:
+    """30 pairs of detections with one object each: too many to be summed at once."""
+    rng = np.random.default_rng(3)
+    true = 100.0 * np.arange(30)
+    at = np.repeat(true, 2) + rng.normal(size=60)
+    log_pair = -0.5 * (at[:, None] - true) ** 2 - 1.0
+    log_absent = np.log(rng.uniform(0.1, 0.9, 60))
+    result = sum_associations(log_pair, log_absent, np.full(30, -np.inf))
+    odds = np.exp(log_pair - log_absent[:, None]).reshape(30, 2, 30)
+    expected = log_absent.sum() + np.log(odds[np.arange(30), :, np.arange(30)].sum(1)).sum()
+    assert result.log_lower == pytest.approx(expected, abs=1e-9)
+    assert 0 <= result.log_upper - result.log_lower <= 1e-9
+
+
 def test_what_is_impossible_is_named() -> None:
     """Two certain detections of one object: one has none. Another object is explained by nothing."""
     certain, far = -np.inf, -np.inf

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from foredrive.errors import InputError
-from foredrive.sets.component import is_small, sum_component
+from foredrive.sets.component import gate_by_price, is_small, sum_component
 
 _COARSER, _COARSEST_NATS = 100.0, 0.1
 
@@ -141,15 +141,20 @@ def _gate(
 
     An association without its left-out pairs is one of those that stay, and weighs less by each pair's
     odds against being absent and background. Hence sum ≤ (sum of those that stay) · Π_j (1 + Σ_i
-    odds_ij), over the pairs left out. Odds are infinite where a detection is certain or an object has no
-    background.
+    odds_ij), over the pairs left out. Where odds are infinite (certain
+    detections, objects without background) prices decide.
     """
     with np.errstate(invalid="ignore"):
         log_odds = log_pair - log_absent[:, None] - log_background
     log_odds[log_pair == -np.inf] = -np.inf
-    kept = log_odds > np.log(budget_nats / max(log_odds.size, 1))
+    kept = log_odds > np.log(0.5 * budget_nats / max(log_odds.size, 1))
     left_out = np.exp(np.where(kept, -np.inf, log_odds))
-    return kept, float(np.log1p(left_out.sum(0)).sum())
+    lost_nats = float(np.log1p(left_out.sum(0)).sum())
+    if (log_odds == np.inf).any():
+        log_kept = np.where(kept, log_pair, -np.inf)
+        kept, more_nats = gate_by_price(log_kept, log_absent, log_background, 0.5 * budget_nats)
+        lost_nats += more_nats
+    return kept, lost_nats
 
 
 def _components(kept: Bool[ndarray, "M N"]) -> list[tuple[Int[ndarray, "_"], Int[ndarray, "_"]]]:
