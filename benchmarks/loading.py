@@ -66,7 +66,7 @@ def _batches(dataset: ClipDataset) -> Iterator[Example]:
 
 
 def _memory_mib() -> float:
-    """Resident memory of this process and all below it."""
+    """Memory of this process and all below it."""
     parents = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -81,13 +81,13 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """What a process holds, files' pages aside; pages that several share count in parts."""
+    """What a process holds, swapped out or not, files' pages aside; pages that several share count in parts."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
         return 0.0
     held = {line.split(":")[0]: int(line.split()[1]) for line in lines[1:]}
-    return (held["Pss_Anon"] + held["Pss_Shmem"]) / 1024
+    return (held["Pss_Anon"] + held["Pss_Shmem"] + held["SwapPss"]) / 1024
 
 
 BENCHMARK = Benchmark(

@@ -78,7 +78,7 @@ def disk(seed: int) -> dict[str, float]:
 
 
 def memory(seed: int) -> dict[str, float]:
-    """Resident memory over one long drive."""
+    """Memory over one long drive, swapped out or not, files' pages aside."""
     with _sampled(1.0, _resident_mib) as samples:
         _record(seed, round(LONG_RUN_S * RATE_HZ))
     settled = samples[int(SETTLED_FROM * len(samples)) : int(2 * SETTLED_FROM * len(samples)) + 1]
@@ -151,7 +151,7 @@ def _part(frame: FrameType | None) -> str:
 
 def _resident_mib() -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon:")) / 1024
+    return sum(int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "VmSwap:"))) / 1024
 
 
 BENCHMARK = Benchmark(
