@@ -133,9 +133,7 @@ def _rank(cost, free, k):
     first_open = np.zeros(k, np.int64)  # rows before it keep their columns
     banned = np.zeros((k, columns + 1), np.bool_)  # what the first open row must not take
     no_ban = np.zeros(columns + 1, np.bool_)
-    waiting = np.full(
-        k, np.inf
-    )  # costs of subproblems in rising order, no more of them than are still asked for
+    waiting = np.full(k, np.inf)  # costs of as many subproblems as are still asked for, in rising order
     parent_of, row_cut = np.empty(k, np.int64), np.empty(k, np.int64)
     nodes = columns + rows
     search = _Search(

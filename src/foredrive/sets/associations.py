@@ -139,10 +139,10 @@ def _gate(
 ) -> tuple[Bool[ndarray, "M N"], float]:
     """Pairs that are kept, and a bound on what the others add to the logarithm of the sum.
 
-    An association without its left-out pairs is one of those that stay, and weighs less by each pair's
-    odds against being absent and background. Hence sum ≤ (sum of those that stay) · Π_j (1 + Σ_i
-    odds_ij), over the pairs left out. Where odds are infinite (certain
-    detections, objects without background) prices decide.
+    An association without its left-out pairs is one of those that stay; each pair put back multiplies its
+    weight by the pair's odds against being absent and background. Hence sum ≤ (sum of those that stay) ·
+    Π_j (1 + Σ_i odds_ij), over the pairs left out. Prices decide where odds are infinite: at certain
+    detections and objects without background.
     """
     with np.errstate(invalid="ignore"):
         log_odds = log_pair - log_absent[:, None] - log_background
