@@ -81,7 +81,7 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """What a process holds, swapped out or not, files' pages aside; pages that several share count in parts."""
+    """What a process holds, swapped out or not, files' pages aside; shared pages count in parts."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
