@@ -34,7 +34,7 @@ class Assets:
     flat_roofs: Palette
     awnings: Palette
     accents: tuple[int, ...]
-    """Colours of doors, shutters and shop signs: rows of `patterns.ACCENT_RGB`."""
+    """Colours of doors, shutters and shop signs: rows of `facades.ACCENT_RGB`."""
     leaves: Palette
     needles: Palette
     trees: tuple[str, ...]

@@ -1,6 +1,5 @@
 """What buildings look like: houses, blocks, towers, halls and barns, each on its plot."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,50 +18,16 @@ from foredrive.towns.place.mesh import (
     join,
     polygon_cap,
     prism,
-    quads,
-    triangles,
-    walls,
 )
+from foredrive.towns.place.plot import Plot
+from foredrive.towns.place.roofs import gable_roof, hip_roof
 from foredrive.towns.place.styles import Style
 
-FOUNDATION_M = 1.5
 PARAPET_M = 0.5
-EAVES_M = 0.45
 CORNER_M = 0.4
 """At either end of a wall there are no windows."""
 FENCE_M, HEDGE_M = 1.0, 1.2
 BALCONY_M = 1.15
-
-
-@dataclass(frozen=True)
-class Plot:
-    """A rectangle to build on. Local x runs along the front with the street behind it, y into the plot."""
-
-    corner: Float[np.ndarray, "2"]
-    """Where the front begins, seen from inside on the left."""
-    along: Float[np.ndarray, "2"]
-    width_m: float
-    depth_m: float
-
-    @property
-    def into(self) -> Float[np.ndarray, "2"]:
-        """Unit direction away from the street."""
-        return np.array([-self.along[1], self.along[0]])
-
-    def world(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Map local points to the town."""
-        return self.corner + xy[..., :1] * self.along + xy[..., 1:] * self.into
-
-    def polygon(self, grow_m: float = 0.0) -> shapely.Polygon:
-        """The rectangle in the town, grown on all sides."""
-        w, d, g = self.width_m, self.depth_m, grow_m
-        return shapely.Polygon(self.world(np.array([[-g, -g], [w + g, -g], [w + g, d + g], [-g, d + g]])))
-
-    def placed(self, mesh: Mesh) -> Mesh:
-        """A mesh in local coordinates, moved to the town; its z stays."""
-        T = np.eye(4)
-        T[:2, 0], T[:2, 1], T[:2, 3] = self.along, self.into, self.corner
-        return mesh.transformed(T)
 
 
 @dataclass(frozen=True)
@@ -120,7 +85,7 @@ class BuildingMaker:
         (x0, y), (x1, _) = ends
         if kind == "hedge":
             ends_z = base - 0.4, base + HEDGE_M
-            return self._box(plot, (0.5 * (x0 + x1), y), (x1 - x0, 0.5), ends_z, self._hedge)
+            return plot.box((0.5 * (x0 + x1), y), (x1 - x0, 0.5), ends_z, self._hedge)
         parts = [
             box((x0, y - 0.02, base + z), (x1, y + 0.02, base + z + 0.1), self._wood) for z in (0.25, 0.75)
         ]
@@ -173,22 +138,22 @@ class BuildingMaker:
         eaves = base + ground_m + (storeys - 1) * storey_m
         w, d = plot.width_m, plot.depth_m
         ridge = eaves + rng.uniform(0.5, 0.85) * 0.5 * d
-        parts = [self._walls(plot, [[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look)]
+        parts = [plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look)]
         if w > d + 1.0 and rng.random() < 0.35:
-            parts.append(self._hip_roof(plot, eaves, ridge, roof))
+            parts.append(hip_roof(plot, eaves, ridge, roof))
         else:
-            parts.append(self._gable_roof(plot, eaves, ridge, roof, facade.look))
+            parts.append(gable_roof(plot, eaves, ridge, roof, facade.look))
         if rng.random() < 0.6:
             x, y = rng.uniform(0.35, 0.6) * w, 0.5 * d + rng.uniform(0.3, 1.2)
             brick = self._plain((0.45, 0.30, 0.26), 0.35)
-            parts.append(self._box(plot, (x, y), (0.7, 0.7), (eaves, ridge + 0.9), brick))
+            parts.append(plot.box((x, y), (0.7, 0.7), (eaves, ridge + 0.9), brick))
         if rng.random() < 0.5:
             x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(1.6, 3.0)
-            parts.append(self._box(plot, (x, -0.6), (wide, 1.4), (base + 2.55, base + 2.7), self._metal))
-            parts.append(self._box(plot, (x, -0.5), (wide, 1.1), (base - 0.5, base + 0.15), facade.look))
+            parts.append(plot.box((x, -0.6), (wide, 1.4), (base + 2.55, base + 2.7), self._metal))
+            parts.append(plot.box((x, -0.5), (wide, 1.1), (base - 0.5, base + 0.15), facade.look))
             for side in (-0.46, 0.46):
                 post = (x + side * wide, -1.15)
-                parts.append(self._box(plot, post, (0.12, 0.12), (base, base + 2.55), self._wood))
+                parts.append(plot.box(post, (0.12, 0.12), (base, base + 2.55), self._wood))
         return join(parts)
 
     def _barn(self, plot: Plot, base: float) -> Mesh:
@@ -201,8 +166,8 @@ class BuildingMaker:
         roof = self._plain(self._choose(self.assets.roofs), 0.4, Texture.TILES)
         eaves, ridge = base + ground, base + ground + rng.uniform(0.6, 0.9) * 0.5 * d
         parts = [
-            self._walls(plot, [[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look),
-            self._gable_roof(plot, eaves, ridge, roof, facade.look),
+            plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look),
+            gable_roof(plot, eaves, ridge, roof, facade.look),
         ]
         if rng.random() < 0.6:
             steel = self._plain((0.70, 0.71, 0.72), 0.6)
@@ -230,17 +195,17 @@ class BuildingMaker:
         top = base + ground + PARAPET_M
         ring: list[Vector] = [[0, 0], [w, 0], [w, d], [0, d]]
         parts = [
-            self._walls(plot, ring, base, top, facade.look),
+            plot.walls(ring, base, top, facade.look),
             polygon_cap(plot.polygon(), top - PARAPET_M, roof),
             *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(2, 6))),
         ]
         if market or rng.random() < 0.4:
             x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(0.2, 0.35) * w
             sign = self._plain(self._choose(self.assets.awnings), 0.6)
-            parts.append(self._box(plot, (x, -0.15), (wide, 0.3), (top - 1.9, top + 0.3), sign))
+            parts.append(plot.box((x, -0.15), (wide, 0.3), (top - 1.9, top + 0.3), sign))
         if market:
             z = base + 3.2
-            parts.append(self._box(plot, (0.5 * w, -0.9), (0.8 * w, 1.8), (z, z + 0.3), self._metal))
+            parts.append(plot.box((0.5 * w, -0.9), (0.8 * w, 1.8), (z, z + 0.3), self._metal))
         return join(parts)
 
     def _block(self, plot: Plot, base: float, tower: bool, detail: bool) -> Mesh:
@@ -257,7 +222,7 @@ class BuildingMaker:
             outline = [[0, 0], [w, 0], [w, d], [x, d], [x, y], [0, y]]
         area = shapely.Polygon(plot.world(np.array(outline, float)))
         parts = [
-            self._walls(plot, outline, base, top, facade.look),
+            plot.walls(outline, base, top, facade.look),
             polygon_cap(area, top - PARAPET_M, roof),
             *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(1, 4))),
         ]
@@ -329,58 +294,8 @@ class BuildingMaker:
         for _ in range(count):
             size = tuple(rng.uniform(1.5, 4.0, 2))
             centre = (rng.uniform(0.2, 0.8) * plot.width_m, rng.uniform(0.15, 0.35) * plot.depth_m)
-            parts.append(self._box(plot, centre, size, (z - 0.2, z + rng.uniform(1.0, 2.6)), look))
+            parts.append(plot.box(centre, size, (z - 0.2, z + rng.uniform(1.0, 2.6)), look))
         return parts
-
-    def _gable_roof(self, plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> Mesh:
-        w, d, e = plot.width_m, plot.depth_m, EAVES_M
-        drop = (ridge - eaves) / (0.5 * d) * e
-        slopes = []
-        for y0, x0, x1 in ((-e, -e, w + e), (d + e, w + e, -e)):
-            corners = [[x0, y0, eaves - drop], [x1, y0, eaves - drop]]
-            corners += [[x1, 0.5 * d, ridge], [x0, 0.5 * d, ridge]]
-            run = float(np.hypot(0.5 * d + e, ridge - eaves + drop))
-            uvw = np.array([[[0, 0, 0], [w, 0, 0], [w, run, 0], [0, run, 0]]], float)
-            top = np.array([corners])
-            slopes += [quads(top, roof, uvw), quads(top[:, ::-1] - [0.0, 0.0, 0.15], roof, uvw)]
-        peak = ridge - 0.1
-        gables = np.array(
-            [
-                [[w, 0.0, eaves], [w, d, eaves], [w, 0.5 * d, peak]],
-                [[0.0, d, eaves], [0.0, 0.0, eaves], [0.0, 0.5 * d, peak]],
-            ]
-        )
-        # Without u and w a façade has no windows.
-        return plot.placed(join([*slopes, triangles(gables, wall, np.zeros((2, 3, 3)))]))
-
-    @staticmethod
-    def _hip_roof(plot: Plot, eaves: float, ridge: float, roof: int) -> Mesh:
-        w, d, e = plot.width_m, plot.depth_m, EAVES_M
-        a, b, c, f = [-e, -e, eaves], [w + e, -e, eaves], [w + e, d + e, eaves], [-e, d + e, eaves]
-        p, q = [0.5 * d, 0.5 * d, ridge], [w - 0.5 * d, 0.5 * d, ridge]
-        run = float(np.hypot(0.5 * d + e, ridge - eaves))
-        parts = [quads(np.array([[f, c, b, a]], float), roof)]
-        for corners in ([a, b, q, p], [c, f, p, q]):
-            uvw = np.array([[[0, 0, 0], [w, 0, 0], [w - 0.5 * d, run, 0], [0.5 * d, run, 0]]], float)
-            parts.append(quads(np.array([corners], float), roof, uvw))
-        for triangle in ([b, c, q], [f, a, p]):
-            uvw = np.array([[[0, 0, 0], [d, 0, 0], [0.5 * d, run, 0]]], float)
-            parts.append(triangles(np.array([triangle], float), roof, uvw))
-        return plot.placed(join(parts))
-
-    @staticmethod
-    def _walls(plot: Plot, outline: Sequence[Vector], base: float, top: float, look: int) -> Mesh:
-        """Walls that reach into the ground; the façade's v starts at the base."""
-        ring = plot.world(np.array([*outline, outline[0]], float))
-        mesh = walls(ring, base - FOUNDATION_M, top, look)
-        mesh.uvw[..., 1] -= FOUNDATION_M
-        return mesh
-
-    @staticmethod
-    def _box(plot: Plot, centre: Vector, size: Vector, z: tuple[float, float], look: int) -> Mesh:
-        (x, y), (a, b) = centre, (0.5 * size[0], 0.5 * size[1])
-        moved = plot.placed(box((x - a, y - b, z[0]), (x + a, y + b, z[1]), look))
-        return Mesh(moved.xyz, np.zeros_like(moved.uvw), moved.look)
 
     def _awning(self, plot: Plot, z: float) -> Mesh:
         rng = self.rng

@@ -7,9 +7,10 @@ import shapely
 from jaxtyping import Float
 
 from foredrive.towns.place.assets import Assets
-from foredrive.towns.place.building_meshes import BuildingMaker, Plot
+from foredrive.towns.place.building_meshes import BuildingMaker
 from foredrive.towns.place.looks import LookTable
 from foredrive.towns.place.mesh import Mesh, join
+from foredrive.towns.place.plot import Plot
 from foredrive.towns.place.site import Frontage, Site, frontages
 from foredrive.towns.place.styles import STYLES, Style
 

@@ -44,7 +44,7 @@ class Texture(enum.IntEnum):
     """u: from the wall's left end; v: above the ground; w: from its right end, m.
     p0: storey height; p1: bay width; p2: share of the bay that is window; p3: of the storey;
     p4: height of the ground floor; p5: `WallKind`; p6: `WindowKind`; p7: `GroundFloor`; p8: row of
-    `patterns.ACCENT_RGB` for doors, shutters and signs."""
+    `facades.ACCENT_RGB` for doors, shutters and signs."""
     TILES = 5
     """u: along the eaves; v: up the slope, m."""
     FOLIAGE = 6

@@ -7,7 +7,8 @@ import numba
 import numpy as np
 
 from foredrive.towns.place.looks import Texture
-from foredrive.towns.sensing.patterns import PAINT_REFLECTIVITY, TEXTURE_WORDS, texture
+from foredrive.towns.sensing.patterns import TEXTURE_WORDS
+from foredrive.towns.sensing.textures import PAINT_REFLECTIVITY, texture
 from foredrive.towns.sensing.wet import LEVEL_COS, is_paved, water_film
 
 MISS = -1

@@ -9,8 +9,9 @@ from jaxtyping import Float32, Int32
 
 from foredrive.towns.place.looks import LookArrays, Texture
 from foredrive.towns.sensing.lamps import lamp_light
-from foredrive.towns.sensing.patterns import TEXTURE_WORDS, texture
+from foredrive.towns.sensing.patterns import TEXTURE_WORDS
 from foredrive.towns.sensing.sky import blurred_sky, sky
+from foredrive.towns.sensing.textures import texture
 from foredrive.towns.sensing.wet import (
     LEVEL_COS,
     WATER_MIRROR,
@@ -216,6 +217,32 @@ def sun_rays(found, t, sun, out_origin):
 
 @_kernel
 @no_type_check
+def _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, out):
+    """Fill out [3] with what a surface of this gloss mirrors: the sky, or the street where that is low."""
+    rise = dz + 2.0 * cosine * nz
+    mx, my, upward = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, max(rise, 0.05)
+    if gloss > CLEAR_MIRROR:
+        sky(light, mx, my, upward, out)
+    else:
+        blurred_sky(light, mx, my, upward, out)
+    open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
+    for c in range(3):
+        out[c] = open_sky * min(out[c], 3.0) + (1.0 - open_sky) * light.street_rgb[c]
+
+
+@_kernel
+@no_type_check
+def _lit_window(light, glass, chance):
+    """How brightly a room shines through a window; `chance` is the window's own random number, 0 for many."""
+    if glass <= 0.0:
+        return 0.0
+    if chance <= 0.0:
+        return light.lit_windows  # the mean of many
+    return 0.2 + 0.8 * chance if chance * 7.3 % 1.0 < light.lit_windows else 0.0
+
+
+@_kernel
+@no_type_check
 def shade(looks, found, t, direction, lit, light, mirrored, known):
     """Radiance [N 3] along rays.
 
@@ -257,25 +284,13 @@ def shade(looks, found, t, direction, lit, light, mirrored, known):
         if film > 0.0 and len(mirrored) > 0 and mirrored[i, 0] >= 0.0:
             mirror[0], mirror[1], mirror[2] = mirrored[i, 0], mirrored[i, 1], mirrored[i, 2]
         elif gloss > 0.0:
-            rise = dz + 2 * cosine * nz
-            upward, mx, my = max(rise, 0.05), dx + 2 * cosine * nx, dy + 2 * cosine * ny
-            if gloss > CLEAR_MIRROR:
-                sky(light, mx, my, upward, mirror)
-            else:
-                blurred_sky(light, mx, my, upward, mirror)
-            open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
-            for c in range(3):
-                mirror[c] = open_sky * min(mirror[c], 3.0) + (1.0 - open_sky) * light.street_rgb[c]
+            _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, mirror)
         if by_lamps:
             x, y, z = found.xyz[i, 0], found.xyz[i, 1], found.xyz[i, 2]
             lamp_light(light.lamps, x, y, z, nx, ny, nz, dx, dy, dz, WET_SHINE if film > 0.0 else 0.0, lamp)
         up = 0.5 + 0.5 * nz
         haze = 1.0 - math.exp(-t[i] * light.air.extinction_per_m)
-        window = 0.0
-        if glass > 0.0 and light.lit_windows > 0.0 and kind == _FACADE:
-            window = light.lit_windows  # the mean of many
-            if colour[5] > 0.0:
-                window = 0.2 + 0.8 * colour[5] if colour[5] * 7.3 % 1.0 < light.lit_windows else 0.0
+        window = _lit_window(light, glass, colour[5]) if kind == _FACADE else 0.0
         for c in range(3):
             ambient = light.sky_rgb[c] * up + light.bounce_rgb[c] * (1.0 - up)
             radiance = colour[c] * (light.sun_rgb[c] * direct + ambient + lamp[c])
