@@ -1,4 +1,4 @@
-"""Shared by all tests: where the real logs are."""
+"""Shared by all tests: where the real logs are, arbitrary examples, Triton's interpreter."""
 
 import math
 import os
@@ -10,6 +10,9 @@ import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # for tests/ops; Triton reads it when something imports it first
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -1,12 +1,14 @@
 """How a fast path is held against its reference."""
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 
 import pytest
 import torch
 from torch import Tensor
 
 Op = Callable[..., Tensor]
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def gradients(op: Op, inputs: Sequence[Tensor], wanted: Sequence[bool]) -> list[Tensor]:
@@ -38,6 +40,23 @@ def check_parity(
             equal_nan=True,
             msg=lambda m, i=i: f"output {i}: {m}",
         )
+
+
+def load_triton_op(module: str, name: str) -> Op:
+    """A Triton op for tensors on the CPU; computed on the GPU where there is one, interpreted elsewhere."""
+    pytest.importorskip("triton", reason="Triton is not installed")
+    op = getattr(import_module(f"foredrive.ops.{module}"), name)
+
+    def moved(x: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
+        return x.to(DEVICE) if isinstance(x, Tensor) else [tensor.to(DEVICE) for tensor in x]
+
+    return lambda *inputs: op(*map(moved, inputs)).cpu()
+
+
+@pytest.fixture(scope="session")
+def triton_op() -> Callable[[str, str], Op]:
+    """See `load_triton_op`."""
+    return load_triton_op
 
 
 @pytest.fixture(scope="session")

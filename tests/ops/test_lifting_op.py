@@ -1,6 +1,7 @@
-"""Deformable lifting: hand-computed cases, the reference's gradients, the fast path against the reference."""
+"""Deformable lifting: hand-computed cases, the reference's gradients, the fast paths against it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +12,13 @@ from torch import Tensor
 from foredrive.ops.lifting import lift, lift_reference
 
 Parity = Callable[..., None]
+Op = Callable[..., Tensor]
+
+
+@pytest.fixture(scope="session", params=["numba", "triton"])
+def op(request: pytest.FixtureRequest, triton_op: Callable[[str, str], Op]) -> Op:
+    """The fast paths."""
+    return lift if request.param == "numba" else triton_op("lifting_triton", "lift_triton")
 
 
 def flat_lift(op: Callable[..., Tensor], uv: Tensor, visible: Tensor) -> Callable[..., Tensor]:
@@ -44,9 +52,9 @@ def case(
 ONE_MAP = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
 
 
-def read_one(u: float, v: float, dx: float = 0.0, dy: float = 0.0, weight: float = 1.0) -> float:
+def read_one(op: Op, u: float, v: float, dx: float = 0.0, dy: float = 0.0, weight: float = 1.0) -> float:
     """What a single query, head and point reads from the 2×2 map [[1, 2], [3, 4]]."""
-    out = lift(
+    out = op(
         [ONE_MAP.view(1, 1, 2, 2, 1)],
         torch.tensor([u, v]).view(1, 1, 1, 2),
         torch.ones(1, 1, 1, dtype=torch.bool),
@@ -56,22 +64,22 @@ def read_one(u: float, v: float, dx: float = 0.0, dy: float = 0.0, weight: float
     return out.item()
 
 
-def test_bilinear_reading_by_hand() -> None:
-    assert read_one(0.25, 0.25) == 1  # the centre of the top left pixel
-    assert read_one(0.75, 0.25) == 2
-    assert read_one(0.25, 0.75) == 3
-    assert read_one(0.5, 0.5) == 2.5
-    assert read_one(0.5, 0.5, weight=0.5) == 1.25
-    assert read_one(0.25, 0.25, dx=1.0, dy=1.0) == 4  # offsets are in pixels
-    assert read_one(0.0, 0.25) == 0.5  # half of what is read there lies outside
-    assert read_one(0.0, 0.0) == 0.25
-    assert read_one(0.25, 0.25, dx=-1.0) == 0
+def test_bilinear_reading_by_hand(op: Op) -> None:
+    assert read_one(op, 0.25, 0.25) == 1  # the centre of the top left pixel
+    assert read_one(op, 0.75, 0.25) == 2
+    assert read_one(op, 0.25, 0.75) == 3
+    assert read_one(op, 0.5, 0.5) == 2.5
+    assert read_one(op, 0.5, 0.5, weight=0.5) == 1.25
+    assert read_one(op, 0.25, 0.25, dx=1.0, dy=1.0) == 4  # offsets are in pixels
+    assert read_one(op, 0.0, 0.25) == 0.5  # half of what is read there lies outside
+    assert read_one(op, 0.0, 0.0) == 0.25
+    assert read_one(op, 0.25, 0.25, dx=-1.0) == 0
 
 
-def test_cameras_that_see_the_query_are_averaged() -> None:
+def test_cameras_that_see_the_query_are_averaged(op: Op) -> None:
     values = torch.stack([torch.full((2, 2, 1), v) for v in (1.0, 4.0, 100.0)])[None]
     visible = torch.tensor([[[True, True, False, False], [True, False, False, True], [False] * 4]])
-    out = lift(
+    out = op(
         [values],
         torch.full((1, 3, 4, 2), 0.5),
         visible,
@@ -81,9 +89,9 @@ def test_cameras_that_see_the_query_are_averaged() -> None:
     assert out.flatten().tolist() == [2.5, 1.0, 0.0, 4.0]
 
 
-def test_every_batch_item_has_its_own_visibility() -> None:
+def test_every_batch_item_has_its_own_visibility(op: Op) -> None:
     visible = torch.tensor([[[True, False]], [[False, True]]])
-    out = lift(
+    out = op(
         [torch.ones(2, 1, 2, 2, 1)],
         torch.full((2, 1, 2, 2), 0.5),
         visible,
@@ -93,11 +101,11 @@ def test_every_batch_item_has_its_own_visibility() -> None:
     assert out[..., 0].tolist() == [[1, 0], [0, 1]]
 
 
-def test_heads_read_their_own_channels_and_levels_their_own_pixels() -> None:
+def test_heads_read_their_own_channels_and_levels_their_own_pixels(op: Op) -> None:
     fine = torch.arange(4.0).view(1, 1, 1, 1, 4).expand(1, 1, 2, 4, 4)  # channel c holds c
     coarse = 10 + torch.arange(2.0).view(1, 1, 1, 2, 1).expand(1, 1, 1, 2, 4)  # column x holds 10 + x
     weights = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).view(1, 1, 2, 2, 1)  # head 0: fine, head 1: coarse
-    out = lift(
+    out = op(
         [fine, coarse],
         torch.tensor([0.25, 0.5]).view(1, 1, 1, 2),
         torch.ones(1, 1, 1, dtype=torch.bool),
@@ -132,6 +140,23 @@ def test_the_fast_path_is_the_reference(
     parity(flat_lift(lift, uv, visible), flat_lift(lift_reference, uv, visible), inputs)
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"queries": 9},
+        {"b": 1, "cameras": 1, "queries": 5, "heads": 3, "width": 5, "points": 2, "sizes": ((1, 3),)},
+        {"queries": 3, "heads": 1, "width": 40, "points": 1, "seen": 1.0},
+        {"b": 1, "queries": 2, "points": 19, "sizes": ((3, 5),)},
+    ],
+)
+def test_triton_is_the_reference(
+    parity: Parity, triton_op: Callable[[str, str], Op], shape: dict[str, Any]
+) -> None:
+    inputs, uv, visible = case(3, **shape)
+    fast = triton_op("lifting_triton", "lift_triton")
+    parity(flat_lift(fast, uv, visible), flat_lift(lift_reference, uv, visible), inputs)
+
+
 def test_parity_where_threads_share_the_work(parity: Parity) -> None:
     inputs, _, visible = case(3, queries=3000, heads=4, points=4, sizes=((8, 12), (5, 7), (3, 3)))
     uv = torch.rand(2, 3, 3000, 2, generator=torch.Generator().manual_seed(4)) * 1.2 - 0.1
@@ -155,45 +180,44 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
 
 
 @pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 1), (0, 0, 0, 1), (0, 0, 0, 0)])
-def test_gradients_of_some_inputs_only(parity: Parity, wanted: tuple[int, ...]) -> None:
-    inputs, uv, visible = case(1)
+def test_gradients_of_some_inputs_only(op: Op, parity: Parity, wanted: tuple[int, ...]) -> None:
+    inputs, uv, visible = case(1, queries=9)
     parity(
-        flat_lift(lift, uv, visible),
+        flat_lift(op, uv, visible),
         flat_lift(lift_reference, uv, visible),
         inputs,
         [bool(w) for w in wanted],
     )
 
 
-def test_inputs_may_lie_in_memory_as_they_like(parity: Parity) -> None:
-    (offsets, weights, *values), uv, visible = case(2)
+def test_inputs_may_lie_in_memory_as_they_like(op: Op, parity: Parity) -> None:
+    (offsets, weights, *values), uv, visible = case(2, queries=9)
 
-    def shuffled(op: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def shuffled(lift: Op) -> Op:
         def run(offsets: Tensor, weights: Tensor, *values: Tensor) -> Tensor:
             turned = [v.permute(0, 1, 4, 2, 3).contiguous().permute(0, 1, 3, 4, 2) for v in values]
             back = offsets.flip(1).transpose(0, 1).contiguous().transpose(0, 1)
-            return op(turned, uv.flip(2), visible.flip(2), back, weights.flip(1))
+            return lift(turned, uv.flip(2), visible.flip(2), back, weights.flip(1))
 
         return run
 
-    parity(shuffled(lift), shuffled(lift_reference), [offsets, weights, *values])
-    parity(
-        shuffled(lift), lambda *args: flat_lift(lift, uv, visible)(*args).flip(1), [offsets, weights, *values]
-    )
+    parity(shuffled(op), shuffled(lift_reference), [offsets, weights, *values])
+    parity(shuffled(op), lambda *args: flat_lift(op, uv, visible)(*args).flip(1), [offsets, weights, *values])
 
 
 @pytest.mark.parametrize("empty", [{"b": 0}, {"cameras": 0}, {"queries": 0}, {"seen": 0.0}])
-def test_nothing_to_see_reads_zero(empty: dict[str, int]) -> None:
-    inputs, uv, visible = case(0, **empty)
+def test_nothing_to_see_reads_zero(op: Op, empty: dict[str, int]) -> None:
+    inputs, uv, visible = case(0, **{"queries": 9} | empty)
     leaves = [x.requires_grad_() for x in inputs]
-    out = flat_lift(lift, uv, visible)(*leaves)
+    out = flat_lift(op, uv, visible)(*leaves)
     assert out.shape == (len(visible), visible.shape[2], 16)
     assert not out.any()
     assert not any(grad.any() for grad in torch.autograd.grad(out.sum(), leaves))
 
 
+@pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning")  # interpreted
 def test_far_away_reads_zero_and_never_outside_the_memory(
-    guard: Callable[[Tensor], Tensor], wild: Tensor
+    op: Op, guard: Callable[[Tensor], Tensor], wild: Tensor
 ) -> None:
     places = torch.cartesian_prod(wild, wild)  # [Q 2]
     visible = torch.ones(1, 1, len(places), dtype=torch.bool)
@@ -205,21 +229,21 @@ def test_far_away_reads_zero_and_never_outside_the_memory(
         (uv, offsets),
         (places[None, None], 0 * weights[..., None].expand_as(offsets)),
     ):
-        out = lift([values], given_uv, visible, given_offsets, weights)
+        out = op([values], given_uv, visible, given_offsets, weights)
         assert torch.equal(out, torch.zeros_like(out))
         assert not any(g.any() for g in torch.autograd.grad(out.sum(), [values, weights]))
 
 
-def test_the_border_reads_nothing_outside_the_memory(guard: Callable[[Tensor], Tensor]) -> None:
-    inputs, uv, visible = case(6, heads=1, width=9, sizes=((4, 6),), queries=200)
+def test_the_border_reads_nothing_outside_the_memory(op: Op, guard: Callable[[Tensor], Tensor]) -> None:
+    inputs, uv, visible = case(6, heads=1, width=9, sizes=((4, 6),), queries=100)
     offsets, weights, values = inputs
-    expected = lift([values], uv, visible, offsets, weights)
-    out = lift([guard(values)], uv, visible, offsets, weights)
+    expected = op([values], uv, visible, offsets, weights)
+    out = op([guard(values)], uv, visible, offsets, weights)
     assert torch.equal(out, expected)
 
 
-def test_nan_goes_to_the_query_it_belongs_to_and_no_further() -> None:
-    inputs, uv, visible = case(0, b=1, seen=0.9)
+def test_nan_goes_to_the_query_it_belongs_to_and_no_further(op: Op) -> None:
+    inputs, uv, visible = case(0, b=1, queries=9, seen=0.9)
     visible[:, :, :3] = True
     visible[:, :, 3] = False
     offsets, weights, *values = inputs
@@ -227,8 +251,8 @@ def test_nan_goes_to_the_query_it_belongs_to_and_no_further() -> None:
     uv[0, 1, 1] = torch.nan
     weights[0, 2, 1, 0, 0] = torch.nan
     offsets[0, 3], uv[0, :, 3] = torch.nan, torch.nan  # nobody sees this one
-    for op in (lift, lift_reference):
-        out = op(values, uv, visible, offsets, weights)[0].unflatten(-1, (2, 8))
+    for path in (op, lift_reference):
+        out = path(values, uv, visible, offsets, weights)[0].unflatten(-1, (2, 8))
         nan = out.isnan()
         assert nan[0].all(-1).tolist() == [True, False]
         assert nan[1].all()
@@ -236,12 +260,12 @@ def test_nan_goes_to_the_query_it_belongs_to_and_no_further() -> None:
         assert not nan[3:].any()
 
 
-def test_half_precision_is_computed_in_full_precision() -> None:
-    inputs, uv, visible = case(0)
+def test_half_precision_is_computed_in_full_precision(op: Op) -> None:
+    inputs, uv, visible = case(0, queries=9)
     halves = [x.bfloat16().requires_grad_() for x in inputs]
-    expected = flat_lift(lift, uv, visible)(*[x.float() for x in halves])
+    expected = flat_lift(op, uv, visible)(*[x.float() for x in halves])
     with torch.autocast("cpu", torch.bfloat16):
-        out = flat_lift(lift, uv, visible)(*halves)
+        out = flat_lift(op, uv, visible)(*halves)
         reference = flat_lift(lift_reference, uv, visible)(*halves)
     assert out.dtype == reference.dtype == torch.float32
     assert torch.equal(out, expected)

@@ -1,7 +1,8 @@
-"""Reading and warping volumes: hand-computed cases, the references' gradients, the fast path against them."""
+"""Reading and warping volumes: hand-computed cases, the references' gradients, the fast paths beside them."""
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,25 @@ from foredrive.ops.attention3d import attend_volume, attend_volume_reference
 from foredrive.ops.volume import sample_volume, sample_volume_reference, warp_volume
 
 Parity = Callable[..., None]
+Op = Callable[..., Tensor]
+
+
+@pytest.fixture(scope="session", params=["numba", "triton"])
+def path(request: pytest.FixtureRequest) -> str:
+    """Which kernels."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def attend(path: str, triton_op: Callable[[str, str], Op]) -> Op:
+    """A fast path of attention."""
+    return attend_volume if path == "numba" else triton_op("volume_triton", "read_volume_triton")
+
+
+@pytest.fixture(scope="session")
+def sample(path: str, triton_op: Callable[[str, str], Op]) -> Op:
+    """A fast path of sampling."""
+    return sample_volume if path == "numba" else triton_op("volume_triton", "sample_volume_triton")
 
 
 def volume_case(
@@ -44,28 +64,28 @@ def attention_case(
     return [values, places, weights]
 
 
-def sample_one(volume: Tensor, x: float, y: float, z: float) -> float:
-    return sample_volume(volume[None, ..., None], torch.tensor([[[x, y, z]]])).item()
+def sample_one(sample: Op, volume: Tensor, x: float, y: float, z: float) -> float:
+    return sample(volume[None, ..., None], torch.tensor([[[x, y, z]]])).item()
 
 
-def test_trilinear_reading_by_hand() -> None:
-    assert sample_one(torch.full((1, 1, 1), 8.0), 0.5, 0.5, 0.5) == 8
-    assert sample_one(torch.full((1, 1, 1), 8.0), 1.0, 0.5, 0.5) == 4  # a face
-    assert sample_one(torch.full((1, 1, 1), 8.0), 0.0, 0.0, 1.0) == 1  # a corner
-    assert sample_one(torch.full((1, 1, 1), 8.0), -0.5, 0.5, 0.5) == 0
+def test_trilinear_reading_by_hand(sample: Op) -> None:
+    assert sample_one(sample, torch.full((1, 1, 1), 8.0), 0.5, 0.5, 0.5) == 8
+    assert sample_one(sample, torch.full((1, 1, 1), 8.0), 1.0, 0.5, 0.5) == 4  # a face
+    assert sample_one(sample, torch.full((1, 1, 1), 8.0), 0.0, 0.0, 1.0) == 1  # a corner
+    assert sample_one(sample, torch.full((1, 1, 1), 8.0), -0.5, 0.5, 0.5) == 0
     volume = torch.arange(24.0).view(2, 3, 4)  # z y x
-    assert sample_one(volume, 3.5, 0.5, 0.5) == 3
-    assert sample_one(volume, 0.5, 2.5, 0.5) == 8
-    assert sample_one(volume, 0.5, 0.5, 1.5) == 12
-    assert sample_one(volume, 2.0, 1.75, 0.75) == 1.5 + 1.25 * 4 + 0.25 * 12
+    assert sample_one(sample, volume, 3.5, 0.5, 0.5) == 3
+    assert sample_one(sample, volume, 0.5, 2.5, 0.5) == 8
+    assert sample_one(sample, volume, 0.5, 0.5, 1.5) == 12
+    assert sample_one(sample, volume, 2.0, 1.75, 0.75) == 1.5 + 1.25 * 4 + 0.25 * 12
 
 
-def test_attention_by_hand() -> None:
+def test_attention_by_hand(attend: Op) -> None:
     values = torch.stack([torch.arange(4.0), 10 * torch.arange(4.0)], dim=-1).view(1, 1, 1, 4, 2)
     x = torch.tensor([[0.5, 2.5], [1.0, 3.5]])  # two heads of two points
     points = torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.5)], dim=-1).view(1, 1, 2, 2, 3)
     weights = torch.tensor([[0.25, 0.75], [0.5, 0.5]]).view(1, 1, 2, 2)
-    assert attend_volume(values, points, weights).flatten().tolist() == [0.75 * 2, 0.5 * 5 + 0.5 * 30]
+    assert attend(values, points, weights).flatten().tolist() == [0.75 * 2, 0.5 * 5 + 0.5 * 30]
 
 
 def test_gradients_of_the_references() -> None:
@@ -104,6 +124,30 @@ def test_sampling_is_its_reference(
     parity(sample_volume, sample_volume_reference, case)
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"queries": 9},
+        {"b": 1, "queries": 5, "heads": 3, "width": 5, "size_zyx": (1, 3, 2)},
+        {"b": 1, "queries": 3, "heads": 1, "points": 19},
+    ],
+)
+def test_attention_by_triton_is_its_reference(
+    parity: Parity, triton_op: Callable[[str, str], Op], shape: dict[str, Any]
+) -> None:
+    attend = triton_op("volume_triton", "read_volume_triton")
+    parity(attend, attend_volume_reference, attention_case(4, **shape))
+
+
+@pytest.mark.parametrize("channels", [1, 33])
+def test_sampling_by_triton_is_its_reference(
+    parity: Parity, triton_op: Callable[[str, str], Op], channels: int
+) -> None:
+    sample = triton_op("volume_triton", "sample_volume_triton")
+    case = volume_case(3, b=2, channels=channels, size_zyx=(2, 3, 4), points=(40,))
+    parity(sample, sample_volume_reference, case)
+
+
 @pytest.mark.parametrize("channels", [1, 33])
 def test_sampling_where_threads_share_the_work(parity: Parity, channels: int) -> None:
     case = volume_case(8, b=2, channels=channels, size_zyx=(6, 9, 11), points=(5000,))
@@ -129,76 +173,77 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
 
 
 @pytest.mark.parametrize("wanted", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])
-def test_gradients_of_some_inputs_only(parity: Parity, wanted: tuple[int, ...]) -> None:
+def test_gradients_of_some_inputs_only(
+    attend: Op, sample: Op, parity: Parity, wanted: tuple[int, ...]
+) -> None:
     flags = [bool(w) for w in wanted]
-    values, points, weights = attention_case(1)
-    parity(attend_volume, attend_volume_reference, [values, points, weights], flags)
-    parity(sample_volume, sample_volume_reference, [values, points[:, :, 0, 0]], flags[:2])
+    values, points, weights = attention_case(1, queries=9)
+    parity(attend, attend_volume_reference, [values, points, weights], flags)
+    parity(sample, sample_volume_reference, [values, points[:, :, 0, 0]], flags[:2])
 
 
-def test_inputs_may_lie_in_memory_as_they_like() -> None:
-    values, points, weights = attention_case(2)
+def test_inputs_may_lie_in_memory_as_they_like(attend: Op) -> None:
+    values, points, weights = attention_case(2, queries=9)
     turned = values.permute(0, 4, 1, 2, 3).contiguous().permute(0, 2, 3, 4, 1)
     assert torch.equal(
-        attend_volume(turned, points.flip(1), weights.flip(1)), attend_volume(values, points, weights).flip(1)
+        attend(turned, points.flip(1), weights.flip(1)), attend(values, points, weights).flip(1)
     )
     repeated = points[:, :1].expand_as(points)
-    assert torch.equal(
-        attend_volume(values, repeated, weights), attend_volume(values, repeated.contiguous(), weights)
-    )
+    assert torch.equal(attend(values, repeated, weights), attend(values, repeated.contiguous(), weights))
 
 
 @pytest.mark.parametrize("empty", [{"b": 0}, {"queries": 0}])
-def test_nothing_to_read(empty: dict[str, int]) -> None:
+def test_nothing_to_read(attend: Op, sample: Op, empty: dict[str, int]) -> None:
     leaves = [x.requires_grad_() for x in attention_case(0, **empty)]
-    for out in (attend_volume(*leaves), sample_volume(leaves[0], leaves[1][:, :, 0, 0])):
+    for out in (attend(*leaves), sample(leaves[0], leaves[1][:, :, 0, 0])):
         assert out.numel() == 0
         assert not torch.autograd.grad(out.sum(), leaves[0])[0].any()
 
 
+@pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning")  # interpreted
 def test_far_away_reads_zero_and_never_outside_the_memory(
-    guard: Callable[[Tensor], Tensor], wild: Tensor
+    attend: Op, sample: Op, guard: Callable[[Tensor], Tensor], wild: Tensor
 ) -> None:
     inside = torch.tensor([1.0])
     reach = torch.cat([wild, inside])
     places = torch.cartesian_prod(reach, reach, reach)
     places = places[(places != inside).any(-1)].requires_grad_()
     volume = guard(torch.ones(1, 2, 3, 4, 9)).requires_grad_()
-    out = sample_volume(volume, places[None])
+    out = sample(volume, places[None])
     assert torch.equal(out, torch.zeros_like(out))
     assert not any(g.any() for g in torch.autograd.grad(out.sum(), [volume, places]))
     weights = torch.ones(1, len(places), 1, 1)
-    assert not attend_volume(volume, places[None, :, None, None], weights).any()
+    assert not attend(volume, places[None, :, None, None], weights).any()
 
 
-def test_the_border_reads_nothing_outside_the_memory(guard: Callable[[Tensor], Tensor]) -> None:
+def test_the_border_reads_nothing_outside_the_memory(sample: Op, guard: Callable[[Tensor], Tensor]) -> None:
     volume, points = volume_case(9, b=1, channels=9, size_zyx=(2, 3, 4), points=(500,))
-    assert torch.equal(sample_volume(guard(volume), points), sample_volume(volume, points))
+    assert torch.equal(sample(guard(volume), points), sample(volume, points))
 
 
-def test_nan_goes_to_the_query_it_belongs_to_and_no_further() -> None:
-    values, points, weights = attention_case(0, b=1)
+def test_nan_goes_to_the_query_it_belongs_to_and_no_further(attend: Op, sample: Op) -> None:
+    values, points, weights = attention_case(0, b=1, queries=9)
     points[0, 0, 0, 1, 2] = torch.nan
     weights[0, 1, 1, 0] = torch.nan
-    for op in (attend_volume, attend_volume_reference):
+    for op in (attend, attend_volume_reference):
         nan = op(values, points, weights)[0].unflatten(-1, (2, 8)).isnan()
         assert nan[0].all(-1).tolist() == [True, False]
         assert nan[1].all(-1).tolist() == [False, True]
         assert not nan[2:].any()
-    for op in (sample_volume, sample_volume_reference):
+    for op in (sample, sample_volume_reference):
         nan = op(values, points[:, :, 0, 1]).isnan()
         assert nan[0, 0].all()
         assert not nan[0, 1:].any()
     values[0, 0, 0, 0, 3] = torch.nan
-    read = sample_volume(values, torch.tensor([[[0.75, 0.5, 0.5], [1.75, 1.5, 0.5]]])).isnan()
+    read = sample(values, torch.tensor([[[0.75, 0.5, 0.5], [1.75, 1.5, 0.5]]])).isnan()
     assert read[0].nonzero().tolist() == [[0, 3]]
 
 
-def test_half_precision_is_computed_in_full_precision() -> None:
-    leaves = [x.bfloat16().requires_grad_() for x in attention_case(0)]
-    expected = attend_volume(*[x.float() for x in leaves])
+def test_half_precision_is_computed_in_full_precision(attend: Op) -> None:
+    leaves = [x.bfloat16().requires_grad_() for x in attention_case(0, queries=9)]
+    expected = attend(*[x.float() for x in leaves])
     with torch.autocast("cpu", torch.bfloat16):
-        out = attend_volume(*leaves)
+        out = attend(*leaves)
         reference = attend_volume_reference(*leaves)
     assert out.dtype == reference.dtype == torch.float32
     assert torch.equal(out, expected)

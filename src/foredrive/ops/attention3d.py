@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
 from foredrive.ops.volume_kernels import BLOCK, Reader
 from foredrive.ops.volume_reading import ReadVolume
 
@@ -42,8 +42,12 @@ def attend_volume(
     if not fits:
         shapes = f"values {(*values.shape,)}, points {(*points.shape,)}, weights {(*weights.shape,)}"
         raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
-    small = values[:1].numel() < MAX_ITEM_SIZE and per_head <= BLOCK
-    if not (small and numba_can(values, points, weights)):
+    small = values[:1].numel() < MAX_ITEM_SIZE
+    if small and triton_can(values, points, weights):
+        from foredrive.ops.volume_triton import read_volume_triton  # there may be no Triton elsewhere
+
+        return read_volume_triton(values, points, weights)
+    if not (small and per_head <= BLOCK and numba_can(values, points, weights)):
         return attend_volume_reference(values, points, weights)
     width = values.shape[-1] // heads
     readers = tuple(Reader(head, head * width, (head + 1) * width, head) for head in range(heads))

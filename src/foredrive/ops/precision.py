@@ -1,7 +1,9 @@
-"""Which numbers the ops compute in, and whether the numba kernels can."""
+"""Which numbers the ops compute in, and which kernels can."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
+from importlib.util import find_spec
 
 import torch
 from torch import Tensor
@@ -23,5 +25,19 @@ def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 def numba_can(*tensors: Tensor) -> bool:
     """Whether CPU kernels can take these: on the CPU, not in float64, and nobody traces the call."""
+    return _plain(tensors, "cpu")
+
+
+def triton_can(*tensors: Tensor) -> bool:
+    """Whether CUDA kernels can take these: as `numba_can`, but on a GPU, and if there is Triton."""
+    return _plain(tensors, "cuda") and _has_triton()
+
+
+def _plain(tensors: tuple[Tensor, ...], device: str) -> bool:
     traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
-    return not traced and all(t.device.type == "cpu" and t.dtype != torch.float64 for t in tensors)
+    return not traced and all(t.device.type == device and t.dtype != torch.float64 for t in tensors)
+
+
+@lru_cache
+def _has_triton() -> bool:
+    return find_spec("triton") is not None

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
 from foredrive.ops.volume_kernels import Reader
 from foredrive.ops.volume_reading import ReadVolume
 
@@ -34,7 +34,12 @@ def sample_volume(
     """
     if len(volume) != len(points) or min(volume.shape[1:]) == 0:
         raise ValueError(f"sample_volume: cannot read {(*points.shape,)} from {(*volume.shape,)}")
-    if volume[:1].numel() >= MAX_ITEM_SIZE or not numba_can(volume, points):
+    small = volume[:1].numel() < MAX_ITEM_SIZE
+    if small and triton_can(volume, points):
+        from foredrive.ops.volume_triton import sample_volume_triton  # there may be no Triton elsewhere
+
+        return sample_volume_triton(volume, points)
+    if not (small and numba_can(volume, points)):
         return sample_volume_reference(volume, points)
     channels = volume.shape[-1]
     starts = range(0, channels, CHANNELS_AT_ONCE)

@@ -1,0 +1,267 @@
+"""The CUDA path of `foredrive.ops.lifting`: Triton kernels that read visible cameras only.
+
+A program takes a few rows (a head of a query each). It walks through levels and cameras, passes over the
+cameras that see none of its queries, and reads rows × points × channels at a time.
+"""
+
+from collections.abc import Sequence
+from typing import Any, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from foredrive.ops.tiles import neighbours, read, read_back, tile_of
+
+
+def lift_triton(
+    values: Sequence[Float[Tensor, "b C _h _w D"]],
+    uv: Float[Tensor, "b C Q 2"],
+    visible: Bool[Tensor, "b C Q"],
+    offsets: Float[Tensor, "b Q H L P 2"],
+    weights: Float[Tensor, "b Q H L P"],
+) -> Float[Tensor, "b Q D"]:
+    """`lift` for what lies on a GPU. Half precision is read as it is and added up in float32.
+
+    The gradient of the values is added up by atomics: its last bits differ from run to run.
+    """
+    sizes, start = [], 0
+    for value in values:
+        sizes.append((value.shape[2], value.shape[3], start))
+        start += value.shape[2] * value.shape[3]
+    levels = [value.flatten(2, 3) for value in values]
+    joined = torch.cat(levels, dim=2) if len(levels) > 1 else levels[0]
+    places = uv.detach().float().contiguous()
+    share = visible / visible.sum(1, keepdim=True).clamp_min(1)
+    out: Tensor = _Lift.apply(
+        joined, offsets, weights, places, share, torch.tensor(sizes, dtype=torch.int32, device=uv.device)
+    )
+    return out
+
+
+class _Lift(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Float[Tensor, "b C S D"],
+        offsets: Float[Tensor, "b Q H L P 2"],
+        weights: Float[Tensor, "b Q H L P"],
+        uv: Float[Tensor, "b C Q 2"],
+        share: Float[Tensor, "b C Q"],
+        sizes: Int32[Tensor, "L 3"],
+    ) -> Float[Tensor, "b Q D"]:
+        inputs = [x.contiguous() for x in (values, offsets, weights, uv, share, sizes)]
+        ctx.save_for_backward(*inputs)
+        out = torch.zeros(*weights.shape[:2], values.shape[-1], device=values.device)
+        _launch(_lift_rows, inputs, [out])
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        values, offsets, weights = inputs[:3]
+        wants_values, wants_offsets, wants_weights = ctx.needs_input_grad[:3]
+        wants_points = wants_offsets or wants_weights
+        grad_values = torch.zeros_like(values, dtype=torch.float32) if wants_values else None
+        grad_offsets = torch.zeros_like(offsets) if wants_points else None
+        grad_weights = torch.zeros_like(weights) if wants_points else None
+        _launch(
+            _lift_rows_back,
+            inputs,
+            [grad_out.float().contiguous(), grad_values, grad_offsets, grad_weights],
+            TO_VALUES=wants_values,
+            TO_POINTS=wants_points,
+        )
+        return (
+            None if grad_values is None else grad_values.to(values.dtype),
+            grad_offsets if wants_offsets else None,
+            grad_weights if wants_weights else None,
+            None,
+            None,
+            None,
+        )
+
+
+def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | None], **flags: bool) -> None:
+    values, _, weights, uv, _, _ = inputs
+    queries, heads, levels, points = weights.shape[1:]
+    rows, width = len(weights) * queries * heads, values.shape[-1] // heads
+    tile = tile_of(points, width)
+    if rows * values.numel() == 0:
+        return
+    kernel[(triton.cdiv(rows, tile.rows),)](
+        *inputs,
+        *outputs,
+        rows,
+        queries,
+        uv.shape[1],
+        values.shape[2],
+        levels,
+        HEADS=heads,
+        POINTS=points,
+        WIDTH=width,
+        ROWS=tile.rows,
+        P=tile.points,
+        W=tile.channels,
+        **flags,
+    )
+
+
+@triton.jit
+@no_type_check
+def _points(offsets, weights, at, inside):
+    """Offsets and weights of rows × points."""
+    dx = tl.load(offsets + 2 * at, mask=inside, other=0.0).to(tl.float32)
+    dy = tl.load(offsets + 2 * at + 1, mask=inside, other=0.0).to(tl.float32)
+    return dx, dy, tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
+
+
+@triton.jit
+@no_type_check
+def _places(uv, pair, seen, dx, dy, height, width):
+    """Coordinates of rows × points in the feature map of a camera and level; integers are pixel centres."""
+    u = tl.load(uv + 2 * pair, mask=seen, other=0.0)
+    v = tl.load(uv + 2 * pair + 1, mask=seen, other=0.0)
+    return (u * width - 0.5)[:, None] + dx, (v * height - 0.5)[:, None] + dy
+
+
+@triton.jit
+@no_type_check
+def _lift_rows(
+    values,  # b·C S D
+    offsets,  # b·Q H L P 2
+    weights,  # b·Q H L P
+    uv,  # b C Q 2
+    share,  # b C Q, one over the number of cameras that see the query, 0 where this one does not
+    sizes,  # L 3: height, width and first pixel
+    out,  # b·Q D
+    row_count,
+    queries,
+    cameras,
+    pixels,
+    levels,
+    HEADS: tl.constexpr,
+    POINTS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    ROWS: tl.constexpr,
+    P: tl.constexpr,
+    W: tl.constexpr,
+):
+    CHANNELS: tl.constexpr = HEADS * WIDTH
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    exists = row < row_count
+    query, head = row // HEADS, row % HEADS
+    c = tl.arange(0, W)
+    total = tl.zeros([ROWS, W], tl.float32)
+    for level in range(0, levels):
+        height, width = tl.load(sizes + 3 * level), tl.load(sizes + 3 * level + 1)
+        start = tl.load(sizes + 3 * level + 2)
+        for first in range(0, POINTS, P):
+            p = first + tl.arange(0, P)
+            inside = exists[:, None] & (p < POINTS)[None, :]
+            at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
+            dx, dy, weight = _points(offsets, weights, at, inside)
+            for camera in range(0, cameras):
+                image = query // queries * cameras + camera
+                pair = image * queries + query % queries
+                part = tl.load(share + pair, mask=exists, other=0.0)
+                if tl.max(part, axis=0) > 0:
+                    seen = inside & (part > 0)[:, None]
+                    x, y = _places(uv, pair, part > 0, dx, dy, height, width)
+                    x0, x1, wx0, wx1, _, _ = neighbours(x, width)
+                    y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+                    w = tl.where((x == x) & (y == y), weight * part[:, None], float("nan"))
+                    w = tl.where(seen, w, 0.0)
+                    base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
+                    for corner in tl.static_range(4):
+                        cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
+                        cy, wy = (y1, wy1) if corner // 2 else (y0, wy0)
+                        total += read(values, base + (cy * width + cx) * CHANNELS, w * wy * wx, c, WIDTH)
+    to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
+    tl.store(out + to, total, mask=exists[:, None] & (c < WIDTH)[None, :])
+
+
+@triton.jit
+@no_type_check
+def _lift_rows_back(
+    values,
+    offsets,
+    weights,
+    uv,
+    share,
+    sizes,
+    grad_out,  # b·Q D
+    grad_values,
+    grad_offsets,
+    grad_weights,
+    row_count,
+    queries,
+    cameras,
+    pixels,
+    levels,
+    HEADS: tl.constexpr,
+    POINTS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    ROWS: tl.constexpr,
+    P: tl.constexpr,
+    W: tl.constexpr,
+    TO_VALUES: tl.constexpr,
+    TO_POINTS: tl.constexpr,
+):
+    CHANNELS: tl.constexpr = HEADS * WIDTH
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    exists = row < row_count
+    query, head = row // HEADS, row % HEADS
+    c = tl.arange(0, W)
+    to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
+    grad = tl.load(grad_out + to, mask=exists[:, None] & (c < WIDTH)[None, :], other=0.0)
+    for level in range(0, levels):
+        height, width = tl.load(sizes + 3 * level), tl.load(sizes + 3 * level + 1)
+        start = tl.load(sizes + 3 * level + 2)
+        for first in range(0, POINTS, P):
+            p = first + tl.arange(0, P)
+            inside = exists[:, None] & (p < POINTS)[None, :]
+            at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
+            dx, dy, weight = _points(offsets, weights, at, inside)
+            to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
+            to_weight = tl.zeros([ROWS, P], tl.float32)
+            for camera in range(0, cameras):
+                image = query // queries * cameras + camera
+                pair = image * queries + query % queries
+                part = tl.load(share + pair, mask=exists, other=0.0)
+                if tl.max(part, axis=0) > 0:
+                    seen = inside & (part > 0)[:, None]
+                    x, y = _places(uv, pair, part > 0, dx, dy, height, width)
+                    x0, x1, wx0, wx1, sx0, sx1 = neighbours(x, width)
+                    y0, y1, wy0, wy1, sy0, sy1 = neighbours(y, height)
+                    w = tl.where((x == x) & (y == y), weight, float("nan"))
+                    w = tl.where(seen, w, 0.0)
+                    base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
+                    g = grad * part[:, None]
+                    for corner in tl.static_range(4):
+                        cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
+                        cy, wy, sy = (y1, wy1, sy1) if corner // 2 else (y0, wy0, sy0)
+                        at_corner = base + (cy * width + cx) * CHANNELS
+                        met = read_back(
+                            values,
+                            grad_values,
+                            at_corner,
+                            w * wy * wx,
+                            seen,
+                            g,
+                            c,
+                            WIDTH,
+                            TO_VALUES,
+                            TO_POINTS,
+                        )
+                        to_x += w * wy * sx * met
+                        to_y += w * sy * wx * met
+                        to_weight += wy * wx * met
+            if TO_POINTS:
+                tl.store(grad_offsets + 2 * at, to_x, mask=inside)
+                tl.store(grad_offsets + 2 * at + 1, to_y, mask=inside)
+                tl.store(grad_weights + at, to_weight, mask=inside)

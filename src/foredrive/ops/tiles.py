@@ -1,0 +1,91 @@
+"""What Triton kernels are made of: tiles of rows × points × channels, and reading between grid cells.
+
+A row is what one head reads for one query. All sums are float32, whatever the inputs are stored in. Without a
+GPU the kernels run in Triton's interpreter if TRITON_INTERPRET=1 is set before Triton is imported, as their
+tests do it.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import triton
+import triton.language as tl
+
+TILE = 1024
+"""Numbers in a tile: eight to a thread."""
+PLACES, POINTS_AT_ONCE = 256, 16
+"""Most places and points in a tile: a place takes more registers than a number that is read there."""
+
+
+class Tile(NamedTuple):
+    """What a program works on at once; all are powers of two."""
+
+    rows: int
+    points: int
+    channels: int
+
+
+def tile_of(points: int, channels: int) -> Tile:
+    """The tile for rows of so many points that read so many channels: all channels, some points and rows."""
+    wide = int(triton.next_power_of_2(channels))
+    many = min(int(triton.next_power_of_2(points)), POINTS_AT_ONCE, max(TILE // wide, 1))
+    return Tile(rows=max(min(TILE // wide, PLACES) // many, 1), points=many, channels=wide)
+
+
+@triton.jit
+@no_type_check
+def neighbours(x, size):
+    """See `lanes.neighbours`: the cells beside a coordinate whose integers are cell centres."""
+    x = tl.where(x > -2.0, x, -2.0)  # NaN goes there too
+    x = tl.where(x < size, x, size * 1.0)
+    floor = tl.floor(x)
+    part = x - floor
+    low = floor.to(tl.int32)
+    high = low + 1
+    has_low = (low >= 0) & (low < size)
+    has_high = (high >= 0) & (high < size)
+    return (
+        tl.minimum(tl.maximum(low, 0), size - 1),
+        tl.minimum(tl.maximum(high, 0), size - 1),
+        tl.where(has_low, 1.0 - part, 0.0),
+        tl.where(has_high, part, 0.0),
+        tl.where(has_low, -1.0, 0.0),
+        tl.where(has_high, 1.0, 0.0),
+    )
+
+
+@triton.jit
+@no_type_check
+def read(values, address, part, c, WIDTH: tl.constexpr):
+    """Σ part · value over a tile's points, rows × channels; where the part is 0 nothing is looked at."""
+    needed = (part != 0)[:, :, None] & (c < WIDTH)[None, None, :]
+    value = tl.load(values + address[:, :, None] + c[None, None, :], mask=needed, other=0.0)
+    return tl.sum(part[:, :, None] * value.to(tl.float32), axis=1)
+
+
+@triton.jit
+@no_type_check
+def read_back(
+    values,
+    grad_values,
+    address,
+    part,
+    inside,
+    grad,
+    c,
+    WIDTH: tl.constexpr,
+    TO_VALUES: tl.constexpr,
+    TO_POINTS: tl.constexpr,
+):
+    """What the gradient of rows × channels does at the cells of one corner.
+
+    Adds part · grad to `grad_values`, and returns the dot product of grad and value for every point.
+    """
+    place = address[:, :, None] + c[None, None, :]
+    dot = tl.zeros(address.shape, tl.float32)
+    if TO_POINTS:
+        value = tl.load(values + place, mask=inside[:, :, None] & (c < WIDTH)[None, None, :], other=0.0)
+        dot = tl.sum(value.to(tl.float32) * grad[:, None, :], axis=2)
+    if TO_VALUES:
+        needed = (part != 0)[:, :, None] & (c < WIDTH)[None, None, :]
+        tl.atomic_add(grad_values + place, part[:, :, None] * grad[:, None, :], mask=needed, sem="relaxed")
+    return dot

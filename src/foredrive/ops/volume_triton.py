@@ -1,0 +1,213 @@
+"""The CUDA path of `sample_volume` and `attend_volume`: Triton kernels of sums of trilinear readings.
+
+A program takes a few rows (a head of a query each) and reads rows × points × channels at a time.
+"""
+
+from collections.abc import Sequence
+from typing import Any, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from foredrive.ops.tiles import neighbours, read, read_back, tile_of
+
+
+def read_volume_triton(
+    values: Float[Tensor, "b Z Y X D"],
+    points: Float[Tensor, "b Q H P 3"],
+    weights: Float[Tensor, "b Q H P"],
+) -> Float[Tensor, "b Q D"]:
+    """`attend_volume` for what lies on a GPU. Half precision is read as it is and added up in float32.
+
+    The gradient of the values is added up by atomics: its last bits differ from run to run.
+    """
+    out: Tensor = _ReadVolume.apply(values, points, weights)
+    return out
+
+
+def sample_volume_triton(
+    volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
+) -> Float[Tensor, "b N D"]:
+    """`sample_volume` for what lies on a GPU: one head with one point of weight 1."""
+    one = torch.ones(*points.shape[:2], 1, 1, device=points.device)
+    return read_volume_triton(volume, points[:, :, None, None], one)
+
+
+class _ReadVolume(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Float[Tensor, "b Z Y X D"],
+        points: Float[Tensor, "b Q H P 3"],
+        weights: Float[Tensor, "b Q H P"],
+    ) -> Float[Tensor, "b Q D"]:
+        inputs = [x.contiguous() for x in (values, points, weights)]
+        ctx.save_for_backward(*inputs)
+        out = torch.empty(*weights.shape[:2], values.shape[-1], device=values.device)
+        _launch(_read_rows, inputs, [out])
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
+        values, points, weights = ctx.saved_tensors
+        wants_values, wants_points, wants_weights = ctx.needs_input_grad
+        to_points = wants_points or wants_weights
+        grad_values = torch.zeros_like(values, dtype=torch.float32) if wants_values else None
+        grad_points = torch.empty_like(points) if to_points else None
+        grad_weights = torch.empty_like(weights) if to_points else None
+        _launch(
+            _read_rows_back,
+            [values, points, weights],
+            [grad_out.float().contiguous(), grad_values, grad_points, grad_weights],
+            TO_VALUES=wants_values,
+            TO_POINTS=to_points,
+        )
+        return (
+            None if grad_values is None else grad_values.to(values.dtype),
+            grad_points if wants_points else None,
+            grad_weights if wants_weights else None,
+        )
+
+
+def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | None], **flags: bool) -> None:
+    values, _, weights = inputs
+    queries, heads, points = weights.shape[1:]
+    rows, width = len(weights) * queries * heads, values.shape[-1] // heads
+    tile = tile_of(points, width)
+    if rows:
+        kernel[(triton.cdiv(rows, tile.rows),)](
+            *inputs,
+            *outputs,
+            rows,
+            queries,
+            *values.shape[1:4],
+            HEADS=heads,
+            POINTS=points,
+            WIDTH=width,
+            ROWS=tile.rows,
+            P=tile.points,
+            W=tile.channels,
+            **flags,
+        )
+
+
+@triton.jit
+@no_type_check
+def _places(points, weights, at, inside):
+    """Coordinates (integers are voxel centres) and weights of rows × points."""
+    x = tl.load(points + 3 * at, mask=inside, other=0.0).to(tl.float32) - 0.5
+    y = tl.load(points + 3 * at + 1, mask=inside, other=0.0).to(tl.float32) - 0.5
+    z = tl.load(points + 3 * at + 2, mask=inside, other=0.0).to(tl.float32) - 0.5
+    weight = tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
+    weight = tl.where((x == x) & (y == y) & (z == z), weight, float("nan"))
+    return x, y, z, tl.where(inside, weight, 0.0)
+
+
+@triton.jit
+@no_type_check
+def _read_rows(
+    values,  # b Z Y X D
+    points,  # b·Q H P 3
+    weights,  # b·Q H P
+    out,  # b·Q D
+    row_count,
+    queries,
+    depth,
+    height,
+    width,
+    HEADS: tl.constexpr,
+    POINTS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    ROWS: tl.constexpr,
+    P: tl.constexpr,
+    W: tl.constexpr,
+):
+    CHANNELS: tl.constexpr = HEADS * WIDTH
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    exists = row < row_count
+    query, head = row // HEADS, row % HEADS
+    base = (query // queries * depth * height * width * CHANNELS + head * WIDTH)[:, None]
+    c = tl.arange(0, W)
+    total = tl.zeros([ROWS, W], tl.float32)
+    for first in range(0, POINTS, P):
+        p = first + tl.arange(0, P)
+        inside = exists[:, None] & (p < POINTS)[None, :]
+        x, y, z, w = _places(points, weights, (row * POINTS)[:, None] + p[None, :], inside)
+        x0, x1, wx0, wx1, _, _ = neighbours(x, width)
+        y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+        z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
+        for corner in tl.static_range(8):
+            cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
+            cy, wy = (y1, wy1) if corner // 2 % 2 else (y0, wy0)
+            cz, wz = (z1, wz1) if corner // 4 else (z0, wz0)
+            voxel = (cz * height + cy) * width + cx
+            total += read(values, base + voxel * CHANNELS, w * wz * wy * wx, c, WIDTH)
+    to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
+    tl.store(out + to, total, mask=exists[:, None] & (c < WIDTH)[None, :])
+
+
+@triton.jit
+@no_type_check
+def _read_rows_back(
+    values,
+    points,
+    weights,
+    grad_out,  # b·Q D
+    grad_values,
+    grad_points,
+    grad_weights,
+    row_count,
+    queries,
+    depth,
+    height,
+    width,
+    HEADS: tl.constexpr,
+    POINTS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    ROWS: tl.constexpr,
+    P: tl.constexpr,
+    W: tl.constexpr,
+    TO_VALUES: tl.constexpr,
+    TO_POINTS: tl.constexpr,
+):
+    CHANNELS: tl.constexpr = HEADS * WIDTH
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    exists = row < row_count
+    query, head = row // HEADS, row % HEADS
+    base = (query // queries * depth * height * width * CHANNELS + head * WIDTH)[:, None]
+    c = tl.arange(0, W)
+    to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
+    grad = tl.load(grad_out + to, mask=exists[:, None] & (c < WIDTH)[None, :], other=0.0)
+    for first in range(0, POINTS, P):
+        p = first + tl.arange(0, P)
+        inside = exists[:, None] & (p < POINTS)[None, :]
+        at = (row * POINTS)[:, None] + p[None, :]
+        x, y, z, w = _places(points, weights, at, inside)
+        x0, x1, wx0, wx1, sx0, sx1 = neighbours(x, width)
+        y0, y1, wy0, wy1, sy0, sy1 = neighbours(y, height)
+        z0, z1, wz0, wz1, sz0, sz1 = neighbours(z, depth)
+        to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
+        to_z, to_weight = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
+        for corner in tl.static_range(8):
+            cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
+            cy, wy, sy = (y1, wy1, sy1) if corner // 2 % 2 else (y0, wy0, sy0)
+            cz, wz, sz = (z1, wz1, sz1) if corner // 4 else (z0, wz0, sz0)
+            at_corner = base + ((cz * height + cy) * width + cx) * CHANNELS
+            part = wz * wy * wx
+            met = read_back(
+                values, grad_values, at_corner, w * part, inside, grad, c, WIDTH, TO_VALUES, TO_POINTS
+            )
+            to_x += w * wz * wy * sx * met
+            to_y += w * wz * sy * wx * met
+            to_z += w * sz * wy * wx * met
+            to_weight += part * met
+        if TO_POINTS:
+            tl.store(grad_points + 3 * at, to_x, mask=inside)
+            tl.store(grad_points + 3 * at + 1, to_y, mask=inside)
+            tl.store(grad_points + 3 * at + 2, to_z, mask=inside)
+            tl.store(grad_weights + at, to_weight, mask=inside)
