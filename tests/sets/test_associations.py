@@ -7,7 +7,8 @@ import pytest
 
 from foredrive.errors import InputError
 from foredrive.sets.associations import sum_associations
-from foredrive.sets.component import sum_component
+from foredrive.sets.component import scale
+from foredrive.sets.interval import bound_component
 
 
 def enumerate_associations(
@@ -72,15 +73,15 @@ def test_the_best_associations_bound_the_sum_from_below_and_the_gap_from_above()
         if expected == -np.inf:
             continue
         for k in missing:
-            for result in (sum_component(*scene, k, 0), sum_associations(*scene, k=k, max_states=0)):
+            for result in (bound_component(scale(*scene), k), sum_associations(*scene, k=k, max_states=0)):
                 assert result.log_lower - 1e-9 <= expected <= result.log_upper + 1e-9
         for k, missed in missing.items():
-            result = sum_component(*scene, k, 0)
+            result = bound_component(scale(*scene), k)
             missed.append(expected - result.log_lower)
             if k == 10_000:  # all there are
                 assert result.log_upper == pytest.approx(expected, abs=1e-9)
                 assert result.log_lower == pytest.approx(expected, abs=1e-9)
-                np.testing.assert_allclose(result.pair, pair, atol=1e-9)
+                np.testing.assert_allclose(result.share, pair, atol=1e-9)
     assert np.mean(missing[1]) > np.mean(missing[3]) > np.mean(missing[10_000])
 
 

@@ -190,3 +190,26 @@ def test_what_is_no_density_is_named() -> None:
     found = MultiBernoulli.from_softmax(torch.zeros(2, 3), good)
     with pytest.raises(InputError, match=r"object \(0,\) has label 7"):
         found.log_label(LabelledBoxes(torch.tensor([7]), torch.zeros(1, 1)))
+
+
+@pytest.mark.parametrize("family", ["gaussian", "laplace"])
+@pytest.mark.parametrize("yaw", [False, True])
+def test_densities_without_gradients_and_of_pairs_are_those_with(family: str, yaw: bool) -> None:
+    rng = np.random.default_rng(7)
+    density, truth = box_density(rng, 9, 5, yaw=yaw, family=family), objects(rng, 7, 5, yaw=yaw)
+    expected = dataclasses.replace(density, mean=density.mean.clone().requires_grad_()).log_prob(truth)
+    assert expected.requires_grad
+    torch.testing.assert_close(density.log_prob(truth), expected.detach(), atol=1e-11, rtol=1e-12)
+    i, j = torch.tensor([0, 8, 3, 3]), torch.tensor([6, 0, 2, 2])
+    torch.testing.assert_close(density.log_prob_of_pairs(i, truth, j), expected[i, j].detach())
+
+
+def test_intensities_without_gradients_are_those_with() -> None:
+    rng = np.random.default_rng(8)
+    log_rate, log_class = torch.as_tensor(rng.normal(size=6)), torch.zeros(6, 3).log_softmax(-1)
+    log_class[2, 1] = -math.inf
+    process = MixturePoisson(log_rate, log_class, box_density(rng, 6, 3, yaw=False, family="gaussian"))
+    truth = objects(rng, 20, 3, yaw=False)
+    learning = dataclasses.replace(process, log_rate=log_rate.clone().requires_grad_())
+    expected = learning.log_intensity(truth).detach()
+    torch.testing.assert_close(process.log_intensity(truth), expected, atol=1e-12, rtol=1e-12)

@@ -55,7 +55,7 @@ def best_assignment(cost: Float[ndarray, "R C"], free: Float[ndarray, "R"]) -> A
 
     Entries of `cost` may be +inf (forbidden) or negative; `free` must be finite. Fastest with R ≤ C.
     """
-    column, row_price, column_price = _solve(_as_costs(cost), _as_costs(free))
+    column, row_price, column_price = solve(_as_costs(cost), _as_costs(free))
     return Assignment(np.where(column == cost.shape[1], -1, column), row_price, column_price)
 
 
@@ -71,8 +71,11 @@ def _as_costs(values: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
 
 @_kernel
 @no_type_check
-def _solve(cost, free):
-    """Add the rows one after the other. Column C stands for none, of which every row has its own."""
+def solve(cost, free):
+    """`best_assignment` within kernels: add the rows one after the other.
+
+    Column C stands for none, of which every row has its own.
+    """
     rows, columns = cost.shape
     column_of = np.full(rows, -1)
     row_of = np.full(columns, -1)
@@ -140,7 +143,7 @@ def _rank(cost, free, k):
         np.empty(nodes), np.empty(nodes, np.int64), np.empty(nodes, np.bool_), np.empty(nodes, np.int64)
     )
 
-    column_of[0], u[0], v[0, :columns] = _solve(cost, free)
+    column_of[0], u[0], v[0, :columns] = solve(cost, free)
     total[0] = 0.0
     for r in range(rows):
         c = column_of[0, r]

@@ -6,17 +6,20 @@ weighs (PMB density, thesis eq. 3.10-3.12, where each summand is one association
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from foredrive.errors import InputError
-from foredrive.sets.component import gate_by_price, is_small, sum_component
+from foredrive.sets.component import Components, find_components, scale, sum_components
+from foredrive.sets.interval import bound_component
 
-_COARSER, _COARSEST_NATS = 100.0, 0.1
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_COARSER, _COARSEST_NATS = 1e3, 0.11
+_NEGLIGIBLE_NATS = 40.0
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,16 @@ class AssociationSum:
     """What was summed; -inf if no association is possible."""
     log_upper: float
     """No more than this was missed by gating and by listing only the best associations."""
-    pair: Float[ndarray, "M N"]
-    """Probability that detection i and object j belong together."""
+    detection: Int[ndarray, "E"]
+    """Detection of each pair that may belong together; all other pairs have probability 0."""
+    object: Int[ndarray, "E"]
+    """Object of each of these pairs."""
+    probability: Float[ndarray, "E"]
+    """That the pair belongs together."""
+    absent: Float[ndarray, "M"]
+    """Probability that a detection has no object."""
+    background: Float[ndarray, "N"]
+    """Probability that an object has no detection."""
     best: Int[ndarray, "N"]
     """Detection of each object in the most likely association; -1: background."""
     impossible_detections: Int[ndarray, "_"]
@@ -37,14 +48,11 @@ class AssociationSum:
     """Objects that no detection and no background explains, in the same association."""
 
     @property
-    def absent(self) -> Float[ndarray, "M"]:
-        """Probability that a detection has no object."""
-        return np.clip(1.0 - self.pair.sum(1), 0.0, 1.0)
-
-    @property
-    def background(self) -> Float[ndarray, "N"]:
-        """Probability that an object has no detection."""
-        return np.clip(1.0 - self.pair.sum(0), 0.0, 1.0)
+    def pair(self) -> Float[ndarray, "M N"]:
+        """Probability that detection i and object j belong together."""
+        pair = np.zeros((len(self.absent), len(self.background)))
+        pair[self.detection, self.object] = self.probability
+        return pair
 
 
 def sum_associations(
@@ -67,76 +75,110 @@ def sum_associations(
 
     Raises `InputError` for weights that are NaN or infinite, naming them.
     """
+    log_pair, log_absent, log_background = (
+        np.ascontiguousarray(log, dtype=np.float64) for log in (log_pair, log_absent, log_background)
+    )
     _check("pair (detection, object)", log_pair)
     _check("absent detection", log_absent)
     _check("background object", log_background)
-    return _sum_gated(log_pair, log_absent, log_background, k, max_states, gate_nats)
+    found = _sum_gated(log_pair, log_absent, log_background, k, max_states, gate_nats)
+    return AssociationSum(
+        found.log_lower, found.log_upper, found.row, found.column, found.share,
+        np.clip(1.0 - np.bincount(found.row, found.share, len(log_absent)), 0.0, 1.0),
+        np.clip(1.0 - np.bincount(found.column, found.share, len(log_background)), 0.0, 1.0),
+        found.best, np.flatnonzero(found.bad_rows), np.flatnonzero(found.bad_columns),
+    )  # fmt: skip
+
+
+@dataclass
+class _Found:
+    """What is known of a scene, or of a part of it; detections are rows, objects columns."""
+
+    log_lower: float
+    log_upper: float
+    row: Int[ndarray, "E"]
+    column: Int[ndarray, "E"]
+    share: Float[ndarray, "E"]
+    best: Int[ndarray, "C"]
+    bad_rows: Bool[ndarray, "R"]
+    bad_columns: Bool[ndarray, "C"]
 
 
 def _sum_gated(
-    log_pair: Float[ndarray, "M N"],
-    log_absent: Float[ndarray, "M"],
-    log_background: Float[ndarray, "N"],
+    log_pair: Float[ndarray, "R C"],
+    log_row: Float[ndarray, "R"],
+    log_column: Float[ndarray, "C"],
     k: int,
     max_states: int,
     gate_nats: float,
-) -> AssociationSum:
+) -> _Found:
     """Gate, and sum every component; one that is too large is gated again, less strictly."""
-    kept, lost_nats = _gate(log_pair, log_absent, log_background, gate_nats)
-    log_kept = np.where(kept, log_pair, -np.inf)
-    alone, unpaired = ~kept.any(1), ~kept.any(0)
-    lower = upper = float(log_absent[alone].sum() + log_background[unpaired].sum())
-    pair, best = np.zeros(log_pair.shape), np.full(len(log_background), -1)
-    bad_detections, bad_objects = alone & (log_absent == -np.inf), unpaired & (log_background == -np.inf)
-    for i, j in _components(kept):
-        here = np.ix_(i, j)
-        scene = log_kept[here], log_absent[i], log_background[j]
-        if is_small(len(i), len(j), max_states) or gate_nats * _COARSER > _COARSEST_NATS:
-            part = _sum_whole(*scene, k, max_states)
-        else:
-            part = _sum_gated(*scene, k, max_states, gate_nats * _COARSER)
-        lower, upper = lower + part.log_lower, upper + part.log_upper
-        pair[here] = part.pair
-        best[j] = np.where(part.best < 0, -1, i[part.best])
-        bad_detections[i[part.impossible_detections]] = True
-        bad_objects[j[part.impossible_objects]] = True
-    impossible = np.flatnonzero(bad_detections), np.flatnonzero(bad_objects)
-    return AssociationSum(lower, upper + lost_nats, pair, best, *impossible)
+    row, column, lost_nats = _gate(log_pair, log_row, log_column, gate_nats)
+    components = find_components(row, column, len(log_row), len(log_column))
+    log_edge = log_pair[row, column]
+    exact = sum_components(components, row, column, log_edge, log_row, log_column, max_states)
+    found = _Found(
+        exact.log_sum, exact.log_sum + lost_nats, row, column, exact.share, exact.best,
+        exact.bad_rows, exact.bad_columns,
+    )  # fmt: skip
+    for n in exact.too_large:
+        i, j, edge = _members(components, n)
+        here = np.full((len(i), len(j)), -np.inf)
+        where = np.searchsorted(i, row[edge]), np.searchsorted(j, column[edge])
+        here[where] = log_edge[edge]
+        part = _sum_large(here, log_row[i], log_column[j], k, max_states, gate_nats * _COARSER)
+        found.log_lower += part.log_lower
+        found.log_upper += part.log_upper
+        share = np.zeros(here.shape)
+        share[part.row, part.column] = part.share
+        found.share[edge] = share[where]
+        found.best[j] = np.where(part.best < 0, -1, i[part.best])
+    return found
 
 
-def _sum_whole(
-    log_pair: Float[ndarray, "M N"],
-    log_absent: Float[ndarray, "M"],
-    log_background: Float[ndarray, "N"],
+def _members(
+    components: Components, n: np.integer
+) -> tuple[Int[ndarray, "_"], Int[ndarray, "_"], Int[ndarray, "_"]]:
+    """Rows, columns and edges of a component."""
+    return (
+        components.row[slice(*components.row_start[n : n + 2])],
+        components.column[slice(*components.column_start[n : n + 2])],
+        components.edge[slice(*components.edge_start[n : n + 2])],
+    )
+
+
+def _sum_large(
+    log_pair: Float[ndarray, "R C"],
+    log_row: Float[ndarray, "R"],
+    log_column: Float[ndarray, "C"],
     k: int,
     max_states: int,
-) -> AssociationSum:
-    """Sum one component with whichever are fewer as rows."""
-    if len(log_absent) <= len(log_background):
-        part = sum_component(log_pair, log_absent, log_background, k, max_states)
-        best = np.full(len(log_background), -1)
-        best[part.column[part.column >= 0]] = np.flatnonzero(part.column >= 0)
-        pair, bad_detections, bad_objects = part.pair, part.bad_rows, part.bad_columns
-    else:
-        part = sum_component(log_pair.T, log_background, log_absent, k, max_states)
-        pair, best, bad_detections, bad_objects = part.pair.T, part.column, part.bad_columns, part.bad_rows
-    impossible = np.flatnonzero(bad_detections), np.flatnonzero(bad_objects)
-    return AssociationSum(part.log_lower, part.log_upper, pair, best, *impossible)
+    gate_nats: float,
+) -> _Found:
+    """Gate a component that is too large less strictly, or bound it."""
+    if gate_nats <= _COARSEST_NATS:
+        return _sum_gated(log_pair, log_row, log_column, k, max_states, gate_nats)
+    interval = bound_component(scale(log_pair, log_row, log_column), k)
+    row, column = np.nonzero(interval.share)
+    return _Found(
+        interval.log_lower, interval.log_upper, row, column, interval.share[row, column], interval.best,
+        np.zeros(len(log_row), bool), np.zeros(len(log_column), bool),
+    )  # fmt: skip
 
 
 def _check(name: str, log_weight: Float[ndarray, "..."]) -> None:
-    wrong = np.argwhere(~(log_weight < np.inf))
-    if len(wrong):
-        where = tuple(wrong[0].tolist())
+    valid = log_weight < np.inf
+    if not valid.all():
+        where = tuple(np.argwhere(~valid)[0].tolist())
         raise InputError(f"weight of {name} {where} is {log_weight[where]}: it must be finite, or zero")
 
 
 def _gate(
-    log_pair: Float[ndarray, "M N"],
-    log_absent: Float[ndarray, "M"],
-    log_background: Float[ndarray, "N"],
+    log_pair: Float[ndarray, "R C"],
+    log_row: Float[ndarray, "R"],
+    log_column: Float[ndarray, "C"],
     budget_nats: float,
-) -> tuple[Bool[ndarray, "M N"], float]:
+) -> tuple[Int[ndarray, "E"], Int[ndarray, "E"], float]:
     """Pairs that are kept, and a bound on what the others add to the logarithm of the sum.
 
     An association without its left-out pairs is one of those that stay; each pair put back multiplies its
@@ -144,24 +186,53 @@ def _gate(
     Π_j (1 + Σ_i odds_ij), over the pairs left out. Prices decide where odds are infinite: at certain
     detections and objects without background.
     """
-    with np.errstate(invalid="ignore"):
-        log_odds = log_pair - log_absent[:, None] - log_background
-    log_odds[log_pair == -np.inf] = -np.inf
-    kept = log_odds > np.log(0.5 * budget_nats / max(log_odds.size, 1))
-    left_out = np.exp(np.where(kept, -np.inf, log_odds))
-    lost_nats = float(np.log1p(left_out.sum(0)).sum())
-    if (log_odds == np.inf).any():
-        log_kept = np.where(kept, log_pair, -np.inf)
-        kept, more_nats = gate_by_price(log_kept, log_absent, log_background, 0.5 * budget_nats)
+    log_least = np.log(0.5 * budget_nats / max(log_pair.size, 1))
+    row, column, lost_nats = _gate_by_odds(log_pair, log_row, log_column, log_least)
+    if (log_row == -np.inf).any() or (log_column == -np.inf).any():
+        log_kept = np.full(log_pair.shape, -np.inf)
+        log_kept[row, column] = log_pair[row, column]
+        kept, more_nats = _gate_by_price(log_kept, log_row, log_column, 0.5 * budget_nats)
+        row, column = np.nonzero(kept)
         lost_nats += more_nats
-    return kept, lost_nats
+    return row, column, lost_nats
 
 
-def _components(kept: Bool[ndarray, "M N"]) -> list[tuple[Int[ndarray, "_"], Int[ndarray, "_"]]]:
-    """Detections and objects of each connected component that has a pair."""
-    m, n = kept.shape
-    i, j = np.nonzero(kept)
-    graph = coo_array((np.ones(len(i), np.int8), (i, j + m)), shape=(m + n, m + n))
-    count, label = connected_components(graph, directed=False)
-    by_label = np.split(np.argsort(label, kind="stable"), np.bincount(label, minlength=count).cumsum()[:-1])
-    return [(group[group < m], group[group >= m] - m) for group in by_label if len(group) > 1]
+@_kernel
+@no_type_check
+def _gate_by_odds(log_pair, log_row, log_column, log_least):
+    rows, columns = log_pair.shape
+    row, column = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.int64)
+    count, lost = 0, np.zeros(columns)
+    for r in range(rows):
+        for c in range(columns):
+            if log_pair[r, c] == -np.inf:
+                continue
+            log_odds = log_pair[r, c] - log_row[r] - log_column[c]
+            if log_odds > log_least:
+                row[count], column[count], count = r, c, count + 1
+            elif log_odds > log_least - _NEGLIGIBLE_NATS:
+                lost[c] += np.exp(log_odds)
+    lost += rows * np.exp(log_least - _NEGLIGIBLE_NATS)
+    return row[:count].copy(), column[:count].copy(), np.log1p(lost).sum()
+
+
+def _gate_by_price(
+    log_pair: Float[ndarray, "R C"],
+    log_row: Float[ndarray, "R"],
+    log_column: Float[ndarray, "C"],
+    budget_nats: float,
+) -> tuple[Bool[ndarray, "R C"], float]:
+    """Pairs to keep so that the others add no more than the budget to the log of the sum; what they add.
+
+    Scaled, the best association weighs 1 and is kept. All that have a given pair weigh no more than the pair
+    times what the other rows (or columns) can choose from, each without regard to the rest. Nothing is left
+    out where no association is possible.
+    """
+    scaled = scale(log_pair, log_row, log_column)
+    if scaled.log_best == -np.inf:
+        return log_pair > -np.inf, 0.0
+    pair = np.exp(scaled.log_pair)
+    by_row, by_column = np.log(scaled.row_alone + pair.sum(1)), np.log(scaled.column_alone + pair.sum(0))
+    log_share = scaled.log_pair + min(by_row.sum() - by_row[:, None], by_column.sum() - by_column, key=np.max)
+    kept = log_share > np.log(budget_nats / max(log_pair.size, 1))
+    return kept, float(np.log1p(np.exp(log_share[~kept]).sum()))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene.record import Record
+from foredrive.sets.box_kernel import add_heading, box_log_prob
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -59,25 +60,58 @@ class BoxDensity(Record):
             require("concentration", self.concentration.isfinite() & (self.concentration >= 0))
 
     def log_prob(self, boxes: LabelledBoxes) -> Float[Tensor, "*b M N"]:
-        """Log-density of each box under each component, float64. Raises `InputError` for boxes not finite."""
-        require("state of object", boxes.state.isfinite().all(-1))
+        """Log-density of each box under each component, float64.
+
+        Raises `InputError` for boxes that are not finite, or without a heading where one is expected.
+        """
+        self._require_boxes(boxes)
+        if self.mean.dim() == 2 and self.mean.device.type == "cpu" and not needs_gradient(self, boxes):
+            return torch.as_tensor(self._values(boxes))
         chol = self.chol.double()
         offset = boxes.state.double()[..., None, :, :] - self.mean.double()[..., :, None, :]
-        white = torch.linalg.solve_triangular(chol, offset.mT, upper=False)  # [*b M D N]
-        if self.family == "gaussian":
-            log_prob = -0.5 * (white.square() + _LOG_2PI).sum(-2)
-        else:
-            log_prob = -(math.sqrt(2) * white.abs() + 0.5 * math.log(2)).sum(-2)
-        log_prob = log_prob - chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None]
-        if self.yaw is None or self.concentration is None:
+        white = torch.linalg.solve_triangular(chol, offset.mT, upper=False).mT  # [*b M N D]
+        log_scale = chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None]
+        log_prob = self._log_white(white) - log_scale
+        if self.yaw is None or self.concentration is None or boxes.yaw is None:
             return log_prob
+        turn = boxes.yaw.double()[..., None, :] - self.yaw.double()[..., :, None]
+        return log_prob + _log_von_mises(turn, self.concentration.double()[..., None])
+
+    def log_prob_of_pairs(
+        self, component: Int[Tensor, "E"], boxes: LabelledBoxes, box: Int[Tensor, "E"]
+    ) -> Float[Tensor, "E"]:
+        """`log_prob` at pairs of a component and a box of one frame."""
+        chol = self.chol[component].double()
+        offset = boxes.state[box].double() - self.mean[component].double()
+        white = torch.linalg.solve_triangular(chol, offset[..., None], upper=False)[..., 0]
+        log_prob = self._log_white(white) - chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        if self.yaw is None or self.concentration is None or boxes.yaw is None:
+            return log_prob
+        turn = boxes.yaw[box].double() - self.yaw[component].double()
+        return log_prob + _log_von_mises(turn, self.concentration[component].double())
+
+    def _log_white(self, white: Float[Tensor, "*e D"]) -> Float[Tensor, "*e"]:
+        if self.family == "gaussian":
+            return -0.5 * (white.square() + _LOG_2PI).sum(-1)
+        return -(math.sqrt(2) * white.abs() + 0.5 * math.log(2)).sum(-1)
+
+    def _values(self, boxes: LabelledBoxes) -> Float[np.ndarray, "M N"]:
+        """`log_prob` without gradients."""
+        mean, chol, state = (_numbers(values) for values in (self.mean, self.chol, boxes.state))
+        log_prob = box_log_prob(mean, chol, state, self.family == "laplace")
+        if self.yaw is not None and self.concentration is not None and boxes.yaw is not None:
+            log_i0e = torch.special.i0e(self.concentration.double()).log()
+            heading = (self.yaw, self.concentration, log_i0e, boxes.yaw)
+            add_heading(log_prob, *(_numbers(values) for values in heading))
+        return log_prob
+
+    def _require_boxes(self, boxes: LabelledBoxes) -> None:
+        require("state of object", boxes.state.isfinite().all(-1))
+        if self.yaw is None:
+            return
         if boxes.yaw is None:
             raise InputError("densities with a heading are asked about boxes without one")
         require("heading of object", boxes.yaw.isfinite())
-        kappa = self.concentration.double()[..., None]
-        cos = (boxes.yaw.double()[..., None, :] - self.yaw.double()[..., :, None]).cos()
-        # i0e(κ) = I₀(κ)·exp(-κ): without it large concentrations overflow.
-        return log_prob + kappa * (cos - 1) - torch.special.i0e(kappa).log() - _LOG_2PI
 
     def sample(
         self, rng: np.random.Generator
@@ -92,6 +126,25 @@ class BoxDensity(Record):
             return state, None
         yaw = rng.vonmises(self.yaw.double().cpu().numpy(), self.concentration.double().cpu().numpy())
         return state, torch.as_tensor(yaw)
+
+
+def needs_gradient(*records: Record) -> bool:
+    """Whether a gradient is asked for with respect to any tensor of the records."""
+    return torch.is_grad_enabled() and any(
+        value.requires_grad
+        for record in records
+        for value in vars(record).values()
+        if isinstance(value, Tensor)
+    )
+
+
+def _numbers(values: Tensor) -> Float[np.ndarray, "..."]:
+    return np.ascontiguousarray(values.detach().cpu().double().numpy())
+
+
+def _log_von_mises(turn: Float[Tensor, "*e"], kappa: Float[Tensor, "..."]) -> Float[Tensor, "*e"]:
+    # i0e(κ) = I₀(κ)·exp(-κ): without it large concentrations overflow.
+    return kappa * (turn.cos() - 1) - torch.special.i0e(kappa).log() - _LOG_2PI
 
 
 def require(what: str, valid: Bool[Tensor, "..."]) -> None:

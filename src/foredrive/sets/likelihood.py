@@ -55,19 +55,21 @@ def set_nll(
     finite, or labels that are unknown, naming the first.
     """
     detected, background = predicted.detected, predicted.background
-    log_box = detected.boxes.log_prob(objects)
-    log_label = detected.log_label(objects)
     log_absent = detected.log_absence.double()
     if background is None:
         log_background = torch.full_like(objects.label, -math.inf, dtype=torch.float64)
         expected = torch.zeros((), dtype=torch.float64, device=log_absent.device)
     else:
         log_background, expected = background.log_intensity(objects), background.expected_count
+    with torch.no_grad():
+        log_pair = detected.boxes.log_prob(objects) + detected.log_label(objects)
     found = sum_associations(
-        *(log.detach().cpu().numpy() for log in (log_box + log_label, log_absent, log_background)),
+        *(log.detach().cpu().numpy() for log in (log_pair, log_absent, log_background)),
         k=k, max_states=max_states, gate_nats=gate_nats,
     )  # fmt: skip
-    localisation, classification = _expected(found.pair, log_box), _expected(found.pair, log_label)
+    i, j = (torch.as_tensor(index, device=log_absent.device) for index in (found.detection, found.object))
+    localisation = _expected(found.probability, detected.boxes.log_prob_of_pairs(i, objects, j))
+    classification = _expected(found.probability, detected.log_label_of_pairs(i, objects, j))
     false, missed = _expected(found.absent, log_absent), _expected(found.background, log_background)
     energy = localisation + classification + false + missed + expected
     value = energy.new_tensor(-found.log_lower) + expected.detach()

@@ -6,11 +6,12 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene.record import Record
+from foredrive.sets.box_kernel import log_sum_exp
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes, require
 
 _ROUNDING = 1e-4  # of probabilities that were computed in float32
@@ -58,9 +59,16 @@ class MultiBernoulli(Record):
 
     def log_label(self, objects: LabelledBoxes) -> Float[Tensor, "*b M N"]:
         """Log-probability that each object exists with its label."""
-        label = _checked(objects.label, self.log_class.shape[-1])
+        label = checked_labels(objects.label, self.log_class.shape[-1])
         index = label[..., None, :].expand(*self.log_class.shape[:-1], label.shape[-1])
         return self.log_existence.double()[..., None] + self.log_class.double().gather(-1, index)
+
+    def log_label_of_pairs(
+        self, component: Int[Tensor, "E"], objects: LabelledBoxes, box: Int[Tensor, "E"]
+    ) -> Float[Tensor, "E"]:
+        """`log_label` at pairs of a component and an object of one frame."""
+        log_class = self.log_class[component, objects.label.long()[box]]
+        return self.log_existence[component].double() + log_class.double()
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
         """One set; of one frame only."""
@@ -111,7 +119,7 @@ class UniformPoisson(Record):
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
         """Log λ at each object, float64; -inf outside the region."""
-        label = _checked(objects.label, len(self.rate))
+        label = checked_labels(objects.label, len(self.rate))
         log_volume = (self.upper - self.lower).double().log().sum()
         log_volume = log_volume + (math.log(2 * math.pi) if self.has_yaw else 0.0)
         inside = ((objects.state >= self.lower) & (objects.state <= self.upper)).all(-1)
@@ -143,9 +151,12 @@ class MixturePoisson(Record):
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
         """Log λ at each object, float64."""
-        label = _checked(objects.label, self.log_class.shape[-1])
+        label = checked_labels(objects.label, self.log_class.shape[-1])
         log_class = self.log_class.double()[:, label]
-        return (self.log_rate.double()[:, None] + log_class + self.boxes.log_prob(objects)).logsumexp(0)
+        log_each = self.log_rate.double()[:, None] + log_class + self.boxes.log_prob(objects)
+        if log_each.requires_grad or log_each.device.type != "cpu":
+            return log_each.logsumexp(0)
+        return torch.as_tensor(log_sum_exp(log_each.numpy()))
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
         """One set."""
@@ -186,7 +197,8 @@ def poisson_log_prob(process: PoissonProcess, objects: LabelledBoxes) -> Float[T
     return process.log_intensity(objects).sum() - process.expected_count
 
 
-def _checked(label: Tensor, classes: int) -> Tensor:
+def checked_labels(label: Int[Tensor, "..."], classes: int) -> Int[Tensor, "..."]:
+    """Labels as indices. Raises `InputError` that names the first that is none."""
     wrong = ((label < 0) | (label >= classes)).nonzero()
     if len(wrong):
         at = tuple(wrong[0].tolist())
