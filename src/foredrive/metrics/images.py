@@ -3,13 +3,14 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 
 def psnr_db(
     rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"], known: Bool[Tensor, "n H W"]
 ) -> Float[Tensor, "n"]:
     """Peak signal-to-noise ratio of each image (RGB, 0 to 1) over its known pixels, dB; NaN without any."""
+    from torchmetrics.functional.image import peak_signal_noise_ratio  # takes seconds
+
     scores = [
         peak_signal_noise_ratio(a[:, k], b[:, k], data_range=1.0) if k.any() else a.new_tensor(torch.nan)
         for a, b, k in zip(rendered, real, known, strict=True)
@@ -25,6 +26,8 @@ def ssim(
     The map is taken over whole images, with unknown pixels set to the real image's so that they add nothing
     to their neighbours' difference, and averaged where pixels are known; NaN where there are none.
     """
+    from torchmetrics.functional.image import structural_similarity_index_measure  # takes seconds
+
     if not len(rendered):
         return rendered.new_zeros(0)
     filled = torch.where(known[:, None], rendered, real)

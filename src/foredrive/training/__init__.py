@@ -1,9 +1,14 @@
 """The training loop, checkpoints, resuming, logging."""
 
-from foredrive.training.checkpoints import load_weights, save_weights
-from foredrive.training.loop import Schedule, read_metrics, train
-from foredrive.training.objective import LossWeights, NemoObjective
-from foredrive.training.rays import ImageRays, thinned_rays
+from typing import TYPE_CHECKING
+
+from foredrive.lazy import on_demand
+
+if TYPE_CHECKING:
+    from foredrive.training.checkpoints import load_weights, save_weights
+    from foredrive.training.loop import Schedule, read_metrics, train
+    from foredrive.training.objective import LossWeights, NemoObjective
+    from foredrive.training.rays import ImageRays, thinned_rays
 
 __all__ = [
     "ImageRays",
@@ -16,3 +21,13 @@ __all__ = [
     "thinned_rays",
     "train",
 ]
+
+__getattr__ = on_demand(
+    __name__,
+    {
+        "checkpoints": ("load_weights", "save_weights"),
+        "loop": ("Schedule", "read_metrics", "train"),
+        "objective": ("LossWeights", "NemoObjective"),
+        "rays": ("ImageRays", "thinned_rays"),
+    },
+)

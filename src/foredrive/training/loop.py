@@ -7,10 +7,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from lightning_fabric import Fabric
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
@@ -20,6 +19,9 @@ from foredrive.files import atomic_path, naming
 from foredrive.scene import Example
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import hold_interrupts, start_fork_server
+
+if TYPE_CHECKING:  # it takes seconds, and schedules and metrics are read without it
+    from lightning_fabric import Fabric
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def train(
     collate: Callable[[list[Example]], Example],
     schedule: Schedule,
     folder: Path,
-    fabric: Fabric,
+    fabric: "Fabric",
 ) -> None:
     """Train `objective` on `dataset`; continue from `folder` where a checkpoint lies there.
 
@@ -129,7 +131,7 @@ def _loader(
     schedule: Schedule,
     done: int,
     total: int,
-    fabric: Fabric,
+    fabric: "Fabric",
 ) -> DataLoader[Example]:
     """Batches from step `done` on; each rank takes its share of every global batch."""
     items = len(dataset)  # type: ignore[arg-type]
@@ -162,7 +164,7 @@ def _one_step(
     step: int,
     total: int,
     schedule: Schedule,
-    fabric: Fabric,
+    fabric: "Fabric",
 ) -> dict[str, Tensor]:
     for group in optimizer.param_groups:
         group["lr"] = schedule.lr_at(step, total)
@@ -179,7 +181,7 @@ def _one_step(
     return {name: value.detach() for name, value in losses.items()}
 
 
-def _progress(fabric: Fabric) -> Progress:
+def _progress(fabric: "Fabric") -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
