@@ -81,7 +81,12 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """What a process holds, swapped out or not, files' pages aside; shared pages count in parts."""
+    """What a process holds, swapped out or not, files' pages aside; shared pages count in parts.
+
+    In parts, so that the sum over processes is what the machine holds. Workers are born with the modules of
+    the process that they are forked from. Where one writes to such a page it gets a copy of its own: that is
+    growth, though each process by itself holds as much as before (its RssAnon does not change).
+    """
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:

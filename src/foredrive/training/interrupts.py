@@ -47,9 +47,9 @@ def start_fork_server(preload: str) -> None:
     workers shall not die of it before the step is done that needs them.
 
     Args:
-        preload: module that the workers need; it is imported once and not in each of them.
+        preload: module that the workers need; it is imported once and not in each of them, and stays shared.
     """
-    multiprocessing.set_forkserver_preload([preload])
+    multiprocessing.set_forkserver_preload([preload, "foredrive.training.frozen"])
     resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
