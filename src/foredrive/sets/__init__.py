@@ -2,6 +2,17 @@
 
 from foredrive.sets.associations import AssociationSum, sum_associations
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes
+from foredrive.sets.calibration import (
+    ExistenceMap,
+    Reliability,
+    conformal_factor,
+    conformal_scores,
+    fit_existence,
+    fit_scale,
+    reliability,
+)
+from foredrive.sets.detections import objects_from_boxes, pmb_from_detections
+from foredrive.sets.gospa import Gospa, gospa, wasserstein_distance
 from foredrive.sets.likelihood import SetNll, set_nll
 from foredrive.sets.processes import (
     MixturePoisson,
@@ -11,18 +22,38 @@ from foredrive.sets.processes import (
     UniformPoisson,
     poisson_log_prob,
 )
+from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.sets.resampling import BootstrapMean, bootstrap_mean
 
 __all__ = [
     "AssociationSum",
+    "BootstrapMean",
     "BoxDensity",
+    "ExistenceMap",
+    "Gospa",
     "LabelledBoxes",
     "MixturePoisson",
     "MultiBernoulli",
     "PoissonMultiBernoulli",
     "PoissonProcess",
+    "Reliability",
     "SetNll",
     "UniformPoisson",
+    "bootstrap_mean",
+    "brier",
+    "conformal_factor",
+    "conformal_scores",
+    "crps_gaussian",
+    "crps_laplace",
+    "energy_score",
+    "fit_existence",
+    "fit_scale",
+    "gospa",
+    "objects_from_boxes",
+    "pmb_from_detections",
     "poisson_log_prob",
+    "reliability",
     "set_nll",
     "sum_associations",
+    "wasserstein_distance",
 ]

@@ -1,0 +1,118 @@
+"""Whether probabilities and covariances mean what they say, and what mends them after training."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from numpy import ndarray
+from scipy.optimize import isotonic_regression
+
+from foredrive.errors import InputError
+from foredrive.sets.boxes import BoxDensity, LabelledBoxes
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Confidences in bins of equal width, beside what came true."""
+
+    count: Int[ndarray, "bins"]
+    confidence: Float[ndarray, "bins"]
+    """Mean in the bin; NaN if it is empty."""
+    outcome: Float[ndarray, "bins"]
+    """Mean of what should have been predicted: how often it was right, or how well it fitted."""
+
+    @property
+    def error(self) -> float:
+        """Mean |outcome - confidence|, bins weighted by their share; NaN if all are empty.
+
+        D-ECE (Küppers et al. 2020) where outcomes are hits. LaECE of one class (Oksuz et al. 2023) where
+        they are the overlap of hits and 0 elsewhere; LaECE₀ (Kuzucu et al. 2024) where any overlap is a hit.
+        """
+        full = self.count > 0
+        if not full.any():
+            return math.nan
+        gap = np.abs(self.outcome[full] - self.confidence[full])
+        return float((gap * self.count[full]).sum() / self.count.sum())
+
+
+def reliability(
+    confidence: Float[ndarray, "n"], outcome: Shaped[ndarray, "n"], bins: int = 25
+) -> Reliability:
+    """Bin confidences in [0, 1] with their outcomes; a bin holds its upper edge."""
+    which = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    count = np.bincount(which, minlength=bins)
+    with np.errstate(invalid="ignore"):
+        mean_confidence = np.bincount(which, confidence, bins) / count
+        mean_outcome = np.bincount(which, outcome.astype(float), bins) / count
+    return Reliability(count, mean_confidence, mean_outcome)
+
+
+@dataclass(frozen=True)
+class ExistenceMap:
+    """A rising map of probabilities, piecewise linear."""
+
+    said: Float[ndarray, "n"]
+    meant: Float[ndarray, "n"]
+
+    def __call__(self, probability: Float[ndarray, "m"]) -> Float[ndarray, "m"]:
+        """Calibrated probabilities."""
+        return np.interp(probability, self.said, self.meant)
+
+
+def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n"]) -> ExistenceMap:
+    """Isotonic regression of what happened on what was said.
+
+    `happened` may be probabilities, such as those of `AssociationSum.absent`, taken from 1. The ends are
+    kept from 0 and 1 by half an observation, so that no likelihood becomes zero.
+    """
+    if len(probability) == 0:
+        raise InputError("calibration of existence needs detections")
+    order = np.argsort(probability, kind="stable")
+    said, where = np.unique(probability[order], return_inverse=True)
+    count = np.bincount(where)
+    mean = np.bincount(where, np.asarray(happened, dtype=float)[order]) / count
+    fitted = isotonic_regression(mean, weights=count.astype(float)).x
+    least = 0.5 / len(probability)
+    return ExistenceMap(said, np.clip(fitted, least, 1 - least))
+
+
+def whiten(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray, "n D"]:
+    """L⁻¹(state - mean) of box i under density i."""
+    with torch.no_grad():
+        offset = (objects.state.double() - boxes.mean.double())[..., None]
+        return torch.linalg.solve_triangular(boxes.chol.double(), offset, upper=False)[..., 0].cpu().numpy()
+
+
+def fit_scale(boxes: BoxDensity, objects: LabelledBoxes, weight: Float[ndarray, "n"] | None = None) -> float:
+    """Factor on standard deviations that makes box i likeliest under density i.
+
+    Weights may be probabilities of association.
+    """
+    white = whiten(boxes, objects)
+    weight = np.ones(len(white)) if weight is None else weight
+    if not weight.sum() > 0:
+        raise InputError("calibration of covariances needs detections that have an object")
+    if boxes.family == "gaussian":
+        return math.sqrt(float(weight @ (white**2).mean(1) / weight.sum()))
+    return math.sqrt(2) * float(weight @ np.abs(white).mean(1) / weight.sum())
+
+
+def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float) -> float:
+    """q such that boxes mean ± q·σ hold all coordinates of a new object with probability ≥ `coverage`.
+
+    Split conformal prediction with the largest |error| / σ as its score: holds for whatever distribution if
+    new pairs are exchangeable with these. +inf if there are too few for that.
+    """
+    score = np.sort(conformal_scores(boxes, objects))
+    rank = math.ceil((len(score) + 1) * coverage)
+    return float(score[rank - 1]) if 1 <= rank <= len(score) else math.inf
+
+
+def conformal_scores(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray, "n"]:
+    """Largest |error| / σ over the coordinates of box i."""
+    with torch.no_grad():
+        error = (objects.state.double() - boxes.mean.double()).abs()
+        std = boxes.chol.double().square().sum(-1).sqrt()
+        return (error / std).amax(-1).cpu().numpy()

@@ -1,0 +1,58 @@
+"""The package's own 3-D detections and boxes, as random finite sets."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.scene.boxes import Boxes
+from foredrive.scene.detections import Detections
+from foredrive.sets.boxes import BoxDensity, LabelledBoxes, require
+from foredrive.sets.processes import MultiBernoulli, PoissonMultiBernoulli, UniformPoisson
+
+_TINY = 1e-12
+
+
+def pmb_from_detections(
+    detections: Detections,
+    lower: Float[Tensor, "6"] | None = None,
+    upper: Float[Tensor, "6"] | None = None,
+) -> PoissonMultiBernoulli:
+    """Detections of one frame; their background is spread evenly over states between `lower` and `upper`.
+
+    A state is centre (ego frame, m) and log lwh (m). Of its covariance with the heading nothing is kept; the
+    heading is von Mises distributed with κ = 1/σ², σ² being the variance of the angle to first order.
+
+    Raises `InputError` for probabilities outside [0, 1], covariances that are not positive definite, and a
+    background without a region.
+    """
+    found = dataclasses.replace(detections, background_rate=None)[detections.valid]
+    existence = found.existence.double()
+    require("existence of detection", (existence >= 0) & (existence <= 1))
+    sin, cos = found.mean[:, 6].double(), found.mean[:, 7].double()
+    # dθ = (cos · d sin - sin · d cos) / ρ², whatever length ρ the two have
+    square = (sin.square() + cos.square()).clamp_min(_TINY)
+    across = torch.stack([cos, -sin], dim=-1) / square[:, None]
+    variance = (across[:, None] @ found.chol[:, 6:].double()).square().sum((-2, -1))
+    boxes = BoxDensity(
+        mean=found.mean[:, :6],
+        chol=found.chol[:, :6, :6],  # of the marginal: the factor is lower triangular
+        yaw=torch.atan2(sin, cos),
+        concentration=1.0 / variance.clamp_min(_TINY),
+    )
+    detected = MultiBernoulli(existence.log(), torch.log1p(-existence), found.log_class, boxes)
+    if detections.background_rate is None:
+        return PoissonMultiBernoulli(detected)
+    if lower is None or upper is None:
+        raise InputError("detections with a background need the region it is spread over")
+    return PoissonMultiBernoulli(detected, UniformPoisson(detections.background_rate, lower, upper, True))
+
+
+def objects_from_boxes(boxes: Boxes) -> LabelledBoxes:
+    """Valid boxes of one time step. Raises `InputError` that names the first of a size that is none."""
+    require("size of box", (boxes.size_lwh > 0).all(-1) | ~boxes.valid)
+    found = boxes[boxes.valid]
+    state = torch.cat([found.centre.double(), found.size_lwh.double().log()], dim=-1)
+    return LabelledBoxes(found.category, state, found.yaw.double())

@@ -1,0 +1,51 @@
+"""Proper scores of single predictions: numbers, boxes, events. Lower is better."""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.special import ndtr
+
+from foredrive.sets.boxes import BoxDensity, LabelledBoxes
+
+
+def brier(probability: Float[ndarray, "n"], happened: Bool[ndarray, "n"]) -> Float[ndarray, "n"]:
+    """Squared error of probabilities (Brier 1950)."""
+    return (probability - happened) ** 2
+
+
+def crps_gaussian(
+    mean: Float[ndarray, "..."], std: Float[ndarray, "..."], value: Float[ndarray, "..."]
+) -> Float[ndarray, "..."]:
+    """Continuous ranked probability score of normal predictions (Gneiting and Raftery 2007, eq. 21).
+
+    In the unit of the value.
+    """
+    z = (value - mean) / std
+    density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
+    return std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / math.sqrt(math.pi))
+
+
+def crps_laplace(
+    mean: Float[ndarray, "..."], std: Float[ndarray, "..."], value: Float[ndarray, "..."]
+) -> Float[ndarray, "..."]:
+    """The same of Laplace predictions, which have scale σ/√2."""
+    scale = std / math.sqrt(2)
+    z = np.abs(value - mean) / scale
+    return scale * (z + np.exp(-z) - 0.75)
+
+
+def energy_score(
+    boxes: BoxDensity, objects: LabelledBoxes, rng: np.random.Generator, samples: int = 256
+) -> Float[ndarray, "n"]:
+    """Energy score of the state of box i under density i (Gneiting and Raftery 2007, eq. 22), estimated.
+
+    E|X - y| - ½ E|X - X'| over `samples` draws of either; unbiased. The heading has no part in it.
+    """
+    repeated = boxes[np.repeat(np.arange(len(boxes.mean)), 2 * samples)]
+    shape = (len(boxes.mean), 2, samples, boxes.mean.shape[-1])
+    one, other = np.moveaxis(repeated.sample(rng)[0].numpy().reshape(shape), 1, 0)
+    truth = objects.state.double().cpu().numpy()[:, None]
+    to_truth = 0.5 * (np.linalg.norm(one - truth, axis=-1) + np.linalg.norm(other - truth, axis=-1))
+    return (to_truth - 0.5 * np.linalg.norm(one - other, axis=-1)).mean(-1)

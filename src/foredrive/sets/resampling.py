@@ -1,0 +1,49 @@
+"""How sure a mean over frames is, where frames of one sequence resemble each other."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.errors import InputError
+
+
+@dataclass(frozen=True)
+class BootstrapMean:
+    """A mean and the interval that resampled sequences give it."""
+
+    mean: float
+    low: float
+    high: float
+    p_value: float
+    """Two-sided, of the mean being 0: twice the smaller share of resampled means on either side of 0."""
+
+
+def bootstrap_mean(
+    values: Float[ndarray, "n"],
+    sequence: Sequence[str],
+    rng: np.random.Generator,
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+) -> BootstrapMean:
+    """Percentile interval of the mean over frames, by drawing whole sequences with replacement.
+
+    Of paired differences this tests whether two detectors differ. With one sequence there is nothing to
+    draw from: the interval is NaN. Raises `InputError` without values, or if any is not finite.
+    """
+    if len(values) == 0 or not np.isfinite(values).all():
+        raise InputError("a mean needs values, all of them finite")
+    _, which = np.unique(np.asarray(sequence), return_inverse=True)
+    total, count = np.bincount(which, values), np.bincount(which)
+    mean = float(values.mean())
+    if len(total) < 2:
+        return BootstrapMean(mean, np.nan, np.nan, np.nan)
+    drawn = rng.integers(0, len(total), (resamples, len(total)))
+    means = total[drawn].sum(1) / count[drawn].sum(1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    below = (np.sum(means <= 0) + 1) / (resamples + 1)
+    above = (np.sum(means >= 0) + 1) / (resamples + 1)
+    return BootstrapMean(mean, float(low), float(high), float(min(1.0, 2 * min(below, above))))
