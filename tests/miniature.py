@@ -7,7 +7,7 @@ import synthetic_log
 
 from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.recipes import Recipe
-from foredrive.recipes.config import BackboneSize, NemoSize, Stage
+from foredrive.recipes.config import BackboneSize, NemoSize, Stage, VolumeEncoderSize
 from foredrive.scene import VoxelSpec
 from foredrive.training import LossWeights, Schedule
 
@@ -33,10 +33,8 @@ def miniature() -> Recipe:
                 layer_type="basic",
                 stages=("stage2", "stage3"),
             ),
+            encoder=VolumeEncoderSize(heads=2, points=2, layers=1),
             channels=8,
-            heads=2,
-            points=2,
-            lifting_layers=1,
             occupancy_hidden=8,
             motion_hidden=4,
             ray_near_m=1.0,

@@ -16,7 +16,7 @@ def foredrive(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
     """Runs the program, which knows the recipe "miniature" too; its exit code and what stood on stderr."""
-    monkeypatch.setitem(RECIPES, "miniature", miniature)
+    monkeypatch.setitem(RECIPES, "miniature", miniature())
 
     def run(*args: str | Path) -> tuple[int, str]:
         capsys.readouterr()

@@ -27,7 +27,7 @@ import sys
 from miniature import miniature
 from foredrive.cli.main import main
 from foredrive.recipes import RECIPES
-RECIPES["miniature"] = miniature
+RECIPES["miniature"] = miniature()
 sys.exit(main(sys.argv[1:]))
 """
 PATIENCE_S = 300.0

@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
+from foredrive.models.lifting import project_to_cameras
 from foredrive.models.nemo import NemoAgent, VolumeRenderer
 from foredrive.recipes.build import build_agent, build_objective
-from foredrive.recipes.config import Recipe
+from foredrive.recipes.config import BevEncoderSize, Recipe, Stage
 from foredrive.recipes.nemo import nemo_base, nemo_tiny
+from foredrive.recipes.nemo_rows import nemo_rows
 from foredrive.scene import Command, Example, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -41,7 +43,7 @@ def example(make_example: Callable[..., Example]) -> Example:
 def test_a_voxel_straight_ahead_is_seen_by_the_front_camera_alone(agent: NemoAgent, example: Example) -> None:
     seen = example.clip.observed().frames([-1])
     rig = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-    uv, visible = agent.world_model.encoder.project(rig, seen.image_valid.flatten(0, 1))
+    uv, visible = project_to_cameras(agent.world_model.encoder.centres_m, rig, seen.image_valid.flatten(0, 1))
     centres = agent.world_model.encoder.centres_m
     ahead = int((centres - torch.tensor([6.5, 0.5, 1.5])).norm(dim=-1).argmin())
     assert visible[0, :, ahead].tolist() == [True, False, False, False]
@@ -156,25 +158,81 @@ def test_an_unknown_command_is_not_taken_for_a_known_one(agent: NemoAgent, examp
     assert not any(torch.allclose(unknown[0], plan) for plan in plans.values())
 
 
+ROWS = nemo_rows(small_recipe(), BevEncoderSize(width=24, heads=4, points=2, pillars=2, layers=1))
+
+
+@pytest.mark.parametrize("row", ROWS)
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
-def test_every_trained_parameter_gets_a_gradient(stage: str, example: Example) -> None:
-    recipe = small_recipe()
+def test_what_is_trained_is_what_gets_a_gradient(row: str, stage: str, example: Example) -> None:
+    recipe = ROWS[row]
+    chosen: Stage | None = getattr(recipe, stage)
+    if chosen is None:
+        return
     torch.manual_seed(0)
-    objective = build_objective(recipe, getattr(recipe, stage), build_agent(recipe))
+    objective = build_objective(recipe, chosen, build_agent(recipe))
     motion = objective.agent.world_model.motion
     for last in (motion.flow[-1], motion.rigid[-1]):  # at exactly zero they pass no gradient on
         torch.nn.init.normal_(last.weight, std=1e-3)
     losses = objective(example, torch.Generator().manual_seed(0))
     losses["loss"].backward()
-    silent = [
+    trained = {name for name, parameter in objective.named_parameters() if parameter.requires_grad}
+    reached = {
         name
         for name, parameter in objective.named_parameters()
-        if parameter.requires_grad and (parameter.grad is None or not parameter.grad.isfinite().all())
-    ]
-    assert not silent
+        if parameter.grad is not None and parameter.grad.isfinite().all()
+    }
+    assert trained == reached
     assert all(math.isfinite(value.item()) for value in losses.values())
-    planner_trained = objective.agent.planner.plan.requires_grad
-    assert planner_trained == (stage == "finetune") == ("wpts" in losses)
+    assert ("agent.planner.plan" in trained) == (stage == "finetune") == ("wpts" in losses)
+    part = {name.split(".")[2] for name in reached if name.startswith("agent.world_model.")}
+    weights, looks_ahead = chosen.weights, stage == "finetune" and objective.agent.planner.looks_ahead > 0
+    expected = {"backbone", "encoder"}
+    expected |= {"motion"} if chosen.imagine or looks_ahead else set()
+    expected |= {"occupancy"} if weights.occ or weights.recon else set()
+    expected |= {"renderer"} if weights.recon else set()
+    assert part == expected
+
+
+def test_the_rows_of_the_tables() -> None:
+    """What each leaves out, in the paper's own terms."""
+    full = small_recipe()
+    assert ROWS[full.name] == full
+    scratch, base = ROWS["nemo_tiny_scratch"], ROWS["nemo_tiny_base"]
+    assert scratch.pretrain is None
+    assert base.pretrain == full.pretrain
+    assert (scratch.model, scratch.finetune) == (base.model, base.finetune)
+    assert base.finetune.weights == dataclasses.replace(full.finetune.weights, recon=0.0, occ=0.0)
+    futures = {name.removeprefix("nemo_tiny_"): row.model.planner_future for name, row in ROWS.items()}
+    assert {name for name, future in futures.items() if future == "attention"} == {"nemo_tiny", "attention"}
+    assert {name for name, future in futures.items() if future == "concatenation"} == {"concatenation"}
+    lacks = {
+        name: [what for what, there in (("image", w.recon), ("occupancy", w.occ)) if not there]
+        for name, row in ROWS.items()
+        if row.pretrain is not None and (w := row.pretrain.weights)
+    }
+    assert lacks["nemo_tiny_no_image"] == lacks["nemo_tiny_bev"] == ["image"]
+    assert lacks["nemo_tiny_no_occupancy"] == ["occupancy"]
+    assert not lacks["nemo_tiny_no_flow"]
+    assert ROWS["nemo_tiny_no_flow"].pretrain.imagine is False
+    assert {row.model.encoder.kind for name, row in ROWS.items() if "bev" in name} == {"bev"}
+
+
+@pytest.mark.parametrize("row", ["nemo_tiny", "nemo_tiny_bev"])
+def test_computing_again_changes_nothing_but_memory(row: str, example: Example) -> None:
+    found = []
+    for checkpoint in (False, True):
+        recipe = dataclasses.replace(
+            ROWS[row], model=dataclasses.replace(ROWS[row].model, checkpoint=checkpoint)
+        )
+        torch.manual_seed(0)
+        assert recipe.pretrain is not None
+        objective = build_objective(recipe, recipe.pretrain, build_agent(recipe))
+        objective(example, torch.Generator().manual_seed(0))["loss"].backward()
+        found.append({name: p.grad for name, p in objective.named_parameters() if p.grad is not None})
+    kept, again = found
+    assert kept.keys() == again.keys()
+    for name, gradient in kept.items():
+        torch.testing.assert_close(again[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_the_same_generator_gives_the_same_losses(example: Example) -> None:

@@ -1,10 +1,12 @@
 """The planner's geometry."""
 
 import math
+from typing import Literal
 
+import pytest
 import torch
 
-from foredrive.models.planner import FutureAttention, _headings
+from foredrive.models.planner import FutureAttention, VolumePlanner, _headings
 
 
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
@@ -23,3 +25,32 @@ def test_attention_over_single_voxels_is_equation_13() -> None:
     expected = (q @ k.T / math.sqrt(4)).softmax(-1) @ v
     expected = expected.T.view(1, 4, 2, 3, 3) * now
     torch.testing.assert_close(attention(now, future), expected)
+
+
+@pytest.mark.parametrize("future", ["attention", "concatenation", "none"])
+def test_the_next_volume_matters_where_it_is_looked_at(
+    future: Literal["attention", "concatenation", "none"],
+) -> None:
+    torch.manual_seed(0)
+    planner = VolumePlanner(
+        channels=4,
+        shape_zyx=(2, 8, 8),
+        width=16,
+        layers=1,
+        heads=2,
+        future=future,
+        pool=(1, 2, 2),
+        horizon_steps=6,
+        dt_s=0.5,
+    ).eval()
+    now, one, other = torch.randn(3, 1, 4, 2, 8, 8)
+    status = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN)
+    with torch.no_grad():
+        same = torch.allclose(planner(now, one, *status).xy, planner(now, other, *status).xy)
+    assert same == (future == "none") == (planner.looks_ahead == 0)
+    if future != "none":
+        with pytest.raises(ValueError, match="next volume"):
+            planner(now, None, *status)
+
+
+SEEN = torch.ones(1, dtype=torch.bool)

@@ -1,5 +1,6 @@
 """Runs as a whole, in miniature: what they leave on disk, how they go on, that they learn."""
 
+import dataclasses
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -81,6 +82,29 @@ def test_a_folder_holds_one_run(trained: Run, log: LogPath, tmp_path: Path) -> N
     with pytest.raises(InputError, match="holds a run with other logs"):
         train_run(trained.recipe, [log, other_log], trained.folder)
     assert files(trained.folder) == before
+
+
+def test_fine_tuning_may_start_from_another_runs_pretraining(trained: Run, tmp_path: Path) -> None:
+    """On the same logs and seed the weights come out as those of the run that did both."""
+    run = train_run(trained.recipe, trained.logs, tmp_path / "few", start=trained.folder)
+    assert open_run(run.folder) == run
+    assert run.start == trained.folder
+    assert not (run.folder / "pretrain").exists()
+    mine, theirs = load_file(run.weights), load_file(trained.weights)
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+    with pytest.raises(InputError, match="holds a run with another start"):
+        train_run(trained.recipe, trained.logs, run.folder)
+    with pytest.raises(InputError, match="no pre-trained weights here"):
+        train_run(trained.recipe, trained.logs, tmp_path / "other", start=run.folder)
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_recipe_without_pretraining_starts_from_scratch(trained: Run, tmp_path: Path) -> None:
+    recipe = dataclasses.replace(trained.recipe, pretrain=None)
+    run = train_run(recipe, trained.logs, tmp_path)
+    assert open_run(tmp_path) == run
+    assert not (tmp_path / "pretrain").exists()
+    assert losses(tmp_path, "finetune")[0]["wpts"] != losses(trained.folder, "finetune")[0]["wpts"]
 
 
 def test_logs_that_cannot_be_read_make_no_run(tmp_path: Path) -> None:

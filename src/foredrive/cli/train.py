@@ -14,6 +14,7 @@ def train(
     out: Path,
     cache: OptionalPath = None,
     occupancy: Literal["lidar", "recorded"] = "lidar",
+    start: OptionalPath = None,
 ) -> None:
     """Train a recipe on logs, or go on with a run that was interrupted.
 
@@ -24,10 +25,11 @@ def train(
         cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
         occupancy: What voxel labels are made from: what lidar beams met and passed through, or the exact
             occupancy that towns record, seen or not. The run is evaluated by the same.
+        start: Another run's folder: take its pre-trained weights and go straight on to fine-tuning.
     """
     from foredrive.recipes import find_all_logs, find_recipe, labelled_by, train_run
 
     chosen = labelled_by(find_recipe(recipe), occupancy)
-    run = train_run(chosen, find_all_logs(logs), out, cache)
+    run = train_run(chosen, find_all_logs(logs), out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 from transformers import ResNetBackbone, ResNetConfig
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -32,6 +33,8 @@ class ImageBackbone(nn.Module):
         channels: D of every pyramid level.
         weights: a hub name or local folder of a `transformers` ResNet, whose sizes then replace the ones
             given here; None starts from random weights.
+        checkpoint: keep only the images for the backward pass and compute the rest again; the running
+            statistics of batch normalisation then see every batch twice.
     """
 
     def __init__(
@@ -44,8 +47,10 @@ class ImageBackbone(nn.Module):
         stages: Sequence[str],
         channels: int,
         weights: str | None = None,
+        checkpoint: bool = False,
     ) -> None:
         super().__init__()
+        self.checkpoint = checkpoint
         self.pretrained = False
         self.resnet = ResNetBackbone(
             ResNetConfig(
@@ -75,6 +80,11 @@ class ImageBackbone(nn.Module):
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
         """Pyramid levels from fine to coarse, channels last."""
+        if self.checkpoint and torch.is_grad_enabled():
+            return checkpoint(self._pyramid, images, use_reentrant=False)
+        return self._pyramid(images)
+
+    def _pyramid(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
         x = normalise_images(images).contiguous(memory_format=torch.channels_last)
         maps = self.resnet(x).feature_maps
         merged = self.lateral[-1](maps[-1])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
@@ -14,7 +15,7 @@ from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, VoxelSpec
 
 
-def _directions_2d(heads: int) -> Float[Tensor, "H 2"]:
+def directions_2d(heads: int) -> Float[Tensor, "H 2"]:
     """Unit square directions, one a head (Zhu et al. 2021, initialisation)."""
     angle = torch.arange(heads) * (2 * math.pi / heads)
     grid = torch.stack([angle.cos(), angle.sin()], dim=-1)
@@ -72,7 +73,7 @@ class CameraCrossAttention(nn.Module):
         nn.init.zeros_(self.offset.weight)
         radius = torch.arange(points).view(1, 1, points, 1)  # the first point starts on the projection
         with torch.no_grad():
-            spread = _directions_2d(heads)[:, None, None] * radius
+            spread = directions_2d(heads)[:, None, None] * radius
             self.offset.bias.copy_(spread.expand(heads, levels, points, 2).flatten())
         nn.init.zeros_(self.weight.weight)
         nn.init.zeros_(self.weight.bias)
@@ -97,12 +98,17 @@ class CameraCrossAttention(nn.Module):
 
 
 class LiftingLayer(nn.Module):
-    """Self-attention, cross-attention, feed-forward; each residual and normalised."""
+    """Self-attention, cross-attention, feed-forward; each residual and normalised.
 
-    def __init__(self, channels: int, heads: int, levels: int, points: int) -> None:
+    Args:
+        channels: D.
+        self_attention: among the queries, as `VolumeSelfAttention`.
+        cross_attention: to the cameras, as `CameraCrossAttention`.
+    """
+
+    def __init__(self, channels: int, self_attention: nn.Module, cross_attention: nn.Module) -> None:
         super().__init__()
-        self.self_attention = VolumeSelfAttention(channels, heads, points)
-        self.cross_attention = CameraCrossAttention(channels, heads, levels, points)
+        self.self_attention, self.cross_attention = self_attention, cross_attention
         self.feed_forward = nn.Sequential(
             nn.Linear(channels, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels)
         )
@@ -113,9 +119,9 @@ class LiftingLayer(nn.Module):
         query: Float[Tensor, "_b Q D"],
         shape_zyx: tuple[int, int, int],
         place: Float[Tensor, "Q 3"],
-        features: Sequence[Float[Tensor, "b C _h _w D"]],
-        uv: Float[Tensor, "b C Q 2"],
-        visible: Bool[Tensor, "b C Q"],
+        features: Sequence[Float[Tensor, "b C _h _w _d"]],
+        uv: Float[Tensor, "b C N 2"],
+        visible: Bool[Tensor, "b C N"],
     ) -> Float[Tensor, "b Q D"]:
         """One round of refinement; arguments as in the two attentions.
 
@@ -127,6 +133,38 @@ class LiftingLayer(nn.Module):
         return self.norms[2](query + self.feed_forward(query))
 
 
+def refine(
+    layers: nn.ModuleList,
+    query: Float[Tensor, "_b Q D"],
+    shape_zyx: tuple[int, int, int],
+    place: Float[Tensor, "Q 3"],
+    features: Sequence[Float[Tensor, "b C _h _w _d"]],
+    uv: Float[Tensor, "b C N 2"],
+    visible: Bool[Tensor, "b C N"],
+    *,
+    recompute: bool,
+) -> Float[Tensor, "_b Q D"]:
+    """Queries after all rounds of `LiftingLayer`s; with `recompute` only each round's input is kept."""
+    for layer in layers:
+        inputs = (query, shape_zyx, place, features, uv, visible)
+        if recompute and torch.is_grad_enabled():
+            query = checkpoint(layer, *inputs, use_reentrant=False)
+        else:
+            query = layer(*inputs)
+    return query
+
+
+def project_to_cameras(
+    points_m: Float[Tensor, "Q 3"], rig: CameraRig, image_valid: Bool[Tensor, "b C"]
+) -> tuple[Float[Tensor, "b C Q 2"], Bool[Tensor, "b C Q"]]:
+    """Where points of the ego frame fall in every image, in [0, 1], and whether they are seen there."""
+    b, c = image_valid.shape
+    in_camera = transform_points(inverse_se3(rig.T_ego_cam), points_m.expand(b, c, -1, -1))
+    uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
+    size_wh = uv.new_tensor(rig.size_hw[::-1])
+    return uv / size_wh, inside & image_valid[..., None]
+
+
 class LiftingEncoder(nn.Module):
     """Learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
 
@@ -136,33 +174,40 @@ class LiftingEncoder(nn.Module):
         heads, points: of the deformable attentions; `points` per head and level.
         levels: number of image feature levels.
         layers: rounds of refinement.
+        checkpoint: keep only each round's input for the backward pass and compute the rest again.
     """
 
     place: Tensor
     centres_m: Tensor
 
     def __init__(
-        self, spec: VoxelSpec, *, channels: int, heads: int, points: int, levels: int, layers: int
+        self,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        heads: int,
+        points: int,
+        levels: int,
+        layers: int,
+        checkpoint: bool = False,
     ) -> None:
         super().__init__()
-        self.spec = spec
+        self.spec, self.checkpoint = spec, checkpoint
         centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
         self.register_buffer("place", place, persistent=False)
         self.query = nn.Parameter(0.02 * torch.randn(len(centres), channels))
-        self.layers = nn.ModuleList([LiftingLayer(channels, heads, levels, points) for _ in range(layers)])
-
-    def project(
-        self, rig: CameraRig, image_valid: Bool[Tensor, "b C"]
-    ) -> tuple[Float[Tensor, "b C Q 2"], Bool[Tensor, "b C Q"]]:
-        """Where every voxel centre falls in every image, in [0, 1], and whether it is seen there."""
-        b, c = image_valid.shape
-        points = self.centres_m.expand(b, c, -1, -1)
-        in_camera = transform_points(inverse_se3(rig.T_ego_cam), points)
-        uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
-        size_wh = uv.new_tensor(rig.size_hw[::-1])
-        return uv / size_wh, inside & image_valid[..., None]
+        self.layers = nn.ModuleList(
+            [
+                LiftingLayer(
+                    channels,
+                    VolumeSelfAttention(channels, heads, points),
+                    CameraCrossAttention(channels, heads, levels, points),
+                )
+                for _ in range(layers)
+            ]
+        )
 
     def forward(
         self,
@@ -171,8 +216,15 @@ class LiftingEncoder(nn.Module):
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b D Z Y X"]:
         """Lift image features; the result lies channels-last in memory."""
-        uv, visible = self.project(rig, image_valid)
-        query = self.query[None]  # the first layer expands it to the batch
-        for layer in self.layers:
-            query = layer(query, self.spec.shape_zyx, self.place, features, uv, visible)
+        uv, visible = project_to_cameras(self.centres_m, rig, image_valid)
+        query = refine(
+            self.layers,
+            self.query[None],  # the first layer expands it to the batch
+            self.spec.shape_zyx,
+            self.place,
+            features,
+            uv,
+            visible,
+            recompute=self.checkpoint,
+        )
         return query.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3)

@@ -1,5 +1,7 @@
 """The temporal attention planner (NeMo §3.3, eq. 12–14)."""
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -43,15 +45,21 @@ class FutureAttention(nn.Module):
 
 
 class VolumePlanner(nn.Module):
-    """Waypoints from the present and the predicted next volume.
+    """Waypoints from the present volume and, unless `future` is "none", the one predicted next.
 
-    Height is folded into the channels, Z·D → C by an MLP; one query (command, speed and a learned planning
-    embedding, fused) attends to the plane through a transformer decoder; an MLP regresses the steps
-    between waypoints, which are summed up.
+    The two are put together by attention (eq. 13), or by concatenation, or only the present is looked at:
+    three rows of NeMo's Table 1. Height is folded into the channels, Z·D → C by an MLP; one query (command,
+    speed and a learned planning embedding, fused) attends to the plane through a transformer decoder; an MLP
+    regresses the steps between waypoints, which are summed up.
 
     Args:
-        channels: D; height: Z; width: C (256 in the paper); layers: decoder layers (3); heads; pool: of the
-            future attention; horizon_steps, dt_s: of the plan; extent_yx: size of the plane in voxels.
+        channels: D.
+        shape_zyx: of the volumes.
+        width: C (256 in the paper).
+        layers, heads: of the decoder (3 layers in the paper).
+        future: what becomes of the predicted volume.
+        pool: blocks of the future attention.
+        horizon_steps, dt_s: of the plan.
     """
 
     def __init__(
@@ -62,6 +70,7 @@ class VolumePlanner(nn.Module):
         width: int,
         layers: int,
         heads: int,
+        future: Literal["attention", "concatenation", "none"],
         pool: tuple[int, int, int],
         horizon_steps: int,
         dt_s: float,
@@ -69,9 +78,14 @@ class VolumePlanner(nn.Module):
         super().__init__()
         height, ny, nx = shape_zyx
         self.horizon_steps, self.dt_s = horizon_steps, dt_s
-        self.fuse_future = FutureAttention(channels, pool)
+        self.future = future
+        self.fuse_future = FutureAttention(channels, pool) if future == "attention" else None
+        volumes = 2 if future == "concatenation" else 1
         self.fold = nn.Sequential(
-            nn.Linear(height * channels, width), nn.ReLU(), nn.Linear(width, width), nn.LayerNorm(width)
+            nn.Linear(height * channels * volumes, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.LayerNorm(width),
         )
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
@@ -88,17 +102,22 @@ class VolumePlanner(nn.Module):
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
 
+    @property
+    def looks_ahead(self) -> int:
+        """How many key frames have to be imagined for a plan."""
+        return 0 if self.future == "none" else 1
+
     def forward(
         self,
         now: Float[Tensor, "b D Z Y X"],
-        future: Float[Tensor, "b D Z Y X"],
+        future: Float[Tensor, "b D Z Y X"] | None,
         command: Int[Tensor, "b"],
         command_valid: Bool[Tensor, "b"],
         speed_mps: Float[Tensor, "b"],
         speed_valid: Bool[Tensor, "b"],
     ) -> Trajectory:
-        """Plan in the ego frame at now."""
-        fused = self.fuse_future(now, future)
+        """Plan in the ego frame at now; `future` is the volume at the next key frame, if it is looked at."""
+        fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         command = torch.where(command_valid, command, len(Command))
@@ -116,6 +135,15 @@ class VolumePlanner(nn.Module):
             log_prob=torch.zeros_like(xy[..., 0, 0]),
             dt_s=self.dt_s,
         )
+
+    def _fuse(
+        self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"] | None
+    ) -> Float[Tensor, "b _D Z Y X"]:
+        if self.future == "none":
+            return now
+        if future is None:
+            raise ValueError("this planner looks at the next volume too")
+        return torch.cat([now, future], 1) if self.fuse_future is None else self.fuse_future(now, future)
 
 
 def _headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:

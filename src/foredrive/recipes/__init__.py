@@ -1,15 +1,18 @@
 """Python functions that return one frozen configuration each, and the runs put together from them."""
 
-from collections.abc import Callable
-
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe, labelled_by
 from foredrive.recipes.demo import DemoSize, full_demo, quick_demo, run_demo
 from foredrive.recipes.evaluate import Inspection, evaluate_run, inspect_run
-from foredrive.recipes.nemo import nemo_base, nemo_tiny
+from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_tiny, nemo_town
+from foredrive.recipes.nemo_rows import nemo_rows
 from foredrive.recipes.train import Run, find_all_logs, open_run, train_run
 
-RECIPES: dict[str, Callable[[], Recipe]] = {"nemo_tiny": nemo_tiny, "nemo_base": nemo_base}
+RECIPES: dict[str, Recipe] = {
+    "nemo_tiny": nemo_tiny(),
+    **nemo_rows(nemo_town(), TOWN_BEV),
+    **nemo_rows(nemo_base(), BASE_BEV),
+}
 
 
 def find_recipe(name: str) -> Recipe:
@@ -20,7 +23,7 @@ def find_recipe(name: str) -> Recipe:
     """
     if name not in RECIPES:
         raise InputError(f"no recipe {name!r}; there are: {', '.join(RECIPES)}")
-    return RECIPES[name]()
+    return RECIPES[name]
 
 
 __all__ = [

@@ -3,12 +3,14 @@
 import warnings
 
 from foredrive.errors import InputError
+from foredrive.models.averaging import AveragingEncoder
 from foredrive.models.backbone import ImageBackbone
+from foredrive.models.bev import BevEncoder
 from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.nemo import MotionFlow, Nemo, NemoAgent, VolumeRenderer
 from foredrive.models.planner import VolumePlanner
 from foredrive.models.vgg import Vgg16Features
-from foredrive.recipes.config import Recipe, Stage
+from foredrive.recipes.config import AveragingEncoderSize, BevEncoderSize, Recipe, Stage
 from foredrive.training import NemoObjective
 
 
@@ -27,15 +29,9 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         stages=size.backbone.stages,
         channels=size.channels,
         weights=size.backbone.weights if load_backbone else None,
+        checkpoint=size.checkpoint,
     )
-    encoder = LiftingEncoder(
-        clips.voxels,
-        channels=size.channels,
-        heads=size.heads,
-        points=size.points,
-        levels=len(size.backbone.stages),
-        layers=size.lifting_layers,
-    )
+    encoder = _build_encoder(recipe)
     motion = MotionFlow(
         channels=size.channels,
         frames=clips.past_frames + 1,
@@ -65,11 +61,40 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         width=size.planner_width,
         layers=size.planner_layers,
         heads=size.planner_heads,
+        future=size.planner_future,
         pool=size.attention_pool,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
     )
     return NemoAgent(world_model, planner)
+
+
+def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEncoder:
+    model, spec = recipe.model, recipe.clips.voxels
+    size, levels = model.encoder, len(model.backbone.stages)
+    if isinstance(size, AveragingEncoderSize):
+        return AveragingEncoder(spec, channels=model.channels, hidden=size.hidden)
+    if isinstance(size, BevEncoderSize):
+        return BevEncoder(
+            spec,
+            channels=model.channels,
+            width=size.width,
+            heads=size.heads,
+            points=size.points,
+            pillars=size.pillars,
+            levels=levels,
+            layers=size.layers,
+            checkpoint=model.checkpoint,
+        )
+    return LiftingEncoder(
+        spec,
+        channels=model.channels,
+        heads=size.heads,
+        points=size.points,
+        levels=levels,
+        layers=size.layers,
+        checkpoint=model.checkpoint,
+    )
 
 
 def build_objective(recipe: Recipe, stage: Stage, agent: NemoAgent) -> NemoObjective:
@@ -83,7 +108,7 @@ def build_objective(recipe: Recipe, stage: Stage, agent: NemoAgent) -> NemoObjec
     return NemoObjective(
         agent,
         stage.weights,
-        steps=recipe.clips.future_frames,
+        steps=recipe.clips.future_frames if stage.imagine else 0,
         ray_stride=stage.ray_stride,
         image_features=features,
     )

@@ -26,14 +26,42 @@ class BackboneSize:
 
 
 @dataclass(frozen=True)
+class VolumeEncoderSize:
+    """NeMo's own way from images to a volume; see `models.lifting.LiftingEncoder`."""
+
+    heads: int
+    points: int
+    layers: int
+    kind: Literal["volume"] = "volume"
+
+
+@dataclass(frozen=True)
+class BevEncoderSize:
+    """A plane first, which is then unfolded; see `models.bev.BevEncoder`."""
+
+    width: int
+    heads: int
+    points: int
+    pillars: int
+    layers: int
+    kind: Literal["bev"] = "bev"
+
+
+@dataclass(frozen=True)
+class AveragingEncoderSize:
+    """No attention at all; see `models.averaging.AveragingEncoder`."""
+
+    hidden: int
+    kind: Literal["averaging"] = "averaging"
+
+
+@dataclass(frozen=True)
 class NemoSize:
     """Sizes of NeMo's parts; see the modules' own docstrings."""
 
     backbone: BackboneSize
+    encoder: VolumeEncoderSize | BevEncoderSize | AveragingEncoderSize
     channels: int
-    heads: int
-    points: int
-    lifting_layers: int
     occupancy_hidden: int
     motion_hidden: int
     ray_near_m: float
@@ -44,6 +72,10 @@ class NemoSize:
     planner_layers: int
     planner_heads: int
     attention_pool: tuple[int, int, int]
+    planner_future: Literal["attention", "concatenation", "none"] = "attention"
+    """How the planner looks at the predicted next volume."""
+    checkpoint: bool = False
+    """Trade time for memory: what backbone and encoder compute is not kept but computed again."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +87,8 @@ class Stage:
     ray_stride: int
     vgg16: str | None = None
     """File of VGG-16 weights for the perceptual loss, or "download"; None leaves that loss out (weight 0)."""
+    imagine: bool = True
+    """Imagine the future key frames and supervise them too, by what happened; otherwise the present alone."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +98,8 @@ class Recipe:
     name: str
     clips: ClipConfig
     model: NemoSize
-    pretrain: Stage
+    pretrain: Stage | None
+    """None: fine-tuning starts from scratch, or from weights that are given."""
     finetune: Stage
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
 

@@ -48,7 +48,7 @@ def quick_demo() -> DemoSize:
         recipe=dataclasses.replace(
             recipe,
             name="nemo_tiny (quick)",
-            pretrain=_shortened(recipe.pretrain, 12),
+            pretrain=None if recipe.pretrain is None else _shortened(recipe.pretrain, 12),
             finetune=_shortened(recipe.finetune, 6),
         ),
         train_drives=(("Town01", 1), ("Town02", 1)),

@@ -25,8 +25,8 @@ class NemoPredictor:
     @torch.no_grad()
     def predict(self, observed: Clip) -> Prediction:
         """Occupancy now and at the next key frames, the plan, the views at now."""
-        output = self.agent(observed, max(self.steps, 1))
-        decoded = output.decoded[: self.steps + 1]
+        output = self.agent(observed, self.steps)
+        decoded = output.decoded
         return Prediction(
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
             plan=output.plan,

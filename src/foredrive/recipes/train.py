@@ -28,6 +28,8 @@ class Run:
     recipe: Recipe
     logs: tuple[LogPath, ...]
     cache_dir: Path
+    start: Path | None = None
+    """The run whose pre-trained weights this one went on from, if it was not pre-trained itself."""
 
     @property
     def weights(self) -> Path:
@@ -51,7 +53,8 @@ def open_run(folder: Path) -> Run:
     try:
         written = json.loads((folder / LOGS).read_text())
         logs = tuple(LogPath(Path(entry["folder"]), Path(entry["maps_dir"])) for entry in written["logs"])
-        return Run(folder, recipe, logs, Path(written["cache_dir"]))
+        start = written.get("start")
+        return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
 
@@ -69,26 +72,53 @@ def open_clips(logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path) -> 
     return dataset
 
 
-def train_run(recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None = None) -> Run:
-    """Pre-train, then fine-tune; goes on where an earlier call with the same recipe and logs stopped.
+def train_run(
+    recipe: Recipe,
+    logs: Sequence[LogPath],
+    folder: Path,
+    cache_dir: Path | None = None,
+    start: Path | None = None,
+) -> Run:
+    """Pre-train, then fine-tune; goes on where an earlier call with the same arguments stopped.
+
+    Args:
+        recipe: one without pre-training starts from scratch.
+        logs: for both stages.
+        folder: of the run.
+        cache_dir: for labels and shrunk images; by default in `folder`.
+        start: a run folder. Its pre-trained weights are taken and that stage is left out here: pre-trained
+            on many logs, fine-tuned on few.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe or other logs, or on logs that cannot be read.
+        InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
+            cannot be read; if `start` has not finished pre-training or its model has other sizes.
     """
-    run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute())
+    start = None if start is None else start.absolute()
+    run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
     started_before = (folder / CONFIG).is_file()
     if started_before:
         _check_same(open_run(folder), run)
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
+    pretrained = None if start is None else _pretrained(start)
     if not started_before:  # only now: logs that cannot be read must not make a run
         _write(run)
     fabric = Fabric(devices="auto" if torch.cuda.is_available() else 1, precision=recipe.precision)
     fabric.launch()
-    torch.manual_seed(recipe.pretrain.schedule.seed)
+    torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
-    _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
+    if pretrained is not None:
+        load_weights(agent, pretrained)
+    elif recipe.pretrain is not None:
+        _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     return run
+
+
+def _pretrained(start: Path) -> Path:
+    weights = start / "pretrain" / WEIGHTS
+    if not weights.is_file():
+        raise InputError(f"{start}: no pre-trained weights here (no pretrain/{WEIGHTS})")
+    return weights
 
 
 def _train_stage(
@@ -116,7 +146,9 @@ def _write(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     logs = [{"folder": str(log.folder), "maps_dir": str(log.maps_dir)} for log in run.logs]
     with atomic_path(run.folder / LOGS) as temporary:
-        temporary.write_text(json.dumps({"logs": logs, "cache_dir": str(run.cache_dir)}, indent=1))
+        start = None if run.start is None else str(run.start)
+        entries = {"logs": logs, "cache_dir": str(run.cache_dir), "start": start}
+        temporary.write_text(json.dumps(entries, indent=1))
     save_recipe(run.recipe, run.folder / CONFIG)
 
 
@@ -124,6 +156,7 @@ def _check_same(there: Run, wanted: Run) -> None:
     for what, same in (
         ("another recipe", there.recipe == wanted.recipe),
         ("other logs", there.logs == wanted.logs),
+        ("another start", there.start == wanted.start),
     ):
         if not same:
             raise InputError(f"{there.folder}: holds a run with {what}; choose another folder")

@@ -38,7 +38,7 @@ class NemoObjective(nn.Module):
     Args:
         agent: world model and planner.
         weights: λ.
-        steps: T_f, number of future key frames that are imagined and supervised.
+        steps: T_f, number of future key frames that are imagined and supervised; 0 trains on now alone.
         ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
         image_features: VGG-16 features with real weights for the perceptual loss, or None to leave it out.
     """
@@ -55,7 +55,11 @@ class NemoObjective(nn.Module):
         super().__init__()
         self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
         self.image_features = image_features
-        agent.planner.requires_grad_(weights.wpts > 0)
+        world, plans = agent.world_model, weights.wpts > 0
+        agent.planner.requires_grad_(plans)
+        world.motion.requires_grad_(steps > 0 or (plans and agent.planner.looks_ahead > 0))
+        world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
+        world.renderer.requires_grad_(weights.recon > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""
@@ -63,8 +67,8 @@ class NemoObjective(nn.Module):
         now, weights = clip.now, self.weights
         observed = clip.observed()
         if weights.wpts > 0:
-            output = self.agent(observed, max(self.steps, 1))
-            decoded, plan = output.decoded[: self.steps + 1], output.plan
+            output = self.agent(observed, self.steps)
+            decoded, plan = output.decoded, output.plan
         else:
             _, decoded = self.agent.world_model(observed, self.steps)
             plan = None
@@ -73,14 +77,15 @@ class NemoObjective(nn.Module):
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
         for k, (belief, share) in enumerate(zip(decoded, shares / shares.sum(), strict=True)):
             frame = now + k
-            losses["occ"] = losses["occ"] + share * occupancy_loss(
-                belief.occupancy_logit,
-                example.occupancy.values[:, frame, 0],
-                example.occupancy.known[:, frame],
-                scal_weight=weights.scal,
-                bce_weight=weights.bce,
-                occupied_weight=weights.occupied,
-            )
+            if weights.occ > 0:
+                losses["occ"] = losses["occ"] + share * occupancy_loss(
+                    belief.occupancy_logit,
+                    example.occupancy.values[:, frame, 0],
+                    example.occupancy.known[:, frame],
+                    scal_weight=weights.scal,
+                    bce_weight=weights.bce,
+                    occupied_weight=weights.occupied,
+                )
             if weights.recon > 0:
                 rays = thinned_rays(clip, frame, self.ray_stride, generator)
                 rendered = self.agent.world_model.renderer(

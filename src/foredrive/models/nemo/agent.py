@@ -28,20 +28,20 @@ class NemoAgent(nn.Module):
         self.planner = planner
 
     def forward(self, clip: Clip, steps: int) -> NemoOutput:
-        """Observe, imagine `steps` ≥ 1 key frames, plan. Args as in `Nemo.forward`."""
-        beliefs, decoded = self.world_model(clip, steps)
+        """Observe, imagine `steps` key frames and whatever the planner looks at, plan."""
+        beliefs, decoded = self.world_model(clip, max(steps, self.planner.looks_ahead))
         now = clip.now
         plan = self.planner(
             beliefs[0].volume,
-            beliefs[1].volume,
+            beliefs[1].volume if self.planner.looks_ahead else None,
             clip.command,
             clip.command_valid,
             clip.ego_speed_mps[:, now],
             clip.ego_speed_valid[:, now],
         )
-        return NemoOutput(beliefs, decoded, plan)
+        return NemoOutput(beliefs[: steps + 1], decoded[: steps + 1], plan)
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """The plan from now on."""
-        return self(observation, 1).plan
+        return self(observation, 0).plan

@@ -7,7 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.models.averaging import AveragingEncoder
 from foredrive.models.backbone import ImageBackbone
+from foredrive.models.bev import BevEncoder
 from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.nemo.motion import MotionFlow
 from foredrive.models.nemo.rendering import VolumeRenderer
@@ -32,7 +34,7 @@ class Nemo(nn.Module):
         self,
         *,
         backbone: ImageBackbone,
-        encoder: LiftingEncoder,
+        encoder: LiftingEncoder | BevEncoder | AveragingEncoder,
         motion: MotionFlow,
         renderer: VolumeRenderer,
         past_frames: int,

@@ -1,0 +1,68 @@
+"""The rows of NeMo's Tables 1 and 3: one recipe with a part left out or put in another's place."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+from foredrive.recipes.config import BevEncoderSize, Recipe
+
+
+def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
+    """All rows by name, the full NeMo first under its own; the others are named FULL_ROW.
+
+    Table 1: `scratch` (no pre-training), `base` (pre-trained, then planning alone, from the present volume
+    alone), `concatenation` and `attention` (base with the predicted volume), the full one (attention, and
+    the losses of pre-training kept while planning is learned), `bev_scratch` and `bev` (BEVFormer-like, as
+    scratch and base; pre-trained by occupancy alone).
+    Table 3: what base becomes when pre-training lacks `no_image` reconstruction, `no_occupancy` prediction or
+    `no_flow`, that is, sees the present alone.
+
+    Args:
+        full: a recipe with pre-training whose planner attends to the future.
+        bev: size of the baseline's encoder.
+    """
+    rows: dict[str, Callable[[Recipe], Recipe]] = {
+        "scratch": lambda recipe: replace(_planning_alone(recipe, "none"), pretrain=None),
+        "base": lambda recipe: _planning_alone(recipe, "none"),
+        "concatenation": lambda recipe: _planning_alone(recipe, "concatenation"),
+        "attention": lambda recipe: _planning_alone(recipe, "attention"),
+        "bev_scratch": lambda recipe: replace(_planning_alone(_in_bev(recipe, bev), "none"), pretrain=None),
+        "bev": lambda recipe: _pretrained_with(
+            _planning_alone(_in_bev(recipe, bev), "none"), image=False, occupancy=True, flow=True
+        ),
+        "no_image": lambda recipe: _pretrained_with(
+            _planning_alone(recipe, "none"), image=False, occupancy=True, flow=True
+        ),
+        "no_occupancy": lambda recipe: _pretrained_with(
+            _planning_alone(recipe, "none"), image=True, occupancy=False, flow=True
+        ),
+        "no_flow": lambda recipe: _pretrained_with(
+            _planning_alone(recipe, "none"), image=True, occupancy=True, flow=False
+        ),
+    }
+    found = {full.name: full}
+    for name, change in rows.items():
+        found[f"{full.name}_{name}"] = replace(change(full), name=f"{full.name}_{name}")
+    return found
+
+
+def _planning_alone(recipe: Recipe, future: Literal["attention", "concatenation", "none"]) -> Recipe:
+    """Fine-tuning by the waypoints alone."""
+    weights = replace(recipe.finetune.weights, recon=0.0, occ=0.0)
+    return replace(
+        recipe,
+        model=replace(recipe.model, planner_future=future),
+        finetune=replace(recipe.finetune, weights=weights, imagine=False),
+    )
+
+
+def _in_bev(recipe: Recipe, bev: BevEncoderSize) -> Recipe:
+    return replace(recipe, model=replace(recipe.model, encoder=bev))
+
+
+def _pretrained_with(recipe: Recipe, *, image: bool, occupancy: bool, flow: bool) -> Recipe:
+    """Pre-training with some of its three parts."""
+    assert recipe.pretrain is not None
+    weights = recipe.pretrain.weights
+    weights = replace(weights, recon=weights.recon if image else 0.0, occ=weights.occ if occupancy else 0.0)
+    return replace(recipe, pretrain=replace(recipe.pretrain, weights=weights, imagine=flow))

@@ -1,0 +1,93 @@
+"""The encoders that NeMo's is compared with: where they look, and what they make of it."""
+
+import math
+
+import pytest
+import torch
+
+from foredrive.models.averaging import AveragingEncoder
+from foredrive.models.bev import BevEncoder, PillarCrossAttention
+from foredrive.models.lifting import project_to_cameras
+from foredrive.scene import CameraRig, VoxelSpec
+
+SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
+SIZE_HW = (32, 64)
+
+
+def rig() -> CameraRig:
+    """One camera 1.6 m up that looks ahead, 40 px focal length."""
+    T_ego_cam = torch.eye(4)
+    T_ego_cam[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    T_ego_cam[2, 3] = 1.6
+    return CameraRig(
+        K=torch.tensor([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])[None, None],
+        T_ego_cam=T_ego_cam[None, None],
+        dist=torch.zeros(1, 1, 5),
+        readout_s=torch.zeros(1, 1),
+        names=("front",),
+        size_hw=SIZE_HW,
+    )
+
+
+SEEN = torch.ones(1, 1, dtype=torch.bool)
+
+
+def test_pillars_stand_on_the_middle_of_their_cells() -> None:
+    encoder = BevEncoder(SPEC, channels=4, width=8, heads=2, points=1, pillars=2, levels=1, layers=1)
+    pillars = encoder.pillars_m.view(16, 16, 2, 3)
+    assert pillars[0, 0].tolist() == [[-7.5, -7.5, 0.0], [-7.5, -7.5, 2.0]]
+    assert pillars[3, 10, :, :2].tolist() == [[2.5, -4.5]] * 2
+    assert encoder.place.view(16, 16, 3)[3, 10].tolist() == [10.5, 3.5, 0.5]
+
+
+def test_a_cell_hears_of_every_height_above_it() -> None:
+    """Half of the image above the horizon, half below: a pillar that reaches both reads their mean."""
+    attention = PillarCrossAttention(features=2, channels=2, heads=1, levels=1, points=1, pillars=2)
+    with torch.no_grad():
+        for layer in (attention.value, attention.out):
+            layer.weight.copy_(torch.eye(2))
+            layer.bias.zero_()
+    image = torch.zeros(1, 1, 8, 16, 2)
+    image[:, :, :4, :, 0], image[:, :, 4:, :, 1] = 1.0, 1.0
+    points = torch.tensor([[6.0, 0.0, 0.6], [6.0, 0.0, 2.6]])  # one metre below the camera, one above
+    uv, visible = project_to_cameras(points, rig(), SEEN)
+    assert visible.all()
+    read = attention(torch.zeros(1, 1, 2), [image], uv, visible)
+    torch.testing.assert_close(read, torch.tensor([[[0.5, 0.5]]]))
+
+
+def test_the_volume_unfolds_from_the_plane() -> None:
+    """What the last layer says of a cell's height z lies at z above that cell."""
+    encoder = BevEncoder(SPEC, channels=3, width=8, heads=2, points=1, pillars=2, levels=1, layers=1)
+    with torch.no_grad():
+        encoder.unfold.weight.zero_()
+        encoder.unfold.bias.copy_(torch.arange(12.0))
+        volume = encoder([torch.randn(1, 1, 4, 8, 3)], rig(), SEEN)
+    assert volume.shape == (1, 3, *SPEC.shape_zyx)
+    assert volume[0, :, 2, 5, 9].tolist() == [6.0, 7.0, 8.0]
+    assert volume.is_contiguous(memory_format=torch.channels_last_3d)
+
+
+def test_averaging_reads_at_the_projection_and_nowhere_else() -> None:
+    encoder = AveragingEncoder(SPEC, channels=2, hidden=2)
+    encoder.convolve = torch.nn.Sequential(torch.nn.Identity())  # type: ignore[assignment]
+    rows, columns = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(16) + 0.5, indexing="ij")
+    image = torch.stack([columns / 16, rows / 8], dim=-1)[None, None]  # says where in the image it is
+    volume = encoder([image, torch.full((1, 1, 2, 4, 2), math.nan)], rig(), SEEN)
+    place = volume[0, :, 2, 8, 14]  # the voxel at x 6.5, y 0.5, z 1.5 m
+    expected = torch.tensor([(32 - 40 * 0.5 / 6.5) / 64, (16 + 40 * 0.1 / 6.5) / 32])
+    torch.testing.assert_close(place, expected, atol=1e-4, rtol=0)
+    assert not volume[0, :, :, :, :8].any()  # behind the camera
+
+
+@pytest.mark.parametrize("kind", ["bev", "averaging"])
+def test_a_camera_without_an_image_is_not_looked_at(kind: str) -> None:
+    torch.manual_seed(0)
+    encoder: BevEncoder | AveragingEncoder
+    if kind == "bev":
+        encoder = BevEncoder(SPEC, channels=4, width=8, heads=2, points=2, pillars=2, levels=1, layers=2)
+    else:
+        encoder = AveragingEncoder(SPEC, channels=4, hidden=4)
+    one, other = torch.randn(2, 1, 1, 8, 16, 4)
+    assert torch.equal(encoder([one], rig(), ~SEEN), encoder([other], rig(), ~SEEN))
+    assert not torch.allclose(encoder([one], rig(), SEEN), encoder([other], rig(), SEEN))
