@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 from foredrive.errors import InputError
 from foredrive.scene import Example, VoxelSpec
 from foredrive.training.checkpoints import latest_checkpoint
+from foredrive.training.fabric import make_fabric
 from foredrive.training.loop import Schedule, batch_order, read_metrics, train
 
 SPEC = VoxelSpec(lower_m=(-2.0, -2.0, -1.0), voxel_m=1.0, shape_zyx=(2, 4, 4))
@@ -88,6 +89,21 @@ def test_a_run_killed_between_checkpoints_drops_what_it_had_not_saved(
         file.write(json.dumps({"step": 8, "loss": 99.0}) + '\n{"step": 9, "lo')
     run(make_example, tmp_path / "killed")
     assert losses(tmp_path / "killed") == losses(tmp_path / "straight")
+
+
+def test_mixed_precision_rounds_no_inputs(make_example: Callable[..., Example], tmp_path: Path) -> None:
+    seen = {}
+
+    class Looks(Prior):
+        def forward(self, example: Example, generator: torch.Generator) -> dict[str, torch.Tensor]:
+            rig = example.clip.rig
+            seen["product"] = (rig.K @ rig.T_ego_cam[..., :3, :3]).dtype
+            seen["inputs"] = (rig.K.dtype, example.clip.T_world_ego.dtype)
+            return super().forward(example, generator)
+
+    train(Looks(), Items(make_example, 1), collate, SCHEDULE, tmp_path, make_fabric("bf16-mixed"))
+    assert seen == {"product": torch.bfloat16, "inputs": (torch.float32, torch.float64)}
+    assert losses(tmp_path)[-1] < losses(tmp_path)[0]
 
 
 def test_a_finished_run_is_left_alone(make_example: Callable[..., Example], tmp_path: Path) -> None:

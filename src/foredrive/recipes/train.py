@@ -14,7 +14,7 @@ from foredrive.files import atomic_path
 from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
-from foredrive.training import load_weights, save_weights, train
+from foredrive.training import load_weights, make_fabric, save_weights, train
 
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 STAGES = ("pretrain", "finetune")
@@ -102,7 +102,7 @@ def train_run(
     pretrained = None if start is None else _pretrained(start)
     if not started_before:  # only now: logs that cannot be read must not make a run
         _write(run)
-    fabric = Fabric(devices="auto" if torch.cuda.is_available() else 1, precision=recipe.precision)
+    fabric = make_fabric(recipe.precision)
     fabric.launch()
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)

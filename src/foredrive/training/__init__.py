@@ -6,6 +6,7 @@ from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
     from foredrive.training.checkpoints import load_weights, save_weights
+    from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective
     from foredrive.training.rays import ImageRays, thinned_rays
@@ -16,6 +17,7 @@ __all__ = [
     "NemoObjective",
     "Schedule",
     "load_weights",
+    "make_fabric",
     "read_metrics",
     "save_weights",
     "thinned_rays",
@@ -26,6 +28,7 @@ __getattr__ = on_demand(
     __name__,
     {
         "checkpoints": ("load_weights", "save_weights"),
+        "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective"),
         "rays": ("ImageRays", "thinned_rays"),
