@@ -166,7 +166,7 @@ def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str])
     [
         (["view", "{tmp}/none", "--save", "{tmp}/x.png"], "{tmp}/none: no such folder"),
         (["view", "{tmp}", "--save", "{tmp}/x.png"], "{tmp}: no 123D log here"),
-        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, nemo_base"),
+        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, nemo_town"),
         (["train", "nemo_tiny", "--logs", "{tmp}/none", "--out", "{tmp}/run"], "{tmp}/none: no such folder"),
         (["record", "--town", "Town9", "--out", "{tmp}/out"], "one of Town01, Town02, Town03"),
         (["evaluate", "{tmp}"], "{tmp}: not a run folder"),
@@ -185,16 +185,40 @@ def test_each_verb_names_what_it_cannot_use(
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
-def test_help_imports_nothing_heavy() -> None:
-    """Help must come at once, so it may not wait for torch."""
-    code = (
-        "import sys\n"
-        "from foredrive.cli.main import main\n"
-        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print({'torch', 'py123d', 'matplotlib', 'numba'} & set(sys.modules))"
-    )
+HEAVY = {"torch", "ray", "py123d", "numba", "matplotlib", "torchmetrics", "lightning_fabric", "transformers"}
+"""What takes long to import."""
+LOGS = {"torch", "ray", "py123d", "numba"}  # py123d brings Ray along
+
+
+def heavy_after(*steps: str) -> list[set[str]]:
+    """What of `HEAVY` a new process has imported after each of some statements."""
+    told = f"\nprint(*({HEAVY} & set(sys.modules)), file=sys.stderr)\n"
+    code = "import sys\n" + told.join([*steps, ""])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.endswith("set()\n")
+    return [set(line.split()) for line in done.stderr.splitlines()]
+
+
+def test_help_waits_for_nothing_heavy() -> None:
+    commands = [["--help"], *([verb, "--help"] for verb in program.VERBS)]
+    helped = "from foredrive.cli.main import main\n" + "\n".join(
+        f"try:\n    main({command})\nexcept SystemExit:\n    pass" for command in commands
+    )
+    assert heavy_after(helped) == [set()]
+
+
+def test_verbs_wait_for_nothing_they_do_not_use() -> None:
+    bench, convert, record, view, evaluate = heavy_after(
+        "import foredrive.evaluation.bench",
+        "import foredrive.data.convert",
+        "import foredrive.recipes.recording",
+        "import foredrive.data, foredrive.view.log_sheet",
+        "import foredrive.recipes.evaluate, foredrive.view.run_report",
+    )
+    assert bench == {"torch"}
+    assert convert <= LOGS
+    assert record <= LOGS
+    assert view <= LOGS | {"matplotlib"}
+    assert "lightning_fabric" not in evaluate
 
 
 def test_it_runs_as_a_module_and_passes_its_exit_code_on(tmp_path: Path) -> None:

@@ -4,9 +4,9 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from lightning_fabric import Fabric
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
@@ -14,7 +14,10 @@ from foredrive.files import atomic_path
 from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
-from foredrive.training import load_weights, make_fabric, save_weights, train
+from foredrive.training import load_weights, save_weights, train
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 STAGES = ("pretrain", "finetune")
@@ -93,6 +96,8 @@ def train_run(
         InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
             cannot be read; if `start` has not finished pre-training or its model has other sizes.
     """
+    from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
+
     start = None if start is None else start.absolute()
     run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
     started_before = (folder / CONFIG).is_file()
@@ -122,7 +127,7 @@ def _pretrained(start: Path) -> Path:
 
 
 def _train_stage(
-    run: Run, name: str, stage: Stage, agent: NemoAgent, dataset: ClipDataset, fabric: Fabric
+    run: Run, name: str, stage: Stage, agent: NemoAgent, dataset: ClipDataset, fabric: "Fabric"
 ) -> None:
     weights = run.folder / name / WEIGHTS
     if not weights.is_file():
