@@ -19,6 +19,7 @@ from foredrive.sets.processes import (
     MultiBernoulli,
     PoissonMultiBernoulli,
     PoissonProcess,
+    SumPoisson,
     UniformPoisson,
     poisson_log_prob,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "PoissonProcess",
     "Reliability",
     "SetNll",
+    "SumPoisson",
     "UniformPoisson",
     "bootstrap_mean",
     "brier",

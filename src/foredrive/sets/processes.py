@@ -1,6 +1,7 @@
 """Random finite sets of labelled boxes: multi-Bernoulli, Poisson, and the union of the two."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -167,6 +168,26 @@ class MixturePoisson(Record):
 
 
 @dataclass(frozen=True)
+class SumPoisson:
+    """The union of independent Poisson processes, which is one whose intensity is the sum."""
+
+    parts: tuple[PoissonProcess, ...]
+
+    @property
+    def expected_count(self) -> Float[Tensor, ""]:
+        """∫λ."""
+        return torch.stack([part.expected_count for part in self.parts]).sum()
+
+    def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
+        """Log λ at each object, float64."""
+        return torch.stack([part.log_intensity(objects) for part in self.parts]).logsumexp(0)
+
+    def sample(self, rng: np.random.Generator) -> LabelledBoxes:
+        """One set."""
+        return _joined([part.sample(rng) for part in self.parts])
+
+
+@dataclass(frozen=True)
 class PoissonMultiBernoulli:
     """The union of a multi-Bernoulli and a Poisson process (thesis eq. 3.12), or the former alone."""
 
@@ -174,27 +195,36 @@ class PoissonMultiBernoulli:
     background: PoissonProcess | None = None
 
     @classmethod
-    def from_detections(cls, detections: MultiBernoulli, confidence: float = 0.1) -> "PoissonMultiBernoulli":
-        """Detections of one frame; those with r ≤ `confidence` become the Poisson process (Paper A)."""
+    def from_detections(
+        cls, detections: MultiBernoulli, confidence: float = 0.1, other: PoissonProcess | None = None
+    ) -> "PoissonMultiBernoulli":
+        """Detections of one frame; those with r ≤ `confidence` become the Poisson process (Paper A).
+
+        With an `other` process, such as a uniform one, added to it: without, objects far from any detection
+        have next to no density.
+        """
         low = detections.log_existence <= math.log(confidence)
         few = detections[low]
-        return cls(detections[~low], MixturePoisson(few.log_existence, few.log_class, few.boxes))
+        mixture = MixturePoisson(few.log_existence, few.log_class, few.boxes)
+        return cls(detections[~low], mixture if other is None else SumPoisson((mixture, other)))
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
         """One set."""
         found = self.detected.sample(rng)
         if self.background is None:
             return found
-        other = self.background.sample(rng)
-        yaw = None if found.yaw is None or other.yaw is None else torch.cat([found.yaw, other.yaw])
-        return LabelledBoxes(
-            torch.cat([found.label, other.label]), torch.cat([found.state, other.state]), yaw
-        )
+        return _joined([found, self.background.sample(rng)])
 
 
 def poisson_log_prob(process: PoissonProcess, objects: LabelledBoxes) -> Float[Tensor, ""]:
     """Log-density of a set of objects under a Poisson process (thesis eq. 3.11)."""
     return process.log_intensity(objects).sum() - process.expected_count
+
+
+def _joined(sets: Sequence[LabelledBoxes]) -> LabelledBoxes:
+    label, state = torch.cat([one.label for one in sets]), torch.cat([one.state for one in sets])
+    headings = [one.yaw for one in sets if one.yaw is not None]
+    return LabelledBoxes(label, state, torch.cat(headings) if len(headings) == len(sets) else None)
 
 
 def checked_labels(label: Int[Tensor, "..."], classes: int) -> Int[Tensor, "..."]:

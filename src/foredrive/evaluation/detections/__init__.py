@@ -1,0 +1,18 @@
+"""Files of detections beside truth: read, scored as random finite sets and by the usual metrics, compared."""
+
+from foredrive.evaluation.detections.files import read_detections
+from foredrive.evaluation.detections.frames import DetectionSet, Frame
+from foredrive.evaluation.detections.score import FrameScore, predicted_set, score_frames
+from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
+
+__all__ = [
+    "DetectionSet",
+    "Frame",
+    "FrameScore",
+    "ScoreSummary",
+    "compare_scores",
+    "predicted_set",
+    "read_detections",
+    "score_frames",
+    "summarise_scores",
+]

@@ -1,0 +1,129 @@
+"""2-D detections in COCO's results format, and truth in COCO's instances format.
+
+Results are a list of records with `image_id`, `category_id`, `bbox` (x, y, width, height in px) and `score`.
+Beyond the format, a record may have `covariance` (of x1, y1, x2, y2 in px) and `class_probabilities` (by
+category name).
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import (
+    STD_OF_SIDE,
+    STD_PX,
+    DetectionSet,
+    Family,
+    Frame,
+    around,
+    class_distribution,
+    covariance_matrix,
+    detections_of_file,
+    numbers_of,
+    objects_of_file,
+)
+
+Record = Mapping[str, Any]
+
+
+def read_coco(
+    results: Sequence[Record], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
+) -> DetectionSet:
+    """Images of the truth, in its order; crowds are left out. Raises `InputError` that names the record."""
+    images, categories = _listed(truth, "images", truth_path), _listed(truth, "categories", truth_path)
+    label_of = {category["id"]: n for n, category in enumerate(categories)}
+    classes = [str(category.get("name", category["id"])) for category in categories]
+    found: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
+    true: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
+    crowds = 0
+    for n, record in enumerate(_listed(truth, "annotations", truth_path, "id")):
+        if record.get("iscrowd"):
+            crowds += 1
+        else:
+            true[record.get("image_id")].append((n, record))
+    for n, record in enumerate(results):
+        found[record.get("image_id") if isinstance(record, dict) else None].append((n, record))
+    known = {image["id"] for image in images}
+    for records, where in ((found, path), (true, truth_path)):
+        for image_id, members in records.items():
+            if image_id not in known:
+                raise InputError(f"{where}: record {members[0][0]} is of the unknown image {image_id}")
+            for n, record in members:
+                if record.get("category_id") not in label_of:
+                    raise InputError(
+                        f"{where}: record {n} has the unknown category {record.get('category_id')}"
+                    )
+    counts = {
+        "frames_without_detections": len(known - set(found)),
+        "boxes_without_covariance": sum("covariance" not in record for record in results),
+        "crowds_left_out": crowds,
+    }
+    frames = [
+        _frame(image, found[image["id"]], true[image["id"]], label_of, classes, path, truth_path, family)
+        for image in images
+    ]
+    return DetectionSet(frames, classes, False, counts)
+
+
+def _frame(
+    image: Record,
+    said: Sequence[tuple[int, Record]],
+    true: Sequence[tuple[int, Record]],
+    label_of: Mapping[Any, int],
+    classes: Sequence[str],
+    path: Path,
+    truth_path: Path,
+    family: Family,
+) -> Frame:
+    where, true_where = f"{path}: image {image['id']}", f"{truth_path}: image {image['id']}"
+    corners, true_corners = _corners(said, path), _corners(true, truth_path)
+    share, covariance = np.zeros((len(said), len(classes))), np.zeros((len(said), 4, 4))
+    score = np.zeros(len(said))
+    for place, (n, record) in enumerate(said):
+        here = f"{path}: record {n}"
+        score[place] = numbers_of(record, "score", 1, here)[0]
+        label = label_of[record["category_id"]]
+        share[place] = class_distribution(here, record.get("class_probabilities"), label, classes)
+        stated = record.get("covariance")
+        covariance[place] = _default(corners[place]) if stated is None else covariance_matrix(here, stated, 4)
+    labels = [label_of[record["category_id"]] for _, record in true]
+    height, width = (numbers_of(image, key, 1, true_where)[0] for key in ("height", "width"))
+    return Frame(
+        str(image.get("file_name", image["id"])),
+        str(image.get("sequence", image["id"])),
+        detections_of_file(where, score, share, corners, covariance, family=family),
+        objects_of_file(true_where, labels, true_corners),
+        *around(np.zeros(4), np.array([width, height, width, height]), true_corners),
+    )
+
+
+def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray, "n 4"]:
+    corners = np.zeros((len(records), 4))
+    for place, (n, record) in enumerate(records):
+        x, y, width, height = numbers_of(record, "bbox", 4, f"{path}: record {n}")
+        if not (width > 0 and height > 0):
+            raise InputError(f"{path}: record {n} has a bbox of the size {width} x {height}")
+        corners[place] = x, y, x + width, y + height
+    return corners
+
+
+def _default(corners: Float[ndarray, "4"]) -> Float[ndarray, "4 4"]:
+    side = np.tile(corners[2:] - corners[:2], 2)
+    return np.diag((STD_OF_SIDE * side) ** 2 + STD_PX**2)
+
+
+def _listed(content: Mapping[str, Any], key: str, path: Path, needs: str | None = None) -> list[Any]:
+    records = content.get(key)
+    if not isinstance(records, list) or not all(isinstance(each, dict) for each in records):
+        raise InputError(f"{path}: has no list of {key}")
+    if needs is None:
+        for n, record in enumerate(records):
+            if "id" not in record:
+                raise InputError(f"{path}: {key} {n} has no id")
+    return records

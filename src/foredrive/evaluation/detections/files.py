@@ -1,0 +1,38 @@
+"""Which format files of detections have."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.coco_results import read_coco
+from foredrive.evaluation.detections.frames import DetectionSet, Family
+from foredrive.evaluation.detections.kitti_labels import read_kitti
+from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
+
+
+def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
+    """Read detections and truth: two folders of KITTI's text, or JSON of nuScenes or COCO.
+
+    `family` is what box densities are taken to be. Raises `InputError` for what cannot be read, naming it.
+    """
+    if results.is_dir() and truth.is_dir():
+        read = read_kitti(results, truth, family)
+    else:
+        said, true = _read_json(results), _read_json(truth)
+        if isinstance(said, dict) and isinstance(true, dict):
+            read = read_nuscenes(said, true, results, truth, family)
+        elif isinstance(said, list) and isinstance(true, dict):
+            read = read_coco(said, true, results, truth, family)
+        else:
+            raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
+    if not read.frames:
+        raise InputError(f"{truth}: holds no frames")
+    return read
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not JSON that can be read") from error

@@ -1,0 +1,161 @@
+"""What a detector said about frames, beside what is true: the form every file of detections is read into."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli
+
+Family = Literal["gaussian", "laplace"]
+
+LEAST_PROBABILITY = 1e-6
+"""Probabilities in files are kept this far from 0 and 1, which are mostly the rounding of such."""
+STD_M = (0.5, 0.5, 0.3)
+"""Standard deviations of a box centre where a detector states none."""
+STD_LOG_SIZE = 0.15
+STD_YAW_RAD = 0.2
+STD_OF_SIDE = 0.05
+"""Standard deviation of an image box's edge where a detector states none: this share of the side across …"""
+STD_PX = 1.0
+"""… and this, in quadrature."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Detections and objects of one frame."""
+
+    name: str
+    sequence: str
+    """Frames of one sequence resemble each other."""
+    detected: MultiBernoulli
+    objects: LabelledBoxes
+    lower: Float[ndarray, "D"]
+    """Region of states in which objects may be that no detection explains."""
+    upper: Float[ndarray, "D"]
+    range_m: Float[ndarray, "N"] | None = None
+    """Distance of each object over ground."""
+    visibility: Float[ndarray, "N"] | None = None
+    """Of each object, however the data set measures it: lidar points, or a level of occlusion."""
+
+
+@dataclass(frozen=True)
+class DetectionSet:
+    """Frames of one file of detections. Upright boxes have a heading and are in m, others in pixels."""
+
+    frames: Sequence[Frame]
+    classes: Sequence[str]
+    upright: bool
+    counts: dict[str, int]
+    """By name, how often something was assumed or missing."""
+
+
+def detections_of_file(
+    where: str,
+    score: Float[ndarray, "M"],
+    class_probability: Float[ndarray, "M K"],
+    mean: Float[ndarray, "M D"],
+    covariance: Float[ndarray, "M D D"],
+    yaw: Float[ndarray, "M"] | None = None,
+    yaw_std: Float[ndarray, "M"] | None = None,
+    *,
+    family: Family = "gaussian",
+) -> MultiBernoulli:
+    """Check and convert the detections of one frame; raises `InputError` with the first that is wrong."""
+    spread = np.linalg.eigvalsh(covariance).min(-1) if np.isfinite(covariance).all() else np.zeros(len(mean))
+    checks = {
+        "a score outside [0, 1]": (score >= 0) & (score <= 1),
+        "class probabilities that do not add up to 1": (class_probability >= 0).all(1)
+        & (np.abs(class_probability.sum(1) - 1) < 1e-3),
+        "a box that is not finite": np.isfinite(mean).all(1),
+        "a covariance that is not positive definite": spread > 0,
+    }
+    if yaw is not None and yaw_std is not None:
+        checks["a heading that is not finite"] = np.isfinite(yaw)
+        checks["a standard deviation of its heading that is not positive"] = yaw_std > 0
+    for fault, fine in checks.items():
+        if not fine.all():
+            raise InputError(f"{where}: detection {int(np.flatnonzero(~fine)[0])} has {fault}")
+    r = torch.as_tensor(np.clip(score, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
+    share = np.clip(class_probability, LEAST_PROBABILITY, None)
+    boxes = BoxDensity(
+        mean=torch.as_tensor(mean),
+        chol=torch.as_tensor(np.linalg.cholesky(covariance)),
+        yaw=None if yaw is None else torch.as_tensor(yaw),
+        concentration=None if yaw_std is None else torch.as_tensor(1.0 / yaw_std**2),
+        family=family,
+    )
+    log_class = torch.as_tensor(np.log(share / share.sum(1, keepdims=True)))
+    return MultiBernoulli(r.log(), torch.log1p(-r), log_class, boxes)
+
+
+def objects_of_file(
+    where: str,
+    label: Sequence[int],
+    state: Float[ndarray, "N D"],
+    yaw: Float[ndarray, "N"] | None = None,
+) -> LabelledBoxes:
+    """Check and convert the objects of one frame; raises `InputError` with the first that is wrong."""
+    fine = np.isfinite(state).all(1) & (True if yaw is None else np.isfinite(yaw))
+    if not fine.all():
+        first = int(np.flatnonzero(~fine)[0])
+        raise InputError(f"{where}: object {first} has a box that is not finite, or of no size")
+    headings = None if yaw is None else torch.as_tensor(yaw)
+    return LabelledBoxes(torch.as_tensor(np.asarray(label, dtype=np.int64)), torch.as_tensor(state), headings)
+
+
+def covariance_matrix(where: str, value: object, dims: int) -> Float[ndarray, "D D"]:
+    """A covariance as files have it: a matrix, or the variances."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: its covariance is not made of numbers") from error
+    if array.shape == (dims,):
+        return np.diag(array)
+    if array.shape != (dims, dims) or not np.allclose(array, array.T, rtol=1e-6):
+        raise InputError(
+            f"{where}: its covariance is neither {dims} variances nor a symmetric matrix of them"
+        )
+    return array
+
+
+def class_distribution(
+    where: str, probabilities: object, label: int, classes: Sequence[str]
+) -> Float[ndarray, "K"]:
+    """Class probabilities by name as files have them; all on the label where there are none."""
+    share = np.zeros(len(classes))
+    if probabilities is None:
+        share[label] = 1.0
+        return share
+    if not isinstance(probabilities, dict) or not set(probabilities) <= set(classes):
+        raise InputError(f"{where}: class_probabilities must be an object with known classes as its keys")
+    for name, value in probabilities.items():
+        share[classes.index(name)] = value
+    return share
+
+
+def around(
+    lower: Float[ndarray, "D"], upper: Float[ndarray, "D"], states: Float[ndarray, "N D"]
+) -> tuple[Float[ndarray, "D"], Float[ndarray, "D"]]:
+    """A region, made larger where states lie outside."""
+    if len(states) == 0:
+        return lower, upper
+    return np.minimum(lower, states.min(0)), np.maximum(upper, states.max(0))
+
+
+def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
+    """Finite numbers that a record of a file must have."""
+    try:
+        value = np.atleast_1d(np.asarray(record[key], dtype=np.float64))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where} has no {key} of {count} number(s)") from error
+    if value.shape != (count,):
+        raise InputError(f"{where} has no {key} of {count} number(s)")
+    if not np.isfinite(value).all():
+        raise InputError(f"{where} has a {key} that is not finite")
+    return value

@@ -1,0 +1,148 @@
+"""3-D detections in nuScenes' results format, and truth in the same.
+
+`results` has a list of boxes by sample token: `translation` (m, global), `size` (w, l, h in m), `rotation`
+(quaternion w x y z), `detection_name`, `detection_score`. Beyond the format, a box may have `covariance` (of
+centre and log l, w, h in m), `yaw_std` (rad) and `class_probabilities` (by name). Truth may have `num_pts`
+and `ego_translation`, as the devkit writes them, and `scene_token`.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import (
+    STD_LOG_SIZE,
+    STD_M,
+    STD_YAW_RAD,
+    DetectionSet,
+    Family,
+    Frame,
+    around,
+    class_distribution,
+    covariance_matrix,
+    detections_of_file,
+    numbers_of,
+    objects_of_file,
+)
+
+LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
+UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])
+"""Where objects may be: around the ego vehicle, or the middle of the frame's boxes, in m and log m."""
+DEFAULT_COVARIANCE = np.diag(np.square([*STD_M, *[STD_LOG_SIZE] * 3]))
+
+Box = Mapping[str, Any]
+
+
+def read_nuscenes(
+    results: Mapping[str, Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
+) -> DetectionSet:
+    """Frames of the truth, in its order. Raises `InputError` that names the record that is wrong."""
+    found, true = _by_frame(results, path), _by_frame(truth, truth_path)
+    unknown = sorted(set(found) - set(true))
+    if unknown:
+        raise InputError(f"{path}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth_path}")
+    names = {str(box.get("detection_name")) for boxes in true.values() for box in boxes}
+    names |= {str(box.get("detection_name")) for boxes in found.values() for box in boxes}
+    classes = sorted(names)
+    counts = {"frames_without_detections": len(set(true) - set(found)), "boxes_without_covariance": 0}
+    frames = []
+    for token, boxes in true.items():
+        said = found.get(token, ())
+        counts["boxes_without_covariance"] += sum("covariance" not in box for box in said)
+        frames.append(_frame(token, said, boxes, classes, path, truth_path, family))
+    return DetectionSet(frames, classes, True, counts)
+
+
+def _frame(
+    token: str,
+    said: Sequence[Box],
+    true: Sequence[Box],
+    classes: Sequence[str],
+    path: Path,
+    truth_path: Path,
+    family: Family,
+) -> Frame:
+    where, true_where = f"{path}: frame {token}", f"{truth_path}: frame {token}"
+    state, yaw = _states(said, where)
+    true_state, true_yaw = _states(true, true_where)
+    origin = _origin(true, true_state, state)
+    state[:, :3] -= origin
+    true_state[:, :3] -= origin
+    label = [classes.index(str(box["detection_name"])) for box in said]
+    detected = detections_of_file(
+        where,
+        np.array(
+            [numbers_of(box, "detection_score", 1, f"{where}, box {n}")[0] for n, box in enumerate(said)]
+        ),
+        np.array(
+            [
+                class_distribution(f"{where}, box {n}", box.get("class_probabilities"), of, classes)
+                for n, (box, of) in enumerate(zip(said, label, strict=True))
+            ]
+        ).reshape(-1, len(classes)),
+        state,
+        np.array(
+            [
+                covariance_matrix(f"{where}, box {n}", box.get("covariance", DEFAULT_COVARIANCE), 6)
+                for n, box in enumerate(said)
+            ]
+        ).reshape(-1, 6, 6),
+        yaw,
+        np.array([float(box.get("yaw_std", STD_YAW_RAD)) for box in said]),
+        family=family,
+    )
+    objects = objects_of_file(
+        true_where, [classes.index(str(box["detection_name"])) for box in true], true_state, true_yaw
+    )
+    seen = [float(box.get("num_pts", np.nan)) for box in true]
+    return Frame(
+        token,
+        str(true[0].get("scene_token", token)) if true else token,
+        detected,
+        objects,
+        *around(LOWER, UPPER, true_state),
+        range_m=np.linalg.norm(true_state[:, :2], axis=1),
+        visibility=np.array(seen),
+    )
+
+
+def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
+    boxes = content.get("results")
+    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+        raise InputError(f"{path}: `results` must have a list of boxes by sample token")
+    for token, each in boxes.items():
+        for n, box in enumerate(each):
+            if not isinstance(box, dict) or "detection_name" not in box:
+                raise InputError(f"{path}: frame {token}, box {n} has no detection_name")
+    return boxes
+
+
+def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
+    """Centre and log length, width, height; heading."""
+    centre, size, rotation = (
+        np.array([numbers_of(box, key, count, f"{where}, box {n}") for n, box in enumerate(boxes)]).reshape(
+            -1, count
+        )
+        for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
+    )
+    wrong = np.flatnonzero(~(size > 0).all(1))
+    if len(wrong):
+        raise InputError(f"{where}, box {wrong[0]} has the size {size[wrong[0]].tolist()}")
+    w, x, y, z = rotation.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    return np.concatenate([centre, np.log(size[:, [1, 0, 2]])], axis=1), yaw
+
+
+def _origin(
+    true: Sequence[Box], true_state: Float[ndarray, "N 6"], state: Float[ndarray, "M 6"]
+) -> Float[ndarray, "3"]:
+    """Where the ego vehicle is, if the truth says, else the middle of all boxes."""
+    if true and "ego_translation" in true[0]:
+        return true_state[0, :3] - np.asarray(true[0]["ego_translation"], dtype=np.float64)
+    every = np.concatenate([true_state, state])[:, :3]
+    return every.mean(0) if len(every) else np.zeros(3)

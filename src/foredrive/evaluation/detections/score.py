@@ -1,0 +1,188 @@
+"""Every frame's set likelihood, its parts, and what detections and objects had to do with each other."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from foredrive.evaluation.detections.frames import DetectionSet, Frame
+from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
+from foredrive.sets import (
+    Gospa,
+    MultiBernoulli,
+    PoissonMultiBernoulli,
+    SetNll,
+    UniformPoisson,
+    gospa,
+    set_nll,
+    wasserstein_distance,
+)
+
+PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
+LOW_CONFIDENCE = 0.1
+"""Detections no surer than this become the Poisson background (Paper A)."""
+UNEXPLAINED_PER_FRAME = 1.0
+"""Objects expected beyond that, evenly over classes and the frame's region: no object is impossible."""
+GOSPA_CUTOFF_M, GOSPA_CUTOFF_PX = 2.0, 50.0
+GOSPA_CONFIDENCE = 0.5
+"""Detections below it are left out of GOSPA, which knows no probabilities."""
+
+
+@dataclass(frozen=True)
+class ObjectScores:
+    """What each object of a frame cost, in nats, expected over associations."""
+
+    label: Int[ndarray, "N"]
+    localisation: Float[ndarray, "N"]
+    classification: Float[ndarray, "N"]
+    missed: Float[ndarray, "N"]
+    missed_probability: Float[ndarray, "N"]
+    best: Int[ndarray, "N"]
+    """Index among the frame's `detected`; -1: background."""
+
+
+@dataclass(frozen=True)
+class DetectionScores:
+    """What each detection of a frame said, and what came of it."""
+
+    label: Int[ndarray, "M"]
+    """Likeliest class."""
+    score: Float[ndarray, "M"]
+    """Existence, times the probability of that class."""
+    existence: Float[ndarray, "M"]
+    has_object: Float[ndarray, "M"]
+    """Probability that it has an object; NaN for those that became background."""
+    hit: Bool[ndarray, "T M"]
+    """Whether it hits an object at each threshold of average precision, by greedy matching."""
+    overlap: Float[ndarray, "M"]
+    """With the object it hits at any overlap, else 0; NaN for upright boxes."""
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """One frame's likelihood and all it is made of."""
+
+    name: str
+    sequence: str
+    nll: float
+    """+inf where an object or a certain detection is impossible."""
+    gap: float
+    """The true value is at most this much less."""
+    parts: dict[str, float]
+    gospa: Gospa
+    pgospa: Gospa
+    detections: DetectionScores
+    objects: ObjectScores
+
+
+def score_frames(
+    read: DetectionSet, *, k: int = 25, told: Callable[[int], None] | None = None
+) -> list[FrameScore]:
+    """Score every frame; none is left out. `told` hears how many are done."""
+    scores = []
+    with torch.no_grad():
+        for done, frame in enumerate(read.frames, 1):
+            scores.append(_score_frame(frame, read, k))
+            if told is not None:
+                told(done)
+    return scores
+
+
+def predicted_set(frame: Frame, classes: int) -> PoissonMultiBernoulli:
+    """A frame's detections as a PMB: unsure ones and a uniform process are its background."""
+    uniform = UniformPoisson(
+        torch.full((classes,), UNEXPLAINED_PER_FRAME / classes, dtype=torch.float64),
+        torch.as_tensor(frame.lower),
+        torch.as_tensor(frame.upper),
+        frame.objects.yaw is not None,
+    )
+    return PoissonMultiBernoulli.from_detections(frame.detected, LOW_CONFIDENCE, uniform)
+
+
+def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
+    pmb = predicted_set(frame, len(read.classes))
+    result = set_nll(pmb, frame.objects, k=k)
+    sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(LOW_CONFIDENCE))
+    detections = _detections(frame, result, sure, read.upright)
+    return FrameScore(
+        frame.name,
+        frame.sequence,
+        float(result.nll),
+        float(result.nll) - result.lower if result.nll.isfinite() else 0.0,
+        {part: float(getattr(result, part)) for part in PARTS},
+        *_gospas(frame, detections, read.upright),
+        detections,
+        _objects(frame, pmb, result, sure),
+    )
+
+
+def _objects(
+    frame: Frame, pmb: PoissonMultiBernoulli, result: SetNll, sure: Int[ndarray, "_"]
+) -> ObjectScores:
+    found = result.associations
+    i, j = torch.as_tensor(found.detection), torch.as_tensor(found.object)
+    count = len(found.background)
+    box = -found.probability * pmb.detected.boxes.log_prob_of_pairs(i, frame.objects, j).numpy()
+    label = -found.probability * pmb.detected.log_label_of_pairs(i, frame.objects, j).numpy()
+    assert pmb.background is not None
+    log_background = pmb.background.log_intensity(frame.objects).numpy()
+    with np.errstate(invalid="ignore"):
+        missed = np.where(found.background > 0, -found.background * log_background, 0.0)
+    return ObjectScores(
+        frame.objects.label.numpy(),
+        np.bincount(found.object, box, count).astype(float),  # of nothing it would be whole numbers
+        np.bincount(found.object, label, count).astype(float),
+        missed,
+        found.background,
+        np.where(found.best < 0, -1, np.append(sure, -1)[found.best]),
+    )
+
+
+def _detections(frame: Frame, result: SetNll, sure: Int[ndarray, "_"], upright: bool) -> DetectionScores:
+    detected, objects = frame.detected, frame.objects
+    label = detected.log_class.argmax(-1).numpy()
+    score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
+    has_object = np.full(len(label), np.nan)
+    has_object[sure] = 1.0 - result.associations.absent
+    closeness, least = _closeness(detected, frame, upright)
+    hit, overlap = np.zeros((len(least), len(label)), bool), np.full(len(label), np.nan)
+    if not upright:
+        overlap[:] = 0.0
+    true = objects.label.numpy()
+    for name in np.intersect1d(label, true):
+        i, j = np.flatnonzero(label == name), np.flatnonzero(true == name)
+        near = closeness[np.ix_(i, j)]
+        for t, threshold in enumerate(least):
+            hit[t, i] = match_greedily(score[i], near, threshold) >= 0
+        if not upright:
+            taken = match_greedily(score[i], near, np.nextafter(0.0, 1.0))
+            overlap[i[taken >= 0]] = near[np.flatnonzero(taken >= 0), taken[taken >= 0]]
+    return DetectionScores(label, score, detected.log_existence.exp().numpy(), has_object, hit, overlap)
+
+
+def _closeness(
+    detected: MultiBernoulli, frame: Frame, upright: bool
+) -> tuple[Float[ndarray, "M N"], Sequence[float]]:
+    """Minus the distance of centres over ground in m, or the overlap; and what a hit needs."""
+    mean, state = detected.boxes.mean.numpy(), frame.objects.state.numpy()
+    if not upright:
+        return overlaps(mean, state), COCO_OVERLAPS
+    apart = np.linalg.norm(mean[:, None, :2] - state[:, :2], axis=-1)
+    return -apart, [-threshold for threshold in NUSCENES_DISTANCES_M]
+
+
+def _gospas(frame: Frame, detections: DetectionScores, upright: bool) -> tuple[Gospa, Gospa]:
+    """GOSPA of what is surer than a half, P-GOSPA of all; likeliest classes must agree."""
+    dims, cutoff = (3, GOSPA_CUTOFF_M) if upright else (4, GOSPA_CUTOFF_PX)
+    boxes, objects = frame.detected.boxes, frame.objects
+    same = detections.label[:, None] == objects.label.numpy()
+    apart = np.linalg.norm(boxes.mean.numpy()[:, None, :dims] - objects.state.numpy()[:, :dims], axis=-1)
+    sure = detections.score >= GOSPA_CONFIDENCE
+    spread = wasserstein_distance(boxes, objects, dims)
+    return (
+        gospa(np.where(same, apart, np.inf)[sure], cutoff),
+        gospa(np.where(same, spread, np.inf), cutoff, existence=detections.existence),
+    )

@@ -1,0 +1,218 @@
+"""Figures over all frames: likelihood, its parts and slices, precision, calibration, proper scores."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import DetectionSet
+from foredrive.evaluation.detections.score import PARTS, FrameScore
+from foredrive.metrics.detection import (
+    COCO_OVERLAPS,
+    NUSCENES_DISTANCES_M,
+    average_precision_coco,
+    average_precision_nuscenes,
+    mean_of_valid,
+)
+from foredrive.sets import (
+    BootstrapMean,
+    BoxDensity,
+    LabelledBoxes,
+    Reliability,
+    bootstrap_mean,
+    brier,
+    conformal_factor,
+    conformal_scores,
+    crps_gaussian,
+    crps_laplace,
+    energy_score,
+    fit_scale,
+    reliability,
+)
+
+RANGES_M = (0.0, 20.0, 40.0, 60.0, np.inf)
+COVERAGE = 0.9
+Summary = dict[str, float | int | str | None]
+
+
+@dataclass(frozen=True)
+class ScoreSummary:
+    """Flat figures, and the reliability diagrams they were taken from."""
+
+    figures: Summary
+    diagrams: Mapping[str, Reliability]
+
+
+def summarise_scores(read: DetectionSet, scores: Sequence[FrameScore], seed: int = 0) -> ScoreSummary:
+    """Means are per frame over frames of finite likelihood, and those that are not are counted."""
+    rng = np.random.default_rng(seed)
+    nll = np.array([score.nll for score in scores])
+    finite = np.isfinite(nll)
+    figures: Summary = {
+        "frames": len(scores),
+        "objects": sum(len(score.objects.label) for score in scores),
+        "detections": sum(len(score.detections.label) for score in scores),
+        "pmb_nll.frames_infinite": int((~finite).sum()),
+        **read.counts,
+    }
+    if finite.any():
+        sequences = [score.sequence for score in scores]
+        interval = bootstrap_mean(nll[finite], np.array(sequences)[finite].tolist(), rng)
+        figures["pmb_nll.mean"] = interval.mean
+        figures["pmb_nll.low_95"], figures["pmb_nll.high_95"] = interval.low, interval.high
+        figures["pmb_nll.gap"] = float(np.mean([score.gap for score in scores]))
+        for part in PARTS:
+            values = np.array([score.parts[part] for score in scores])[finite]
+            figures[f"pmb_nll.{part}"] = float(values.mean())
+    for name in ("gospa", "pgospa"):
+        for part in ("distance", "localisation", "existence", "missed", "false"):
+            figures[f"{name}.{part}"] = float(np.mean([getattr(getattr(s, name), part) for s in scores]))
+    figures |= _precision(read, scores)
+    diagrams = _diagrams(read, scores)
+    figures |= {f"calibration.{name}": diagram.error for name, diagram in diagrams.items()}
+    figures |= _calibration(read, scores) | _of_pairs(read, scores, rng) | _slices(read, scores)
+    return ScoreSummary(figures, diagrams)
+
+
+def compare_scores(
+    scores: Sequence[FrameScore], others: Sequence[FrameScore], seed: int = 0
+) -> tuple[BootstrapMean, int]:
+    """Mean of ours minus theirs by frame, over frames where both are finite; how many are not.
+
+    Raises `InputError` if the frames are not the same, or none can be compared.
+    """
+    if [score.name for score in scores] != [other.name for other in others]:
+        raise InputError("two files of detections can be compared on the same frames only")
+    ours, theirs = (np.array([score.nll for score in each]) for each in (scores, others))
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    if not both.any():
+        raise InputError("there is no frame in which both likelihoods are finite")
+    sequences = np.array([score.sequence for score in scores])[both].tolist()
+    compared = bootstrap_mean((ours - theirs)[both], sequences, np.random.default_rng(seed))
+    return compared, int((~both).sum())
+
+
+def _joined(scores: Sequence[FrameScore], part: str, field: str) -> ndarray:
+    return np.concatenate([getattr(getattr(score, part), field) for score in scores], axis=-1)
+
+
+def _precision(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+    """Average precision by class and threshold, as the data sets define it."""
+    label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
+    hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
+    thresholds = NUSCENES_DISTANCES_M if read.upright else COCO_OVERLAPS
+    average = average_precision_nuscenes if read.upright else average_precision_coco
+    table = np.array(
+        [
+            [average(score[label == c], row[label == c], int((true == c).sum())) for row in hit]
+            for c in range(len(read.classes))
+        ]
+    )
+    figures: Summary = {"map": mean_of_valid(table.ravel().tolist())}
+    for t, threshold in enumerate(thresholds):
+        unit = f"{threshold:g}_m" if read.upright else f"{threshold:.2f}"
+        figures[f"map_at.{unit}"] = mean_of_valid(table[:, t].tolist())
+    for c, name in enumerate(read.classes):
+        figures[f"ap.{name}"] = mean_of_valid(table[c].tolist())
+    return figures
+
+
+def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
+    """D-ECE at 2 m or overlap 0.5; LaECE's bins for image boxes; existence against associations."""
+    score, hit = _joined(scores, "detections", "score"), _joined(scores, "detections", "hit")
+    at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
+    diagrams = {"d_ece": reliability(score, hit[at])}
+    existence = _joined(scores, "detections", "existence")
+    has_object = _joined(scores, "detections", "has_object")
+    sure = ~np.isnan(has_object)
+    diagrams["existence"] = reliability(existence[sure], has_object[sure])
+    return diagrams
+
+
+def _calibration(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+    """By class: D-ECE, and for image boxes LaECE (overlap of hits at 0.5) and LaECE₀ (any overlap)."""
+    label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
+    hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
+    at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
+    figures: Summary = {"brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None}
+    outcomes = {} if read.upright else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
+    for c, name in enumerate(read.classes):
+        figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[at][label == c]).error
+    for key, outcome in outcomes.items():
+        errors = [reliability(score[label == c], outcome[label == c]).error for c in range(len(read.classes))]
+        figures[f"calibration.{key}"] = mean_of_valid(errors)
+    return figures
+
+
+def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Of boxes and their objects in the likeliest associations: proper scores, scale of σ, coverage."""
+    boxes, objects = [], []
+    for frame, score in zip(read.frames, scores, strict=True):
+        has = np.flatnonzero(score.objects.best >= 0)
+        if len(has):
+            boxes.append(frame.detected.boxes[score.objects.best[has]])
+            objects.append(frame.objects[has])
+    if not boxes:
+        return {}
+    density, truth = _stacked_boxes(boxes), _stacked_objects(objects)
+    mean, state = density.mean.numpy(), truth.state.numpy()
+    std = density.chol.square().sum(-1).sqrt().numpy()
+    crps = crps_gaussian if density.family == "gaussian" else crps_laplace
+    axes = ("x_m", "y_m", "z_m") if read.upright else ("x1_px", "y1_px", "x2_px", "y2_px")
+    figures: Summary = {
+        f"crps.{axis}": float(crps(mean[:, d], std[:, d], state[:, d]).mean()) for d, axis in enumerate(axes)
+    }
+    some = rng.permutation(len(mean))[:2000]
+    figures["energy_score"] = float(energy_score(density[some], truth[some], rng).mean())
+    figures["std.best_factor"] = fit_scale(density, truth)
+    half, rest = np.split(rng.permutation(len(mean)), [len(mean) // 2])
+    factor = conformal_factor(density[half], truth[half], COVERAGE)
+    figures["conformal.factor_90"] = factor
+    figures["conformal.coverage_90"] = float((conformal_scores(density[rest], truth[rest]) <= factor).mean())
+    return figures
+
+
+def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+    """What objects cost by class, range and visibility, nats an object."""
+    label = _joined(scores, "objects", "label")
+    figures: Summary = {}
+    for c, name in enumerate(read.classes):
+        figures |= _slice(f"by_class.{name}", scores, np.flatnonzero(label == c))
+    if all(frame.range_m is not None for frame in read.frames):
+        range_m = np.concatenate([frame.range_m for frame in read.frames if frame.range_m is not None])
+        for low, high in pairwise(RANGES_M):
+            inside = np.flatnonzero((range_m >= low) & (range_m < high))
+            figures |= _slice(f"by_range.from_{low:g}_m", scores, inside)
+    seen = [frame.visibility for frame in read.frames if frame.visibility is not None]
+    if len(seen) == len(scores) and not np.isnan(np.concatenate(seen)).any():
+        visibility = np.concatenate(seen)
+        edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else np.zeros(0)
+        for low, high in zip(edges, [*edges[1:], np.inf], strict=True):
+            inside = np.flatnonzero((visibility >= low) & (visibility < high))
+            figures |= _slice(f"by_visibility.from_{low:g}", scores, inside)
+    return figures
+
+
+def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Summary:
+    figures: Summary = {f"{name}.objects": len(which)}
+    for part in ("localisation", "classification", "missed", "missed_probability"):
+        values: Float[ndarray, _] = _joined(scores, "objects", part)[which]
+        figures[f"{name}.{part}"] = float(values.mean()) if len(values) else None
+    return figures
+
+
+def _stacked_boxes(parts: Sequence[BoxDensity]) -> BoxDensity:
+    return BoxDensity(
+        torch.cat([part.mean for part in parts]),
+        torch.cat([part.chol for part in parts]),
+        family=parts[0].family,
+    )
+
+
+def _stacked_objects(parts: Sequence[LabelledBoxes]) -> LabelledBoxes:
+    return LabelledBoxes(torch.cat([part.label for part in parts]), torch.cat([part.state for part in parts]))

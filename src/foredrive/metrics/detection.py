@@ -1,0 +1,75 @@
+"""Average precision of boxes: hits by centre distance (nuScenes) or by overlap (COCO)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+NUSCENES_DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
+COCO_OVERLAPS = tuple(np.round(np.arange(0.5, 1.0, 0.05), 2).tolist())
+
+
+def overlaps(boxes: Float[ndarray, "M 4"], others: Float[ndarray, "N 4"]) -> Float[ndarray, "M N"]:
+    """Intersection over union of image boxes (x1, y1, x2, y2)."""
+    low = np.maximum(boxes[:, None, :2], others[:, :2])
+    high = np.minimum(boxes[:, None, 2:], others[:, 2:])
+    shared = np.clip(high - low, 0.0, None).prod(-1)
+    area, other_area = (np.clip(b[:, 2:] - b[:, :2], 0.0, None).prod(-1) for b in (boxes, others))
+    either = area[:, None] + other_area - shared
+    return np.divide(shared, either, out=np.zeros_like(shared), where=either > 0)
+
+
+def match_greedily(
+    score: Float[ndarray, "M"], closeness: Float[ndarray, "M N"], least: float
+) -> Int[ndarray, "M"]:
+    """Object of each detection, or -1: the best scored first, each takes the closest that is left.
+
+    Of one frame and class. `closeness` is larger for better pairs; those below `least` are none.
+    """
+    found = np.full(len(score), -1)
+    left = closeness.copy()
+    for i in np.argsort(-score, kind="stable") if closeness.size else ():
+        j = int(left[i].argmax())
+        if left[i, j] >= least:
+            found[i] = j
+            left[:, j] = -np.inf
+    return found
+
+
+def precision_recall(
+    score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+    """Precision and recall as the threshold falls, over all frames; precision made to fall with recall."""
+    order = np.argsort(-score, kind="stable")
+    hits = np.cumsum(hit[order])
+    precision = hits / np.arange(1, len(score) + 1)
+    return np.maximum.accumulate(precision[::-1])[::-1], hits / max(objects, 1)
+
+
+def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
+    """Mean of the precision at recall 0, 0.01 … 1, as in COCO; NaN without objects."""
+    if objects == 0:
+        return float("nan")
+    precision, recall = precision_recall(score, hit, objects)
+    at = np.searchsorted(recall, np.linspace(0, 1, 101), side="left")
+    return float(np.append(precision, 0.0)[at].mean())
+
+
+def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
+    """As in nuScenes: precision above 0.1, averaged over recall above 0.1, over 0.9; NaN without objects."""
+    if objects == 0:
+        return float("nan")
+    if not hit.any():
+        return 0.0
+    order = np.argsort(-score, kind="stable")
+    hits = np.cumsum(hit[order])
+    precision, recall = hits / np.arange(1, len(score) + 1), hits / objects
+    at = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
+    return float(np.clip(at[11:] - 0.1, 0.0, None).mean() / 0.9)
+
+
+def mean_of_valid(values: Sequence[float]) -> float:
+    """Mean over classes that have objects; NaN if none has."""
+    valid = [value for value in values if not np.isnan(value)]
+    return float(np.mean(valid)) if valid else float("nan")

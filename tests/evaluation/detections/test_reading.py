@@ -1,0 +1,137 @@
+"""Files of detections: what is read, and what a wrong record is told."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections import read_detections
+
+
+def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
+    truth = write_nuscenes(
+        tmp_path / "gt.json",
+        {
+            "a": [box(1003.0, 504.0, yaw=3.0, ego_translation=[3.0, 4.0, 0.5], num_pts=7, scene_token="s")],
+            "b": [],
+        },
+    )
+    said = box(1004.0, 504.0, yaw=-3.0, detection_score=0.5, covariance=[0.1] * 6, yaw_std=0.5)
+    results = write_nuscenes(tmp_path / "found.json", {"a": [said]})
+    read = read_detections(results, truth)
+    assert read.upright
+    assert read.classes == ["car"]
+    assert read.counts == {"frames_without_detections": 1, "boxes_without_covariance": 0}
+    frame, empty = read.frames
+    assert (frame.name, frame.sequence, empty.name) == ("a", "s", "b")
+    expected = [3.0, 4.0, 0.5, math.log(4), math.log(2), math.log(1.5)]
+    np.testing.assert_allclose(frame.objects.state.numpy(), [expected])
+    np.testing.assert_allclose(frame.detected.boxes.mean.numpy(), [[4.0, *expected[1:]]])
+    np.testing.assert_allclose(frame.detected.boxes.chol.numpy()[0], np.eye(6) * math.sqrt(0.1))
+    assert frame.detected.boxes.yaw is not None
+    assert frame.detected.boxes.concentration is not None
+    assert frame.detected.boxes.yaw.item() == pytest.approx(-3.0)
+    assert frame.detected.boxes.concentration.item() == pytest.approx(4.0)
+    assert frame.range_m is not None
+    assert frame.range_m.tolist() == pytest.approx([5.0])
+    assert frame.visibility is not None
+    assert frame.visibility.tolist() == [7.0]
+    assert len(empty.detected.log_existence) == len(empty.objects.label) == 0
+
+
+def test_coco_boxes_and_class_probabilities(tmp_path: Path) -> None:
+    truth = write_coco_truth(
+        tmp_path / "gt.json",
+        [
+            {"image_id": 2, "category_id": 7, "bbox": [10, 20, 30, 40]},
+            {"image_id": 2, "category_id": 7, "bbox": [0, 0, 1, 1], "iscrowd": 1},
+        ],
+    )
+    record = {"image_id": 2, "category_id": 7, "bbox": [10, 20, 100, 40], "score": 1.0}
+    record["class_probabilities"] = {"dog": 0.75, "car": 0.25}
+    read = read_detections(write_list(tmp_path / "found.json", [record]), truth)
+    assert not read.upright
+    assert read.counts["crowds_left_out"] == read.counts["boxes_without_covariance"] == 1
+    frame = read.frames[1]
+    assert frame.objects.state.tolist() == [[10, 20, 40, 60]]
+    assert frame.objects.label.tolist() == [1]
+    np.testing.assert_allclose(frame.detected.log_class.exp().numpy(), [[0.25, 0.75]])
+    std = [math.sqrt(side**2 + 1) for side in (5.0, 2.0, 5.0, 2.0)]
+    np.testing.assert_allclose(frame.detected.boxes.chol.numpy()[0], np.diag(std))
+    assert frame.detected.log_absence.exp().item() == pytest.approx(1e-6)  # not 0, whatever the rounding
+
+
+def test_kitti_boxes_forward_left_up(tmp_path: Path) -> None:
+    """A car 20 m ahead and 3 m to the right that heads away (rotation -π/2), and one that heads right (0)."""
+    (tmp_path / "gt").mkdir()
+    (tmp_path / "found").mkdir()
+    (tmp_path / "gt" / "000001.txt").write_text(
+        f"Car 0.00 2 0 1 2 3 4 1.5 2.0 4.0 3.0 1.7 20.0 {-math.pi / 2}\n"
+        "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1 -1 -1 -1\n"
+    )
+    (tmp_path / "found" / "000001.txt").write_text("Car -1 -1 0 1 2 3 4 1.5 2.0 4.0 3.0 1.7 20.0 0.0 0.9\n")
+    read = read_detections(tmp_path / "found", tmp_path / "gt")
+    (frame,) = read.frames
+    expected = [20.0, -3.0, -(1.7 - 0.75), math.log(4), math.log(2), math.log(1.5)]
+    np.testing.assert_allclose(frame.objects.state.numpy(), [expected])
+    assert frame.objects.yaw is not None
+    assert frame.detected.boxes.yaw is not None
+    assert frame.objects.yaw.item() == pytest.approx(0.0, abs=1e-12)
+    assert frame.detected.boxes.yaw.item() == pytest.approx(-math.pi / 2)
+    assert frame.visibility is not None
+    assert frame.visibility.tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": [0.0, 4.0, 1.5]}, r"frame a, box 1 has the size"),
+        ({"size": [2.0, 4.0]}, r"box 1 has no size of 3"),
+        ({"translation": [float("nan"), 0.0, 0.0]}, r"frame a, box 1 has a translation that is not finite"),
+        ({"detection_score": 1.2}, r"detection 1 has a score outside"),
+        ({"detection_score": float("nan")}, r"box 1 has a detection_score that is not finite"),
+        ({"covariance": [1, 1, 1, 1, 1, -1]}, r"detection 1 has a covariance that is not positive"),
+        ({"covariance": [1, 2]}, r"box 1: its covariance is neither"),
+        ({"yaw_std": 0.0}, r"detection 1 has a standard deviation of its heading"),
+        ({"class_probabilities": {"moon": 1.0}}, r"box 1: class_probabilities"),
+        ({"class_probabilities": {"car": 0.4}}, r"detection 1 has class probabilities"),
+    ],
+)
+def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> None:
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [box(0.0, 0.0)]})
+    good = box(0.0, 0.0, detection_score=0.5)
+    results = write_nuscenes(tmp_path / "found.json", {"a": [good, {**good, **change}]})
+    with pytest.raises(InputError, match=message):
+        read_detections(results, truth)
+
+
+def test_wrong_files_are_named(tmp_path: Path) -> None:
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": []})
+    elsewhere = write_nuscenes(tmp_path / "found.json", {"z": []})
+    with pytest.raises(InputError, match=r"frame z .* is not in"):
+        read_detections(elsewhere, truth)
+    (tmp_path / "empty.json").write_text("")
+    with pytest.raises(InputError, match=r"empty\.json: not JSON"):
+        read_detections(tmp_path / "empty.json", truth)
+    with pytest.raises(InputError, match="holds no frames"):
+        read_detections(write_nuscenes(tmp_path / "none.json", {}), tmp_path / "none.json")
+    coco = write_coco_truth(tmp_path / "coco.json", [])
+    for record, message in (
+        ({"image_id": 9, "category_id": 3}, "record 0 is of the unknown image 9"),
+        ({"image_id": 1, "category_id": 8}, "record 0 has the unknown category 8"),
+        (
+            {"image_id": 1, "category_id": 3, "bbox": [1, 2, 0, 4], "score": 1},
+            "record 0 has a bbox of the size",
+        ),
+        ({"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]}, "record 0 has no score"),
+        (17, "record 0 is of the unknown image None"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_detections(write_list(tmp_path / "list.json", [record]), coco)
+    (tmp_path / "number.json").write_text(json.dumps(3))
+    with pytest.raises(InputError, match="neither a list"):
+        read_detections(tmp_path / "number.json", coco)

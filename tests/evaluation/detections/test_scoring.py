@@ -1,0 +1,120 @@
+"""Scores of files of detections: parts that add up, figures by hand, comparisons."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections import (
+    DetectionSet,
+    compare_scores,
+    read_detections,
+    score_frames,
+    summarise_scores,
+)
+
+
+def drives(folder: Path, *, error_m: float, seed: int = 0) -> DetectionSet:
+    """Twelve frames of four scenes: five cars, all found with the error; two detections of nothing."""
+    rng, other = np.random.default_rng(seed), np.random.default_rng(99)
+    truth, found = {}, {}
+    for n in range(12):
+        at = rng.uniform(-40, 40, (5, 2))
+        moved = at + error_m * other.normal(size=at.shape)
+        truth[f"f{n}"] = [box(*xy, scene_token=f"s{n % 4}", ego_translation=[*xy, 0.0]) for xy in at]
+        found[f"f{n}"] = [box(*xy, detection_score=0.9) for xy in moved]
+        found[f"f{n}"] += [box(*rng.uniform(-40, 40, 2), detection_score=s) for s in (0.3, 0.05)]
+    return read_detections(
+        write_nuscenes(folder / "found.json", found), write_nuscenes(folder / "gt.json", truth)
+    )
+
+
+def test_one_certain_pair_by_hand(tmp_path: Path) -> None:
+    """r = .9, σ as assumed, no error: the parts are known but for the background's small share."""
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [box(5.0, 5.0)]})
+    results = write_nuscenes(tmp_path / "found.json", {"a": [box(5.0, 5.0, detection_score=0.9)]})
+    read = read_detections(results, truth)
+    (score,) = score_frames(read)
+    linear = sum(math.log(s * math.sqrt(2 * math.pi)) for s in (0.5, 0.5, 0.3, 0.15, 0.15, 0.15))
+    heading = math.log(2 * math.pi * np.i0(25.0)) - 25.0
+    assert score.parts["localisation"] == pytest.approx(linear + heading, abs=1e-4)
+    assert score.parts["classification"] == pytest.approx(-math.log(0.9), abs=1e-4)
+    assert score.parts["expected_background"] == pytest.approx(1.0)
+    assert score.nll == pytest.approx(sum(score.parts.values()), abs=1e-9)
+    figures = summarise_scores(read, [score]).figures
+    assert figures["map"] == pytest.approx(1.0)
+    assert figures["gospa.distance"] == 0.0
+    spread = 0.5**2 + 0.5**2 + 0.3**2
+    assert figures["pgospa.localisation"] == pytest.approx(0.9 * spread)
+    assert figures["pgospa.existence"] == pytest.approx(0.1 * 2.0)
+    assert figures["calibration.d_ece"] == pytest.approx(0.1)
+
+
+def test_what_objects_cost_adds_up_to_the_parts(tmp_path: Path) -> None:
+    for score in score_frames(drives(tmp_path, error_m=0.7)):
+        assert score.objects.localisation.sum() == pytest.approx(score.parts["localisation"], abs=1e-9)
+        assert score.objects.classification.sum() == pytest.approx(score.parts["classification"], abs=1e-9)
+        assert score.objects.missed.sum() == pytest.approx(score.parts["missed"], abs=1e-9)
+        assert score.nll == pytest.approx(sum(score.parts.values()), abs=1e-9)
+        assert np.isnan(score.detections.has_object).tolist() == [False] * 6 + [True]
+
+
+def test_worse_detections_are_found_worse_beyond_chance(tmp_path: Path) -> None:
+    good, bad = drives(tmp_path, error_m=0.4), drives(tmp_path, error_m=1.5)
+    ours, theirs = score_frames(good), score_frames(bad)
+    compared, uncompared = compare_scores(ours, theirs)
+    assert uncompared == 0
+    assert compared.high < 0
+    assert compared.p_value < 0.01
+    assert compared.mean == pytest.approx(np.mean([s.nll for s in ours]) - np.mean([s.nll for s in theirs]))
+    with pytest.raises(InputError, match="same frames"):
+        compare_scores(ours, theirs[:-1])
+    better, worse = summarise_scores(good, ours).figures, summarise_scores(bad, theirs).figures
+    for figure in ("crps.x_m", "energy_score", "gospa.distance", "pgospa.distance", "std.best_factor"):
+        assert better[figure] < worse[figure], figure  # type: ignore[operator]
+    assert better["map"] > worse["map"]  # type: ignore[operator]
+    assert better["by_class.car.objects"] == 60
+    assert better["by_range.from_40_m.objects"] == sum(
+        int((f.range_m >= 40).sum() - (f.range_m >= 60).sum()) for f in good.frames if f.range_m is not None
+    )
+
+
+def test_images_with_overlaps_by_hand(tmp_path: Path) -> None:
+    """One hit of overlap .8, one detection of another class, one object missed."""
+    truth = write_coco_truth(
+        tmp_path / "gt.json",
+        [
+            {"image_id": 1, "category_id": 3, "bbox": [0, 0, 10, 10]},
+            {"image_id": 1, "category_id": 3, "bbox": [50, 50, 10, 10]},
+        ],
+    )
+    records = [
+        {"image_id": 1, "category_id": 3, "bbox": [0, 0, 10, 8], "score": 0.6},
+        {"image_id": 1, "category_id": 7, "bbox": [50, 50, 10, 10], "score": 0.3},
+    ]
+    read = read_detections(write_list(tmp_path / "found.json", records), truth)
+    figures = summarise_scores(read, score_frames(read)).figures
+    half = 51 / 101  # precision 1 up to recall .5
+    assert figures["map_at.0.50"] == pytest.approx(half)
+    assert figures["map_at.0.80"] == pytest.approx(half)
+    assert figures["map_at.0.85"] == 0.0
+    assert figures["calibration.d_ece"] == pytest.approx((0.4 + 0.3) / 2)
+    assert figures["calibration.la_ece"] == pytest.approx((0.2 + 0.3) / 2)
+    assert figures["gospa.missed"] == pytest.approx(50.0**2 / 2 / 2)  # one of two images
+    assert figures["frames"] == 2
+    assert figures["pmb_nll.frames_infinite"] == 0
+
+
+def test_no_detections_at_all(tmp_path: Path) -> None:
+    """Every object is left to the uniform background: -log of one object over its region and classes."""
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [box(0.0, 0.0)]})
+    read = read_detections(write_nuscenes(tmp_path / "found.json", {}), truth)
+    (score,) = score_frames(read)
+    volume = 120 * 120 * 20 * 7**3 * 2 * math.pi
+    assert score.nll == pytest.approx(1.0 + math.log(volume), abs=1e-6)
+    figures = summarise_scores(read, [score]).figures
+    assert figures["map"] == 0.0
+    assert figures["frames_without_detections"] == 1
