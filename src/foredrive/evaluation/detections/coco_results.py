@@ -33,7 +33,7 @@ Record = Mapping[str, Any]
 
 
 def read_coco(
-    results: Sequence[Record], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
+    results: Sequence[Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
 ) -> DetectionSet:
     """Images of the truth, in its order; crowds are left out. Raises `InputError` that names the record."""
     images, categories = _listed(truth, "images", truth_path), _listed(truth, "categories", truth_path)
