@@ -89,12 +89,12 @@ def train_run(
         logs: for both stages.
         folder: of the run.
         cache_dir: for labels and shrunk images; by default in `folder`.
-        start: a run folder. Its pre-trained weights are taken and that stage is left out here: pre-trained
-            on many logs, fine-tuned on few.
+        start: a run folder. Its pre-trained world model is taken and that stage is left out here:
+            pre-trained on many logs, fine-tuned on few, or with another planner.
 
     Raises:
         InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
-            cannot be read; if `start` has not finished pre-training or its model has other sizes.
+            cannot be read; if `start` has not finished pre-training or its world model has other sizes.
     """
     from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
 
@@ -112,7 +112,7 @@ def train_run(
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
     if pretrained is not None:
-        load_weights(agent, pretrained)
+        load_weights(agent.world_model, pretrained, "world_model")
     elif recipe.pretrain is not None:
         _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)

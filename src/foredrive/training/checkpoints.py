@@ -57,12 +57,18 @@ def save_weights(model: nn.Module, path: Path) -> None:
     save_file({name: tensor.detach().contiguous() for name, tensor in model.state_dict().items()}, path)
 
 
-def load_weights(model: nn.Module, path: Path) -> None:
-    """Load weights into a model of the same architecture."""
+def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
+    """Load weights into a model of the same architecture.
+
+    Args:
+        part: the model is this part of what was saved, such as "world_model"; "" is all of it.
+    """
+    prefix = f"{part}." if part else ""
     try:
-        state = load_file(path)
+        saved = load_file(path)
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: weights cannot be read: {error}") from error
+    state = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
     own = model.state_dict()
     wrong = sorted(set(own) ^ set(state)) + [
         name for name in sorted(set(own) & set(state)) if own[name].shape != state[name].shape

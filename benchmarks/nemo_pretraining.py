@@ -1,0 +1,107 @@
+"""Does NeMo's self-supervised pre-training help? `foredrive bench nemo_pretraining`, hours on two cores.
+
+Everything is kept in runs/nemo_study/COMMIT, so that an interrupted study goes on where it stopped: drives,
+the cache of labels, and a run folder for every arm and seed.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import find_recipe
+from foredrive.recipes.config import AveragingEncoderSize, Recipe
+from foredrive.recipes.study import (
+    StudyLogs,
+    StudyTowns,
+    occupancy_alone,
+    record_study,
+    run_arm,
+    seeded,
+    share_of,
+    work_folder,
+)
+from foredrive.training import read_metrics
+
+WORK = work_folder(Path("runs/nemo_study"))
+SHARES = (0.1, 0.3, 1.0)
+TOWNS = StudyTowns()
+RECIPE = "nemo_town"
+AVERAGING = AveragingEncoderSize(hidden=128)
+PROBE_STEPS = 30
+
+
+def _logs() -> StudyLogs:
+    return record_study(TOWNS, WORK / "towns", workers=2)
+
+
+def _folder(arm: str, seed: int) -> Path:
+    return WORK / "runs" / f"{arm}_seed{seed}"
+
+
+def planned(pretrained: bool, share: float) -> Callable[[int], dict[str, float]]:
+    """The full recipe, fine-tuned on a share of the drives, after pre-training on all of them or none."""
+
+    def measure(seed: int) -> dict[str, float]:
+        logs, recipe = _logs(), seeded(find_recipe(RECIPE), seed)
+        few = dataclasses.replace(logs, train=share_of(logs.train, share))
+        folder = _folder(_name(pretrained, share), seed)
+        if not pretrained:
+            recipe = dataclasses.replace(recipe, pretrain=None)
+            return run_arm(recipe, few, folder, WORK / "cache")
+        whole = _folder(RECIPE, seed)
+        figures = run_arm(recipe, logs, whole, WORK / "cache")
+        return figures if share == 1.0 else run_arm(recipe, few, folder, WORK / "cache", start=whole)
+
+    return measure
+
+
+def _name(pretrained: bool, share: float) -> str:
+    return f"{'pretrained' if pretrained else 'scratch'}_{100 * share:.0f}pct"
+
+
+def occupancy(seed: int) -> dict[str, float]:
+    """NeMo's encoder on the occupancy of the present alone, for as many steps as pre-training has."""
+    recipe = occupancy_alone(seeded(find_recipe(RECIPE), seed))
+    return _seen(run_arm(recipe, _logs(), _folder("occupancy", seed), WORK / "cache"))
+
+
+def occupancy_averaging(seed: int) -> dict[str, float]:
+    """The averaging encoder on the same, for as long as NeMo's encoder took."""
+    recipe = seeded(find_recipe(RECIPE), seed)
+    recipe = dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, encoder=AVERAGING))
+    recipe = occupancy_alone(recipe)
+    logs = _logs()
+    budget_s = occupancy(seed)["train_s"]
+    probe = _folder("occupancy_averaging_probe", seed)
+    run_arm(_of_steps(recipe, PROBE_STEPS), logs, probe, WORK / "cache")
+    took = sorted(line["step_s"] for line in read_metrics(probe / "finetune" / "metrics.jsonl"))
+    steps = round(budget_s / took[len(took) // 2])
+    folder = _folder("occupancy_averaging", seed)
+    return _seen(run_arm(_of_steps(recipe, steps), logs, folder, WORK / "cache")) | {"steps": float(steps)}
+
+
+def _of_steps(recipe: Recipe, steps: int) -> Recipe:
+    schedule = dataclasses.replace(recipe.finetune.schedule, steps=steps)
+    return dataclasses.replace(recipe, finetune=dataclasses.replace(recipe.finetune, schedule=schedule))
+
+
+def _seen(figures: dict[str, float]) -> dict[str, float]:
+    """Without what an untrained planner says."""
+    return {name: value for name, value in figures.items() if "l2" not in name and "collision" not in name}
+
+
+BENCHMARK = Benchmark(
+    question="Does pre-training help NeMo to see and to plan in a town it has not seen?",
+    arms={
+        _name(pretrained, share): planned(pretrained, share)
+        for pretrained in (True, False)
+        for share in SHARES
+    }
+    | {"occupancy": occupancy, "occupancy_averaging": occupancy_averaging},
+    config={
+        "recipe": dataclasses.asdict(find_recipe(RECIPE)),
+        "averaging": dataclasses.asdict(AVERAGING),
+        "towns": dataclasses.asdict(TOWNS),
+    },
+)
