@@ -10,17 +10,15 @@ from foredrive.ops.compositing import composite, stratified_depths
 
 def test_three_samples_by_hand() -> None:
     alpha = torch.tensor([0.5, 0.5, 1.0])
-    features = torch.tensor([[1.0, 0.0], [0.0, 4.0], [8.0, 8.0]])
-    seen = composite(alpha, features, torch.tensor([2.0, 4.0, 8.0]))
+    seen = composite(alpha, torch.tensor([2.0, 4.0, 8.0]))
     assert seen.weights.tolist() == [0.5, 0.25, 0.25]
-    assert seen.feature.tolist() == [2.5, 3.0]
     assert seen.expected_depth.item() == 4.0
     assert seen.transmittance.item() == 0.0
 
 
 def test_empty_space_lets_all_light_pass_and_a_wall_none() -> None:
     alpha = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.3]])
-    seen = composite(alpha, torch.ones(2, 3, 1), torch.tensor([1.0, 2.0, 3.0]).expand(2, 3))
+    seen = composite(alpha, torch.tensor([1.0, 2.0, 3.0]).expand(2, 3))
     assert seen.transmittance.tolist() == [1, 0]
     assert seen.weights.tolist() == [[0, 0, 0], [0, 1, 0]]
     assert seen.expected_depth.tolist() == [0, 2]
@@ -29,8 +27,8 @@ def test_empty_space_lets_all_light_pass_and_a_wall_none() -> None:
 def test_gradients_are_exact_at_the_ends_of_the_range() -> None:
     """∂w/∂α by hand: behind a wall nothing matters, but how solid the wall is does."""
     alpha = torch.tensor([0.0, 1.0, 0.5, 1.0], requires_grad=True)
-    features = torch.tensor([[3.0], [5.0], [7.0], [11.0]])
-    composite(alpha, features, torch.ones(4)).feature.sum().backward()
+    features = torch.tensor([3.0, 5.0, 7.0, 11.0])
+    (composite(alpha, torch.ones(4)).weights @ features).backward()
     # V behind sample i: 11, then .5·7 + .5·11 = 9, then 5, then 5; gradient T_i (f_i - V_{i+1})
     assert alpha.grad is not None
     assert alpha.grad.tolist() == [3 - 5, 5 - 9, 0, 0]
@@ -38,8 +36,8 @@ def test_gradients_are_exact_at_the_ends_of_the_range() -> None:
 
 def test_gradients_stay_finite_in_the_thick_of_it() -> None:
     alpha = torch.stack([torch.ones(48), torch.full((48,), 1 - 2**-24), torch.zeros(48)]).requires_grad_()
-    seen = composite(alpha, torch.randn(3, 48, 4), torch.linspace(1, 40, 48).expand(3, 48))
-    total = seen.feature.sum() + seen.expected_depth.sum() + seen.transmittance.sum()
+    seen = composite(alpha, torch.linspace(1, 40, 48).expand(3, 48))
+    total = (seen.weights @ torch.randn(48)).sum() + seen.expected_depth.sum() + seen.transmittance.sum()
     (grad,) = torch.autograd.grad(total, alpha)
     assert grad.isfinite().all()
 
@@ -48,32 +46,31 @@ def test_gradients() -> None:
     rng = torch.Generator().manual_seed(0)
     alpha = torch.rand(2, 2, 5, generator=rng, dtype=torch.float64)
     alpha[0, 0, 1], alpha[0, 1, 3], alpha[1, 0, :3], alpha[1, 1] = 0, 1, 1, 0
-    features = torch.randn(2, 2, 5, 3, generator=rng, dtype=torch.float64)
     depth = torch.rand(2, 2, 5, generator=rng, dtype=torch.float64)
-    assert torch.autograd.gradcheck(composite, [x.requires_grad_() for x in (alpha, features, depth)])
+    assert torch.autograd.gradcheck(composite, [x.requires_grad_() for x in (alpha, depth)])
 
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=60))
 def test_no_light_is_lost(alphas: list[float]) -> None:
     alpha = torch.tensor(alphas)
-    seen = composite(alpha, torch.ones(len(alpha), 1), torch.ones(len(alpha)))
+    seen = composite(alpha, torch.ones(len(alpha)))
     assert (seen.weights >= 0).all()
-    assert seen.feature.item() + seen.transmittance.item() == pytest.approx(1, abs=1e-5)
-    assert seen.expected_depth.item() == pytest.approx(seen.feature.item(), abs=1e-5)
+    assert seen.weights.sum().item() + seen.transmittance.item() == pytest.approx(1, abs=1e-5)
+    assert seen.expected_depth.item() == pytest.approx(seen.weights.sum().item(), abs=1e-5)
 
 
 def test_autocast_does_not_coarsen_depths() -> None:
-    alpha, features = torch.rand(4, 9).bfloat16(), torch.randn(4, 9, 3).bfloat16()
+    alpha = torch.rand(4, 9).bfloat16()
     depth = torch.linspace(1, 70, 9).expand(4, 9)
     with torch.autocast("cpu", torch.bfloat16):
-        seen = composite(alpha, features, depth)
-    expected = composite(alpha.float(), features.float(), depth)
+        seen = composite(alpha, depth)
+    expected = composite(alpha.float(), depth)
     assert all(torch.equal(a, b) for a, b in zip(seen, expected, strict=True))
 
 
 def test_no_rays() -> None:
-    seen = composite(torch.zeros(0, 5), torch.zeros(0, 5, 3), torch.zeros(0, 5))
-    assert [x.shape for x in seen] == [(0, 3), (0, 5), (0,), (0,)]
+    seen = composite(torch.zeros(0, 5), torch.zeros(0, 5))
+    assert [x.shape for x in seen] == [(0, 5), (0,), (0,)]
 
 
 def test_depths_are_stratified() -> None:

@@ -40,7 +40,8 @@ class FutureAttention(nn.Module):
         """V_F = A ⊙ V_t."""
         blocks = F.avg_pool3d(future, self.pool).flatten(2).transpose(1, 2)  # [b, blocks, D]
         tokens = future.flatten(2).transpose(1, 2)  # [b, Z·Y·X, D]
-        attended = F.scaled_dot_product_attention(self.query(tokens), self.key(blocks), self.value(blocks))
+        one_head = (x[:, None] for x in (self.query(tokens), self.key(blocks), self.value(blocks)))
+        attended = F.scaled_dot_product_attention(*one_head)[:, 0]  # without a head it would hold all pairs
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
-from foredrive.ops.volume_kernels import BLOCK, Reader
-from foredrive.ops.volume_reading import ReadVolume
+from foredrive.ops.volume_kernels import BLOCK
+from foredrive.ops.volume_reading import ReadVolume, readers_of
 
 
 def attend_volume(
@@ -49,8 +49,7 @@ def attend_volume(
         return read_volume_triton(values, points, weights)
     if not (small and per_head <= BLOCK and numba_can(values, points, weights)):
         return attend_volume_reference(values, points, weights)
-    width = values.shape[-1] // heads
-    readers = tuple(Reader(head, head * width, (head + 1) * width, head) for head in range(heads))
+    readers = readers_of(heads, values.shape[-1])
     with full_precision(values, points, weights) as (values, points, weights):
         out: Tensor = ReadVolume.apply(values, points, weights, readers)
         return out

@@ -1,4 +1,8 @@
-"""Sampling and compositing along rays (NeMo eq. 2 and 5)."""
+"""Sampling and compositing along rays (NeMo eq. 2 and 5).
+
+What a ray sees of a volume is Σ w_i f_i over its samples. `attention3d.attend_volume` reads it off the volume
+by the weights found here, so that no sample's feature is ever stored.
+"""
 
 from typing import NamedTuple
 
@@ -13,38 +17,32 @@ class Composite(NamedTuple):
     """What is left of N samples on a ray.
 
     Attributes:
-        feature: Σ w_i f_i.
         weights: w_i = α_i Π_{j<i} (1 - α_j), the probability that the ray ends at sample i.
         expected_depth: Σ w_i d_i, m. A ray that does not end adds nothing: divide by Σ w_i for the depth of
             those that do.
         transmittance: Π (1 - α_i), the probability that the ray passes all samples.
     """
 
-    feature: Float[Tensor, "*b D"]
     weights: Float[Tensor, "*b N"]
     expected_depth: Float[Tensor, "*b"]
     transmittance: Float[Tensor, "*b"]
 
 
-def composite(
-    alpha: Float[Tensor, "*b N"], features: Float[Tensor, "*b N D"], depth_m: Float[Tensor, "*b N"]
-) -> Composite:
-    """Composite features along rays, front to back (NeMo eq. 5). Exact, gradients too, at α = 0 and α = 1.
+def composite(alpha: Float[Tensor, "*b N"], depth_m: Float[Tensor, "*b N"]) -> Composite:
+    """What each sample of a ray counts, front to back (NeMo eq. 5). Exact, gradients too, at α = 0 and 1.
 
     Args:
         alpha: opacity of each sample, 0 to 1.
-        features: of each sample.
         depth_m: distance of each sample along its ray.
 
     Returns:
         float32 (float64 for float64 input), also from half precision.
     """
-    with full_precision(alpha, features, depth_m) as (alpha, features, depth_m):
+    with full_precision(alpha, depth_m) as (alpha, depth_m):
         # this costs memory traffic and little else: a numba kernel was measured to be no faster
         passed = torch.cumprod(1 - alpha, dim=-1)
         weights = torch.cat([torch.ones_like(alpha[..., :1]), passed[..., :-1]], dim=-1) * alpha
         return Composite(
-            feature=(weights[..., None, :] @ features)[..., 0, :],
             weights=weights,
             expected_depth=(weights * depth_m).sum(-1),
             transmittance=passed[..., -1],

@@ -10,11 +10,7 @@ from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
 from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
-from foredrive.ops.volume_kernels import Reader
-from foredrive.ops.volume_reading import ReadVolume
-
-CHANNELS_AT_ONCE = 16
-"""The backward pass of sampling runs in parallel over slices of one cache line."""
+from foredrive.ops.volume_reading import ReadVolume, readers_of
 
 
 def sample_volume(
@@ -41,11 +37,7 @@ def sample_volume(
         return sample_volume_triton(volume, points)
     if not (small and numba_can(volume, points)):
         return sample_volume_reference(volume, points)
-    channels = volume.shape[-1]
-    starts = range(0, channels, CHANNELS_AT_ONCE)
-    readers = tuple(
-        Reader(0, start, min(start + CHANNELS_AT_ONCE, channels), slot) for slot, start in enumerate(starts)
-    )
+    readers = readers_of(1, volume.shape[-1])
     with full_precision(volume, points) as (volume, points):
         one = points.new_ones(()).expand(*points.shape[:2], 1, 1)
         out: Tensor = ReadVolume.apply(volume, points[:, :, None, None], one, readers)

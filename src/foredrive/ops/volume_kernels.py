@@ -175,7 +175,7 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
     points, channels = inputs.weights.shape[3], inputs.values.shape[4]
     queries = grads.out.shape[1]
     base = item * inputs.values[0].size + channel
-    to_values, to_points = grads.values.size > 0, grads.weights.size > 0
+    to_values, to_points = grads.values.size > 0, grads.points.size + grads.weights.size > 0
     for q in range(first, last):
         grad = load(grads.out, (item * queries + q) * channels + channel, zero)
         i = (q - first) * points
@@ -240,9 +240,11 @@ def _hand_out(inputs, block, item, first, last, slot, grads):
     for q in range(first, last):
         i = (q - first) * points
         for p in range(points):
-            for axis in range(3):
-                grads.points[item, q, slot, p, axis] = slope[axis * BLOCK + i + p]
-            grads.weights[item, q, slot, p] = slope[3 * BLOCK + i + p]
+            if grads.points.size > 0:
+                for axis in range(3):
+                    grads.points[item, q, slot, p, axis] = slope[axis * BLOCK + i + p]
+            if grads.weights.size > 0:
+                grads.weights[item, q, slot, p] = slope[3 * BLOCK + i + p]
 
 
 @kernel
@@ -251,7 +253,7 @@ def read_back(inputs, item, reader, grads):
     """Add the values' gradients that one reader of a batch item brings, and write those of its points.
 
     Readers touch disjoint channels and slots, batch items disjoint volumes: calls that differ in either can
-    run at the same time. Gradients that are not wanted have size 0 (points and weights: both or none).
+    run at the same time. Gradients that are not wanted have size 0.
     """
     width = reader.last_channel - reader.first_channel
     whole = reader.first_channel + width - width % WIDTH
@@ -265,5 +267,5 @@ def read_back(inputs, item, reader, grads):
             _read_back(inputs, block, item, first, last, c, zeros8(), grads)
         for c in range(whole, reader.last_channel):
             _read_back(inputs, block, item, first, last, c, ZERO, grads)
-        if grads.weights.size > 0:
+        if grads.points.size + grads.weights.size > 0:
             _hand_out(inputs, block, item, first, last, reader.slot, grads)

@@ -12,6 +12,19 @@ from foredrive.ops.volume_kernels import Gradients, Inputs, Reader, read_back, r
 
 MIN_QUERIES = 256
 """Fewer are not worth a thread of their own."""
+CHANNELS_AT_ONCE = 16
+"""The backward pass runs in parallel over slices of one cache line."""
+
+
+def readers_of(heads: int, channels: int) -> tuple[Reader, ...]:
+    """Who reads which channels in the backward pass: for each head, slices of its share of the channels."""
+    width = channels // heads
+    slices = [
+        (head, start, min(start + CHANNELS_AT_ONCE, (head + 1) * width))
+        for head in range(heads)
+        for start in range(head * width, (head + 1) * width, CHANNELS_AT_ONCE)
+    ]
+    return tuple(Reader(*part, slot) for slot, part in enumerate(slices))
 
 
 class ReadVolume(torch.autograd.Function):
@@ -56,9 +69,9 @@ class ReadVolume(torch.autograd.Function):
         readers: tuple[Reader, ...] = ctx.readers
         b, queries, heads, per_head = weights.shape
         grad_values = torch.zeros_like(values) if wants_values else values[:0]
-        slots = len(readers) if wants_points or wants_weights else 0
-        grad_points = points.new_empty(b, queries, slots, per_head, 3)
-        grad_weights = weights.new_empty(b, queries, slots, per_head)
+        slots = len(readers)
+        grad_points = points.new_empty(b, queries, slots if wants_points else 0, per_head, 3)
+        grad_weights = weights.new_empty(b, queries, slots if wants_weights else 0, per_head)
         inputs = Inputs(*(tensor.numpy() for tensor in (values, points, weights)))
         found = (grad_out.contiguous(), grad_values, grad_points, grad_weights)
         grads = Gradients(*(tensor.numpy() for tensor in found))
@@ -69,8 +82,10 @@ class ReadVolume(torch.autograd.Function):
 
         in_parallel(job, b * len(readers))
         if slots > heads:
-            grad_points = grad_points.unflatten(2, (heads, -1)).sum(3)
-            grad_weights = grad_weights.unflatten(2, (heads, -1)).sum(3)
+            grad_points, grad_weights = (
+                grad.unflatten(2, (heads, -1)).sum(3) if grad.numel() else grad
+                for grad in (grad_points, grad_weights)
+            )
         return (
             grad_values if wants_values else None,
             grad_points if wants_points else None,

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.compositing import composite, stratified_depths
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import VoxelSpec
@@ -68,11 +69,10 @@ class VolumeRenderer(nn.Module):
         depth = stratified_depths(self.near_m, self.far_m, self.samples, (b, rays), generator)
         depth = depth.to(origin)
         points = origin[:, :, None] + depth[..., None] * direction[:, :, None]  # [b, R, N, 3]
-        place = ((points - self.lower_m) / self.spec.voxel_m).flatten(1, 2)
-        both = torch.cat([feature, occupancy_logit.sigmoid()[:, None]], dim=1)
-        sampled = sample_volume(both.permute(0, 2, 3, 4, 1).contiguous(), place)
-        sampled = sampled.unflatten(1, (rays, self.samples))
-        rendered, _, range_m, through = composite(sampled[..., -1], sampled[..., :-1], depth)
+        place = (points - self.lower_m) / self.spec.voxel_m
+        alpha = sample_volume(occupancy_logit.sigmoid()[..., None], place.flatten(1, 2))
+        weights, range_m, through = composite(alpha.view(b, rays, self.samples), depth)
+        rendered = attend_volume(feature.permute(0, 2, 3, 4, 1), place[:, :, None], weights[:, :, None])
         rendered = rendered + through[..., None] * self.background
         rgb = self.recon(rendered).float().sigmoid()
         return RenderedRays(rgb=rgb, range_m=range_m + through * self.far_m, alpha=1 - through)
