@@ -16,6 +16,7 @@ from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.record import record
+from foredrive.cli.score import score
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
@@ -27,6 +28,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "convert": convert,
     "train": train,
     "evaluate": evaluate,
+    "score": score,
     "view": view,
     "bench": bench,
 }

@@ -1,21 +1,17 @@
 """Loss curves as an inline SVG that takes on the page's text colour."""
 
-import io
-import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from foredrive.view.inline_svg import INK_MARK, inline_svg
+
 COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227")
-INK_MARK = "#010203"
-"""Drawn wherever the page's own text colour shall be."""
 NOT_LOSSES = ("step", "step_s", "lr")
 SMOOTH_STEPS = 15
-NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
 def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float | int]]]) -> str:
@@ -27,17 +23,11 @@ def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float | int]]]) 
     shown = {name: lines for name, lines in stages.items() if lines}
     if not shown:
         return ""
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):
-        figure = Figure(figsize=(5.2 * len(shown), 3.1), layout="constrained")
-        axes = figure.subplots(1, len(shown), squeeze=False)[0]
-        for ax, (name, lines) in zip(axes, shown.items(), strict=True):
-            _draw_stage(ax, name, lines)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
-    svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)  # the page sets the size
-    return re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg)
+    figure = Figure(figsize=(5.2 * len(shown), 3.1), layout="constrained")
+    axes = figure.subplots(1, len(shown), squeeze=False)[0]
+    for ax, (name, lines) in zip(axes, shown.items(), strict=True):
+        _draw_stage(ax, name, lines)
+    return inline_svg(figure)
 
 
 def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]]) -> None:

@@ -1,0 +1,77 @@
+"""`foredrive score`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath
+
+if TYPE_CHECKING:
+    from foredrive.evaluation.detections import DetectionSet, FrameScore
+
+
+def score(
+    results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS")],
+    truth: Path,
+    against: OptionalPath = None,
+    out: Path = Path("runs/score"),
+    family: Literal["gaussian", "laplace"] = "gaussian",
+    k: int = 25,
+    worst: int = 6,
+) -> None:
+    """Score detections as a random finite set; write summary.json and report.html.
+
+    Args:
+        results: nuScenes or COCO results (JSON), or a folder of KITTI's text; docs/sets.md says how such
+            files state their uncertainty.
+        truth: The truth in the same format; for COCO its instances.
+        against: Other results on the same frames, to compare with.
+        out: Folder for summary.json and report.html.
+        family: What box densities are taken to be.
+        k: Best associations that are listed where there are too many to be summed.
+        worst: How many of the frames that lost most likelihood the report draws.
+    """
+    import time
+
+    from rich.console import Console
+
+    from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
+    from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
+    from foredrive.view.score_report import print_scores, write_score_report
+
+    started = time.perf_counter()
+    read = read_detections(results, truth, family)
+    scores = _scored(read, k, results)
+    result = summarise_scores(read, scores)
+    figures = result.figures
+    if against is not None:
+        others = _scored(read_detections(against, truth, family), k, against)
+        compared, uncompared = compare_scores(scores, others)
+        figures |= {
+            "against": str(against),
+            "against.difference": compared.mean,
+            "against.difference_low_95": compared.low,
+            "against.difference_high_95": compared.high,
+            "against.p_value": compared.p_value,
+            "against.frames_not_compared": uncompared,
+        }
+    figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
+    figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
+    out.mkdir(parents=True, exist_ok=True)
+    write_summary(out / "summary.json", figures)
+    write_score_report(
+        out / "report.html", f"{results.name} against {truth.name}", read, scores, result, worst
+    )
+    print_scores(figures, Console())
+    print(f"wrote {out / 'summary.json'} and {out / 'report.html'}")
+
+
+def _scored(read: "DetectionSet", k: int, path: Path) -> "list[FrameScore]":
+    from rich.progress import Progress
+
+    from foredrive.evaluation.detections import score_frames
+
+    with Progress(transient=True) as progress:
+        task = progress.add_task(path.name, total=len(read.frames))
+        return score_frames(read, k=k, told=lambda done: progress.update(task, completed=done))

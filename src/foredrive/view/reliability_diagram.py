@@ -1,0 +1,33 @@
+"""Confidence beside what came true."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from foredrive.sets import Reliability
+from foredrive.view.inline_svg import INK_MARK
+
+TITLES = {
+    "d_ece": "Scores and hits (2 m, or overlap 0.5)",
+    "existence": "Existence and associations",
+}
+
+
+def draw_reliability(name: str, diagram: Reliability) -> Figure:
+    """Points on the diagonal are calibrated; bars have the share of detections in each bin."""
+    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+    axes = figure.subplots()
+    full = diagram.count > 0
+    centre = (np.arange(len(diagram.count)) + 0.5) / len(diagram.count)
+    share = diagram.count / max(diagram.count.sum(), 1)
+    axes.bar(centre, share, 0.9 / len(centre), color="#3f8efc40")
+    axes.plot([0, 1], [0, 1], color=INK_MARK, linewidth=0.8, alpha=0.5)
+    axes.plot(diagram.confidence[full], diagram.outcome[full], "o-", color="#3f8efc", markersize=4)
+    title = f"{TITLES.get(name, name)}: error {diagram.error:.3f}"
+    axes.set_title(title, color=INK_MARK, loc="left", fontsize=10)
+    axes.set_xlabel("confidence", color=INK_MARK)
+    axes.set_ylabel("came true", color=INK_MARK)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    axes.tick_params(colors=INK_MARK, labelsize=9)
+    axes.grid(color="#8888884d", linewidth=0.6)
+    axes.spines[:].set_visible(False)
+    return figure

@@ -1,0 +1,48 @@
+"""`foredrive score`: what it writes, and what a user is told whose files do not fit."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from evaluation.detections.files_of_detections import box, write_nuscenes
+
+from foredrive.cli.main import main
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    """Two scenes of a frame each; one detector is 0.2 m off, the other 1.5 m."""
+    truth = {f: [box(5.0, y, "<car>", scene_token=f) for y in (0.0, 9.0)] for f in ("a", "b")}
+    return {
+        "truth": write_nuscenes(tmp_path / "gt.json", truth),
+        **{
+            name: write_nuscenes(
+                tmp_path / f"{name}.json",
+                {f: [box(5.0 + off, y, "<car>", detection_score=0.9) for y in (0.0, 9.0)] for f in "ab"},
+            )
+            for name, off in (("near", 0.2), ("far", 1.5))
+        },
+    }
+
+
+def test_figures_and_a_report_that_loads_nothing(files: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "scores"
+    arguments = ["--truth", str(files["truth"]), "--against", str(files["far"]), "--out", str(out)]
+    assert main(["score", str(files["near"]), *arguments]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames"] == 2
+    assert summary["map"] == pytest.approx(1.0)
+    expected = 2 * 0.5 * (0.2**2 - 1.5**2) / 0.5**2  # two cars whose x has a standard deviation of 0.5 m
+    assert summary["against.difference"] == pytest.approx(expected, abs=0.05)
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 4  # two diagrams, two frames
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    assert "ap.&lt;car&gt;" in page
+    assert "ap.<car>" not in page
+
+
+def test_wrong_files_are_one_line(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    missing = files["truth"].with_name("none.json")
+    assert main(["score", str(missing), "--truth", str(files["truth"])]) == 2
+    assert capsys.readouterr().err == f"foredrive: {missing}: not JSON that can be read\n"
