@@ -28,11 +28,12 @@ def match_greedily(
     Of one frame and class. `closeness` is larger for better pairs; those below `least` are none.
     """
     found = np.full(len(score), -1)
-    left = closeness.copy()
-    for i in np.argsort(-score, kind="stable") if closeness.size else ():
-        j = int(left[i].argmax())
-        if left[i, j] >= least:
-            found[i] = j
+    near = np.flatnonzero((closeness >= least).any(1))  # few are
+    left = closeness[near]
+    for place in np.argsort(-score[near], kind="stable"):
+        j = int(left[place].argmax())
+        if left[place, j] >= least:
+            found[near[place]] = j
             left[:, j] = -np.inf
     return found
 

@@ -1,0 +1,211 @@
+"""How long set likelihoods take, beside a Murty on SciPy's assignments and the best assignment alone.
+
+Times are of the processor, on one thread, so that others on the machine count for less, and the least of
+several runs: `foredrive bench sets_speed`.
+"""
+
+import itertools
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
+from foredrive.sets import (
+    BoxDensity,
+    LabelledBoxes,
+    MultiBernoulli,
+    PoissonMultiBernoulli,
+    UniformPoisson,
+    set_nll,
+)
+from foredrive.sets.assignment import k_best_assignments
+
+SIZES = {"100x50": (100, 50, 100.0), "900x200": (900, 200, 100.0), "900x200_crowded": (900, 200, 60.0)}
+"""Detections, objects, side of the square they are in, m."""
+K, CLASSES = 25, 10
+STD = np.array([0.4, 0.4, 0.2, 0.15, 0.15, 0.15])
+FRAMES, DETECTIONS = 6019, 200
+"""Of nuScenes' validation set."""
+
+Costs = tuple[np.ndarray, np.ndarray]
+
+
+def scene(m: int, n: int, side_m: float, rng: np.random.Generator) -> tuple[MultiBernoulli, LabelledBoxes]:
+    """Objects of which 90 % are detected, half of those twice; all other detections are of nothing."""
+    half = side_m / 2
+
+    def places(count: int) -> np.ndarray:
+        flat = rng.uniform(-half, half, (count, 2))
+        height, size = rng.normal(0, 0.3, (count, 1)), rng.normal([1.5, 0.7, 0.5], 0.1, (count, 3))
+        return np.concatenate([flat, height, size], axis=1)
+
+    state, yaw, label = places(n), rng.uniform(-3, 3, n), rng.integers(0, CLASSES, n)
+    seen = np.flatnonzero(rng.random(n) < 0.9)
+    source = np.concatenate([seen, rng.choice(seen, len(seen) // 2)])[:m]
+    clutter = m - len(source)
+    mean = np.concatenate([state[source] + STD * rng.normal(size=(len(source), 6)), places(clutter)])
+    heading = np.concatenate([yaw[source] + rng.normal(0, 0.15, len(source)), rng.uniform(-3, 3, clutter)])
+    logits = np.full((m, CLASSES), -3.0)
+    logits[np.arange(m), np.concatenate([label[source], rng.integers(0, CLASSES, clutter)])] = 2.0
+    twice = max(len(source) - len(seen), 0)
+    r = np.concatenate([rng.beta(5, 2, len(source) - twice), rng.beta(1, 3, twice), rng.beta(1, 15, clutter)])
+    r = torch.as_tensor(np.clip(r, 1e-4, 1 - 1e-4))
+    boxes = BoxDensity(
+        torch.as_tensor(mean),
+        torch.diag_embed(torch.as_tensor(STD).expand(m, 6)).contiguous(),
+        torch.as_tensor(heading),
+        torch.full((m,), 40.0, dtype=torch.float64),
+    )
+    log_class = torch.as_tensor(logits).log_softmax(-1)
+    detected = MultiBernoulli(r.log(), torch.log1p(-r), log_class, boxes)
+    return detected, LabelledBoxes(torch.as_tensor(label), torch.as_tensor(state), torch.as_tensor(yaw))
+
+
+def region(side_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where objects may be that are not detected."""
+    upper = np.array([side_m, side_m, 10.0, 4.0, 4.0, 4.0])
+    return -upper, upper
+
+
+def predicted(size: str, seed: int) -> tuple[PoissonMultiBernoulli, LabelledBoxes]:
+    """All detections as Bernoullis, the dearest case, beside a uniform background."""
+    m, n, side_m = SIZES[size]
+    detected, objects = scene(m, n, side_m, np.random.default_rng(seed))
+    lower, upper = (torch.as_tensor(bound) for bound in region(side_m))
+    rate = torch.full((CLASSES,), 0.5, dtype=torch.float64)
+    return PoissonMultiBernoulli(detected, UniformPoisson(rate, lower, upper, True)), objects
+
+
+def costs(size: str, seed: int) -> Costs:
+    """Costs of pairs, objects as rows, and of leaving an object to the background."""
+    pmb, objects = predicted(size, seed)
+    found = pmb.detected
+    log_pair = found.boxes.log_prob(objects) + found.log_label(objects) - found.log_absence[:, None]
+    assert pmb.background is not None
+    return np.ascontiguousarray(-log_pair.numpy().T), -pmb.background.log_intensity(objects).numpy()
+
+
+def least_ms(run: Callable[[], object], runs: int = 9) -> float:
+    """Processor time of the fastest run, after one that is not counted."""
+    run()
+    taken = []
+    for _ in range(runs):
+        started = time.process_time()
+        run()
+        taken.append(1e3 * (time.process_time() - started))
+    return min(taken)
+
+
+def likelihood(seed: int) -> dict[str, float]:
+    """The whole PMB-NLL with its parts; how wide an interval it leaves."""
+    torch.set_num_threads(1)
+    figures = {}
+    for size in SIZES:
+        pmb, objects = predicted(size, seed)
+        figures[f"ms_{size}_k{K}"] = least_ms(lambda pmb=pmb, objects=objects: set_nll(pmb, objects, k=K))
+        result = set_nll(pmb, objects, k=K)
+        figures[f"gap_nats_{size}"] = float(result.nll) - result.lower
+    return figures
+
+
+def k_best(seed: int) -> dict[str, float]:
+    """The K best assignments, ungated, by our kernel, and by Murty on SciPy, which must agree."""
+    figures = {}
+    for size in ("100x50", "900x200"):
+        cost, free = costs(size, seed)
+        figures[f"ms_{size}_k{K}"] = least_ms(lambda c=cost, f=free: k_best_assignments(c, f, K), 5)
+        started = time.process_time()
+        expected = murty_on_scipy(cost, free, K)
+        scipy_ms = 1e3 * (time.process_time() - started)
+        np.testing.assert_allclose(k_best_assignments(cost, free, K).cost, expected, atol=1e-6)
+        figures[f"scipy_murty_ms_{size}_k{K}"] = scipy_ms
+        figures[f"speedup_over_scipy_murty_{size}"] = scipy_ms / figures[f"ms_{size}_k{K}"]
+    return figures
+
+
+def best_only(seed: int) -> dict[str, float]:
+    """One assignment by SciPy: what a score by Hungarian matching takes, densities not counted."""
+    figures = {}
+    for size in SIZES:
+        padded = with_background(*costs(size, seed))
+        figures[f"ms_{size}_k1"] = least_ms(lambda padded=padded: linear_sum_assignment(padded))
+    return figures
+
+
+def with_background(cost: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Each row has a column of its own for none; what is forbidden is dear."""
+    own = np.full((len(free), len(free)), 1e9)
+    np.fill_diagonal(own, free)
+    return np.concatenate([cost, own], axis=1)
+
+
+def murty_on_scipy(cost: np.ndarray, free: np.ndarray, k: int) -> np.ndarray:
+    """Costs of the k best assignments: Murty's partition, each subproblem solved from the start."""
+    whole = with_background(cost, free)
+    count = itertools.count()
+
+    def solve(kept: np.ndarray, banned: list[tuple[int, int]]) -> tuple[float, int, np.ndarray, list]:
+        problem = whole.copy()
+        for row, column in banned:
+            problem[row, column] = 1e9
+        for row, column in enumerate(kept):
+            problem[row, :column] = problem[row, column + 1 :] = 1e9
+        rows, columns = linear_sum_assignment(problem)
+        return float(problem[rows, columns].sum()), next(count), columns, banned
+
+    waiting = [(*solve(np.zeros(0, int), []), 0)]
+    found: list[float] = []
+    while waiting and len(found) < k:
+        waiting.sort(key=lambda entry: entry[:2])
+        total, _, columns, banned, first = waiting.pop(0)
+        found.append(total)
+        for row in range(first, len(columns)):
+            bans = [*banned, (row, int(columns[row]))] if row == first else [(row, int(columns[row]))]
+            waiting.append((*solve(columns[:row], bans), row))
+    return np.array(found)
+
+
+def validation(seed: int) -> dict[str, float]:
+    """Every figure of `foredrive score` on as many frames as nuScenes' validation set has, on one thread."""
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(seed)
+    lower, upper = region(60.0)
+    frames = [
+        Frame(f"{n}", f"{n // 40}", *scene(DETECTIONS, int(rng.integers(5, 60)), 100.0, rng), lower, upper)
+        for n in range(FRAMES)
+    ]
+    read = DetectionSet(frames, [str(n) for n in range(CLASSES)], True, {})
+    score_frames(DetectionSet(frames[:2], read.classes, True, {}))
+    started, wall_started = time.process_time(), time.perf_counter()
+    scores = score_frames(read, k=K)
+    likelihood_s = time.process_time() - started
+    summarise_scores(read, scores)
+    return {
+        "validation_size_s": time.process_time() - started,
+        "validation_size_wall_s": time.perf_counter() - wall_started,
+        "of_which_frames_s": likelihood_s,
+        "largest_gap_nats": max(score.gap for score in scores),
+    }
+
+
+BENCHMARK = Benchmark(
+    question="How long do set likelihoods take, beside SciPy's assignments?",
+    arms={
+        "pmb_nll": likelihood,
+        "k_best": k_best,
+        "hungarian_by_scipy": best_only,
+        "validation": validation,
+    },
+    seeds=(0,),
+    config={
+        "k": K,
+        "sizes": SIZES,
+        "frames": FRAMES,
+        "detections": DETECTIONS,
+        "time": "processor, 1 thread",
+    },
+)
