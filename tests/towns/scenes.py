@@ -6,7 +6,7 @@ import numpy as np
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.map.town_map import Strip, StripKind, TownMap
 
 STILL = np.zeros(6)
 """The twist of a vehicle at rest."""
@@ -39,3 +39,11 @@ def actor_at(T_world_ego: np.ndarray, xyz: tuple[float, float, float], **changes
         parked=False,
     )
     return dataclasses.replace(state, **changes)
+
+
+def straight(name: str, start: tuple[float, ...], end: tuple[float, ...]) -> Strip:
+    """A lane of 4 m."""
+    line = np.linspace(start, end, 81)
+    ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+    left = 2.0 * np.array([-ahead[1], ahead[0], 0.0])
+    return Strip(name, StripKind.DRIVING, 0, None, line + left, line - left, (), ())

@@ -5,9 +5,10 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import straight
 
 from foredrive.towns.map.ground_plan import make_ground_plan
-from foredrive.towns.map.town_map import Strip, StripKind, TownMap
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import LookTable, Surface
 from foredrive.towns.place.mesh import Mesh, box, frustum, join, prism, walls
 from foredrive.towns.place.parking import footprint
@@ -89,14 +90,6 @@ def test_each_spot_of_a_level_belongs_to_one_piece(town02: TownMap) -> None:
         area = shapely.union_all([p.area for p in plan.pieces if p.strip.kind == rank])
         assert area.intersection(plan.lanes).area < 0.5
     assert plan.ground.area >= plan.lanes.area
-
-
-def straight(name: str, start: tuple[float, ...], end: tuple[float, ...]) -> Strip:
-    """A lane of 4 m."""
-    line = np.linspace(start, end, 81)
-    ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    left = 2.0 * np.array([-ahead[1], ahead[0], 0.0])
-    return Strip(name, StripKind.DRIVING, 0, None, line + left, line - left, (), ())
 
 
 def test_a_road_over_another_is_a_bridge_with_room_below() -> None:

@@ -5,13 +5,15 @@ import math
 import numpy as np
 import pytest
 from scenes import STILL, actor_at, ego_pose
+from scipy.integrate import quad
 
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import CONDITIONS, Conditions, find_conditions
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture
 from foredrive.towns.sensing import lens
-from foredrive.towns.sensing.air import make_air, rain_extinction_per_m
+from foredrive.towns.sensing.air import BACKSCATTER_RATIO, make_air, rain_extinction_per_m
+from foredrive.towns.sensing.beams import ASIDE_M, add_beams, phase
 from foredrive.towns.sensing.capture import NOT_KNOWN, SensorSuite
 from foredrive.towns.sensing.lamps import UNIT_LUX, gather_lamps, lamp_light
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
@@ -158,13 +160,14 @@ def test_overcast_has_no_sun() -> None:
 
 
 def test_lights_go_on_when_it_is_dark_or_hard_to_see() -> None:
-    assert [n for n, c in CONDITIONS.items() if is_dark(c)] == ["night", "night_rain"]
+    assert [n for n, c in CONDITIONS.items() if is_dark(c)] == ["night", "night_rain", "night_fog"]
     assert {n for n, c in CONDITIONS.items() if drive_lit(c)} == {
         "dusk",
         "night",
         "rain",
         "night_rain",
         "fog",
+        "night_fog",
     }
 
 
@@ -295,3 +298,29 @@ def test_the_same_weather_gives_the_same_bytes(
     first = under["night_rain"]
     assert all(first.images[name].tobytes() == image.tobytes() for name, image in again.images.items())
     assert first.sweep.range_m.numpy().tobytes() == again.sweep.range_m.numpy().tobytes()
+
+
+def test_beams_in_fog_are_seen_from_aside_and_scatter_all_that_they_lose() -> None:
+    share, _ = quad(lambda cosine: 2.0 * math.pi * phase(cosine), -1.0, 1.0)
+    assert share == pytest.approx(1.0)
+    assert phase(-1.0) == pytest.approx(BACKSCATTER_RATIO, rel=0.02)
+    extinction = 0.03
+    T = np.eye(4)
+    T[:2, 3] = 500.0
+    lamps = gather_lamps(np.array([[500.0, 480.0, 7.5]]), [], T)
+    start = np.array([[500.0, 470.0, 4.0], [500.0, 470.0, 12.0]], np.float32)  # below the lamp, above it
+    ahead = np.tile(np.array([[0.0, 1.0, 0.0]], np.float32), (2, 1))
+    seen = np.zeros((2, 3), np.float32)
+    add_beams(lamps, extinction, np.full(2, 20.0, np.float32), start, ahead, NOT_KNOWN, seen)
+    assert not seen[1].any()
+
+    def gathered(s: float) -> float:
+        """Of the light of the lamp, by the radiance of a white surface, on the metre at s."""
+        y, z = s - 10.0, -3.5
+        r = math.hypot(y, z)
+        sent = min(max(5.0 * (-z / r - 0.2), 0.0), 1.0) * 0.8 * 3200.0 / UNIT_LUX
+        return math.pi * extinction * sent * phase(-y / r) * math.exp(-extinction * (s + r)) / r**2
+
+    aside = ASIDE_M[0] * math.exp(-extinction * 10.0)
+    faded = 1.0 - (3.5 / aside) ** 2
+    assert seen[0, 1] == pytest.approx(faded * quad(gathered, 0.0, 20.0)[0], rel=0.05)

@@ -50,6 +50,7 @@ CONDITIONS = {
     "rain": Conditions(clouds=1.0, rain_mmph=15.0, wetness=0.8, visibility_m=2_500.0),
     "night_rain": Conditions(hour=22.0, clouds=1.0, rain_mmph=15.0, wetness=0.9, visibility_m=2_500.0),
     "fog": Conditions(hour=9.0, clouds=0.9, wetness=0.2, visibility_m=150.0),
+    "night_fog": Conditions(hour=4.0, clouds=0.9, wetness=0.2, visibility_m=120.0),
 }
 """By the names the command line knows."""
 

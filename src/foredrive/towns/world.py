@@ -20,6 +20,7 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.actor_looks import MeshLooks
 from foredrive.towns.place.assets import Assets, AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.buildings import build_buildings
+from foredrive.towns.place.fields import build_on_fields, lay_out_fields
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
@@ -34,6 +35,7 @@ from foredrive.towns.place.props import (
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.street_furniture import build_street_furniture
+from foredrive.towns.place.styles import STYLES
 from foredrive.towns.place.terrain import build_terrain, make_terrain
 from foredrive.towns.place.vegetation import build_vegetation
 from foredrive.towns.sensing import capture, lens, raycast, shading
@@ -313,7 +315,6 @@ def build_static(
     place = join(
         [
             build_roads(town, plan, table),
-            build_terrain(terrain, plan, table),
             posts.mesh,
             lots,
             build_buildings(site, town.name, assets, table, rng),
@@ -321,8 +322,11 @@ def build_static(
     )
     furniture, details = build_street_furniture(town, site, table, rng)
     lamps = build_street_lamps(site, table, rng)
+    fields = lay_out_fields(site, table, rng) if STYLES[town.name].farmland else ()
+    land = build_terrain(terrain, plan, table, fields)
+    farm, fences = build_on_fields(fields, site, table, rng)
     plants, trunks = build_vegetation(site, assets, table, rng)
-    place = join([place, furniture, lamps.mesh, plants])
+    place = join([place, furniture, lamps.mesh, land, farm, plants])
     vehicle_lights = VehicleLights.of(table)
     vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
     track = [np.full(len(place.look), NOBODY, dtype=np.int32)]
@@ -332,7 +336,7 @@ def build_static(
         track=np.concatenate(track),
         parked=parked,
         heads=posts.heads,
-        thin=join_thin([posts.thin, details, lamps.thin, trunks]),
+        thin=join_thin([posts.thin, details, lamps.thin, fences, trunks]),
         lamps=lamps.lamps,
         vehicle_lights=vehicle_lights,
     )

@@ -53,6 +53,9 @@ class Texture(enum.IntEnum):
     GLASS = 8
     GLOW = 9
     """Shines by itself."""
+    FIELD = 10
+    """Crops. u: across the rows; v: along them; w: from the field's border inwards, m; grass outside.
+    p0: distance of the rows; p1: their width; p2..p4: linear colour between them."""
 
 
 class LinePattern(enum.IntEnum):
@@ -107,6 +110,9 @@ class GroundFloor(enum.IntEnum):
 
 
 PARAMETERS = 9
+GRASS_RGB = (0.40, 0.43, 0.26)
+"""Of the land."""
+ASPHALT_RGB = (0.36, 0.36, 0.365)
 RETROREFLECTIVE = 3.0
 """Reflectivity of road signs and number plates, seen from where the light comes."""
 

@@ -7,9 +7,8 @@ from jaxtyping import Float
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import Strip, StripKind, TownMap
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.looks import ASPHALT_RGB, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
-from foredrive.towns.place.road_mesh import ASPHALT_RGB
 from foredrive.towns.place.site import Frontage, Site, frontages
 
 FIRST_TRACK_ID = 50_000

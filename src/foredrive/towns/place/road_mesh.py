@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from foredrive.towns.map.ground_plan import GroundPlan, Piece
 from foredrive.towns.map.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
-from foredrive.towns.place.looks import LinePattern, Look, LookTable, Surface, Texture
+from foredrive.towns.place.looks import ASPHALT_RGB, GRASS_RGB, LinePattern, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, frustum, join, polygon_triangles, quads, ribbon, triangles, walls
 
 KERB_FOOT_M = 0.3
@@ -31,7 +31,6 @@ _PATTERN = {
     MarkingKind.BROKEN_SOLID: LinePattern.DOUBLE_BROKEN,
     MarkingKind.BROKEN_BROKEN: LinePattern.DOUBLE_BROKEN,
 }
-ASPHALT_RGB = (0.36, 0.36, 0.365)
 CONCRETE_RGB = (0.60, 0.585, 0.56)
 
 
@@ -56,7 +55,7 @@ def add_road_looks(table: LookTable) -> RoadLooks:
     return RoadLooks(
         walkway=table.add(Look(Surface.SIDEWALK, Texture.SLABS, CONCRETE_RGB, 0.35, params=(1.2,))),
         kerb=table.add(kerb),
-        median=table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.40, 0.43, 0.26), 0.45)),
+        median=table.add(Look(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45)),
         stripes=table.add(stripes),
         line=table.add(Look(Surface.ROAD, Texture.PLAIN, (0.86, 0.86, 0.84), 0.75, params=(0.5,))),
         concrete=table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.61, 0.58), 0.35, params=(1.0,))),

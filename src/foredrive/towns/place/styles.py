@@ -23,6 +23,8 @@ class Style:
     """Share of the roads with wires on poles beside them, in place of street lamps."""
     billboards: float
     """Per kilometre of road."""
+    farmland: bool = False
+    """Whether the land between the roads is tilled."""
 
 
 _SMALL = (("house", 0.55), ("block", 0.45))
@@ -35,6 +37,6 @@ STYLES = {
     "Town04": Style(_OUTSKIRTS, (2, 5), 0.70, 0.14, 0.10, 0.35, 0.15, 1.0),
     "Town05": Style((("block", 0.78), ("tower", 0.22)), (3, 8), 0.80, 0.15, 0.35, 0.7, 0.0, 1.2),
     "Town06": Style(_OUTSKIRTS, (1, 4), 0.60, 0.22, 0.10, 0.3, 0.2, 1.2),
-    "Town07": Style((("house", 0.66), ("barn", 0.34)), (1, 2), 0.50, 0.20, 0.07, 0.2, 0.7, 0.1),
+    "Town07": Style((("house", 0.66), ("barn", 0.34)), (1, 2), 0.50, 0.20, 0.07, 0.2, 0.7, 0.1, True),
     "Town10HD": Style((("block", 0.6), ("tower", 0.4)), (4, 10), 0.90, 0.3, 0.50, 0.8, 0.0, 1.0),
 }

@@ -1,5 +1,6 @@
 """The land between and around the roads: a height field that meets every road at its edge."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from foredrive.towns.map.ground_plan import GroundPlan
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.looks import ASPHALT_RGB, GRASS_RGB, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, triangles
 
 CELL_M = 4.0
@@ -23,6 +24,8 @@ SMOOTHING_ROUNDS = 200
 HILL_M, HILL_WAVE_M = 1.6, 45.0
 HILL_START_M, HILL_RAMP_M = 30.0, 60.0
 TILE_CELLS = 10
+GAP_M2 = 12.0
+"""Between lanes, what the map leaves open and is smaller than this is paved."""
 
 Grid = Float[np.ndarray, "Y X"]
 
@@ -38,6 +41,18 @@ class Terrain:
         """Height of the land, bilinear between the nodes."""
         rows_columns = ((xy - self.origin_xy) / CELL_M).T[::-1]
         return map_coordinates(self.z, rows_columns, order=1, mode="nearest")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A piece of farmland, at least a cell's diagonal from roads and other fields."""
+
+    area: shapely.Polygon
+    along: Float[np.ndarray, "2"]
+    """Unit direction of its rows."""
+    kind: str
+    look: int | None
+    """None for what looks like the rest of the land."""
 
 
 def make_terrain(
@@ -57,13 +72,14 @@ def make_terrain(
     return Terrain(origin, _below_decks(z, xy, plan))
 
 
-def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
+def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable, fields: Sequence[Field] = ()) -> Mesh:
     """Mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon.
 
     Below the roads it goes on, sunk, for rays that slip through a crack between the roads' pieces.
     """
     sunk = table.add(Look(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
-    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, (0.40, 0.43, 0.26), 0.45))
+    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45))
+    asphalt = table.add(Look(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15))
     rows, columns = terrain.z.shape
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     lower = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
@@ -71,10 +87,18 @@ def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable) -> Mesh:
     shapely.prepare(plan.ground)
     touched = shapely.intersects(plan.ground, cells)
     cut = touched & ~shapely.contains_properly(plan.ground, cells)
+    whole, tilled = ~touched, []
+    for field in fields:
+        if field.look is not None:
+            inside = whole & shapely.intersects(field.area, cells)
+            tilled.append(_tilled(field, _cell_corners(terrain, j[inside], i[inside]), field.look))
+            whole &= ~inside
+    edges = _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), look)
     return join(
         [
-            quads(_cell_corners(terrain, j[~touched], i[~touched]), look),
-            _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), look),
+            quads(_cell_corners(terrain, j[whole], i[whole]), look),
+            *tilled,
+            _paved_in_gaps(edges, plan, asphalt),
             quads(_cell_corners(terrain, j[touched], i[touched]) - np.array([0.0, 0.0, SUNK_M]), sunk),
             _horizon(terrain, look),
         ]
@@ -125,6 +149,18 @@ def _cell_corners(terrain: Terrain, j: np.ndarray, i: np.ndarray) -> Float[np.nd
     )
 
 
+def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], look: int) -> Mesh:
+    """Cells of a field, with the border of its crop in their texture coordinates."""
+    xy = corners[..., :2]
+    points = shapely.points(xy)
+    within = shapely.distance(field.area.exterior, points)
+    within = np.where(shapely.covers(field.area, points), within, -within)
+    across = np.array([-field.along[1], field.along[0]])
+    middle = shapely.get_coordinates(field.area.centroid)[0]
+    uvw = np.stack([(xy - middle) @ across, (xy - middle) @ field.along, within], axis=-1)
+    return quads(corners, look, uvw)
+
+
 def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.ndarray, look: int) -> Mesh:
     """What the roads leave of the cells on their edges: nodes keep their height, the cut has the road's."""
     tiles, tile_of_cell = np.unique(index // TILE_CELLS, axis=0, return_inverse=True)
@@ -141,6 +177,17 @@ def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.
         at_node, terrain.height(xy.reshape(-1, 2)).reshape(at_node.shape), plan.borders.top(xy) - EDGE_DROP_M
     )
     return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+
+
+def _paved_in_gaps(land: Mesh, plan: GroundPlan, look: int) -> Mesh:
+    """The same with small gaps between lanes paved."""
+    rings = [ring for part in shapely.get_parts(plan.ground) for ring in part.interiors]
+    gaps = [gap for gap in map(shapely.Polygon, rings) if gap.area < GAP_M2]
+    middle = land.xyz[..., :2].mean(axis=1)
+    found = shapely.STRtree(gaps).query(shapely.points(middle), predicate="intersects")[0]
+    looks = land.look.copy()
+    looks[found] = look
+    return Mesh(land.xyz, np.zeros_like(land.uvw), looks)
 
 
 def _horizon(terrain: Terrain, look: int) -> Mesh:

@@ -17,6 +17,7 @@ BACKSCATTER_RATIO = 0.0154
 class AirArrays(NamedTuple):
     """Air and wetness, for kernels."""
 
+    foggy: bool
     extinction_per_m: float
     """Of visible light."""
     lidar_extinction_per_m: float
@@ -49,6 +50,7 @@ def make_air(conditions: Conditions) -> AirArrays:
     foggy = conditions.visibility_m < FOG_BELOW_M
     droplets = max(extinction - rain, 0.0)
     return AirArrays(
+        foggy=foggy,
         extinction_per_m=extinction,
         lidar_extinction_per_m=rain + droplets * (1.0 if foggy else HAZE_AT_905_NM),
         backscatter_per_m_sr=BACKSCATTER_RATIO * (rain + (droplets if foggy else 0.0)),

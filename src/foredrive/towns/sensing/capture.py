@@ -15,6 +15,7 @@ from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
 from foredrive.towns.sensing import echoes, shading
 from foredrive.towns.sensing import wet as wet_ground
+from foredrive.towns.sensing.beams import add_beams
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import LightArrays
 from foredrive.towns.sensing.outlines import Looked, outlines, same_as_centre
@@ -139,7 +140,11 @@ class Moment:
         """Radiance along rays. Where `known` is not negative it is that; it may have no rows."""
         mirrored = self.mirrored(found, hits, rays, ray_rad)
         looks, light = self.scene.looks, self.light
-        return shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
+        out = shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
+        if light.air.foggy and len(light.lamps.near) > 0:
+            t = np.where(found.look == shading.MISS, np.float32(np.inf), hits.t)
+            add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, known, out)
+        return out
 
     def sunlit(
         self, found: shading.Surfaces, hits: shading.Hits, dt_s: Times | None

@@ -128,7 +128,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
 
 @_kernel
 @no_type_check
-def _beam(kind, hx, hy, lx, ly, lz):
+def beam(kind, hx, hy, lx, ly, lz):
     """Share of a lamp's intensity that leaves it along the unit vector (lx, ly, lz)."""
     if kind == STREET:  # cut off at 78° from straight down
         return min(max(5.0 * (-lz - 0.2), 0.0), 1.0)
@@ -171,7 +171,7 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
         facing = -(nx * lx + ny * ly + nz * lz)
         if facing <= 0.0:
             continue
-        sent = _beam(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
+        sent = beam(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
         if shine > 0.0:
             hx, hy, hz = -lx - dx, -ly - dy, -lz - dz
             length = math.sqrt(hx * hx + hy * hy + hz * hz)

@@ -14,13 +14,16 @@ from foredrive.towns.sensing.sky import FOG_TOP_M
 Rgb = Float32[np.ndarray, "3"]
 
 NOON_ELEVATION_DEG = 60.0
-SUN_OUTSIDE_RGB = (1.60, 1.62, 1.60)
-"""Before the air takes its share."""
-AIR_DEPTH_RGB = (0.19, 0.23, 0.31)
-"""Optical depth of somewhat hazy air at the zenith."""
+SUN_OUTSIDE_RGB = (1.93, 1.96, 1.93)
+"""Before the air takes its share: 127.5 klx (IES Lighting Handbook, 2000)."""
+AIR_DEPTH_RGB = (0.17, 0.21, 0.29)
+"""Optical depth of clear air at the zenith."""
 _ELEVATION_DEG = (-18.0, -12.0, -6.0, 0.0, 5.0, 15.0, 30.0, 60.0)
-_SKY_LUX = (1e-3, 8e-3, 3.4, 450.0, 4e3, 1.2e4, 2.3e4, 3.1e4)
-"""Of a clear sky on level ground (twilight: Explanatory Supplement to the Astronomical Almanac, 1992)."""
+_SKY_LUX = (1e-3, 8e-3, 3.4, 450.0, 5.4e3, 8.7e3, 1.18e4, 1.52e4)
+"""Of a clear sky on level ground: 0.8 + 15.5 √sin h klx (IES Lighting Handbook, 2000); twilight: Explanatory
+Supplement to the Astronomical Almanac, 1992."""
+SUNLIT_CLOUD = 0.45
+"""How bright clouds are from below that the sun shines on, by level white ground in it."""
 TOWN_GLOW_LUX, TOWN_GLOW_CLOUDED_LUX = 0.12, 0.5
 """What the sky above a lit town sends back at night."""
 STREET_LUX = 6.5
@@ -33,6 +36,8 @@ LAMPS_BELOW_LUX, HEADLIGHTS_BELOW_LUX = 500.0, 9e3
 HEADLIGHTS_BELOW_M = 3000.0
 """Drivers turn their lights on when they see no further."""
 NOON_WHITE, NOON_EXPOSURE = 1.6, 0.6
+NOON_SKY = 0.32
+"""Light of a clear sky whose colours are as `_sky_colours` has them."""
 ADAPTATION = 0.82
 """1 would show every night as bright as day."""
 
@@ -89,8 +94,12 @@ class _Daylight(NamedTuple):
     """The sun, before clouds and fog."""
     through: float
     """Share of it that gets through them."""
+    clear: float
+    """What falls from a clear sky on level ground."""
+    cloud: float
+    """Radiance of the clouds."""
     sky: float
-    """What falls from the sky on level ground."""
+    """What falls from the sky as it is on level ground."""
     white: float
     """Radiance of level white ground."""
 
@@ -110,8 +119,9 @@ def _daylight(conditions: Conditions) -> _Daylight:
     through *= math.exp(-CONTRAST_LOST / conditions.visibility_m * FOG_TOP_M / max(height, 0.05))
     through = through if through > 0.02 else 0.0
     dimmed = (1.0 - 0.75 * clouds**3.4) * (level + clear_sky)
-    sky = (1.0 - clouds) * clear_sky + clouds * max(dimmed - through * level, 0.3 * clear_sky)
-    return _Daylight(elevation_deg, beam, through, sky, through * level + sky)
+    cloud = through * SUNLIT_CLOUD * (level + clear_sky) + (1.0 - through) * dimmed
+    sky = (1.0 - clouds) * clear_sky + clouds * cloud
+    return _Daylight(elevation_deg, beam, through, clear_sky, cloud, sky, through * level + sky)
 
 
 def daylight_lux(conditions: Conditions) -> float:
@@ -124,9 +134,9 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
     toward, clouds = sun_direction(conditions.hour, east_rad), conditions.clouds
     fall = _daylight(conditions)
     beam, sky, through, white_lux = fall.beam, fall.sky, fall.through, fall.white * UNIT_LUX
+    behind = (1.0 - clouds) * fall.clear + clouds * sky  # of the sky between the clouds
     level_sun = beam * max(float(toward[2]), 0.0)
     town = TOWN_GLOW_LUX + clouds * (TOWN_GLOW_CLOUDED_LUX - TOWN_GLOW_LUX)
-    white_lux = UNIT_LUX * (through * float(level_sun[1]) + sky)
     dark = white_lux < LAMPS_BELOW_LUX
     night = _rgb(1.0, 0.80, 0.62) * np.float32((town + LIT_STREET_AMBIENT_LUX) / UNIT_LUX if dark else 0.0)
     white = (white_lux + (STREET_LUX if dark else 0.0)) / UNIT_LUX
@@ -139,10 +149,11 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
         sun=toward * np.float32(through > 0.0),
         sun_rgb=beam * np.float32(through),
         sunward=toward,
-        glow_rgb=colours.glow * np.float32(sky / 0.48) + np.float32(0.12) * beam * np.float32(through),
-        zenith=colours.zenith * np.float32(sky / 0.48) + np.float32(0.5) * glow_lux * _rgb(0.8, 0.9, 1.25),
-        horizon=colours.horizon * np.float32(sky / 0.48) + np.float32(1.6) * glow_lux,
-        cloud_rgb=colours.cloud * np.float32(sky / 0.48) + glow_lux,
+        glow_rgb=colours.glow * np.float32(behind / NOON_SKY) + np.float32(0.12) * beam * np.float32(through),
+        zenith=colours.zenith * np.float32(behind / NOON_SKY)
+        + np.float32(0.5) * glow_lux * _rgb(0.8, 0.9, 1.25),
+        horizon=colours.horizon * np.float32(behind / NOON_SKY) + np.float32(1.6) * glow_lux,
+        cloud_rgb=colours.cloud * np.float32(fall.cloud) + glow_lux,
         clouds=clouds,
         sky_rgb=colours.sky * np.float32(sky) + night,
         bounce_rgb=_rgb(0.168, 0.160, 0.145) * np.float32(white_lux / UNIT_LUX) + np.float32(0.6) * night,
@@ -188,9 +199,9 @@ def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
         return ((1.0 - grey) * clear + grey * overcast).astype(np.float32)
 
     return _SkyColours(
-        zenith=mix(_rgb(0.14, 0.28, 0.60), _rgb(0.20, 0.28, 0.52), _rgb(0.57, 0.60, 0.64)),
-        horizon=mix(_rgb(0.62, 0.72, 0.83), _rgb(0.95, 0.62, 0.44), _rgb(0.38, 0.40, 0.43)),
-        cloud=mix(_rgb(0.95, 0.96, 0.98), _rgb(0.80, 0.68, 0.66), _rgb(0.46, 0.48, 0.51)),
+        zenith=mix(_rgb(0.14, 0.28, 0.60), _rgb(0.20, 0.28, 0.52), _rgb(0.38, 0.40, 0.43)),
+        horizon=mix(_rgb(0.62, 0.72, 0.83), _rgb(0.95, 0.62, 0.44), _rgb(0.25, 0.27, 0.29)),
+        cloud=mix(_rgb(0.99, 1.00, 1.02), _rgb(1.12, 0.95, 0.92), _rgb(0.96, 1.00, 1.06)),
         glow=mix(_rgb(0.0, 0.0, 0.0), _rgb(2.2, 1.0, 0.35), _rgb(0.0, 0.0, 0.0)),
         sky=mix(_rgb(0.88, 1.00, 1.19), _rgb(0.98, 0.98, 1.08), _rgb(0.97, 1.00, 1.04)),
     )

@@ -5,7 +5,7 @@ from typing import no_type_check
 
 import numba
 
-from foredrive.towns.place.looks import LinePattern, Texture
+from foredrive.towns.place.looks import GRASS_RGB, LinePattern, Texture, srgb_to_linear
 from foredrive.towns.sensing.facades import facade
 from foredrive.towns.sensing.patterns import band, bands, lattice, noise
 
@@ -16,10 +16,13 @@ PAINT_REFLECTIVITY = 0.75
 ASPHALT = 0.10
 """Linear reflectance between the stripes of a crosswalk."""
 KERB_STONE_M = 0.16
+TRAMLINES_M, TRACK_M, RUT_M = 18.0, 1.8, 0.4
+"""Ruts of tractors in fields: distance of the pairs, of the two of a pair, and their width."""
+_GRASS_RGB = srgb_to_linear([GRASS_RGB])[0]
 
 _ROAD, _SLABS, _GRASS = int(Texture.ROAD), int(Texture.SLABS), int(Texture.GRASS)
 _FACADE, _TILES, _FOLIAGE = int(Texture.FACADE), int(Texture.TILES), int(Texture.FOLIAGE)
-_STRIPES, _GLASS = int(Texture.STRIPES), int(Texture.GLASS)
+_STRIPES, _GLASS, _FIELD = int(Texture.STRIPES), int(Texture.GLASS), int(Texture.FIELD)
 _LINE_NONE, _LINE_BROKEN = int(LinePattern.NONE), int(LinePattern.BROKEN)
 _LINE_DOUBLE, _LINE_DOUBLE_BROKEN = int(LinePattern.DOUBLE_SOLID), int(LinePattern.DOUBLE_BROKEN)
 
@@ -75,15 +78,44 @@ def _road(p, look, x, y, uvw, extent, i, out):
 
 @_kernel
 @no_type_check
+def _grass(x, y, size):
+    """Factors on red, green and blue of the land."""
+    wide = noise(x / 23.0, y / 23.0, size / 23.0, 21)
+    fine = noise(x * 1.7, y * 1.7, size * 1.7, 22) + 0.6 * noise(x * 6.0, y * 6.0, size * 6.0, 23)
+    dry = 0.5 + 0.5 * noise(x / 5.0, y / 5.0, size / 5.0, 24) + 0.3 * wide
+    shade = 1.0 + 0.16 * fine + 0.12 * wide
+    return shade * (0.8 + 0.5 * dry), shade * (0.95 + 0.12 * dry), shade * (0.8 + 0.3 * dry)
+
+
+@_kernel
+@no_type_check
+def _field(p, look, x, y, uvw, extent, i, out):
+    """Rows of crops with the ruts of tractors; grass beyond the border."""
+    u, size = uvw[i, 0], extent[i, 3]
+    crop = bands(u + 0.06 * noise(x, y, size, 26), p[look, 0], p[look, 1], extent[i, 0])
+    rut = bands(u, TRAMLINES_M, RUT_M, extent[i, 0]) + bands(u + TRACK_M, TRAMLINES_M, RUT_M, extent[i, 0])
+    crop *= 1.0 - 0.8 * rut
+    shade = (
+        1.0
+        + 0.14 * noise(x / 14.0, y / 14.0, size / 14.0, 27)
+        + 0.10 * noise(x / 3.0, y / 3.0, size / 3.0, 28)
+    )
+    shade += 0.12 * noise(x * 3.0, y * 3.0, size * 3.0, 29)
+    border = uvw[i, 2] + 0.3 * noise(x / 1.5, y / 1.5, size / 1.5, 30)
+    inside = band(border, 0.0, 1e6, extent[i, 2])
+    grass = _grass(x, y, size)
+    for c in range(3):
+        tilled = shade * (out[c] * crop + p[look, 2 + c] * (1.0 - crop))
+        out[c] = tilled * inside + _GRASS_RGB[c] * grass[c] * (1.0 - inside)
+
+
+@_kernel
+@no_type_check
 def _tint(kind, p, look, xyz, uvw, extent, i):
     """Factors on red, green and blue of the simpler textures."""
     x, y, z, size = xyz[i, 0], xyz[i, 1], xyz[i, 2], extent[i, 3]
     if kind == _GRASS:
-        wide = noise(x / 23.0, y / 23.0, size / 23.0, 21)
-        fine = noise(x * 1.7, y * 1.7, size * 1.7, 22) + 0.6 * noise(x * 6.0, y * 6.0, size * 6.0, 23)
-        dry = 0.5 + 0.5 * noise(x / 5.0, y / 5.0, size / 5.0, 24) + 0.3 * wide
-        shade = 1.0 + 0.16 * fine + 0.12 * wide
-        return shade * (0.8 + 0.5 * dry), shade * (0.95 + 0.12 * dry), shade * (0.8 + 0.3 * dry)
+        return _grass(x, y, size)
     if kind == _SLABS:
         edge = p[look, 0]
         joint = bands(x, edge, 0.025, size) + bands(y, edge, 0.025, size)
@@ -134,6 +166,8 @@ def texture(looks, look, xyz, uvw, extent, i, out):
     out[3] = out[4] = out[5] = 0.0
     if kind == _ROAD:
         _road(p, look, x, y, uvw, extent, i, out)
+    elif kind == _FIELD:
+        _field(p, look, x, y, uvw, extent, i, out)
     elif kind == _FACADE:
         facade(p, look, x, y, uvw, extent, i, out)
     elif kind == _STRIPES:

@@ -17,7 +17,9 @@ WET_DARKENING = 0.5
 """Of porous ground: light is caught below the film (Lekner & Dorf, Applied Optics 27, 1988)."""
 WET_SHINE = 120.0
 """How sharp lamps are mirrored, as a Blinn-Phong exponent."""
-PUDDLE_M = 4.0
+PUDDLE_M = 3.0
+_DRY_DEPTH = 1.12
+"""How deep a hollow must be to hold water on ground that is all but dry; the deepest has 1.4."""
 THIN_FILM = 0.28
 RIPPLES = 0.008
 FAINTEST_MIRROR = 0.015
@@ -46,7 +48,7 @@ def water_film(wetness, surface, xyz, extent, i):
         return 0.6 * film
     deep = noise(x / PUDDLE_M, y / PUDDLE_M, size / PUDDLE_M, 91)
     deep += 0.4 * noise(x * 0.9, y * 0.9, size * 0.9, 92)
-    puddle = min(max(5.0 * (deep + 0.9 * wetness - 1.3), 0.0), 1.0)
+    puddle = min(max(5.0 * (deep - _DRY_DEPTH + 0.85 * wetness**3), 0.0), 1.0)
     return film + (1.0 - film) * puddle
 
 
