@@ -25,12 +25,17 @@ def distort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[T
 
 def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
     """Inverse of `distort`, by fixed-point iteration; accurate where the distortion is invertible."""
-    if not dist.any():
+    if _is_ideal(dist):
         return xy
     out = xy
     for _ in range(UNDISTORT_ITERATIONS):
         out = out - (distort(out, dist) - xy)
     return out
+
+
+def _is_ideal(dist: Float[Tensor, "*b 5"]) -> bool:
+    """Whether there is no distortion to compute; what is traced has to hold for any, so there always is."""
+    return not torch.compiler.is_compiling() and not bool(dist.any())
 
 
 def project(
@@ -53,7 +58,7 @@ def project(
     rays = pixels_to_rays(corners.to(K.device).expand(*K.shape[:-2], 4, 2), K, dist)
     reach = (rays[..., :2] / rays[..., 2:]).norm(dim=-1).amax(-1)[..., None]
     in_view = (depth > MIN_DEPTH_M) & (xy.norm(dim=-1) <= 1.05 * reach)
-    bent = distort(torch.where(in_view[..., None], xy, torch.zeros_like(xy)), dist) if dist.any() else xy
+    bent = xy if _is_ideal(dist) else distort(torch.where(in_view[..., None], xy, torch.zeros_like(xy)), dist)
     uv = bent * torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :] + K[..., None, :2, 2]
     inside = (uv >= 0).all(-1) & (uv[..., 0] < width) & (uv[..., 1] < height)
     return uv, depth, in_view & inside

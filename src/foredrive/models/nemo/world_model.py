@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
@@ -14,7 +14,7 @@ from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.nemo.motion import MotionFlow
 from foredrive.models.nemo.rendering import VolumeRenderer
 from foredrive.ops.volume import warp_volume
-from foredrive.scene import Belief, Clip, Decoded, VoxelSpec
+from foredrive.scene import Belief, CameraRig, Clip, Decoded, VoxelSpec
 
 OCCUPIED_PRIOR = 0.02
 """Where f_occ starts: most of space is free, and a volume that starts opaque hides what lies behind."""
@@ -65,12 +65,17 @@ class Nemo(nn.Module):
         if frames < self.past_frames + 1:
             raise InputError(f"NeMo needs {self.past_frames} frames before now, the clip has {frames - 1}")
         seen = clip.frames(slice(frames - self.past_frames - 1, frames))
-        b, t, c = seen.image_valid.shape
-        levels = self.backbone(seen.images.flatten(0, 2))
+        return self.encode(seen.images, seen.image_valid, seen.rig)
+
+    def encode(
+        self, images: UInt8[Tensor, "b T C 3 H W"], image_valid: Bool[Tensor, "b T C"], rig: CameraRig
+    ) -> Belief:
+        """The frames of `observe`, now last, as a belief; nothing here depends on what the data say."""
+        b, t, c = image_valid.shape
+        levels = self.backbone(images.flatten(0, 2))
         features = [level.unflatten(0, (b * t, c)) for level in levels]
-        rig = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-        volumes = self.encoder(features, rig, seen.image_valid.flatten(0, 1))
-        volumes = volumes.unflatten(0, (b, t))
+        per_image = rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+        volumes = self.encoder(features, per_image, image_valid.flatten(0, 1)).unflatten(0, (b, t))
         return Belief(volume=volumes[:, -1], history=volumes)
 
     def imagine(
