@@ -29,7 +29,7 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         stages=size.backbone.stages,
         channels=size.channels,
         weights=size.backbone.weights if load_backbone else None,
-        checkpoint=size.checkpoint,
+        checkpoint="backbone" in size.checkpoint,
     )
     encoder = _build_encoder(recipe)
     motion = MotionFlow(
@@ -84,7 +84,7 @@ def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEnc
             pillars=size.pillars,
             levels=levels,
             layers=size.layers,
-            checkpoint=model.checkpoint,
+            checkpoint="encoder" in model.checkpoint,
         )
     return LiftingEncoder(
         spec,
@@ -93,7 +93,7 @@ def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEnc
         points=size.points,
         levels=levels,
         layers=size.layers,
-        checkpoint=model.checkpoint,
+        checkpoint="encoder" in model.checkpoint,
     )
 
 

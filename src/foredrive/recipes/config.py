@@ -74,8 +74,8 @@ class NemoSize:
     attention_pool: tuple[int, int, int]
     planner_future: Literal["attention", "concatenation", "none"] = "attention"
     """How the planner looks at the predicted next volume."""
-    checkpoint: bool = False
-    """Trade time for memory: what backbone and encoder compute is not kept but computed again."""
+    checkpoint: tuple[Literal["backbone", "encoder"], ...] = ()
+    """Trade time for memory: what these parts compute is not kept but computed again."""
 
 
 @dataclass(frozen=True)
