@@ -40,17 +40,42 @@ def test_the_next_volume_matters_where_it_is_looked_at(
         heads=2,
         future=future,
         pool=(1, 2, 2),
+        history=0,
         horizon_steps=6,
         dt_s=0.5,
     ).eval()
     now, one, other = torch.randn(3, 1, 4, 2, 8, 8)
-    status = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN)
+    status = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
     with torch.no_grad():
         same = torch.allclose(planner(now, one, *status).xy, planner(now, other, *status).xy)
     assert same == (future == "none") == (planner.looks_ahead == 0)
     if future != "none":
         with pytest.raises(ValueError, match="next volume"):
             planner(now, None, *status)
+
+
+def test_where_nothing_is_learned_it_goes_straight_on() -> None:
+    """With a last layer of zeros it is constant velocity, and standing still where the speed is unknown."""
+    planner = VolumePlanner(
+        channels=4,
+        shape_zyx=(2, 8, 8),
+        width=16,
+        layers=1,
+        heads=2,
+        future="none",
+        pool=(1, 2, 2),
+        history=1,
+        horizon_steps=3,
+        dt_s=0.5,
+    ).eval()
+    torch.nn.init.zeros_(planner.waypoints[-1].weight)
+    torch.nn.init.zeros_(planner.waypoints[-1].bias)
+    volume, past = torch.randn(2, 4, 2, 8, 8), torch.randn(2, 1, 4)
+    speed, known = torch.tensor([6.0, 6.0]), torch.tensor([True, False])
+    plan = planner(volume, None, torch.zeros(2, dtype=torch.int64), known, speed, known, past)
+    assert plan.xy[0, 0].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
+    assert not plan.xy[1].any()
+    assert not plan.yaw.any()
 
 
 SEEN = torch.ones(1, dtype=torch.bool)

@@ -9,11 +9,15 @@ from foredrive.geometry.se3 import inverse_se3, yaw_of
 from foredrive.scene import Clip, Command, Trajectory
 
 
-def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
-    """What a vehicle knows of itself at now: where it was, how fast, and the command.
+def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Float[Tensor, "b P+1"]]:
+    """Where a vehicle was, and how fast, up to now.
 
-    x, y, yaw of the last `past_frames` key frames in the ego frame at now; speed at those and now (m/s, 0
-    where unknown); the command as one-hot (zeros where unknown). Accelerations follow from the speeds.
+    Returns:
+        x, y (m), yaw (rad) of the last P = `past_frames` key frames in the ego frame at now; speed at those
+        and now (m/s, 0 where unknown).
+
+    Raises:
+        InputError: if the clip has fewer frames.
     """
     now = clip.now
     if now < past_frames:
@@ -21,9 +25,17 @@ def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
     seen = slice(now - past_frames, now + 1)
     T_now_ego = inverse_se3(clip.T_world_ego[:, now : now + 1]) @ clip.T_world_ego[:, seen]
     poses = torch.cat([T_now_ego[..., :2, 3], yaw_of(T_now_ego)[..., None]], dim=-1)[:, :-1]
-    speed = torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, seen]
+    return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, seen]
+
+
+def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
+    """What a vehicle knows of itself at now: `ego_motion` and the command as one-hot (zeros where unknown).
+
+    Accelerations follow from the speeds.
+    """
+    poses, speeds = ego_motion(clip, past_frames)
     command = nn.functional.one_hot(clip.command.long(), len(Command)) * clip.command_valid[:, None]
-    return torch.cat([poses.flatten(1).float(), speed, command.float()], dim=-1)
+    return torch.cat([poses.flatten(1), speeds, command.float()], dim=-1)
 
 
 class EgoMLP(nn.Module):

@@ -11,7 +11,8 @@ from foredrive.scene import Command, Trajectory
 
 SPEED_SCALE_MPS = 10.0
 MOVES_M = 0.1
-STEP_SCALE_M = 3.0
+PAST_SCALE = (5.0, 5.0, 1.0, SPEED_SCALE_MPS)
+STEP_SCALE_M = 1.0
 """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
 
 
@@ -51,7 +52,8 @@ class VolumePlanner(nn.Module):
     The two are put together by attention (eq. 13), or by concatenation, or only the present is looked at:
     three rows of NeMo's Table 1. Height is folded into the channels, Z·D → C by an MLP; one query (command,
     speed and a learned planning embedding, fused) attends to the plane through a transformer decoder; an MLP
-    regresses the steps between waypoints, which are summed up.
+    regresses by how much the steps between waypoints differ from going straight on at this speed, and they
+    are summed up.
 
     Args:
         channels: D.
@@ -60,6 +62,8 @@ class VolumePlanner(nn.Module):
         layers, heads: of the decoder (3 layers in the paper).
         future: what becomes of the predicted volume.
         pool: blocks of the future attention.
+        history: how many key frames before now the query knows pose and speed of; in the paper it knows the
+            speed at now alone, from which nobody can tell who brakes.
         horizon_steps, dt_s: of the plan.
     """
 
@@ -73,13 +77,14 @@ class VolumePlanner(nn.Module):
         heads: int,
         future: Literal["attention", "concatenation", "none"],
         pool: tuple[int, int, int],
+        history: int,
         horizon_steps: int,
         dt_s: float,
     ) -> None:
         super().__init__()
         height, ny, nx = shape_zyx
         self.horizon_steps, self.dt_s = horizon_steps, dt_s
-        self.future = future
+        self.future, self.history = future, history
         self.fuse_future = FutureAttention(channels, pool) if future == "attention" else None
         volumes = 2 if future == "concatenation" else 1
         self.fold = nn.Sequential(
@@ -91,7 +96,7 @@ class VolumePlanner(nn.Module):
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last one: not known
-        self.speed = nn.Sequential(nn.Linear(2, width), nn.ReLU(), nn.Linear(width, width))
+        self.speed = nn.Sequential(nn.Linear(2 + 4 * history, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
         # Normalising first keeps an open path for speed and command, which most of a plan follows from.
@@ -116,19 +121,29 @@ class VolumePlanner(nn.Module):
         command_valid: Bool[Tensor, "b"],
         speed_mps: Float[Tensor, "b"],
         speed_valid: Bool[Tensor, "b"],
+        past: Float[Tensor, "b P 4"],
     ) -> Trajectory:
-        """Plan in the ego frame at now; `future` is the volume at the next key frame, if it is looked at."""
+        """Plan in the ego frame at now.
+
+        Args:
+            now, future: volumes at now and at the next key frame, if it is looked at.
+            command, command_valid, speed_mps, speed_valid: of now.
+            past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
+        """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         command = torch.where(command_valid, command, len(Command))
-        speed = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
+        speed_mps = torch.where(speed_valid, speed_mps, 0.0)
+        status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
+        status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
         query = torch.cat(
-            [self.command(command), self.speed(speed), self.plan.expand(len(command), -1)], dim=-1
+            [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
         decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        steps = STEP_SCALE_M * self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
-        xy = steps.cumsum(dim=2)
+        change = STEP_SCALE_M * self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
+        straight_on = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
+        xy = (straight_on[:, None, None] + change).cumsum(dim=2)
         return Trajectory(
             xy=xy,
             yaw=_headings(xy),

@@ -63,6 +63,7 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         heads=size.planner_heads,
         future=size.planner_future,
         pool=size.attention_pool,
+        history=size.planner_history,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
     )

@@ -74,6 +74,8 @@ class NemoSize:
     attention_pool: tuple[int, int, int]
     planner_future: Literal["attention", "concatenation", "none"] = "attention"
     """How the planner looks at the predicted next volume."""
+    planner_history: int = 0
+    """Key frames before now whose pose and speed the planner is told; in the paper, now's speed alone."""
     checkpoint: tuple[Literal["backbone", "encoder"], ...] = ()
     """Trade time for memory: what these parts compute is not kept but computed again."""
 

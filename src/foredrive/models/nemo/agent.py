@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
+from foredrive.models.ego_mlp import ego_motion
 from foredrive.models.nemo.world_model import Nemo
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Belief, Clip, Decoded, Trajectory
@@ -31,6 +32,7 @@ class NemoAgent(nn.Module):
         """Observe, imagine `steps` key frames and whatever the planner looks at, plan."""
         beliefs, decoded = self.world_model(clip, max(steps, self.planner.looks_ahead))
         now = clip.now
+        poses, speeds = ego_motion(clip, self.planner.history)
         plan = self.planner(
             beliefs[0].volume,
             beliefs[1].volume if self.planner.looks_ahead else None,
@@ -38,6 +40,7 @@ class NemoAgent(nn.Module):
             clip.command_valid,
             clip.ego_speed_mps[:, now],
             clip.ego_speed_valid[:, now],
+            torch.cat([poses, speeds[:, :-1, None]], dim=-1),
         )
         return NemoOutput(beliefs[: steps + 1], decoded[: steps + 1], plan)
 
