@@ -1,6 +1,6 @@
 """Draws the pictures of docs/towns.md: `python docs/draw_towns.py`. Takes some minutes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,7 @@ from foredrive.towns.conditions import CONDITIONS, Conditions
 from foredrive.towns.map.town_map import TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.expert import Drive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
@@ -27,16 +27,18 @@ BRIGHTER = 2.55
 """White is what a white matt surface returns; signs and plates return more."""
 
 
-def see(town: str, conditions: Conditions, at_s: float = 6.0) -> tuple[SensorFrame, Moment]:
-    """What the expert's sensors see some seconds into its drive."""
+def see(town: str, all_conditions: Mapping[str, Conditions], at_s: float = 6.0) -> dict[str, SensorFrame]:
+    """What the expert's sensors see some seconds into its drive, in several conditions."""
     town_map = load_town_map(town)
     sensors = SensorSuite(camera_rig(SIZE_HW), roof_lidar(channels=64, azimuth_steps=1024))
     *_, moment = Drive(Traffic(town_map, SEED, 31, 20), at_s + 1.0).moments(int(at_s * 5) + 1, 0.2)
-    world = World(town_map, SEED, conditions)
-    frame = world.render(
-        moment.actors, sensors, moment.T_world_ego, moment.twist_ego, noise_seed=0, lights=moment.lights
-    )
-    return frame, moment
+    world = World(town_map, SEED, CONDITIONS["clear"])
+    return {
+        name: world.under(conditions).render(
+            moment.actors, sensors, moment.T_world_ego, moment.twist_ego, noise_seed=0, lights=moment.lights
+        )
+        for name, conditions in all_conditions.items()
+    }
 
 
 def sheet(cells: Sequence[tuple[str, np.ndarray]], columns: int) -> Image.Image:
@@ -98,10 +100,13 @@ def _colours(values: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Every town by day, one place in all conditions, one sweep in three views."""
-    days = [(town, see(town, CONDITIONS["clear"])[0].images["PCAM_F0"]) for town in TOWNS]
-    sheet(days, 4).save(HERE / "towns_places.jpg", quality=88)
-    frames = {name: see("Town05", conditions)[0] for name, conditions in CONDITIONS.items()}
-    sheet([(name, frame.images["PCAM_F0"]) for name, frame in frames.items()], 4).save(
+    fair = {"clear": CONDITIONS["clear"]}
+    days = {town: see(town, CONDITIONS if town == "Town05" else fair) for town in TOWNS}
+    sheet([(town, frames["clear"].images["PCAM_F0"]) for town, frames in days.items()], 4).save(
+        HERE / "towns_places.jpg", quality=88
+    )
+    frames = days["Town05"]
+    sheet([(name, frame.images["PCAM_F0"]) for name, frame in frames.items()], 3).save(
         HERE / "towns_conditions.jpg", quality=88
     )
     side = 2 * SIZE_HW[0] + GAP

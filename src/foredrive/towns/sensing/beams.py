@@ -36,20 +36,36 @@ def phase(cosine):
 
 @_kernel
 @no_type_check
+def _within_sight(lamps, extinction_per_m, origin):
+    """Indices of the lamps that rays from about there can see anything of."""
+    index = np.empty(len(lamps.xyz), np.int64)
+    count = 0
+    for k in range(len(lamps.xyz) if len(origin) > 0 else 0):
+        x, y = lamps.xyz[k, 0] - origin[0, 0], lamps.xyz[k, 1] - origin[0, 1]
+        if math.hypot(x, y) < DEPTHS / extinction_per_m + ASIDE_M[lamps.kind[k]]:
+            index[count] = k
+            count += 1
+    return index[:count]
+
+
+@_kernel
+@no_type_check
 def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
     """Add to radiance [N 3] what lamps send along rays by way of the air.
 
     Args:
         lamps: `LampArrays`.
         t: [N] where rays end, m.
+        origin: [N 3] where they start: within metres of one another.
         known: [N 3] not negative for rays to be left as they are; or [0 3].
     """
+    seen = _within_sight(lamps, extinction_per_m, origin)
     for i in range(len(t)):
         if len(known) > 0 and known[i, 0] >= 0.0:
             continue
         end = min(t[i], DEPTHS / extinction_per_m)
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-        for k in range(len(lamps.xyz)):
+        for k in seen:
             px, py, pz = lamps.xyz[k, 0], lamps.xyz[k, 1], lamps.xyz[k, 2]
             px, py, pz = px - origin[i, 0], py - origin[i, 1], pz - origin[i, 2]
             along, aside_m = px * dx + py * dy + pz * dz, ASIDE_M[lamps.kind[k]]
