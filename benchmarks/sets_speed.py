@@ -24,7 +24,7 @@ from foredrive.sets import (
 )
 from foredrive.sets.assignment import k_best_assignments
 
-SIZES = {"100x50": (100, 50, 100.0), "900x200": (900, 200, 100.0), "900x200_crowded": (900, 200, 60.0)}
+SIZES = {"100x50": (100, 50, 100.0), "900x200": (900, 200, 100.0), "900x200_dense": (900, 200, 25.0)}
 """Detections, objects, side of the square they are in, m."""
 K, CLASSES = 25, 10
 STD = np.array([0.4, 0.4, 0.2, 0.15, 0.15, 0.15])

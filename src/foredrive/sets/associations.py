@@ -18,7 +18,8 @@ from foredrive.sets.component import Components, find_components, scale, sum_com
 from foredrive.sets.interval import bound_component
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_COARSER, _COARSEST_NATS = 1e3, 0.11
+_COARSER_NATS = (1e-7, 1e-4, 0.1, 1.0, 10.0)
+"""What may be gated of components that are too large to be summed, until they are not."""
 _NEGLIGIBLE_NATS = 40.0
 
 
@@ -68,10 +69,10 @@ def sum_associations(
 
     Pairs are left out (gated) as long as that takes no more than `gate_nats` off the logarithm. What
     remains falls into connected components, each of which is summed exactly where that takes at most
-    `max_states` numbers. A larger one is gated again, up to 0.1 nats; what is too large even then is
-    summed over its `k` best associations. The interval of the result holds what either may have missed. A
-    component without any possible association makes the sum zero; its probabilities are then those of the
-    association with fewest impossible members.
+    `max_states` numbers. A larger one is gated again, a little less strictly each time, up to 10 nats; what
+    is too large even then is summed over its `k` best associations. The interval of the result holds what
+    either may have missed. A component without any possible association makes the sum zero; its
+    probabilities are then those of the association with fewest impossible members.
 
     Raises `InputError` for weights that are NaN or infinite, naming them.
     """
@@ -126,7 +127,7 @@ def _sum_gated(
         here = np.full((len(i), len(j)), -np.inf)
         where = np.searchsorted(i, row[edge]), np.searchsorted(j, column[edge])
         here[where] = log_edge[edge]
-        part = _sum_large(here, log_row[i], log_column[j], k, max_states, gate_nats * _COARSER)
+        part = _sum_large(here, log_row[i], log_column[j], k, max_states, gate_nats)
         found.log_lower += part.log_lower
         found.log_upper += part.log_upper
         share = np.zeros(here.shape)
@@ -156,8 +157,9 @@ def _sum_large(
     gate_nats: float,
 ) -> _Found:
     """Gate a component that is too large less strictly, or bound it."""
-    if gate_nats <= _COARSEST_NATS:
-        return _sum_gated(log_pair, log_row, log_column, k, max_states, gate_nats)
+    for coarser_nats in _COARSER_NATS:
+        if coarser_nats > gate_nats:
+            return _sum_gated(log_pair, log_row, log_column, k, max_states, coarser_nats)
     interval = bound_component(scale(log_pair, log_row, log_column), k)
     row, column = np.nonzero(interval.share)
     return _Found(
@@ -186,43 +188,64 @@ def _gate(
     Π_j (1 + Σ_i odds_ij), over the pairs left out. Prices decide where odds are infinite: at certain
     detections and objects without background.
     """
-    log_least = np.log(0.5 * budget_nats / max(log_pair.size, 1))
-    row, column, lost_nats = _gate_by_odds(log_pair, log_row, log_column, log_least)
-    if (log_row == -np.inf).any() or (log_column == -np.inf).any():
+    infinite = bool((log_row == -np.inf).any() or (log_column == -np.inf).any())
+    by_odds = (0.5 if infinite else 1.0) * budget_nats
+    row, column, log_odds, lost_nats = _list_odds(
+        log_pair, log_row, log_column, np.log(0.5 * by_odds / max(log_pair.size, 1))
+    )
+    kept, more_nats = _keep_likely(log_odds, 0.5 * by_odds)
+    row, column, lost_nats = row[kept], column[kept], lost_nats + more_nats
+    if infinite:
         log_kept = np.full(log_pair.shape, -np.inf)
         log_kept[row, column] = log_pair[row, column]
-        kept, more_nats = _gate_by_price(log_kept, log_row, log_column, 0.5 * budget_nats)
-        row, column = np.nonzero(kept)
-        lost_nats += more_nats
+        kept, more_nats = _gate_by_price(log_kept, log_row, log_column, row, column, 0.5 * budget_nats)
+        row, column, lost_nats = row[kept], column[kept], lost_nats + more_nats
     return row, column, lost_nats
+
+
+def _keep_likely(log_share: Float[ndarray, "E"], budget: float) -> tuple[Bool[ndarray, "E"], float]:
+    """All but the least, as many as together are no more than the budget; what these add to the logarithm.
+
+    None of at least 1 is left out: pairs whose odds are smaller are in no best association.
+    """
+    share = np.exp(np.minimum(log_share, 0.0))
+    order = np.argsort(share)
+    total = np.cumsum(share[order])
+    out = order[(total <= budget) & (log_share[order] < 0.0)]
+    kept = np.ones(len(share), bool)
+    kept[out] = False
+    return kept, float(share[out].sum())
 
 
 @_kernel
 @no_type_check
-def _gate_by_odds(log_pair, log_row, log_column, log_least):
+def _list_odds(log_pair, log_row, log_column, log_least):
+    """Pairs of larger odds than the least, these, and what all others may add to the logarithm."""
     rows, columns = log_pair.shape
     row, column = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.int64)
-    count, lost = 0, np.zeros(columns)
+    odds, count, lost = np.empty(rows * columns), 0, np.zeros(columns)
     for r in range(rows):
         for c in range(columns):
             if log_pair[r, c] == -np.inf:
                 continue
             log_odds = log_pair[r, c] - log_row[r] - log_column[c]
             if log_odds > log_least:
-                row[count], column[count], count = r, c, count + 1
+                row[count], column[count], odds[count], count = r, c, log_odds, count + 1
             elif log_odds > log_least - _NEGLIGIBLE_NATS:
                 lost[c] += np.exp(log_odds)
     lost += rows * np.exp(log_least - _NEGLIGIBLE_NATS)
-    return row[:count].copy(), column[:count].copy(), np.log1p(lost).sum()
+    return row[:count].copy(), column[:count].copy(), odds[:count].copy(), np.log1p(lost).sum()
 
 
 def _gate_by_price(
     log_pair: Float[ndarray, "R C"],
     log_row: Float[ndarray, "R"],
     log_column: Float[ndarray, "C"],
+    row: Int[ndarray, "E"],
+    column: Int[ndarray, "E"],
     budget_nats: float,
-) -> tuple[Bool[ndarray, "R C"], float]:
-    """Pairs to keep so that the others add no more than the budget to the log of the sum; what they add.
+) -> tuple[Bool[ndarray, "E"], float]:
+    """Which of the pairs to keep so that the others add no more than the budget; what they add.
 
     Scaled, the best association weighs 1 and is kept. All that have a given pair weigh no more than the pair
     times what the other rows (or columns) can choose from, each without regard to the rest. Nothing is left
@@ -230,9 +253,13 @@ def _gate_by_price(
     """
     scaled = scale(log_pair, log_row, log_column)
     if scaled.log_best == -np.inf:
-        return log_pair > -np.inf, 0.0
-    pair = np.exp(scaled.log_pair)
-    by_row, by_column = np.log(scaled.row_alone + pair.sum(1)), np.log(scaled.column_alone + pair.sum(0))
-    log_share = scaled.log_pair + min(by_row.sum() - by_row[:, None], by_column.sum() - by_column, key=np.max)
-    kept = log_share > np.log(budget_nats / max(log_pair.size, 1))
-    return kept, float(np.log1p(np.exp(log_share[~kept]).sum()))
+        return np.ones(len(row), bool), 0.0
+    log_scaled = scaled.log_pair[row, column]
+    pair = np.exp(log_scaled)
+    by_row = np.log(scaled.row_alone + np.bincount(row, pair, len(log_row)))
+    by_column = np.log(scaled.column_alone + np.bincount(column, pair, len(log_column)))
+    of_rows, of_columns = by_row.sum() - by_row, by_column.sum() - by_column
+    others = of_rows[row] if of_rows.max() <= of_columns.max() else of_columns[column]
+    kept, lost = _keep_likely(log_scaled + others, budget_nats)
+    has = scaled.column[row] == column
+    return kept | has, float(np.log1p(lost))
