@@ -1,6 +1,6 @@
 """How far the towns' sensors are from real ones: statistics of lidar sweeps and images, side by side.
 
-`foredrive bench domain_gap`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset.
+`foredrive bench domain-gap`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset.
 """
 
 import functools

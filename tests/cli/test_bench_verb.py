@@ -36,6 +36,13 @@ def test_without_a_name_benchmarks_are_listed(folder: Path, capsys: pytest.Captu
     assert not (folder / "ran.txt").exists()
 
 
+def test_names_have_hyphens_where_files_have_underscores(folder: Path) -> None:
+    (folder / "speed.py").rename(folder / "top_speed.py")
+    for name in ("top-speed", "top_speed"):
+        assert main(["bench", name, "--folder", str(folder)]) == 0
+    assert [path.name for path in (folder / "results").iterdir()] == ["top-speed.json"]
+
+
 def test_an_interrupted_benchmark_goes_on_where_it_stopped(folder: Path) -> None:
     source = folder / "speed.py"
     source.write_text(SOURCE.replace("STOP_AT = None", "STOP_AT = 1"))

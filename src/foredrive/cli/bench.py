@@ -23,11 +23,11 @@ def bench(
     Args:
         name: Benchmark to run; an interrupted one goes on where it stopped. Without a name they are listed.
         arms: Run these arms only.
-        folder: Where the benchmarks lie: each is a Python file that defines BENCHMARK.
+        folder: Where the benchmarks lie: each is a Python file (_ for - in its name) that defines BENCHMARK.
     """
     from foredrive.evaluation import run_benchmark
 
-    files = {path.stem: path for path in sorted(folder.glob("*.py"))}
+    files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:
         raise InputError(
             f"{folder}: no benchmarks here; run this in Foredrive's checkout or name their --folder"
@@ -40,6 +40,7 @@ def bench(
             else:
                 print(f"{found}: {benchmark.question}\n    arms: {', '.join(benchmark.arms)}")
         return
+    name = name.replace("_", "-")
     if name not in files:
         raise InputError(f"no benchmark {name!r} in {folder}; there are: {', '.join(files)}")
     chosen = _load(files[name])
