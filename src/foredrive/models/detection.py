@@ -1,0 +1,120 @@
+"""A small probabilistic detection head on a volume, after DETR: a set of boxes, each with its uncertainty."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.scene import Detections, VoxelSpec
+from foredrive.scene.record import Record
+
+LOG_STD_RANGE = (-4.0, 2.0)
+"""Standard deviations stay between 2 cm and 7 m (and as much of log sizes and headings)."""
+TYPICAL_LOG_LWH = (1.2, 0.4, 0.4)
+
+
+@dataclass(frozen=True)
+class BoxSet(Record):
+    """What the head says of each query; `detections` is the same as probabilities."""
+
+    logits: Float[Tensor, "*b Q K_1"]
+    """Of the classes and, last, of no object."""
+    mean: Float[Tensor, "*b Q 6"]
+    """Centre (ego frame, m) and log length, width, height (m)."""
+    log_std: Float[Tensor, "*b Q 6"]
+    heading: Float[Tensor, "*b Q 2"]
+    """Sine and cosine of the yaw, of length 1."""
+    log_std_yaw: Float[Tensor, "*b Q"]
+
+    def detections(self) -> Detections:
+        """As the package's type; sine and cosine have the variance that the angle has."""
+        log_prob = self.logits.double().log_softmax(-1)
+        log_existence = log_prob[..., :-1].logsumexp(-1)
+        std_yaw = self.log_std_yaw[..., None].expand(*self.log_std_yaw.shape, 2)
+        std = torch.cat([self.log_std, std_yaw], dim=-1).exp()
+        return Detections(
+            existence=log_existence.exp(),
+            log_class=log_prob[..., :-1] - log_existence[..., None],
+            mean=torch.cat([self.mean, self.heading], dim=-1),
+            chol=torch.diag_embed(std),
+            valid=torch.ones_like(self.log_std_yaw, dtype=torch.bool),
+        )
+
+
+class DetectionHead(nn.Module):
+    """Volume → set of boxes.
+
+    Height is folded into the channels; convolutions shrink the plane until one cell is one query. Queries
+    attend to each other, so that one of them can speak for an object and the others be silent, and each
+    says where a box is from the middle of its cell, what it is and how sure it is of that.
+
+    Args:
+        spec: of the volume.
+        channels: D of the volume.
+        classes: K.
+        width: of the queries.
+        shrink: times the plane is halved.
+        layers, heads: of the attention among queries.
+    """
+
+    middle_m: Tensor
+
+    def __init__(
+        self,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        classes: int,
+        width: int = 64,
+        shrink: int = 2,
+        layers: int = 2,
+        heads: int = 4,
+    ) -> None:
+        super().__init__()
+        depth, height, breadth = spec.shape_zyx
+        self.classes = classes
+        convolutions: list[nn.Module] = [nn.Conv2d(depth * channels, width, 3, padding=1), nn.ReLU()]
+        for _ in range(shrink):
+            convolutions += [
+                nn.Conv2d(width, width, 3, stride=2, padding=1),
+                nn.GroupNorm(8, width),
+                nn.ReLU(),
+            ]
+            convolutions += [nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
+        self.plane = nn.Sequential(*convolutions)
+        rows, columns = -(-height // 2**shrink), -(-breadth // 2**shrink)
+        cell_m = spec.voxel_m * 2**shrink
+        y = spec.lower_m[1] + (torch.arange(rows) + 0.5) * cell_m
+        x = spec.lower_m[0] + (torch.arange(columns) + 0.5) * cell_m
+        middle = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
+        self.register_buffer("middle_m", middle, persistent=False)
+        self.cell_m = cell_m
+        self.place = nn.Parameter(0.02 * torch.randn(rows * columns, width))
+        layer = nn.TransformerEncoderLayer(
+            width, heads, 2 * width, dropout=0.0, batch_first=True, norm_first=True
+        )
+        self.attention = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, classes + 1 + 6 + 2 + 7))
+        final = self.out[1]
+        assert isinstance(final, nn.Linear)
+        with torch.no_grad():  # at first hardly anything exists
+            final.bias[classes] = 4.0
+
+    def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> BoxSet:
+        """All queries' boxes."""
+        plane = self.plane(volume.flatten(1, 2))
+        queries = self.attention(plane.flatten(2).mT + self.place)
+        logits, shift, size, heading, log_std = self.out(queries).split(
+            [self.classes + 1, 3, 3, 2, 7], dim=-1
+        )
+        ground = self.middle_m + self.cell_m * shift[..., :2]
+        log_lwh = size + size.new_tensor(TYPICAL_LOG_LWH)
+        log_std = log_std.clamp(*LOG_STD_RANGE)
+        return BoxSet(
+            logits=logits,
+            mean=torch.cat([ground, shift[..., 2:], log_lwh], dim=-1),
+            log_std=log_std[..., :6],
+            heading=nn.functional.normalize(heading, dim=-1, eps=1e-3),
+            log_std_yaw=log_std[..., 6],
+        )

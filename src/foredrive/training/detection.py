@@ -1,0 +1,73 @@
+"""Two ways to train a detection head: by matching (DETR), or by the likelihood of the set (Paper A)."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.models.detection import BoxSet
+from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli, PoissonMultiBernoulli, set_nll
+from foredrive.sets.assignment import best_assignment
+
+NO_OBJECT_WEIGHT = 0.1
+BOX_WEIGHT, HEADING_WEIGHT = 0.5, 0.5
+STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
+"""Errors of this size, in m and log m, count alike."""
+
+
+def as_multi_bernoulli(found: BoxSet) -> MultiBernoulli:
+    """One frame's boxes as a random finite set, from logits: no digits are lost where r is close to 1."""
+    boxes = BoxDensity(
+        mean=found.mean,
+        chol=torch.diag_embed(found.log_std.exp()),
+        yaw=torch.atan2(found.heading[..., 0], found.heading[..., 1]),
+        concentration=(-2 * found.log_std_yaw).exp(),
+    )
+    return MultiBernoulli.from_softmax(found.logits, boxes)
+
+
+def set_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
+    """MB-NLL of one frame, an object: every association counts as it is likely, none has to be chosen."""
+    pmb = PoissonMultiBernoulli(as_multi_bernoulli(found))
+    return set_nll(pmb, truth).nll / max(len(truth.label), 1)
+
+
+def matching_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
+    """DETR's of one frame, an object: cross-entropy and L1 of the best matching.
+
+    Standard deviations learn from the Gaussian likelihood of matched boxes at fixed means, as probabilistic
+    detectors do that are trained by matching.
+    """
+    assert truth.yaw is not None
+    query, match = _best_matching(found, truth)
+    objects = max(len(truth.label), 1)
+    classes = found.logits.shape[-1] - 1
+    target = torch.full(found.logits.shape[:1], classes, device=found.logits.device)
+    target[query] = truth.label[match].long()
+    weight = torch.where(target == classes, NO_OBJECT_WEIGHT, 1.0)
+    entropy = (F.cross_entropy(found.logits, target, reduction="none") * weight).sum()
+    state = truth.state[match].to(found.mean)
+    error = (found.mean[query] - state).abs() / found.mean.new_tensor(STATE_SCALE)
+    yaw = truth.yaw[match].to(found.mean)
+    arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
+    turn = (found.heading[query] - arrow).abs().sum()
+    log_std = found.log_std[query]
+    z = (found.mean[query].detach() - state) / log_std.exp()
+    log_std_yaw = found.log_std_yaw[query]
+    cos = (found.heading[query].detach() * arrow).sum(-1)
+    spread = (0.5 * z.square() + log_std).sum() + (log_std_yaw + (1 - cos) * (-2 * log_std_yaw).exp()).sum()
+    return (entropy + BOX_WEIGHT * error.sum() + HEADING_WEIGHT * turn + 0.1 * spread) / objects
+
+
+def _best_matching(found: BoxSet, truth: LabelledBoxes) -> tuple[Tensor, Tensor]:
+    """Queries and the objects they are matched with: each object has one."""
+    with torch.no_grad():
+        class_cost = -found.logits.softmax(-1)[:, truth.label.long()]
+        scale = found.mean.new_tensor(STATE_SCALE)
+        apart = (found.mean[:, None] - truth.state.to(found.mean)) / scale
+        cost = (class_cost + BOX_WEIGHT * apart.abs().sum(-1)).T.double().cpu().numpy()
+    dear = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # no object stays without, if there are queries
+    column = torch.as_tensor(best_assignment(cost, dear).column)
+    match = (column >= 0).nonzero()[:, 0]
+    return column[match].to(found.mean.device), match.to(found.mean.device)
