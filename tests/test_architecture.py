@@ -12,7 +12,7 @@ FLOORS = [
     {"scene", "ops"},
     {"sensors"},
     {"data", "towns", "rendering", "models", "losses", "metrics", "sets"},
-    {"search", "simulation", "training", "evaluation"},
+    {"search", "simulation", "training", "evaluation", "export"},
     {"recipes"},
     {"view"},
     {"cli"},

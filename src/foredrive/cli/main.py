@@ -15,6 +15,7 @@ from foredrive.cli.bench import bench
 from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
 from foredrive.cli.evaluate import evaluate
+from foredrive.cli.export import export
 from foredrive.cli.record import record
 from foredrive.cli.score import score
 from foredrive.cli.train import train
@@ -29,6 +30,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "evaluate": evaluate,
     "score": score,
+    "export": export,
     "view": view,
     "bench": bench,
 }

@@ -1,0 +1,36 @@
+"""`foredrive export`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath, SomePaths
+
+
+def export(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    out: OptionalPath = None,
+    logs: SomePaths = (),
+    clips: int = 8,
+) -> None:
+    """Write a trained run as model.onnx and model.pt2 (torch.export); compare both with the run itself.
+
+    Args:
+        run: Folder of a trained run.
+        out: Folder for the models and export.json, which tells inputs, outputs, differences and latencies;
+            "export" in the run's folder by default.
+        logs: 123D logs, splits or data roots to compare on; by default those it was trained on.
+        clips: How many clips are compared.
+    """
+    from foredrive.recipes import find_all_logs, open_run
+    from foredrive.recipes.export import export_run
+
+    trained = open_run(run)
+    folder = out or run / "export"
+    facts = export_run(trained, find_all_logs(logs) if logs else trained.logs, folder, clips)
+    for name, latency in facts["latency_ms"].items():
+        print(f"{name}: {latency['median']:.1f} ms a clip (90 % below {latency['p90']:.1f} ms)")
+        for output, difference in facts["largest_difference"].get(name, {}).items():
+            print(f"    {output}: at most {difference:.2g} off")
+    print(f"wrote {folder / 'model.onnx'}, {folder / 'model.pt2'} and {folder / 'export.json'}")
