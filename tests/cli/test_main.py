@@ -211,7 +211,7 @@ def test_verbs_wait_for_nothing_they_do_not_use() -> None:
         "import foredrive.evaluation.bench",
         "import foredrive.data.convert",
         "import foredrive.recipes.recording",
-        "import foredrive.data, foredrive.view.log_sheet",
+        "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_times",
         "import foredrive.recipes.evaluate, foredrive.view.run_report",
     )
     assert bench == {"torch"}

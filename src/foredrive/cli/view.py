@@ -5,63 +5,62 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from foredrive.cli.arguments import OptionalPath
+
 if TYPE_CHECKING:
-    from foredrive.data import LogPath
-    from foredrive.scene import Clip
+    from foredrive.recipes import Run
 
 
 def view(
     log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
-    save: Path,
+    run: OptionalPath = None,
+    save: OptionalPath = None,
     t: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None,
     reach: Annotated[float, tyro.conf.arg(metavar="METRES")] = 50.0,
+    host: str = "localhost",
+    port: int = 8080,
 ) -> None:
-    """Draw one time of a log: every camera with lidar and boxes, and the scene from above with the map.
+    """Look at a log: in 3-D and over time on a page in the browser, or one time of it as a picture.
 
     Args:
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
-        save: Picture to write (PNG).
-        t: Time since the log's start, s; the middle of the log if not given.
-        reach: How far the view from above looks in each direction, m.
+        run: Folder of a trained run: the page shows what its model sees, imagines and plans, too.
+        save: Write a picture (PNG) and serve no page: every camera with lidar and boxes, and the scene from
+            above with the map.
+        t: Time since the log's start, s; by default the middle of the log.
+        reach: How far the picture's view from above looks in each direction, m.
+        host: Where the page is served; other machines see it at 0.0.0.0.
+        port: The page's port; the next free one if it is taken.
     """
     from foredrive.data import find_logs
     from foredrive.errors import InputError
-    from foredrive.view.log_sheet import write_log_sheet
+    from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
+    from foredrive.view.log_times import LogTimes
 
     logs = find_logs(log)
     if len(logs) > 1:
         raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
-    clip, t_s = _clip_at(logs[0], t)
-    write_log_sheet(save, clip, f"{logs[0].name}    t = {t_s:.2f} s", reach)
-    print(f"wrote {save}")
+    if save is not None and run is not None:
+        raise InputError("--save draws the log alone; leave out --run, or --save for the page")
+    times = LogTimes(logs[0], CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    index = times.nearest(t)
+    if save is not None:
+        title = f"{times.name}    t = {times.t_s[index]:.2f} s"
+        write_log_sheet(save, times.clip(index), title, reach)
+        print(f"wrote {save}")
+        return
+    from foredrive.view.viewer import Viewer
+
+    viewer = Viewer(times, host, port)
+    try:
+        viewer.show(index)
+        print(f"{times.name} is at {viewer.url} until you press Ctrl-C")
+        viewer.play()
+    finally:
+        viewer.close()
 
 
-def _clip_at(path: "LogPath", t_s: float | None) -> tuple["Clip", float]:
-    """The clip of one frame and its time since the log's start, s."""
-    from foredrive.data import ClipConfig, ClipDataset
-    from foredrive.data.cameras import pinhole_cameras
-    from foredrive.data.logs import Log
-    from foredrive.errors import InputError
-    from foredrive.scene import VoxelSpec
-    from foredrive.view.log_sheet import CAMERA_WIDTH_PX
+def _opened(run: Path) -> "Run":
+    from foredrive.recipes import open_run  # only now: a log alone needs none of it
 
-    log = Log(path)
-    duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
-    wanted_s = duration_s / 2 if t_s is None else t_s
-    if not 0 <= wanted_s <= duration_s:
-        raise InputError(f"{path.folder}: no time {wanted_s:g} s in this log of {duration_s:.2f} s")
-    camera = next(iter(pinhole_cameras(log).values()), None)
-    aspect = 9 / 16 if camera is None else camera.height / camera.width
-    config = ClipConfig(
-        past_frames=0,
-        future_frames=0,
-        image_hw=(round(CAMERA_WIDTH_PX * aspect), CAMERA_WIDTH_PX),
-        voxels=VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2)),  # labels are not drawn
-        now_stride_s=log.period_s or 1.0,
-        lidar=True,
-        map=True,
-    )
-    dataset = ClipDataset([path], config, cache_dir=None)
-    times_s = [(dataset.now_us(index) - int(log.t_us[0])) * 1e-6 for index in range(len(dataset))]
-    nearest = min(range(len(times_s)), key=lambda index: abs(times_s[index] - wanted_s))
-    return dataset[nearest].clip, times_s[nearest]
+    return open_run(run)

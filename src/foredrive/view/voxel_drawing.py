@@ -120,17 +120,39 @@ def draw_volume_pca(volume: Float[Tensor, "D Z Y X"]) -> UInt8[np.ndarray, "X Y 
 
     Each channel is stretched from its 1st to its 99th percentile.
     """
-    features = volume.float().flatten(1)
-    centred = features - features.mean(1, keepdim=True)
+    colours = _principal(volume).mean(1)  # [3 Y X]
+    return _from_above(_stretched(colours).permute(1, 2, 0))
+
+
+def pca_colours(
+    volume: Float[Tensor, "D Z Y X"], shown: Bool[Tensor, "Z Y X"]
+) -> UInt8[np.ndarray, "Z Y X 3"]:
+    """Features of every voxel as a colour: PCA over the voxels that are shown, each channel stretched.
+
+    With fewer than three of them there is nothing to tell apart, and all are grey.
+    """
+    colours = torch.full((3, *shown.shape), 128, dtype=torch.uint8)
+    if int(shown.sum()) >= 3:
+        colours[:, shown] = _stretched(_principal(volume[:, shown]))
+    return colours.permute(1, 2, 3, 0).numpy()
+
+
+def _principal(features: Float[Tensor, "D *n"]) -> Float[Tensor, "3 *n"]:
+    """The three principal components of D channels, of fixed sign, so that colours repeat."""
+    flat = features.float().flatten(1)
+    centred = flat - flat.mean(1, keepdim=True)
     _, vectors = torch.linalg.eigh(centred @ centred.T / centred.shape[1])
     components = vectors[:, -3:].flip(-1)  # largest variance first
-    signs = components.gather(0, components.abs().argmax(0, keepdim=True)).sign()  # fixed: colours repeat
-    colours = ((components * signs).T @ centred).unflatten(1, volume.shape[1:]).mean(1)  # [3 Y X]
-    flat = colours.flatten(1)
+    signs = components.gather(0, components.abs().argmax(0, keepdim=True)).sign()
+    return ((components * signs).T @ centred).unflatten(1, features.shape[1:])
+
+
+def _stretched(channels: Float[Tensor, "3 *n"]) -> UInt8[Tensor, "3 *n"]:
+    """Each channel from its 1st to its 99th percentile to 0 to 255."""
+    flat = channels.flatten(1)
     low, high = (torch.from_numpy(np.percentile(flat.numpy(), q, axis=1)).float() for q in (1, 99))
-    span = (high - low).clamp_min(1e-12)[:, None, None]
-    unit = ((colours - low[:, None, None]) / span).clamp(0, 1)
-    return _from_above((unit.permute(1, 2, 0) * 255).to(torch.uint8))
+    unit = ((flat - low[:, None]) / (high - low).clamp_min(1e-12)[:, None]).clamp(0, 1)
+    return (unit * 255).to(torch.uint8).view(channels.shape)
 
 
 def _from_above(rows: UInt8[Tensor, "Y X 3"]) -> UInt8[np.ndarray, "X Y 3"]:

@@ -1,0 +1,100 @@
+"""One log over time: what was sensed at each of its frames, and what a run makes of it."""
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING
+
+from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
+from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.scene import Clip, VoxelSpec
+
+if TYPE_CHECKING:
+    from foredrive.recipes import Run
+    from foredrive.recipes.vision import Observer, Vision
+
+NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
+"""Labels are made with every clip, but nobody looks at them here."""
+KEPT = 16
+
+
+class LogTimes:
+    """The frames of a log in the order of time.
+
+    Args:
+        path: of the log.
+        image_width_px: width that camera images are read in.
+        run: a trained run, or None to see the log alone.
+
+    Raises:
+        InputError: on a log that cannot be read; a run that has no weights yet; a log that the run's model
+            cannot see, because it lacks its cameras or is too short.
+    """
+
+    observer: "Observer | None"
+    """None without a run."""
+
+    def __init__(self, path: LogPath, image_width_px: int, run: "Run | None" = None) -> None:
+        log = Log(path)
+        camera = next(iter(pinhole_cameras(log).values()), None)
+        aspect = 9 / 16 if camera is None else camera.height / camera.width
+        self.name, self.run = path.name, run
+        self.duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
+        config = ClipConfig(
+            past_frames=0,
+            future_frames=0,
+            image_hw=(round(image_width_px * aspect), image_width_px),
+            voxels=NO_LABELS,
+            now_stride_s=log.period_s or 1.0,
+            lidar=True,
+            map=True,
+        )
+        self._clips = ClipDataset([path], config, cache_dir=None)
+        self.now_us = [self._clips.now_us(index) for index in range(len(self._clips))]
+        """Time of every frame, in the time of the log."""
+        self.t_s = [(t_us - int(log.t_us[0])) * 1e-6 for t_us in self.now_us]
+        """Time since the log's start of every frame, s."""
+        self.observer = None
+        if run is not None:
+            from foredrive.recipes.train import load_agent  # a log alone does not wait for models
+            from foredrive.recipes.vision import Observer
+
+            size = run.recipe.clips
+            self.observer = Observer(load_agent(run), size.future_frames)
+            seen = dataclasses.replace(
+                size,
+                future_frames=0,
+                voxels=NO_LABELS,
+                now_stride_s=config.now_stride_s,
+                occupancy_source="lidar",
+            )
+            self._observed = ClipDataset([path], seen, cache_dir=None)
+            index_at = {self._observed.now_us(index): index for index in range(len(self._observed))}
+            self._observed_index = [index_at.get(t_us) for t_us in self.now_us]
+        self.clip = functools.lru_cache(KEPT)(self._clip)
+        self.vision = functools.lru_cache(KEPT)(self._vision)
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def nearest(self, t_s: float | None) -> int:
+        """The frame nearest to a time since the log's start, by default to its middle.
+
+        Raises:
+            InputError: if the log has no such time.
+        """
+        wanted_s = self.duration_s / 2 if t_s is None else t_s
+        if not 0 <= wanted_s <= self.duration_s:
+            raise InputError(f"{self.name}: no time {wanted_s:g} s in this log of {self.duration_s:.2f} s")
+        return min(range(len(self)), key=lambda index: abs(self.t_s[index] - wanted_s))
+
+    def _clip(self, index: int) -> Clip:
+        """What was sensed at a frame: one key frame, without leading dimensions but for it."""
+        return self._clips[index].clip
+
+    def _vision(self, index: int) -> "Vision | None":
+        """What the run holds to be the case; None without a run, and at frames without enough past."""
+        if self.observer is None or (seen := self._observed_index[index]) is None:
+            return None
+        return self.observer.look(collate([self._observed[seen]]).clip.observed())

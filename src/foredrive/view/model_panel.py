@@ -1,0 +1,116 @@
+"""The part of the page that shows what a model holds to be the case, and renders it from where one looks."""
+
+import threading
+from typing import Literal, cast
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+from viser.transforms import SO3
+
+from foredrive.scene import CameraRig
+from foredrive.view import palette
+from foredrive.view.log_times import LogTimes
+from foredrive.view.scene_nodes import FRUSTUM_M, show_path
+from foredrive.view.volume_nodes import show_flow, show_occupancy, shown_voxels
+
+RENDERED_HEIGHT_PX = 160
+NODES = ("occupancy", "flow", "plan")
+
+
+class ModelPanel:
+    """Controls and nodes of one run's model.
+
+    Args:
+        server: of the page.
+        times: with a run.
+    """
+
+    def __init__(self, server: viser.ViserServer, times: LogTimes) -> None:
+        assert times.run is not None
+        assert times.observer is not None
+        self._server, self._times, self._observer = server, times, times.observer
+        self.spec, self._dt_s = times.run.recipe.clips.voxels, times.run.recipe.clips.frame_dt_s
+        self._index, self._drawing = 0, threading.Lock()
+        gui, steps, spec = server.gui, self._observer.steps, self.spec
+        low_m, high_m = spec.lower_m[2], spec.upper_m[2] - spec.voxel_m
+        with gui.add_folder("Model"):
+            self._note = gui.add_markdown("")
+            self.frame = gui.add_slider("imagined frame", 0, max(steps, 1), 1, 0, disabled=steps == 0)
+            self.boxes = {name: gui.add_checkbox(name, True) for name in NODES}
+            self.colour_by = gui.add_dropdown("coloured by", ("height", "features"))
+            self.above = gui.add_slider("probability >", 0.05, 0.95, 0.05, 0.5)
+            self.lowest_m = gui.add_slider("height > (m)", low_m, high_m, spec.voxel_m, low_m)
+            render = gui.add_button("Render from here", hint="what the model would see with your eyes")
+            self._rendered = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
+        for slider in (self.frame, self.above, self.lowest_m):
+            slider.on_update(lambda _: self.show(self._index))
+        for box in self.boxes.values():
+            box.on_update(lambda _: self.show(self._index))
+        self.colour_by.on_update(lambda _: self.show(self._index))
+        render.on_click(self._render_from)
+
+    def show(self, index: int) -> None:
+        """Draw what the model holds to be the case at a frame of the log."""
+        with self._drawing:
+            self._index = index
+            vision, k, scene = self._times.vision(index), self.frame.value, self._server.scene
+            self._note.content = self._when(k) if vision is not None else "too few frames before this one"
+            with self._server.atomic():
+                if vision is not None:
+                    spec = self.spec
+                    shown = shown_voxels(vision, k, spec, self.above.value, self.lowest_m.value)
+                    colour_by = cast(Literal["height", "features"], self.colour_by.value)
+                    show_occupancy(scene, vision, k, spec, shown, colour_by)
+                    show_flow(scene, vision, k, spec, shown)
+                    show_path(scene, "plan", vision.plan, palette.PLAN)
+                for name, box in self.boxes.items():
+                    node = scene.get_handle_by_name(f"/{name}")
+                    if node is not None:
+                        node.visible = box.value and vision is not None
+
+    def _when(self, k: int) -> str:
+        return f"imagined, **{k * self._dt_s:g} s** ahead" if k else "observed **now**"
+
+    def _render_from(self, event: viser.GuiEvent) -> None:
+        """Render from the eye of whoever pressed the button, and leave the picture there."""
+        if event.client is None:
+            return
+        with self._drawing:
+            vision, k = self._times.vision(self._index), self.frame.value
+            if vision is None:
+                return
+            camera = event.client.camera
+            T_now_cam = np.eye(4)
+            T_now_cam[:3, :3], T_now_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
+            T_ego_cam = np.linalg.inv(vision.T_now_ego[k].double().numpy()) @ T_now_cam
+            rig = pinhole(T_ego_cam, camera.fov, camera.aspect, RENDERED_HEIGHT_PX)
+            rgb = (255 * self._observer.render(vision, k, rig)[0]).to(torch.uint8).numpy()
+        self._rendered.image, self._rendered.visible = rgb, True
+        self._server.scene.add_camera_frustum(
+            "/rendered",
+            fov=camera.fov,
+            aspect=camera.aspect,
+            scale=FRUSTUM_M,
+            color=palette.rgb255(palette.PLAN),
+            image=rgb,
+            wxyz=camera.wxyz,
+            position=camera.position,
+        )
+
+
+def pinhole(
+    T_ego_cam: Float[np.ndarray, "4 4"], fov_y_rad: float, aspect: float, height_px: int
+) -> CameraRig:
+    """One ideal camera without leading dimensions, given by its vertical field of view."""
+    width_px = max(round(aspect * height_px), 1)
+    focal = height_px / 2 / float(np.tan(fov_y_rad / 2))
+    return CameraRig(
+        K=torch.tensor([[[focal, 0.0, width_px / 2], [0.0, focal, height_px / 2], [0.0, 0.0, 1.0]]]),
+        T_ego_cam=torch.from_numpy(T_ego_cam).float()[None],
+        dist=torch.zeros(1, 5),
+        readout_s=torch.zeros(1),
+        names=("here",),
+        size_hw=(height_px, width_px),
+    )

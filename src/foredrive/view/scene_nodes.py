@@ -1,0 +1,135 @@
+"""What was sensed, as nodes of a 3-D scene: points, boxes, map, cameras, paths. All in the ego frame at now.
+
+Every function replaces what it drew before under its own name, and takes it away if there is nothing to draw.
+"""
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+from torch import Tensor
+from viser.transforms import SO3
+
+from foredrive.geometry.boxes import EDGES, box_corners
+from foredrive.scene import Clip, MapKind, Trajectory
+from foredrive.view import palette
+from foredrive.view.bev import EGO_OUTLINE_XY, path_points
+
+POINT_M = 0.09
+FRUSTUM_M = 1.2
+EGO_HEIGHT_M = 1.5
+PATH_LIFT_M = 0.15
+"""Paths lie on the road, and would be half sunk in it."""
+
+
+def show_lidar(scene: viser.SceneApi, clip: Clip) -> None:
+    """Returns, near ones bright."""
+    sweep = clip.sweeps[clip.now]
+    returned = sweep.returned & sweep.valid
+    if not bool(returned.any()):
+        return clear(scene, "/lidar")
+    scene.add_point_cloud(
+        "/lidar",
+        sweep.points_ego[returned].numpy(),
+        palette.range_colours(sweep.range_m[returned].numpy()),
+        point_size=POINT_M,
+        point_shape="circle",
+    )
+    return None
+
+
+def show_boxes(scene: viser.SceneApi, clip: Clip) -> None:
+    """Wire frames in the colours of their kinds, a cross on the front of each."""
+    boxes = clip.boxes[clip.now]
+    boxes = boxes[boxes.valid]
+    edges = torch.tensor([*EDGES, (0, 5), (1, 4)])  # corners 0, 1, 5, 4 are the front
+    corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
+    colours = np.array([palette.rgb255(palette.box_colour(kind)) for kind in boxes.category.tolist()])
+    each = np.repeat(colours.reshape(-1, 3), 2 * len(edges), axis=0)
+    _lines(scene, "/boxes", corners[:, edges].flatten(0, 1), each.reshape(-1, 2, 3), width=2.5)
+
+
+def show_map(scene: viser.SceneApi, clip: Clip) -> None:
+    """Polylines in the colours of their kinds."""
+    if clip.map is None:
+        return clear(scene, "/map")
+    both = clip.map.valid[:, 1:] & clip.map.valid[:, :-1]
+    pieces = torch.stack([clip.map.vertices[:, :-1], clip.map.vertices[:, 1:]], dim=2)[both]
+    kinds = clip.map.kind[:, None].expand(both.shape)[both].tolist()
+    colours = np.array([palette.rgb255(palette.MAP_COLOURS[MapKind(kind)]) for kind in kinds])
+    _lines(scene, "/map", pieces, np.repeat(colours.reshape(-1, 1, 3), 2, axis=1), width=2.0)
+    return None
+
+
+def show_cameras(scene: viser.SceneApi, clip: Clip) -> None:
+    """Every camera with an image as a frustum with the image in it; lens distortion is not drawn."""
+    rig, now = clip.rig[clip.now], clip.now
+    height, width = rig.size_hw
+    for c, name in enumerate(rig.names):
+        if not bool(clip.image_valid[now, c]):
+            clear(scene, f"/cameras/{name}")
+            continue
+        pose = rig.T_ego_cam[c].double().numpy()
+        scene.add_camera_frustum(
+            f"/cameras/{name}",
+            fov=2 * float(np.arctan(height / 2 / float(rig.K[c, 1, 1]))),
+            aspect=width / height,
+            scale=FRUSTUM_M,
+            color=palette.rgb255(palette.FAINT),
+            image=clip.images[now, c].permute(1, 2, 0).numpy(),
+            jpeg_quality=85,
+            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+            position=pose[:3, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def show_path(scene: viser.SceneApi, name: str, path: Trajectory, colour: str) -> None:
+    """A trajectory's first alternative from the rear axle on, a ball per valid waypoint."""
+    points = path_points(path) + torch.tensor([0.0, 0.0, PATH_LIFT_M])
+    if len(points) < 2:
+        return clear(scene, f"/{name}")
+    rgb = palette.rgb255(colour)
+    _lines(scene, f"/{name}", torch.stack([points[:-1], points[1:]], dim=1), np.array(rgb), width=7.0)
+    scene.add_point_cloud(
+        f"/{name}/waypoints", points[1:].numpy(), np.array(rgb), point_size=0.22, point_shape="circle"
+    )
+    return None
+
+
+def show_ego(scene: viser.SceneApi) -> None:
+    """The vehicle itself, as a prism over its footprint."""
+    count = len(EGO_OUTLINE_XY)
+    bottom = np.column_stack([EGO_OUTLINE_XY, np.full(count, 0.25)])
+    top = np.column_stack([EGO_OUTLINE_XY, np.full(count, EGO_HEIGHT_M)])
+    side = [(i, (i + 1) % count) for i in range(count)]
+    faces = [(0, i, i + 1) for i in range(1, count - 1)] + [
+        (count, count + i + 1, count + i) for i in range(1, count - 1)
+    ]
+    faces += [face for i, j in side for face in ((i, i + count, j), (j, i + count, j + count))]
+    scene.add_mesh_simple(
+        "/ego",
+        np.concatenate([bottom, top]),
+        np.array(faces),
+        color=palette.rgb255(palette.EGO),
+        opacity=0.85,
+        flat_shading=True,
+        side="double",
+        cast_shadow=False,
+    )
+
+
+def _lines(
+    scene: viser.SceneApi, name: str, ends: Float[Tensor, "N 2 3"], colours: np.ndarray, width: float
+) -> None:
+    if len(ends) == 0:
+        return clear(scene, name)
+    scene.add_line_segments(name, ends.numpy(), colours, line_width=width)
+    return None
+
+
+def clear(scene: viser.SceneApi, name: str) -> None:
+    """Take a node away, if it is there."""
+    if scene.get_handle_by_name(name) is not None:
+        scene.remove_by_name(name)

@@ -1,0 +1,132 @@
+"""A log in the browser, in 3-D and over time, and what a run makes of it."""
+
+import contextlib
+import errno
+import io
+import socket
+import threading
+import time
+
+import viser
+
+from foredrive.errors import InputError
+from foredrive.view import palette
+from foredrive.view.log_times import LogTimes
+from foredrive.view.model_panel import ModelPanel
+from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_lidar, show_map, show_path
+
+LAYERS = ("lidar", "boxes", "map", "cameras", "driven")
+PLAY_PERIOD_S = 0.1
+PORTS, PORTS_TRIED = 65536, 100
+START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
+
+
+def free_port(host: str, port: int) -> int:
+    """The first port from `port` on that nobody else serves at; any one if `port` is 0.
+
+    Raises:
+        InputError: if there is no such host here, no such port, or none that this user may serve at.
+    """
+    if not 0 <= port < PORTS:
+        raise InputError(f"no port {port}: there are 0 to {PORTS - 1}")
+    candidates = range(port, min(port + PORTS_TRIED, PORTS))
+    for candidate in candidates:
+        try:
+            with socket.create_server((host, candidate)) as found:
+                return int(found.getsockname()[1])
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise InputError(f"cannot serve a page at {host}:{candidate}: {error}") from error
+    raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
+
+
+class Viewer:
+    """A web page with a slider for time and, with a run, one for how far ahead its model imagines.
+
+    All is drawn in the ego frame at the time shown, so the view goes along with the vehicle. The server runs
+    in threads of its own until `close`.
+
+    Args:
+        times: what is shown.
+        host, port: where the page is served; at the next free port if this one is taken.
+
+    Raises:
+        InputError: if it cannot be served there.
+    """
+
+    def __init__(self, times: LogTimes, host: str, port: int) -> None:
+        self.times = times
+        self._drawing, self._drawn = threading.Lock(), -1
+        self.port = free_port(host, port)  # viser would wait for a host that does not exist
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+            self.server = viser.ViserServer(host=host, port=self.port, label=times.name, verbose=False)
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self.server.scene.configure_environment_map(hdri=None)  # lights that nobody has to download
+        self.server.initial_camera.position = START_EYE_M
+        self.server.initial_camera.look_at = START_TARGET_M
+        show_ego(self.server.scene)
+        self._add_controls()
+        self.model = None if times.observer is None else ModelPanel(self.server, times)
+        self.show(0)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self.server.get_host()}:{self.port}"
+
+    def show(self, index: int) -> None:
+        """Go to a frame of the log."""
+        self._frame.value = index
+        self._draw()
+
+    def play(self) -> None:
+        """Step through the log while "play" is ticked on the page; does not return."""
+        while True:
+            time.sleep(PLAY_PERIOD_S)
+            if self._play.value:
+                self.show((self._frame.value + 1) % len(self.times))
+
+    def close(self) -> None:
+        """Stop serving."""
+        with contextlib.suppress(RuntimeError):  # its thread may be done before it has been told everything
+            self.server.stop()
+
+    def _add_controls(self) -> None:
+        gui, count = self.server.gui, len(self.times)
+        with gui.add_folder("Time"):
+            self._clock = gui.add_markdown("")
+            self._frame = gui.add_slider("frame", 0, max(count - 1, 1), 1, 0, disabled=count == 1)
+            step = gui.add_button_group("step", ("back", "on"))
+            self._play = gui.add_checkbox("play", False)
+        with gui.add_folder("Log"):
+            self.layers = {name: gui.add_checkbox(name, True) for name in LAYERS}
+        self._frame.on_update(lambda _: self._draw())
+        step.on_click(lambda _: self._step(1 if step.value == "on" else -1))
+        for box in self.layers.values():
+            box.on_update(lambda _: self._show_layers())
+
+    def _step(self, change: int) -> None:
+        self.show(min(max(self._frame.value + change, 0), len(self.times) - 1))
+
+    def _draw(self) -> None:
+        """Draw the frame that is wanted by now: of many that were passed over in haste only the last."""
+        with self._drawing:
+            index = min(self._frame.value, len(self.times) - 1)
+            if index == self._drawn:
+                return
+            clip = self.times.clip(index)
+            with self.server.atomic():
+                self._clock.content = f"**{self.times.t_s[index]:.2f} s** of {self.times.duration_s:.2f} s"
+                for show in (show_lidar, show_boxes, show_map, show_cameras):
+                    show(self.server.scene, clip)
+                show_path(self.server.scene, "driven", clip.future, palette.EXPERT)
+                self._show_layers()
+            if self.model is not None:
+                self.model.show(index)
+            self._drawn = index
+
+    def _show_layers(self) -> None:
+        for name, box in self.layers.items():
+            node = self.server.scene.get_handle_by_name(f"/{name}")
+            if node is not None:
+                node.visible = box.value

@@ -1,0 +1,105 @@
+"""What a model holds to be the case, as nodes of a 3-D scene: cubes of occupancy, arrows of flow."""
+
+from typing import Literal
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from viser.transforms import SO3
+
+from foredrive.recipes.vision import Vision
+from foredrive.scene import VoxelSpec
+from foredrive.view import palette
+from foredrive.view.scene_nodes import clear
+from foredrive.view.voxel_drawing import height_colours, pca_colours
+
+FILL = 0.94
+"""Edge of a drawn cube over that of its voxel, so that single ones can be told apart."""
+MOVES_M = 0.25
+"""Shorter arrows are not drawn."""
+ARROW_WIDTH, HEAD_SHARE = 3.0, 0.3
+
+_CUBE = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+_CUBE_FACES = np.array(
+    [
+        [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
+        [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5],
+    ]
+)  # fmt: skip
+
+
+def shown_voxels(
+    vision: Vision, k: int, spec: VoxelSpec, above: float, lowest_m: float
+) -> Bool[Tensor, "Z Y X"]:
+    """Voxels of frame k that are occupied with a probability of more than `above`.
+
+    Args:
+        lowest_m: height in the ego frame below which voxel centres are left out: the road hides much.
+    """
+    z = spec.centres_m()[..., 2]
+    return (vision.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
+
+
+def show_occupancy(
+    scene: viser.SceneApi,
+    vision: Vision,
+    k: int,
+    spec: VoxelSpec,
+    shown: Bool[Tensor, "Z Y X"],
+    colour_by: Literal["height", "features"],
+) -> None:
+    """Voxels of frame k as cubes in the ego frame now, where the model thinks that they will be."""
+    colours: UInt8[np.ndarray, "Z Y X 3"] = (
+        height_colours(spec) if colour_by == "height" else pca_colours(vision.volume[k], shown)
+    )
+    pose = vision.T_now_ego[k].double().numpy()
+    count = int(shown.sum())
+    if count == 0:
+        return clear(scene, "/occupancy")
+    scene.add_batched_meshes_simple(
+        "/occupancy",
+        FILL * spec.voxel_m * _CUBE,
+        _CUBE_FACES,
+        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        batched_positions=spec.centres_m()[shown].numpy(),
+        batched_colors=colours[shown.numpy()],
+        flat_shading=True,
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
+        wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+        position=pose[:3, 3],
+    )
+    return None
+
+
+def show_flow(
+    scene: viser.SceneApi, vision: Vision, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
+) -> None:
+    """From where shown voxels of frame k came since frame k - 1, as arrows over ground; none for now."""
+    if k == 0:
+        return clear(scene, "/flow")
+    start, end = vision.movement_m(k, spec)
+    moves = shown & ((end - start).norm(dim=-1) > MOVES_M)
+    if not bool(moves.any()):
+        return clear(scene, "/flow")
+    ends = arrows(start[moves], end[moves])
+    lift = torch.tensor([0.0, 0.0, 0.75 * spec.voxel_m])  # on top of the cubes, not inside
+    scene.add_line_segments(
+        "/flow",
+        (ends + lift).numpy(),
+        np.array(palette.rgb255(palette.FALSE_POSITIVE)),
+        line_width=ARROW_WIDTH,
+    )
+    return None
+
+
+def arrows(start: Float[Tensor, "N 3"], end: Float[Tensor, "N 3"]) -> Float[Tensor, "N3 2 3"]:
+    """Segments of N arrows whose heads lie flat: three to each, its shaft first."""
+    along = end - start
+    across = torch.stack([-along[:, 1], along[:, 0], torch.zeros_like(along[:, 0])], dim=-1)
+    back = end - HEAD_SHARE * along
+    heads = [back + 0.5 * HEAD_SHARE * across, back - 0.5 * HEAD_SHARE * across]
+    return torch.stack([torch.stack([start, *heads], 1), end[:, None].expand(-1, 3, 3)], 2).flatten(0, 1)

@@ -1,0 +1,196 @@
+"""The page that shows a log and a run: served, stepped through, stopped."""
+
+import socket
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from miniature import miniature, write_log
+
+from foredrive.cli.main import main
+from foredrive.data import LogPath
+from foredrive.recipes import Run, train_run
+from foredrive.recipes.vision import Vision
+from foredrive.scene import Trajectory, VoxelSpec
+from foredrive.view.log_times import LogTimes
+from foredrive.view.model_panel import pinhole
+from foredrive.view.viewer import Viewer, free_port
+from foredrive.view.volume_nodes import arrows, shown_voxels
+from foredrive.view.voxel_drawing import pca_colours
+
+SPEC = VoxelSpec((0.0, -1.0, 0.0), 1.0, (1, 2, 3))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+    return write_log(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture(scope="module")
+def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return train_run(miniature(), [log], tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def viewer(log: LogPath, run: Run) -> Iterator[Viewer]:
+    viewer = Viewer(LogTimes(log, 96, run), "localhost", 0)
+    yield viewer
+    viewer.close()
+
+
+def node(viewer: Viewer, name: str):
+    return viewer.server.scene.get_handle_by_name(name)
+
+
+def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
+    viewer = Viewer(LogTimes(log, 96), "localhost", 0)
+    with urllib.request.urlopen(viewer.url) as page:
+        assert page.status == 200
+        assert b"<html" in page.read().lower()
+    viewer.close()
+    for _ in range(100):
+        try:
+            socket.create_connection(("localhost", viewer.port), 5).close()
+        except ConnectionRefusedError:
+            return
+        time.sleep(0.1)
+    pytest.fail("it still listens after 10 s")
+
+
+def test_stepping_shows_what_was_sensed_then(viewer: Viewer) -> None:
+    for index in (3, 20):
+        viewer.show(index)
+        clip = viewer.times.clip(index)
+        sweep = clip.sweeps[clip.now]
+        points = sweep.points_ego[sweep.returned & sweep.valid].numpy()
+        assert node(viewer, "/lidar").points == pytest.approx(points, abs=0.05)  # sent in half precision
+        centres = node(viewer, "/boxes").points.reshape(2, 14, 2, 3)[:, :12].mean((1, 2))
+        assert centres == pytest.approx(clip.boxes[clip.now].centre.numpy(), abs=1e-4)
+        assert node(viewer, "/cameras/left").position == pytest.approx((0.8, 0.5, 1.5), abs=1e-5)
+    assert np.ptp(node(viewer, "/driven").points[..., 0]) > 5  # 5 m/s ahead for up to 3 s
+
+
+def test_layers_stay_hidden_while_time_goes_on(viewer: Viewer) -> None:
+    viewer.layers["lidar"].value = False
+    viewer.show(7)
+    assert not node(viewer, "/lidar").visible
+    viewer.layers["lidar"].value = True
+    assert node(viewer, "/lidar").visible
+
+
+def test_the_model_is_shown_where_it_has_seen_enough(viewer: Viewer) -> None:
+    viewer.show(2)  # at 0.2 s; the model wants to have seen 0.5 s
+    assert viewer.times.vision(2) is None
+    viewer.show(10)
+    vision = viewer.times.vision(10)
+    assert vision is not None
+    panel = viewer.model
+    assert panel is not None
+    for k in (0, 2):
+        above = float(vision.occupancy_logit[k].sigmoid().median())
+        panel.frame.value, panel.above.value = k, above
+        shown = shown_voxels(vision, k, panel.spec, above, panel.spec.lower_m[2])
+        cubes = node(viewer, "/occupancy")
+        assert len(cubes.batched_positions) == int(shown.sum()) > 0
+        assert cubes.position == pytest.approx(vision.T_now_ego[k, :3, 3].numpy(), abs=1e-6)
+    assert len(node(viewer, "/plan").points) == 6
+    panel.above.value = 1.0
+    assert node(viewer, "/occupancy") is None
+    panel.above.value = above
+    viewer.show(2)
+    assert not node(viewer, "/occupancy").visible
+    assert not node(viewer, "/plan").visible
+
+
+def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run) -> None:
+    from foredrive.data import ClipDataset, collate
+    from foredrive.recipes.predict import NemoPredictor
+
+    times = LogTimes(log, 96, run)
+    vision, observer = times.vision(10), times.observer
+    assert vision is not None
+    assert observer is not None
+    dataset = ClipDataset([log], run.recipe.clips, None)
+    at = next(k for k in range(len(dataset)) if dataset.now_us(k) == times.now_us[10])
+    observed = collate([dataset[at]]).clip.observed()
+    expected = NemoPredictor(observer.agent, 2, ray_stride=4).predict(observed).images
+    assert expected is not None
+    whole = observer.render(vision, 0, observed.rig[0, -1])
+    assert whole[:, 2::4, 2::4].permute(0, 3, 1, 2).numpy() == pytest.approx(expected[0, 0].numpy(), abs=1e-5)
+
+
+def some_vision(flow: torch.Tensor) -> Vision:
+    """Nothing but motion: the vehicle goes 2 m ahead and turns left by 90°."""
+    turned = torch.eye(4)
+    turned[:2, :2], turned[0, 3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]]), 2.0
+    nothing = torch.zeros(2, *SPEC.shape_zyx)
+    plan = Trajectory(torch.zeros(1, 1, 2), torch.zeros(1, 1), torch.ones(1, 1).bool(), torch.zeros(1), 0.5)
+    return Vision(nothing, nothing[:, None], torch.stack([torch.eye(4), turned]), flow, plan)
+
+
+def test_what_stands_still_has_no_arrow_however_the_vehicle_goes() -> None:
+    start, end = some_vision(torch.zeros(1, 3, 1, 2, 3)).movement_m(1, SPEC)
+    assert start == pytest.approx(end)
+    assert end[0, 1, 0].tolist() == pytest.approx([1.5, 0.5, 0.5])  # (0.5, 0.5) there: left of where it went
+
+
+def test_arrows_lead_from_where_things_were() -> None:
+    """What warping by `warp_volume` gathers from z + f is drawn as going from there to z."""
+    flow = torch.zeros(1, 3, 1, 2, 3)
+    flow[:, 0] = -1.0
+    start, end = some_vision(flow).movement_m(1, SPEC)
+    assert (end - start)[0, 0, 0].tolist() == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)  # its x is now's y
+
+
+def test_arrow_heads_end_at_the_tip() -> None:
+    lines = arrows(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[2.0, 0.0, 1.0]]))
+    assert lines[:, 1].tolist() == [[2.0, 0.0, 1.0]] * 3
+    assert lines[0, 0].tolist() == [0.0, 0.0, 1.0]
+    assert lines[1, 0].tolist() == pytest.approx([1.4, 0.3, 1.0])
+    assert lines[2, 0].tolist() == pytest.approx([1.4, -0.3, 1.0])
+
+
+def test_features_that_differ_get_colours_that_differ() -> None:
+    volume = torch.zeros(4, 1, 2, 4)
+    volume[0, 0, 0], volume[1, 0, 1] = 1.0, 1.0
+    colours = pca_colours(volume, torch.ones(1, 2, 4).bool())
+    assert (colours[0, 0] == colours[0, 0, 0]).all()
+    assert np.abs(colours[0, 0, 0].astype(int) - colours[0, 1, 0]).max() > 200
+    assert (pca_colours(volume, torch.zeros(1, 2, 4).bool()) == 128).all()
+
+
+def test_a_camera_of_one_s_own_sees_as_wide_as_the_window() -> None:
+    rig = pinhole(np.eye(4), np.pi / 2, 2.0, 100)
+    assert rig.size_hw == (100, 200)
+    K = np.array([[50.0, 0, 100], [0, 50, 50], [0, 0, 1]])
+    assert rig.K[0].numpy() == pytest.approx(K)
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--t", "9"], "no time 9 s in this log"),
+        (["--run", "{tmp}"], "{tmp}: not a run folder"),
+        (["--run", "{tmp}", "--save", "{tmp}/x.png"], "--save draws the log alone"),
+        (["--host", "no-such-host.invalid"], "cannot serve a page at no-such-host.invalid"),
+        (["--port", "70000"], "no port 70000"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(
+    flags: list[str], said: str, log: LogPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", str(log.folder), *(flag.format(tmp=tmp_path) for flag in flags)]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert said.format(tmp=tmp_path) in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_that_is_taken_is_passed_over() -> None:
+    with socket.create_server(("localhost", 0)) as taken:
+        port = int(taken.getsockname()[1])
+        assert free_port("localhost", port) > port
