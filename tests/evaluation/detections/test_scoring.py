@@ -106,6 +106,24 @@ def test_images_with_overlaps_by_hand(tmp_path: Path) -> None:
     assert figures["gospa.missed"] == pytest.approx(50.0**2 / 2 / 2)  # one of two images
     assert figures["frames"] == 2
     assert figures["pmb_nll.frames_infinite"] == 0
+    assert 0.2 < figures["pdq"] < math.sqrt(0.6) / 2  # type: ignore[operator]
+    assert figures["by_size.from_0_px.objects"] == 2
+    assert "object_cost.by_relevance" not in figures
+
+
+def test_relevance_stands_beside_what_is_not_weighted(tmp_path: Path) -> None:
+    """The found object counts three times as much as the missed one."""
+    truth = [box(0.0, 0.0, relevance=3.0), box(30.0, 30.0, relevance=1.0)]
+    found = {"a": [box(0.0, 0.0, detection_score=0.9)]}
+    read = read_detections(
+        write_nuscenes(tmp_path / "found.json", found), write_nuscenes(tmp_path / "gt.json", {"a": truth})
+    )
+    (score,) = score_frames(read)
+    figures = summarise_scores(read, [score]).figures
+    cost = score.objects.localisation + score.objects.classification + score.objects.missed
+    assert figures["object_cost"] == pytest.approx(cost.mean())
+    assert figures["object_cost.by_relevance"] == pytest.approx((3 * cost[0] + cost[1]) / 4)
+    assert cost[1] > 10 > cost[0]
 
 
 def test_no_detections_at_all(tmp_path: Path) -> None:

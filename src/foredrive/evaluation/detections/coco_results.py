@@ -27,6 +27,7 @@ from foredrive.evaluation.detections.frames import (
     detections_of_file,
     numbers_of,
     objects_of_file,
+    relevance_of,
 )
 
 Record = Mapping[str, Any]
@@ -100,6 +101,7 @@ def _frame(
         detections_of_file(where, score, share, corners, covariance, family=family),
         objects_of_file(true_where, labels, true_corners),
         *around(np.zeros(4), np.array([width, height, width, height]), true_corners),
+        relevance=relevance_of([record for _, record in true], true_where),
     )
 
 

@@ -42,6 +42,8 @@ class Frame:
     """Distance of each object over ground."""
     visibility: Float[ndarray, "N"] | None = None
     """Of each object, however the data set measures it: lidar points, or a level of occlusion."""
+    relevance: Float[ndarray, "N"] | None = None
+    """Weight of each object, where the truth has one."""
 
 
 @dataclass(frozen=True)
@@ -159,3 +161,16 @@ def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> F
     if not np.isfinite(value).all():
         raise InputError(f"{where} has a {key} that is not finite")
     return value
+
+
+def relevance_of(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:
+    """Weights of objects; 1 for those without, None if none has one."""
+    if not any("relevance" in record for record in objects):
+        return None
+    weight = np.ones(len(objects))
+    for n, record in enumerate(objects):
+        if "relevance" in record:
+            weight[n] = numbers_of(record, "relevance", 1, f"{where}, object {n}")[0]
+            if weight[n] < 0:
+                raise InputError(f"{where}, object {n} has a relevance below 0")
+    return weight

@@ -3,7 +3,7 @@
 `results` has a list of boxes by sample token: `translation` (m, global), `size` (w, l, h in m), `rotation`
 (quaternion w x y z), `detection_name`, `detection_score`. Beyond the format, a box may have `covariance` (of
 centre and log l, w, h in m), `yaw_std` (rad) and `class_probabilities` (by name). Truth may have `num_pts`
-and `ego_translation`, as the devkit writes them, and `scene_token`.
+and `ego_translation`, as the devkit writes them, `scene_token` and `relevance`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,6 +28,7 @@ from foredrive.evaluation.detections.frames import (
     detections_of_file,
     numbers_of,
     objects_of_file,
+    relevance_of,
 )
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
@@ -108,6 +109,7 @@ def _frame(
         *around(LOWER, UPPER, true_state),
         range_m=np.linalg.norm(true_state[:, :2], axis=1),
         visibility=np.array(seen),
+        relevance=relevance_of(true, true_where),
     )
 
 

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
+from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
 from foredrive.sets import (
     Gospa,
     MultiBernoulli,
@@ -76,6 +77,8 @@ class FrameScore:
     pgospa: Gospa
     detections: DetectionScores
     objects: ObjectScores
+    pdq: PdqCounts | None
+    """Of image boxes."""
 
 
 def score_frames(
@@ -116,7 +119,17 @@ def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
         *_gospas(frame, detections, read.upright),
         detections,
         _objects(frame, pmb, result, sure),
+        None if read.upright else _pdq(frame, detections),
     )
+
+
+def _pdq(frame: Frame, detections: DetectionScores) -> PdqCounts:
+    """Label quality is existence times class probability."""
+    boxes = frame.detected.boxes
+    std = boxes.chol.square().sum(-1).sqrt().numpy()
+    share = detections.existence[:, None] * frame.detected.log_class.exp().numpy()
+    true = frame.objects
+    return count_pdq(pixel_quality(boxes.mean.numpy(), std, share, true.state.numpy(), true.label.numpy()))
 
 
 def _objects(

@@ -19,6 +19,7 @@ from foredrive.metrics.detection import (
     average_precision_nuscenes,
     mean_of_valid,
 )
+from foredrive.metrics.pdq import pdq
 from foredrive.sets import (
     BootstrapMean,
     BoxDensity,
@@ -35,6 +36,9 @@ from foredrive.sets import (
     reliability,
 )
 
+LENGTHS_M = (0.0, 2.0, 6.0, np.inf)
+SIDES_PX = (0.0, 32.0, 96.0, np.inf)
+"""Roots of areas: COCO's small, medium and large."""
 RANGES_M = (0.0, 20.0, 40.0, 60.0, np.inf)
 COVERAGE = 0.9
 Summary = dict[str, float | int | str | None]
@@ -73,6 +77,9 @@ def summarise_scores(read: DetectionSet, scores: Sequence[FrameScore], seed: int
         for part in ("distance", "localisation", "existence", "missed", "false"):
             figures[f"{name}.{part}"] = float(np.mean([getattr(getattr(s, name), part) for s in scores]))
     figures |= _precision(read, scores)
+    counts = [score.pdq for score in scores if score.pdq is not None]
+    if counts:
+        figures["pdq"] = pdq(counts)
     diagrams = _diagrams(read, scores)
     figures |= {f"calibration.{name}": diagram.error for name, diagram in diagrams.items()}
     figures |= _calibration(read, scores) | _of_pairs(read, scores, rng) | _slices(read, scores)
@@ -178,9 +185,14 @@ def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.G
 
 
 def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """What objects cost by class, range and visibility, nats an object."""
+    """What objects cost by class, size, range and visibility, nats an object."""
     label = _joined(scores, "objects", "label")
-    figures: Summary = {}
+    figures: Summary = _relevance(read, scores)
+    size = np.concatenate([_size(frame.objects, read.upright) for frame in read.frames])
+    steps, unit = (LENGTHS_M, "m") if read.upright else (SIDES_PX, "px")
+    for low, high in pairwise(steps):
+        inside = np.flatnonzero((size >= low) & (size < high))
+        figures |= _slice(f"by_size.from_{low:g}_{unit}", scores, inside)
     for c, name in enumerate(read.classes):
         figures |= _slice(f"by_class.{name}", scores, np.flatnonzero(label == c))
     if all(frame.range_m is not None for frame in read.frames):
@@ -196,6 +208,27 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
             inside = np.flatnonzero((visibility >= low) & (visibility < high))
             figures |= _slice(f"by_visibility.from_{low:g}", scores, inside)
     return figures
+
+
+def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+    """What an object costs: all alike, and weighted where the truth has weights."""
+    cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
+    if not np.size(cost):
+        return {}
+    figures: Summary = {"object_cost": float(np.mean(cost))}
+    weights = [np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in read.frames]
+    if any(frame.relevance is not None for frame in read.frames):
+        weight = np.concatenate(weights)
+        figures["object_cost.by_relevance"] = float((weight * cost).sum() / weight.sum())
+    return figures
+
+
+def _size(objects: LabelledBoxes, upright: bool) -> Float[ndarray, "N"]:
+    """Length in m, or root of the area in px."""
+    state = objects.state.double().numpy()
+    if upright:
+        return np.exp(state[:, 3])
+    return np.sqrt((state[:, 2:] - state[:, :2]).prod(-1))
 
 
 def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Summary:
