@@ -15,6 +15,7 @@ from foredrive.sets import (
     MixturePoisson,
     MultiBernoulli,
     PoissonMultiBernoulli,
+    SumPoisson,
     UniformPoisson,
     poisson_log_prob,
 )
@@ -213,3 +214,32 @@ def test_intensities_without_gradients_are_those_with() -> None:
     learning = dataclasses.replace(process, log_rate=log_rate.clone().requires_grad_())
     expected = learning.log_intensity(truth).detach()
     torch.testing.assert_close(process.log_intensity(truth), expected, atol=1e-12, rtol=1e-12)
+
+
+def test_a_sum_of_poisson_processes_has_the_sum_of_intensities() -> None:
+    rng = np.random.default_rng(9)
+    box = torch.full((2,), 4.0)
+    uniform = UniformPoisson(torch.tensor([2.0, 0.0, 1.0]), -box, box)
+    cloud = MixturePoisson(
+        torch.tensor([0.5]).log(),
+        torch.zeros(1, 3).log_softmax(-1),
+        box_density(rng, 1, 2, yaw=False, family="gaussian"),
+    )
+    both, truth = SumPoisson((uniform, cloud)), objects(rng, 6, 2, yaw=False)
+    expected = uniform.log_intensity(truth).exp() + cloud.log_intensity(truth).exp()
+    torch.testing.assert_close(both.log_intensity(truth).exp(), expected)
+    assert both.expected_count.item() == pytest.approx(3.5)
+    counts = [len(both.sample(rng).label) for _ in range(2000)]
+    assert np.mean(counts) == pytest.approx(3.5, abs=4 * math.sqrt(3.5 / 2000))
+
+
+def test_unsure_detections_become_background_beside_another() -> None:
+    rng = np.random.default_rng(10)
+    r = torch.tensor([0.9, 0.05, 0.1], dtype=torch.float64)
+    boxes = box_density(rng, 3, 2, yaw=False, family="gaussian")
+    detected = MultiBernoulli(r.log(), torch.log1p(-r), torch.zeros(3, 3).log_softmax(-1), boxes)
+    box = torch.full((2,), 4.0)
+    pmb = PoissonMultiBernoulli.from_detections(detected, 0.1, UniformPoisson(torch.ones(3), -box, box))
+    assert pmb.detected.log_existence.exp().tolist() == pytest.approx([0.9])
+    assert pmb.background is not None
+    assert pmb.background.expected_count.item() == pytest.approx(3.15)
