@@ -8,6 +8,7 @@ import pytest
 from foredrive.towns.map.town_map import Lane, MarkingKind, TownMap
 from foredrive.towns.traffic.drivers import Situation
 from foredrive.towns.traffic.lane_changes import (
+    COURTEOUS_MPS2,
     HAS_TO_MPS2,
     LEFT,
     POLITENESS,
@@ -18,6 +19,7 @@ from foredrive.towns.traffic.lane_changes import (
     find_gaps,
     find_stretches,
     incentive,
+    let_in,
     who_may_change,
 )
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
@@ -153,6 +155,27 @@ def test_who_is_ahead_and_behind_is_found_over_the_ends_of_lanes(graph: LaneGrap
     assert (found.leader[0], found.follower[0]) == (1, 2)
     assert found.leader_gap_m[0] == pytest.approx(INNER_M * np.deg2rad(6) - 4, abs=0.1)
     assert found.follower_gap_m[0] == pytest.approx(INNER_M * np.deg2rad(8) - 4, abs=0.1)
+
+
+def test_nobody_abreast_is_overlooked_in_a_curve(graph: LaneGraph) -> None:
+    """One that leaves a lane is on it still: wherever it is, it is ahead or behind, and too near."""
+    target = np.array([-1, graph.ids.index("outer0")])
+    for ahead_deg in np.linspace(-0.05, 0.05, 51):
+        v = begin_change(graph, cars(graph, [("outer0", 90, 8.0), ("inner0", 90 + ahead_deg, 8.0)]), 0, LEFT)
+        found = find_gaps(graph, v, path_starts(graph, v.path), target, RIGHT)
+        assert min(found.leader_gap_m[1], found.follower_gap_m[1]) < 0, ahead_deg
+
+
+def test_who_has_to_change_is_let_in(graph: LaneGraph) -> None:
+    # 1 m more than behind somebody in its lane: s* = 2 + 8 · 1.5 = 14 m, z = 14 / (15 - 1).
+    target = np.array([graph.ids.index("outer0"), -1, -1])
+    for gap_m, limit_mps2 in ((15.0, 0.0), (4.0, -COURTEOUS_MPS2), (1.5, np.inf)):
+        behind_deg = np.rad2deg((gap_m + 4.0) / (INNER_M + LANE_M))
+        v = cars(graph, [("inner0", 90, 8.0), ("outer0", 90 - behind_deg, 8.0), ("outer0", 40, 8.0)])
+        starts_m = path_starts(graph, v.path)
+        limit = let_in(graph, v, starts_m, seen(graph, v, [1.0] * 3), target, RIGHT)
+        assert limit[1] == pytest.approx(limit_mps2, abs=0.02)
+        assert limit[0] == limit[2] == np.inf
 
 
 def chosen(graph: LaneGraph, v: Vehicles, urge: np.ndarray | None = None) -> tuple[int, int] | None:

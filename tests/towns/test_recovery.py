@@ -66,6 +66,24 @@ def test_a_disturbed_drive_stays_near_the_flawless_one(town02: TownMap) -> None:
         assert turned == pytest.approx(0.5 * (before.twist_ego[5] + after.twist_ego[5]), abs=0.3)
 
 
+def test_the_outline_of_the_ego_vehicle_sways_with_it(town02: TownMap) -> None:
+    traffic = Traffic(town02, 1, 6, 0)
+    drive = Drive(traffic, 15.0, steering_noise=0.03)
+    aside_m = []
+    for moment in drive.moments(100, DT_S):
+        poses = drive.poses()
+        T_ego_world = np.linalg.inv(moment.T_world_ego)
+        size_m = drive.state.vehicles.size_lwh[0]
+        expected_ego = [drive.state.vehicles.axle_to_centre_m[0], 0.0, size_m[2] / 2, 1.0]
+        np.testing.assert_allclose(T_ego_world @ [*poses.centre_m[0], 1.0], expected_ego, atol=1e-9)
+        np.testing.assert_allclose(T_ego_world[:3, :3] @ poses.forward[0], [1.0, 0.0, 0.0], atol=1e-9)
+        on_path = traffic.poses(drive.state)
+        np.testing.assert_array_equal(poses.centre_m[1:], on_path.centre_m[1:])
+        aside_m.append(np.linalg.norm(poses.axle_xyz[0] - on_path.axle_xyz[0]))
+    assert aside_m[0] == pytest.approx(0.0, abs=1e-9)
+    assert max(aside_m) > 0.05
+
+
 def test_noise_is_not_negative(town02: TownMap) -> None:
     with pytest.raises(InputError, match="steering noise"):
         Drive(Traffic(town02, 1, 2, 0), 1.0, steering_noise=-0.1)

@@ -19,12 +19,13 @@ SECONDS = dict.fromkeys(TOWNS, 8.0) | dict.fromkeys(("Town03", "Town04", "Town05
 def test_nothing_goes_wrong(town: str, town_of: Callable[[str], TownMap]) -> None:
     town_map, seconds = town_of(town), SECONDS[town]
     traffic = Traffic(town_map, seed=5, vehicle_count=30, people_count=15)
-    drive, audit = Drive(traffic, seconds), Audit(town_map, traffic)
+    drive, audit = Drive(traffic, seconds, steering_noise=0.02), Audit(town_map, traffic)
     state, driven_m = drive.state, 0.0
     for _ in range(round(seconds / DT_S)):
-        after = traffic.step(state, DT_S)
-        audit.watch(state, after)
-        state = after
+        before = state
+        drive.step(DT_S)
+        state = drive.state
+        audit.watch(before, state, drive.poses())
         driven_m += DT_S * float(state.vehicles.speed_mps[state.vehicles.active].mean())
     assert audit.examples == {name: [] for name in audit.counts}
     assert driven_m / seconds > 1.0

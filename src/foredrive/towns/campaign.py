@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +12,16 @@ from foredrive.scene import Command
 from foredrive.towns.conditions import CONDITIONS, find_conditions
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import FASTEST_HZ, Crowd
-from foredrive.towns.traffic.expert import driven_m, plan_route
+from foredrive.towns.traffic.expert import SETTLE_S, Drive, plan_route
 from foredrive.towns.traffic.fleet import find_starts
 from foredrive.towns.traffic.lane_graph import build_lane_graph
+from foredrive.towns.traffic.traffic import Traffic
 
 ANY_CONDITIONS = "any"
 SEEDS_PER_DRIVE = 8
-"""How many routes are drawn for each one that is driven, where seeds may be chosen."""
+TRIES_PER_DRIVE = 4
+"""How many routes are drawn for each drive that is recorded, where seeds may be chosen, and how many of them
+are driven at most."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +62,13 @@ class Campaign:
 
     towns: tuple[str, ...]
     seeds: tuple[int, ...] | int
-    """Of each town under each of the conditions; or how many, then the seeds are chosen such that the route
-    commands even out over all drives."""
+    """Of each town under each of the conditions; or how many, then the seeds are chosen such that what is
+    done at the forks that are passed evens out over all drives."""
     conditions: tuple[str, ...] = ()
     """Names of `CONDITIONS`. Alone, `ANY_CONDITIONS` deals them out evenly, one for each town and seed; none
     at all leaves bright daylight."""
     vehicles: tuple[int, int] = (Crowd.vehicles, Crowd.vehicles)
-    """Fewest and most; drawn for each drive."""
+    """Fewest and most; drawn for each town and seed."""
     people: tuple[int, int] = (Crowd.people, Crowd.people)
     seconds: float = 20.0
     rate_hz: float = 10.0
@@ -88,6 +91,8 @@ class Campaign:
 def plan_drives(campaign: Campaign) -> list[DrivePlan]:
     """The drives of a campaign, always the same, by town, conditions and seed; log names are unique.
 
+    Where it chooses seeds it drives some of them, without sensors: a second or two for each.
+
     Raises:
         InputError: there is no such town.
     """
@@ -96,13 +101,17 @@ def plan_drives(campaign: Campaign) -> list[DrivePlan]:
     for town in dict.fromkeys(campaign.towns):
         load_town_map(town)  # names the known towns if it is none of them
         for conditions, seed in _town_drives(campaign, town, deck, driven):
-            rng = np.random.default_rng([seed, *f"{town} {conditions}".encode()])
-            vehicles, people = (
-                int(rng.integers(fewest, most + 1)) for fewest, most in (campaign.vehicles, campaign.people)
-            )
-            drive = (campaign.seconds, campaign.rate_hz)
-            plans.append(DrivePlan(town, seed, conditions, vehicles, people, *drive))
+            plans.append(_plan_drive(campaign, town, seed, conditions))
     return plans
+
+
+def _plan_drive(campaign: Campaign, town: str, seed: int, conditions: str | None) -> DrivePlan:
+    """One drive; its traffic is the same under all conditions."""
+    rng = np.random.default_rng([seed, *town.encode()])
+    vehicles, people = (
+        int(rng.integers(fewest, most + 1)) for fewest, most in (campaign.vehicles, campaign.people)
+    )
+    return DrivePlan(town, seed, conditions, vehicles, people, campaign.seconds, campaign.rate_hz)
 
 
 def _town_drives(
@@ -116,9 +125,11 @@ def _town_drives(
     if isinstance(campaign.seeds, int):
         drives = campaign.seeds * len(groups)
         routes = route_commands(town, campaign.seconds, range(SEEDS_PER_DRIVE * drives))
-        chosen = choose_balanced(routes, drives, driven)
-        for seed in chosen:
-            driven.update(routes[seed])
+        chosen = choose_balanced(
+            routes, drives, driven, lambda seed: commands_met(_plan_drive(campaign, town, seed, None))
+        )
+        for commands in chosen.values():
+            driven.update(commands)
         found = [(groups[i % len(groups)], seed) for i, seed in enumerate(chosen)]
     else:
         found = [(group, seed) for group in groups for seed in dict.fromkeys(campaign.seeds)]
@@ -135,32 +146,56 @@ def _deal_conditions() -> Iterator[str]:
 
 
 def route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Counter[Command]]:
-    """How often the route of a drive says what while it is recorded, for each of some seeds (1 ms each)."""
+    """About how often the route of a drive says what while it is recorded, for each of some seeds (some ms
+    each)."""
     lanes = build_lane_graph(load_town_map(town))
     starts = find_starts(lanes)
     routes = (plan_route(lanes, starts, seed, seconds) for seed in seeds)
-    before_m, until_m = driven_m(0.0), driven_m(seconds)  # traffic settles before the first frame
+    window_s = SETTLE_S, SETTLE_S + seconds
     return [
-        Counter(route.commands(lanes, until_m)) - Counter(route.commands(lanes, before_m)) for route in routes
+        Counter(route.commands(lanes, until_m, from_m))
+        for route in routes
+        for from_m, until_m in [(route.driven_m(lanes, s) for s in window_s)]
     ]
 
 
-def choose_balanced(routes: Sequence[Counter[Command]], count: int, so_far: Counter[Command]) -> list[int]:
-    """Indices of `count` routes whose commands, with those so far, even out.
+def commands_met(plan: DrivePlan) -> Counter[Command]:
+    """What the expert does at the forks that it passes while a drive is recorded."""
+    drive = Drive(Traffic(load_town_map(plan.town), plan.seed, plan.vehicles + 1, plan.people), plan.seconds)
+    for _ in drive.moments(plan.frames, 1 / plan.rate_hz):
+        pass
+    return Counter(drive.commands_met())
 
-    Greedy: the next route is the one that does most for the rarest command and least for the commonest. A
+
+def choose_balanced(
+    routes: Sequence[Counter[Command]],
+    count: int,
+    so_far: Counter[Command],
+    met: Callable[[int], Counter[Command]],
+) -> dict[int, Counter[Command]]:
+    """Indices of `count` routes whose commands, with those so far, even out, and the commands that are met.
+
+    Greedy: the next route is the one after which there are most commands, less the squares of how far each of
+    them is from their mean. What is met on a route is asked for only when the route would be chosen, of no
+    more than `TRIES_PER_DRIVE` for each; then its commands are known, and another one may be better. A
     command that none of the routes has is left out of account.
     """
-    kinds = sorted(set().union(*routes))
-    times = np.array([[route[kind] for kind in kinds] for route in routes]).reshape(len(routes), len(kinds))
+    kinds = list(Command)
+    times = np.array([[route[kind] for kind in kinds] for route in routes])
     total = np.array([so_far[kind] for kind in kinds], dtype=np.int64)
-    left = np.ones(len(routes), dtype=bool)
-    chosen: list[int] = []
-    for _ in range(count):
-        after = total + times
-        gain = 2 * after.min(axis=1, initial=after.max(initial=0)) - after.max(axis=1, initial=0)
-        best = int(np.where(left, gain, np.iinfo(np.int64).min).argmax())
-        left[best] = False
-        total = after[best]
-        chosen.append(best)
+    left, tries, known = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
+    chosen: dict[int, Counter[Command]] = {}
+    while len(chosen) < count:
+        after = (total + times)[:, times.any(axis=0)]
+        number, mean = after.sum(axis=1), after.mean(axis=1, keepdims=True) if after.size else 0.0
+        gain = np.where(left, number - np.sum((after - mean) ** 2, axis=1), -np.inf)
+        if tries == TRIES_PER_DRIVE:
+            gain[[i for i in range(len(routes)) if i not in known]] = -np.inf
+        best = int(gain.argmax())
+        if best not in known:
+            known[best], tries = met(best), tries + 1
+            times[best] = [known[best][kind] for kind in kinds]
+        else:
+            chosen[best], left[best], tries = known[best], False, 0
+            total = total + times[best]
     return chosen

@@ -70,10 +70,14 @@ class Audit:
         """The track ids involved."""
         return {name: sorted(found) for name, found in self._found.items()}
 
-    def watch(self, before: TrafficState, after: TrafficState) -> None:
-        """Look at one step."""
+    def watch(self, before: TrafficState, after: TrafficState, poses: Poses | None = None) -> None:
+        """Look at one step.
+
+        Args:
+            poses: where the vehicles are after it, if one of them is not on its path.
+        """
         then = self._poses_of(before)
-        now = self._traffic.poses(after)
+        now = poses or self._traffic.poses(after)
         self._poses = after, now
         v, w = before.vehicles, after.vehicles
         same = v.active & w.active & (v.track_id == w.track_id)

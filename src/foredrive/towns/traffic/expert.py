@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.errors import InputError
-from foredrive.scene import Category
+from foredrive.scene import Category, Command
 from foredrive.towns.actors import ActorState
 from foredrive.towns.traffic.fleet import Starts, place
 from foredrive.towns.traffic.lane_graph import LaneGraph
@@ -36,7 +36,6 @@ SETTLE_S = 6.0
 LONGEST_SETTLE_S = 30.0
 MOVING_MPS = 3.0
 """A drive begins once traffic has left its first, unlikely state and the ego vehicle moves."""
-AVERAGE_MPS = 7.0
 BEYOND_M = 60.0
 
 
@@ -80,7 +79,7 @@ class Drive:
         self.state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
         while not self._is_settled():
             self.state = traffic.step(self.state, LONGEST_STEP_S)
-        self.route = self._remaining()
+        self.route, self._passed = self._remaining(), self.state.route_passed
         self._steering_noise, self._sway = steering_noise, Sway()
         self._rng = np.random.default_rng((traffic.seed, 4))
 
@@ -90,14 +89,28 @@ class Drive:
         for index in range(count):
             if index:
                 for _ in range(steps):
-                    self._step(dt_s / steps)
+                    self.step(dt_s / steps)
             yield self._moment(index * dt_s)
 
-    def _step(self, dt_s: float) -> None:
+    def step(self, dt_s: float) -> None:
+        """Drive on, for no longer than `LONGEST_STEP_S`."""
         self.state = self._traffic.step(self.state, dt_s)
         if self._steering_noise > 0:
             speed, wheelbase = (float(x[0]) for x in (self._ego.speed_mps, self._ego.wheelbase_m))
             self._sway = step_sway(self._sway, speed, wheelbase, self._steering_noise, dt_s, self._rng)
+
+    def poses(self) -> Poses:
+        """Poses of all vehicles of `state`, with the ego vehicle where it sways to."""
+        poses, ego = self._traffic.poses(self.state), self._ego
+        T_world_ego = _axle_pose(poses) @ _beside(self._sway)
+        to_centre_ego = [float(ego.axle_to_centre_m[0]), 0.0, 0.5 * ego.size_lwh[0, 2], 1.0]
+        poses.axle_xyz[0], poses.forward[0] = T_world_ego[:3, 3], T_world_ego[:3, 0]
+        poses.centre_m[0] = T_world_ego[:3] @ to_centre_ego
+        return poses
+
+    def commands_met(self) -> list[Command]:
+        """What was done at the forks that were passed since the drive began."""
+        return self.route.commands_on(self._traffic.lanes, 0, self.state.route_passed - self._passed)
 
     @property
     def _ego(self) -> Vehicles:
@@ -147,12 +160,7 @@ def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> R
     """The route of a drive, which depends on nothing else."""
     rng = np.random.default_rng((seed, 3))
     fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
-    return draw_route(lanes, starts, rng, fastest_m, driven_m(seconds))
-
-
-def driven_m(seconds: float) -> float:
-    """About how much of its route a drive follows, from the route's start on."""
-    return AVERAGE_MPS * (seconds + SETTLE_S)
+    return draw_route(lanes, starts, rng, fastest_m, SETTLE_S, SETTLE_S + seconds)
 
 
 def _ego_vehicle(traffic: Traffic, route: Route) -> Vehicles:

@@ -24,6 +24,10 @@ SHORTEST_CHANGE_M = 16.0
 STOPPING_MPS2 = 2.5
 """Whoever need not change does so only where there is room to stop this gently after it."""
 NEAREST_M = 2.0
+COURTEOUS_MPS2 = 1.5
+"""Drivers brake no harder than this to let somebody in who has to change lanes."""
+COURTEOUS_GAP_M = 1.0
+"""And leave this much more room than they would behind somebody in their lane."""
 SETTLED_M = 60.0
 """Drivers stay in a lane for this long before they change again, unless they have to."""
 LONGEST_STRETCH_M = 600.0
@@ -34,6 +38,8 @@ LIKES_TO_MPS2 = 0.5
 """What it is worth to be in the lane of one's route, towards its end and far from it."""
 FLAT_M = 0.3
 """Lanes further apart in height are not side by side."""
+TIGHTEST_M = 30.0
+"""Nobody changes lanes where one of them has a curve of a smaller radius: they are not equally long there."""
 
 
 class Stretches(NamedTuple):
@@ -57,10 +63,12 @@ class Gaps(NamedTuple):
 
 
 def find_stretches(graph: LaneGraph) -> Stretches:
-    """Where lanes may be changed: outside of junctions, over lines that may be crossed, with room to wait."""
+    """Where lanes may be changed: outside of junctions and tight curves, over lines that may be crossed, with
+    room to wait."""
     sides = graph.sides.lane
     level = np.abs(graph.xyz[graph.first, 2] - graph.xyz[graph.first[sides], 2]) < FLAT_M
-    open_to = graph.may_cross & (sides >= 0) & ~graph.contested & ~graph.contested[sides] & level
+    possible = ~graph.contested & (graph.tightest_m >= TIGHTEST_M)
+    open_to = graph.may_cross & (sides >= 0) & possible & possible[sides] & level
     target = np.where(open_to, sides, -1)
     room = np.where(open_to, graph.length_m, 0.0)
     goes_back = np.zeros(room.shape, dtype=np.bool_)
@@ -166,7 +174,9 @@ def _find_gaps(motion, lanes, target, side):
                     over = k > BEHIND and -front_j > motion.to_clear_m[j]
                     if over or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
                         continue
-                    front_j = abreast(lane_j, front_j, motion.beside[j], sides)
+                    # From its rear, as above: else nobody would be ahead of it or behind in a curve.
+                    length_j = front[j] - rear[j]
+                    front_j = abreast(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
                 is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
                 if is_behind and centre - half - front_j < follower_gap[i]:
                     follower[i], follower_gap[i] = j, centre - half - front_j
@@ -264,6 +274,25 @@ def choose_change(
         if gain.max() > least:
             best, least = (int(np.argmax(gain)), side), float(gain.max())
     return best
+
+
+def let_in(
+    graph: LaneGraph,
+    vehicles: Vehicles,
+    starts_m: Float64[np.ndarray, "N W"],
+    now: Situation,
+    target: Int[np.ndarray, "N"],
+    side: int,
+) -> Float64[np.ndarray, "N"]:
+    """Accelerations that N drivers do not exceed, so that those who have to change to the lanes `target` (-1:
+    they need not) find a gap; infinite for all but the ones behind those gaps."""
+    limit = np.full(len(target), np.inf)
+    gaps = find_gaps(graph, vehicles, starts_m, target, side)
+    who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= NEAREST_M))
+    n = gaps.follower[who]
+    wanted = behind(vehicles, n, now.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M)
+    np.minimum.at(limit, n, np.maximum(wanted, -COURTEOUS_MPS2))
+    return limit
 
 
 def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> Vehicles:

@@ -18,8 +18,10 @@ CATCH_UP = 1.3
 ACCEPTED_BRAKING_MPS2 = 2.0
 REACTION_S = 1.0
 MARGIN_M = 1.0
-YIELD_BRAKING_MPS2 = 4.0
-"""Drivers stop for people on a crossing unless they would have to brake harder than this."""
+YIELD_BRAKING_MPS2, EMERGENCY_BRAKING_MPS2 = 3.0, 4.0
+"""Drivers stop for people who come to their lane if they need not brake harder than the first once they have
+reacted, `YIELD_S` later; else those wait. In their lane: if they need not brake harder than the second."""
+YIELD_S = 0.5
 IN_THE_WAY_M = 0.3
 ALONG_CROSSING_M = 4.0
 SLOW_MPS = 3.0
@@ -202,7 +204,8 @@ def _crossing_gap(motion, passing, crossers):
         if not motion.active[i]:
             continue
         speed, length = motion.speed_mps[i], motion.front_m[i] - motion.rear_m[i]
-        too_late = speed**2 / (2 * YIELD_BRAKING_MPS2)
+        too_late = speed**2 / (2 * EMERGENCY_BRAKING_MPS2)
+        too_sudden = speed**2 / (2 * YIELD_BRAKING_MPS2) + YIELD_S * speed
         for k in range(BEHIND, WINDOW):
             lane, start = motion.path[i, k], motion.starts_m[i, k] - motion.front_m[i]
             if lane < 0 or start > LOOK_M:
@@ -216,7 +219,8 @@ def _crossing_gap(motion, passing, crossers):
                     near, far = walk_span[m, 0] - s[p], walk_span[m, 1] - s[p]
                     if onward[p] < 0:
                         near, far = -far, -near
-                    if walk[p] == crossings[m] and far > 0 and near < pace[p] * (cleared_s + SPARE_S):
+                    comes = near <= 0 or (to_go >= too_sudden and near < pace[p] * (cleared_s + SPARE_S))
+                    if walk[p] == crossings[m] and far > 0 and comes:
                         gap[i] = to_go
     return gap
 
@@ -257,6 +261,7 @@ def _walks_into_vehicle(
             there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
             to_go = starts_m + graph.lane_span_m[m, 0] - vehicles.front_m[:, None]
             passed = starts_m + graph.lane_span_m[m, 1] < vehicles.rear_m[:, None]
-            too_late = (vehicles.speed_mps**2 / (2 * YIELD_BRAKING_MPS2))[:, None]
-            blocked[i] |= bool((there & ~passed & (to_go < np.maximum(too_late, IN_THE_WAY_M))).any())
+            speed = vehicles.speed_mps[:, None]
+            too_sudden = speed**2 / (2 * YIELD_BRAKING_MPS2) + YIELD_S * speed
+            blocked[i] |= bool((there & ~passed & (to_go < np.maximum(too_sudden, IN_THE_WAY_M))).any())
     return blocked

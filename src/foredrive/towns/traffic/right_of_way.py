@@ -25,7 +25,7 @@ PLANNED_BRAKING_MPS2 = 1.5
 """Right of way is asked for `EARLY_M` before one would have to brake this hard for the line."""
 LIGHT_BRAKING_MPS2 = 3.0
 """Whoever would have to brake harder than this for a yellow light drives on."""
-LIGHT_REACTION_S = 0.5
+REACTION_S = 0.5
 YIELD_BRAKING_MPS2 = 3.0
 """Inside, rank does not count for whoever would have to brake harder than this: the other waits."""
 LEFT_WAITS_S = 2.0
@@ -154,7 +154,7 @@ def _withdraw(
 
 
 def _can_stop(vehicles: Vehicles, gap_m: Float64[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    needed = vehicles.speed_mps**2 / (2 * LIGHT_BRAKING_MPS2) + LIGHT_REACTION_S * vehicles.speed_mps
+    needed = vehicles.speed_mps**2 / (2 * LIGHT_BRAKING_MPS2) + REACTION_S * vehicles.speed_mps
     return (gap_m >= 0) & (gap_m >= needed)
 
 
@@ -247,10 +247,11 @@ def _inside_gap(motion, lanes, granted, rank):
     length, sides, _, conflicts = lanes
     on = link_occupants(motion, length, sides, granted)
     gap = np.full(len(granted), np.inf)
-    to_stop = motion.speed_mps**2 / (2 * YIELD_BRAKING_MPS2)
+    to_stop = motion.speed_mps**2 / (2 * YIELD_BRAKING_MPS2) + REACTION_S * motion.speed_mps
     for i in range(len(granted)):
         if not motion.active[i]:
             continue
+        goes_before = _goes_before(i, granted[i], to_stop[i], motion, conflicts, on)
         for k in range(BEHIND, BEHIND + granted[i] + 1):
             lane = path[i, k]
             for m in range(conflicts.first[lane], conflicts.first[lane + 1]):
@@ -261,11 +262,33 @@ def _inside_gap(motion, lanes, granted, rank):
                     entry = on.following[entry]
                     to_go_j = conflicts.other_enter_m[m] + INSIDE_M - (rear_j + front[j] - rear[j])
                     in_the_way = j != i and rear_j < conflicts.other_clear_m[m]
-                    yields = rank[j] < rank[i] and to_go >= to_stop[i]
+                    yields = rank[j] < rank[i] and to_go >= to_stop[i] and not goes_before[j]
                     goes_first = in_the_way and (to_go_j < to_stop[j] or yields)
                     if goes_first and not _is_behind(j, at, i, path, starts, rear):
                         gap[i] = to_go
     return gap
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _goes_before(i, granted, to_stop, motion, conflicts, on):
+    """Whom vehicle i is in the way of, or soon will be: who waits for it there goes first nowhere else."""
+    goes_before = np.zeros(len(motion.active), np.bool_)
+    for k in range(BEHIND, BEHIND + granted + 1):
+        lane, start = motion.path[i, k], motion.starts_m[i, k]
+        for m in range(conflicts.first[lane], conflicts.first[lane + 1]):
+            if start + conflicts.enter_m[m] + INSIDE_M - motion.front_m[i] >= to_stop:
+                continue
+            other, clear = conflicts.other[m], np.inf
+            for n in range(conflicts.first[other], conflicts.first[other + 1]):
+                if conflicts.other[n] == lane:
+                    clear = conflicts.other_clear_m[n]
+            entry = on.head[other] if motion.rear_m[i] - start < clear else -1
+            while entry >= 0:
+                j = on.who[entry]
+                goes_before[j] |= j != i and on.rear_m[entry] < conflicts.other_clear_m[m]
+                entry = on.following[entry]
+    return goes_before
 
 
 @numba.njit(cache=True)

@@ -1,5 +1,6 @@
 """Routes to follow: random ways over the lane graph that turn left, right and go straight alike."""
 
+import itertools
 from collections import Counter
 from dataclasses import dataclass
 
@@ -14,10 +15,17 @@ from foredrive.towns.traffic.leaders import abreast
 
 CANDIDATES = 48
 ROUTE_SPACING_M = 1.0
-PLANNED_CHANGE_S = 4.0
+PLANNED_CHANGE_S, SHORTEST_CHANGE_M = 4.0, 45.0
+"""Routes change lanes over so long: on any shorter way 3.5 m aside would look like a turn."""
 CHANGE_ROOM_M = 30.0
 CHANGE_ROOM_S = 5.0
 """Routes change lanes where a lane is this long and takes this much longer to drive."""
+BUSY = 1.3
+LIGHT_S, GIVE_WAY_S = 15.0, 6.0
+"""What other traffic makes of the time that a route takes, and what it takes longer for each light and each
+sign to wait at: means over hours in all towns, from 30 % less (Town02) to 60 % more (Town05)."""
+LONG_DRIVE_M = 600.0
+"""Routes of longer drives have all commands, of shorter ones two."""
 
 
 @dataclass(frozen=True)
@@ -45,41 +53,62 @@ class Route:
             before = graph.position(
                 np.array([old]), np.array([abreast(lane[k], along[k], beside, graph.sides)])
             )
-            over_m = PLANNED_CHANGE_S * graph.limit_mps[old]
-            x = np.clip((along[k] - (self.start_m if at[k] == 0 else 0.0)) / over_m, 0.0, 1.0)
+            from_m = self.start_m if at[k] == 0 else 0.0
+            over_m = max(SHORTEST_CHANGE_M, PLANNED_CHANGE_S * graph.limit_mps[old])
+            over_m = min(over_m, graph.length_m[lane[k]] - from_m)
+            x = np.clip((along[k] - from_m) / over_m, 0.0, 1.0)
             points[k] += (1 - x**3 * (10 - 15 * x + 6 * x**2)) * (before[0] - points[k])
         return points
 
-    def commands(self, graph: LaneGraph, within_m: float) -> list[Command]:
-        """What to do at each fork that is met within a distance from the start."""
+    def commands(self, graph: LaneGraph, until_m: float, from_m: float = 0.0) -> list[Command]:
+        """What to do at each fork that is met between two distances from the start."""
         length = graph.length_m[self.lanes]
         begins = np.cumsum(length) - length - self.start_m
+        first, end = np.searchsorted(begins[1:], [from_m, until_m])
+        return self.commands_on(graph, int(first), int(end))
+
+    def commands_on(self, graph: LaneGraph, first: int, end: int) -> list[Command]:
+        """What to do at each fork on the way from lane number `first` to number `end`."""
         return [
             graph.command(int(lane))
-            for lane, before, begin in zip(self.lanes[1:], self.lanes[:-1], begins[1:], strict=True)
-            if begin < within_m
-            and (graph.successor_count[before] > 1 or graph.command(int(lane)) != Command.STRAIGHT)
+            for before, lane in itertools.pairwise(self.lanes[first : end + 1])
+            if graph.successor_count[before] > 1 or graph.command(int(lane)) != Command.STRAIGHT
         ]
+
+    def driven_m(self, graph: LaneGraph, seconds: float) -> float:
+        """About how much of the route is driven in a time, others on the road and lights included."""
+        pace_s = np.add.reduceat(1 / graph.speed_mps, graph.first) / graph.count
+        length = graph.length_m[self.lanes].copy()
+        length[0] -= self.start_m
+        waits_s = np.array([0.0, LIGHT_S, GIVE_WAY_S, GIVE_WAY_S])[graph.control[self.lanes]]
+        waits_s[0] = 0.0
+        steps_s = np.stack([waits_s, BUSY * pace_s[self.lanes] * length], axis=1)
+        steps_m = np.stack([np.zeros(len(length)), length], axis=1)
+        at_s, at_m = (np.append(0.0, np.cumsum(steps)) for steps in (steps_s, steps_m))
+        return float(np.interp(seconds, at_s, at_m))
 
 
 def draw_route(
-    graph: LaneGraph, starts: Starts, rng: np.random.Generator, length_m: float, driven_m: float
+    graph: LaneGraph, starts: Starts, rng: np.random.Generator, length_m: float, from_s: float, until_s: float
 ) -> Route:
     """A random route of at least `length_m`.
 
-    Of some random starts the first is taken whose route turns and also goes on in another way within the
-    `driven_m` that will be driven of it; if there is none, the one that turns most often.
+    Of some random starts the first is taken whose route turns and also goes on in another way, or on long
+    drives in all ways, in what is driven of it from `from_s` to `until_s`; if there is none, the one with
+    most ways, and if there is but one way, with one drawn at random.
     """
-    best, most_turns = None, -1
+    best, most = None, (-1, False, -1)
+    wanted = rng.choice(list(Command))
     stretches = find_stretches(graph)
     for start in rng.choice(len(starts.lane), CANDIDATES):
         route = _roll_out(graph, stretches, int(starts.lane[start]), float(starts.s_m[start]), rng, length_m)
-        commands = route.commands(graph, driven_m)
-        turns = len(commands) - commands.count(Command.STRAIGHT)
-        if turns and len(set(commands)) > 1:
+        from_m, until_m = route.driven_m(graph, from_s), route.driven_m(graph, until_s)
+        commands = route.commands(graph, until_m, from_m)
+        turns, ways = len(commands) - commands.count(Command.STRAIGHT), len(set(commands))
+        if turns and ways >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
             return route
-        if turns > most_turns:
-            best, most_turns = route, turns
+        if (ways, wanted in commands, turns) > most:
+            best, most = route, (ways, wanted in commands, turns)
     assert best is not None
     return best
 

@@ -18,6 +18,7 @@ from foredrive.towns.traffic.lane_changes import (
     begin_change,
     choose_change,
     find_stretches,
+    let_in,
     room_to_change_m,
     who_may_change,
 )
@@ -112,6 +113,8 @@ class Traffic:
         if to_route is not None:
             halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
         situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
+        courtesy_mps2 = self._courtesy_mps2(v, to_route, situation, starts_m)
+        wanted_mps2 = np.minimum(situation.wanted_mps2(v), courtesy_mps2)
         halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
         v = dataclasses.replace(
             v,
@@ -129,7 +132,7 @@ class Traffic:
             people=people,
         )
         state = self._begin_change(state, situation, rng)
-        vehicles = drive(state.vehicles, situation.wanted_mps2(v), dt_s)
+        vehicles = drive(state.vehicles, wanted_mps2, dt_s)
         state = dataclasses.replace(state, vehicles=vehicles)
         state = self._change_lanes_at_ends(state, rng)
         return self._turnover.renew(state, rng)
@@ -215,6 +218,20 @@ class Traffic:
             room_m = self._stretches.room_m[:, v.lane[0]] - v.s_m[0]
             urge[:, 0] = np.where(room_m > 2 * enough_m, 0.0, -np.inf)
         return urge
+
+    def _courtesy_mps2(
+        self,
+        v: Vehicles,
+        to_route: tuple[int, float] | None,
+        situation: Situation,
+        starts_m: Float64[np.ndarray, "N W"],
+    ) -> Float64[np.ndarray, "N"]:
+        """What accelerations are limited to, so that vehicle 0 can change lanes where it soon has to."""
+        if to_route is None or to_route[1] > SETTLED_M + URGENT_S * v.speed_mps[0]:
+            return np.full(len(v.active), np.inf)
+        side, target = to_route[0], np.full(len(v.active), -1)
+        target[0] = self._stretches.target[side, v.lane[0]]
+        return let_in(self.lanes, v, starts_m, situation, target, side)
 
     def _to_route(self, state: TrafficState) -> tuple[int, float] | None:
         """To which side vehicle 0 has to change for its route, and how far ahead it can still begin."""

@@ -115,6 +115,7 @@ class Turnover:
             leader_mps = v.speed_mps[ahead.leader[row]]
             speed[row] = min(speed[row], np.sqrt(leader_mps**2 + 2 * NEWCOMER_BRAKING_MPS2 * room_m))
         v = dataclasses.replace(v, speed_mps=speed)
+        ahead = find_leaders(self._lanes, v, starts_m)  # whom others brake for depends on its speed
         no_halt = np.full(len(speed), np.inf)
         wanted = see_ahead(self._lanes, v, starts_m, ahead, no_halt).wanted_mps2(v)
         concerned = ((ahead.leader == row) | (ahead.limiting == row)) & v.active

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.towns.traffic.car_following import SLOWING_TIME_S
 from foredrive.towns.traffic.centrelines import SLOWING_MPS2
 from foredrive.towns.traffic.lane_graph import LaneGraph
 
@@ -226,11 +227,15 @@ def _left_of(forward: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 def speed_to_drive(
     graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
 ) -> Float64[np.ndarray, "N"]:
-    """The wanted speed: the profile where the vehicle is, and slowing in time for the lanes ahead of it."""
-    here = graph.speed(vehicles.lane, vehicles.s_m)
+    """The wanted speed: the profile where the vehicle is, and slowing in time for the lanes ahead of it.
+
+    Drivers look `SLOWING_TIME_S` ahead: so much later they drive the speed that they want now.
+    """
+    soon_m = vehicles.s_m + SLOWING_TIME_S * vehicles.speed_mps
+    here = np.minimum(graph.speed(vehicles.lane, vehicles.s_m), graph.speed(vehicles.lane, soon_m))
     ahead = vehicles.path[:, BEHIND + 1 :]
     entry = np.where(ahead >= 0, graph.speed_mps[graph.first[ahead]], np.inf)
-    to_go = starts_m[:, BEHIND + 1 :] - vehicles.s_m[:, None]
+    to_go = starts_m[:, BEHIND + 1 :] - soon_m[:, None]
     in_time = np.sqrt(entry**2 + 2 * SLOWING_MPS2 * np.maximum(to_go, 0.0)).min(axis=1)
     wanted = np.minimum(vehicles.top_speed_mps, vehicles.haste * np.minimum(here, in_time))
     return np.minimum(wanted, vehicles.steerable_mps)

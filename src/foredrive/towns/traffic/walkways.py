@@ -257,7 +257,7 @@ def _lane_meetings(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: Lane
             if not near.any():
                 continue
             on_lane = np.flatnonzero(near)[[0, -1]] * lanes.step_m[lane]
-            on_walk = way.project(way.intersection(lines[lane]).representative_point())
-            rows.append([walk, lane, *on_lane, on_walk - ACROSS_LANE_M, on_walk + ACROSS_LANE_M])
+            on_walk = shapely.line_locate_point(way, shapely.points(points[near, :2]))  # some run along it
+            rows.append([walk, lane, *on_lane, on_walk.min() - ACROSS_LANE_M, on_walk.max() + ACROSS_LANE_M])
     table = np.array(rows).reshape(-1, 6)
     return table[np.lexsort((table[:, 0], table[:, 1]))]
