@@ -25,7 +25,7 @@ from foredrive.scene import Clip
 
 PROGRAM, MODEL, FACTS = "model.pt2", "model.onnx", "export.json"
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-ROUNDS = 5
+ROUNDS = 3
 """How often each clip is run when time is taken."""
 
 Infer = Callable[[GraphInputs], GraphOutputs]

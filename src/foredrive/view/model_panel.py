@@ -1,5 +1,6 @@
 """The part of the page that shows what a model holds to be the case, and renders it from where one looks."""
 
+import math
 import threading
 from typing import Literal, cast
 
@@ -9,6 +10,7 @@ import viser
 from jaxtyping import Float
 from viser.transforms import SO3
 
+from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.scene import CameraRig
 from foredrive.view import palette
 from foredrive.view.log_times import LogTimes
@@ -35,13 +37,16 @@ class ModelPanel:
         self._index, self._drawing = 0, threading.Lock()
         gui, steps, spec = server.gui, self._observer.steps, self.spec
         low_m, high_m = spec.lower_m[2], spec.upper_m[2] - spec.voxel_m
+        above_road = low_m + spec.voxel_m * math.ceil((ABOVE_GROUND_M - low_m) / spec.voxel_m)
         with gui.add_folder("Model"):
             self._note = gui.add_markdown("")
             self.frame = gui.add_slider("imagined frame", 0, max(steps, 1), 1, 0, disabled=steps == 0)
             self.boxes = {name: gui.add_checkbox(name, True) for name in NODES}
             self.colour_by = gui.add_dropdown("coloured by", ("height", "features"))
             self.above = gui.add_slider("probability >", 0.05, 0.95, 0.05, 0.5)
-            self.lowest_m = gui.add_slider("height > (m)", low_m, high_m, spec.voxel_m, low_m)
+            self.lowest_m = gui.add_slider(
+                "height, m >", low_m, high_m, spec.voxel_m, min(above_road, high_m)
+            )
             render = gui.add_button("Render from here", hint="what the model would see with your eyes")
             self._rendered = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
         for slider in (self.frame, self.above, self.lowest_m):

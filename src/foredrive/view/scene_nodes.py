@@ -15,7 +15,7 @@ from foredrive.scene import Clip, MapKind, Trajectory
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, path_points
 
-POINT_M = 0.09
+POINT_M = 0.06
 FRUSTUM_M = 1.2
 EGO_HEIGHT_M = 1.5
 PATH_LIFT_M = 0.15

@@ -18,6 +18,7 @@ from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_
 LAYERS = ("lidar", "boxes", "map", "cameras", "driven")
 PLAY_PERIOD_S = 0.1
 PORTS, PORTS_TRIED = 65536, 100
+AMBIENT_LIGHT = 0.7
 START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
 
@@ -62,6 +63,7 @@ class Viewer:
             self.server = viser.ViserServer(host=host, port=self.port, label=times.name, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.scene.configure_environment_map(hdri=None)  # lights that nobody has to download
+        self.server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
         self.server.initial_camera.position = START_EYE_M
         self.server.initial_camera.look_at = START_TARGET_M
         show_ego(self.server.scene)

@@ -1,0 +1,66 @@
+"""Draws docs/nemo_volume.jpg: `python docs/draw_volume.py LOG RUN SECONDS [SECONDS ...]`."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from foredrive.data import find_logs
+from foredrive.recipes import open_run
+from foredrive.view.example_panel import front_camera
+from foredrive.view.image_drawing import Camera, resize
+from foredrive.view.log_times import LogTimes
+from foredrive.view.volume_nodes import shown_voxels
+from foredrive.view.voxel_drawing import draw_volume_pca, draw_voxels
+
+HERE = Path(__file__).parent
+CELL_HW = (198, 352)
+PCA_PX, GAP = 198, 6
+NAMES = ("camera", "rendered from the volume", "PCA, mean over Z", "occupancy now", "imagined, 1 s ahead")
+
+
+def row(times: LogTimes, t_s: float) -> list[np.ndarray]:
+    """What the front camera saw, and what the model made of it."""
+    index = times.nearest(t_s)
+    clip, vision = times.clip(index), times.vision(index)
+    if vision is None or times.observer is None or times.run is None or (c := front_camera(clip)) is None:
+        sys.exit(f"no view of {times.name} at {t_s:g} s")
+    spec, camera = times.run.recipe.clips.voxels, Camera.of(clip.rig[clip.now], c).resized(CELL_HW)
+    one = clip.rig[clip.now, c : c + 1]
+    rig = dataclasses.replace(one, K=camera.K[None], names=(clip.rig.names[c],), size_hw=CELL_HW)
+    last = len(vision.occupancy_logit) - 1
+    occupied = [shown_voxels(vision, k, spec, 0.5, spec.lower_m[2]) for k in (0, last)]
+    return [
+        resize(clip.images[clip.now, c].permute(1, 2, 0).numpy(), CELL_HW),
+        (255 * times.observer.render(vision, 0, rig)[0]).to(torch.uint8).numpy(),
+        resize(draw_volume_pca(vision.volume[0]), (PCA_PX, PCA_PX)),
+        *(draw_voxels(voxels, spec, CELL_HW) for voxels in occupied),
+    ]
+
+
+def sheet(rows: list[list[np.ndarray]]) -> Image.Image:
+    """Rows of pictures of one height, named above."""
+    head = 26
+    left = np.cumsum([0, *(cell.shape[1] + GAP for cell in rows[0])])
+    page = Image.new("RGB", (int(left[-1]) - GAP, head + len(rows) * (CELL_HW[0] + GAP) - GAP), "white")
+    draw, font = ImageDraw.Draw(page), ImageFont.load_default(15)
+    for x, name in zip(left, NAMES, strict=False):
+        draw.text((int(x) + 4, 4), name, font=font, fill="black")
+    for y, cells in enumerate(rows):
+        for x, cell in zip(left, cells, strict=False):
+            page.paste(Image.fromarray(cell), (int(x), head + y * (CELL_HW[0] + GAP)))
+    return page
+
+
+def main(log: Path, run: Path, *seconds: float) -> None:
+    """One row a time."""
+    times = LogTimes(find_logs(log)[0], CELL_HW[1], open_run(run))
+    page = sheet([row(times, t_s) for t_s in seconds])
+    page.save(HERE / "nemo_volume.jpg", quality=88, optimize=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *map(float, sys.argv[3:]))
