@@ -1,7 +1,7 @@
 """How long set likelihoods take, beside a Murty on SciPy's assignments and the best assignment alone.
 
 Times are of the processor, on one thread, so that others on the machine count for less, and the least of
-several runs: `foredrive bench sets_speed`.
+several runs: `foredrive bench sets-speed`.
 """
 
 import itertools

@@ -2,7 +2,7 @@
 
 A detection head on a volume of lidar hits learns from drives in towns and is judged in Town05, which it has
 not seen. Both arms that are trained go on from the same head for equally many steps:
-`foredrive bench sets_training`.
+`foredrive bench sets-training`.
 """
 
 import copy
