@@ -6,7 +6,11 @@ from typing import Literal
 import pytest
 import torch
 
-from foredrive.models.planner import FutureAttention, VolumePlanner, _headings
+from foredrive.models.ego_mlp import EgoMLP
+from foredrive.models.planner import FutureAttention, PathReading, VolumePlanner, _headings
+from foredrive.scene import VoxelSpec
+
+SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
 
 
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
@@ -34,7 +38,7 @@ def test_the_next_volume_matters_where_it_is_looked_at(
     torch.manual_seed(0)
     planner = VolumePlanner(
         channels=4,
-        shape_zyx=(2, 8, 8),
+        spec=SPEC,
         width=16,
         layers=1,
         heads=2,
@@ -58,7 +62,7 @@ def test_where_nothing_is_learned_it_goes_straight_on() -> None:
     """With a last layer of zeros it is constant velocity, and standing still where the speed is unknown."""
     planner = VolumePlanner(
         channels=4,
-        shape_zyx=(2, 8, 8),
+        spec=SPEC,
         width=16,
         layers=1,
         heads=2,
@@ -76,6 +80,54 @@ def test_where_nothing_is_learned_it_goes_straight_on() -> None:
     assert plan.xy[0, 0].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
     assert not plan.xy[1].any()
     assert not plan.yaw.any()
+
+
+def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
+    torch.manual_seed(0)
+    ego_mlp = EgoMLP(past_frames=1, horizon_steps=3, dt_s=0.5)
+    planner = VolumePlanner(
+        channels=4,
+        spec=SPEC,
+        width=16,
+        layers=1,
+        heads=2,
+        future="none",
+        pool=(1, 2, 2),
+        history=1,
+        horizon_steps=3,
+        dt_s=0.5,
+        ego_mlp=ego_mlp,
+        look_m=(1.0, 3.0),
+    ).eval()
+    x, y, yaw, before, now, known = -2.5, 0.1, 0.05, 4.0, 6.0, torch.tensor([True, False])
+    past, speed = torch.tensor([[[x, y, yaw, before]]]).expand(2, 1, 4), torch.full((2,), now)
+    command = torch.tensor([1, 1])
+    plan = planner(torch.randn(2, 4, 2, 8, 8), None, command, known, speed, torch.tensor([True, True]), past)
+    status = torch.tensor([[x, y, yaw, before, now, 0, 1, 0], [x, y, yaw, before, now, 0, 0, 0]])
+    torch.testing.assert_close(plan.xy[:, 0], ego_mlp(status)[..., :2])
+
+
+def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
+    """3 m ahead, then 4 m to the left: distances 1.5, 5 and 9 m lie on both legs and 2 m beyond."""
+    reading = PathReading(SPEC, 8, (1.5, 5.0, 9.0))
+    places = reading.places(torch.tensor([[[3.0, 0.0], [3.0, 4.0]]]))[0]
+    right, middle, left = places.unbind(1)
+    torch.testing.assert_close(middle, torch.tensor([[1.5, 0.0], [3.0, 2.0], [3.0, 6.0]]))
+    torch.testing.assert_close(left, torch.tensor([[1.5, 3.0], [0.0, 2.0], [0.0, 6.0]]))
+    torch.testing.assert_close(right, torch.tensor([[1.5, -3.0], [6.0, 2.0], [6.0, 6.0]]))
+    standing = reading.places(torch.zeros(1, 2, 2))[0, :, 1]  # looks straight ahead
+    torch.testing.assert_close(standing, torch.tensor([[1.5, 0.0], [5.0, 0.0], [9.0, 0.0]]))
+
+
+def test_what_stands_on_the_path_matters_and_what_stands_elsewhere_does_not() -> None:
+    torch.manual_seed(0)
+    reading = PathReading(SPEC, 8, (1.0, 2.5))
+    plane, path = torch.randn(1, 8, 8, 8), torch.tensor([[[2.5, 0.0]]])
+    on_path, elsewhere = plane.clone(), plane.clone()
+    on_path[0, 4, 6] += 1  # x 2 to 3 m, y 0 to 1 m
+    elsewhere[0, 4, 1] += 1  # behind
+    assert not torch.allclose(reading(on_path, path), reading(plane, path))
+    torch.testing.assert_close(reading(elsewhere, path), reading(plane, path))
 
 
 SEEN = torch.ones(1, dtype=torch.bool)

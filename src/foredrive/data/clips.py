@@ -109,7 +109,7 @@ class ClipDataset(Dataset[Example]):
         labels = [self._voxel_labels(log, frame) for frame in frames]
         occupied = torch.stack([label.occupied for label in labels])
         return Example(
-            clip=self._clip(number, frames),
+            clip=self.clip(index),
             occupancy=VoxelGrid(
                 spec=self.config.voxels,
                 values=occupied[:, None].float(),
@@ -141,7 +141,13 @@ class ClipDataset(Dataset[Example]):
         future = log.driven_future(now, self.config.horizon_steps, self.config.horizon_dt_s)
         return command_at(log, now, future)
 
-    def _clip(self, number: int, frames: list[int]) -> Clip:
+    def clip(self, index: int) -> Clip:
+        """Read one clip without its labels.
+
+        Raises:
+            InputError: on data that cannot be read.
+        """
+        number, frames = self._clips[index]
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
         images, image_valid, rig = self._read_cameras(number, frames)

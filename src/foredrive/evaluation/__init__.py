@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         DrivenStatus,
         StandStill,
         fit_ego_mlp,
+        read_status,
         read_training_set,
     )
     from foredrive.evaluation.bench import Benchmark, run_benchmark
@@ -32,6 +33,7 @@ __all__ = [
     "fit_ego_mlp",
     "peak_rss_gib",
     "print_summary",
+    "read_status",
     "read_summary",
     "read_training_set",
     "run_benchmark",
@@ -41,7 +43,14 @@ __all__ = [
 __getattr__ = on_demand(
     __name__,
     {
-        "baselines": ("ConstantVelocity", "DrivenStatus", "StandStill", "fit_ego_mlp", "read_training_set"),
+        "baselines": (
+            "ConstantVelocity",
+            "DrivenStatus",
+            "StandStill",
+            "fit_ego_mlp",
+            "read_status",
+            "read_training_set",
+        ),
         "bench": ("Benchmark", "run_benchmark"),
         "predictor": ("Prediction", "Predictor"),
         "provenance": ("collect_provenance", "peak_rss_gib"),

@@ -1,6 +1,6 @@
 """What a model has to beat: planners that see nothing, and what the training set alone tells."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -73,6 +73,28 @@ class DrivenStatus(Record):
     valid: Bool[Tensor, "N T"]
 
 
+def read_status(clips: Iterable[Clip], past_frames: int) -> DrivenStatus:
+    """Ego status and what was driven, of batches of clips.
+
+    Raises:
+        InputError: if there is none.
+    """
+    rows = [_driven_status(clip, past_frames) for clip in clips]
+    if not rows:
+        raise InputError("the training set is empty")
+    return DrivenStatus(
+        torch.cat([row.status for row in rows]),
+        torch.cat([row.driven for row in rows]),
+        torch.cat([row.valid for row in rows]),
+    )
+
+
+def _driven_status(clip: Clip, past_frames: int) -> DrivenStatus:
+    future = clip.future
+    driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
+    return DrivenStatus(ego_status(clip, past_frames), driven, future.valid[:, 0])
+
+
 def read_training_set(
     loader: Iterable[Example], frames: int, past_frames: int
 ) -> tuple[VoxelPrior, DrivenStatus]:
@@ -83,22 +105,18 @@ def read_training_set(
         past_frames: of the ego status.
     """
     prior: VoxelPrior | None = None
-    rows: list[DrivenStatus] = []
-    for example in loader:
-        labels = labels_from_now(example.occupancy, example.clip, frames)
-        prior = prior or VoxelPrior(frames, labels.spec)
-        prior.add(labels)
-        future = example.clip.future
-        driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
-        rows.append(DrivenStatus(ego_status(example.clip, past_frames), driven, future.valid[:, 0]))
-    if prior is None:
-        raise InputError("the training set is empty")
-    joined = DrivenStatus(
-        torch.cat([row.status for row in rows]),
-        torch.cat([row.driven for row in rows]),
-        torch.cat([row.valid for row in rows]),
-    )
-    return prior, joined
+
+    def clips() -> Iterator[Clip]:
+        nonlocal prior
+        for example in loader:
+            labels = labels_from_now(example.occupancy, example.clip, frames)
+            prior = prior or VoxelPrior(frames, labels.spec)
+            prior.add(labels)
+            yield example.clip
+
+    status = read_status(clips(), past_frames)
+    assert prior is not None
+    return prior, status
 
 
 def fit_ego_mlp(

@@ -1,7 +1,7 @@
 """A planner that sees nothing but the ego vehicle's own status."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
@@ -34,8 +34,18 @@ def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
     Accelerations follow from the speeds.
     """
     poses, speeds = ego_motion(clip, past_frames)
-    command = nn.functional.one_hot(clip.command.long(), len(Command)) * clip.command_valid[:, None]
-    return torch.cat([poses.flatten(1), speeds, command.float()], dim=-1)
+    return status_row(poses, speeds, clip.command, clip.command_valid)
+
+
+def status_row(
+    poses: Float[Tensor, "b P 3"],
+    speeds: Float[Tensor, "b P+1"],
+    command: Int[Tensor, "b"],
+    command_valid: Bool[Tensor, "b"],
+) -> Float[Tensor, "b S"]:
+    """The numbers of `ego_status` in their order."""
+    one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
+    return torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
 
 
 class EgoMLP(nn.Module):

@@ -1,5 +1,6 @@
 """The temporal attention planner (NeMo §3.3, eq. 12–14)."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -7,13 +8,19 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from foredrive.scene import Command, Trajectory
+from foredrive.models.ego_mlp import EgoMLP, status_row
+from foredrive.ops.precision import full_precision
+from foredrive.ops.volume import sample_volume
+from foredrive.scene import Command, Trajectory, VoxelSpec
 
 SPEED_SCALE_MPS = 10.0
 MOVES_M = 0.1
 PAST_SCALE = (5.0, 5.0, 1.0, SPEED_SCALE_MPS)
 STEP_SCALE_M = 1.0
 """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
+PLACE_SCALE_M = 20.0
+ASIDE_M = (-3.0, 0.0, 3.0)
+"""Where beside a path it is looked: on it and in the lanes next to it."""
 
 
 class FutureAttention(nn.Module):
@@ -46,18 +53,72 @@ class FutureAttention(nn.Module):
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
+class PathReading(nn.Module):
+    """What lies along a path: features of the plane at given distances on it and beside it, put together.
+
+    The same numbers mean the same place on the way whatever the curve, so that braking for what stands in the
+    lane need not be learned anew for every cell of the plane.
+
+    Args:
+        spec: grid of the volume whose plane is read.
+        width: C.
+        distances_m: along the path; it goes on straight where it ends.
+    """
+
+    distances_m: Tensor
+    aside_m: Tensor
+    lower_m: Tensor
+
+    def __init__(self, spec: VoxelSpec, width: int, distances_m: Sequence[float]) -> None:
+        super().__init__()
+        self.voxel_m = spec.voxel_m
+        self.register_buffer("distances_m", torch.tensor(distances_m), persistent=False)
+        self.register_buffer("aside_m", torch.tensor(ASIDE_M), persistent=False)
+        self.register_buffer("lower_m", torch.tensor(spec.lower_m[:2]), persistent=False)
+        hidden = width // 4
+        self.place = nn.Sequential(nn.Linear(len(ASIDE_M) * (width + 2), width), nn.ReLU())
+        self.place.append(nn.Linear(width, hidden))
+        self.together = nn.Sequential(nn.Linear(len(distances_m) * hidden, width), nn.ReLU())
+
+    def forward(
+        self, plane: Float[Tensor, "b Y X C"], path_xy: Float[Tensor, "b T 2"]
+    ) -> Float[Tensor, "b C"]:
+        """Args: features, and a path from the origin in the ego frame, m."""
+        places = self.places(path_xy)  # [b, D, S, 2]
+        with full_precision(plane, places) as (values, at):
+            cells = F.pad((at - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
+            read = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at.shape[1:3])
+        seen = torch.cat([read, at / PLACE_SCALE_M], dim=-1).flatten(2)
+        return self.together(self.place(seen).flatten(1))
+
+    def places(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
+        """Where is looked: at every distance along the path, at S places across it."""
+        steps = torch.diff(path_xy, dim=1, prepend=torch.zeros_like(path_xy[:, :1]))
+        lengths = steps.norm(dim=-1)[:, None]  # [b, 1, T]
+        begins = lengths.cumsum(-1) - lengths
+        share = ((self.distances_m[:, None] - begins) / lengths.clamp_min(1e-6)).clamp(0, 1)  # [b, D, T]
+        beyond = (self.distances_m - lengths.sum(-1)).clamp_min(0)  # [b, D]
+        yaw = _headings(path_xy[:, None])[:, 0]
+        forward = torch.stack([yaw.cos(), yaw.sin()], dim=-1)  # [b, T, 2]
+        on_path = share @ steps + beyond[..., None] * forward[:, -1:]
+        step = (self.distances_m[:, None] >= begins).sum(-1) - 1  # [b, D]: the last one begun
+        ahead = forward.gather(1, step[..., None].expand(-1, -1, 2))
+        left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
+        return on_path[:, :, None] + self.aside_m[:, None] * left[:, :, None]
+
+
 class VolumePlanner(nn.Module):
     """Waypoints from the present volume and, unless `future` is "none", the one predicted next.
 
     The two are put together by attention (eq. 13), or by concatenation, or only the present is looked at:
     three rows of NeMo's Table 1. Height is folded into the channels, Z·D → C by an MLP; one query (command,
     speed and a learned planning embedding, fused) attends to the plane through a transformer decoder; an MLP
-    regresses by how much the steps between waypoints differ from going straight on at this speed, and they
-    are summed up.
+    regresses by how much the steps between waypoints differ from those of a plan made without looking, and
+    they are summed up. That plan goes straight on at this speed, or is what `ego_mlp` says.
 
     Args:
         channels: D.
-        shape_zyx: of the volumes.
+        spec: grid of the volumes.
         width: C (256 in the paper).
         layers, heads: of the decoder (3 layers in the paper).
         future: what becomes of the predicted volume.
@@ -65,13 +126,16 @@ class VolumePlanner(nn.Module):
         history: how many key frames before now the query knows pose and speed of; in the paper it knows the
             speed at now alone, from which nobody can tell who brakes.
         horizon_steps, dt_s: of the plan.
+        ego_mlp: fitted beforehand, knows `history` frames and has the same horizon; it is not trained on.
+        look_m: distances along the plan made without looking at which the plane is read as well
+            (`PathReading`); none in the paper.
     """
 
     def __init__(
         self,
         *,
         channels: int,
-        shape_zyx: tuple[int, int, int],
+        spec: VoxelSpec,
         width: int,
         layers: int,
         heads: int,
@@ -80,9 +144,11 @@ class VolumePlanner(nn.Module):
         history: int,
         horizon_steps: int,
         dt_s: float,
+        ego_mlp: EgoMLP | None = None,
+        look_m: Sequence[float] = (),
     ) -> None:
         super().__init__()
-        height, ny, nx = shape_zyx
+        height, ny, nx = spec.shape_zyx
         self.horizon_steps, self.dt_s = horizon_steps, dt_s
         self.future, self.history = future, history
         self.fuse_future = FutureAttention(channels, pool) if future == "attention" else None
@@ -104,9 +170,14 @@ class VolumePlanner(nn.Module):
             width, heads, 2 * width, dropout=0.1, batch_first=True, norm_first=True
         )
         self.decoder = nn.TransformerDecoder(layer, layers)
-        self.waypoints = nn.Sequential(
-            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
-        )
+        self.path = PathReading(spec, width, look_m) if look_m else None
+        known = 2 * width if look_m else width
+        to_hidden, to_steps = nn.Linear(known, width), nn.Linear(width, 2 * horizon_steps)
+        if ego_mlp is not None:  # what it says is good already: only what is learned by looking is added
+            nn.init.zeros_(to_steps.weight)
+            nn.init.zeros_(to_steps.bias)
+        self.waypoints = nn.Sequential(to_hidden, nn.ReLU(), to_steps)
+        self.ego_mlp = ego_mlp
 
     @property
     def looks_ahead(self) -> int:
@@ -133,17 +204,19 @@ class VolumePlanner(nn.Module):
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
-        command = torch.where(command_valid, command, len(Command))
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
+        unseen = self._without_looking(command, command_valid, speed_mps, past)
+        command = torch.where(command_valid, command, len(Command))
         status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
         status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
         decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        change = STEP_SCALE_M * self.waypoints(decoded).float().view(len(command), 1, self.horizon_steps, 2)
-        straight_on = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
-        xy = (straight_on[:, None, None] + change).cumsum(dim=2)
+        if self.path is not None:
+            decoded = torch.cat([decoded, self.path(plane, unseen)], dim=-1)
+        change = STEP_SCALE_M * self.waypoints(decoded).float().unflatten(1, (self.horizon_steps, 2))
+        xy = (unseen + change.cumsum(dim=1))[:, None]
         return Trajectory(
             xy=xy,
             yaw=_headings(xy),
@@ -151,6 +224,22 @@ class VolumePlanner(nn.Module):
             log_prob=torch.zeros_like(xy[..., 0, 0]),
             dt_s=self.dt_s,
         )
+
+    @torch.no_grad()
+    def _without_looking(
+        self,
+        command: Int[Tensor, "b"],
+        command_valid: Bool[Tensor, "b"],
+        speed_mps: Float[Tensor, "b"],
+        past: Float[Tensor, "b P 4"],
+    ) -> Float[Tensor, "b T 2"]:
+        """The plan that looking changes."""
+        if self.ego_mlp is None:
+            step = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
+            return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1)
+        told = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
+        with full_precision(past, told) as (poses, speeds):
+            return self.ego_mlp(status_row(poses[..., :3], speeds, command, command_valid))[..., :2]
 
     def _fuse(
         self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"] | None

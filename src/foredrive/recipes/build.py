@@ -6,6 +6,7 @@ from foredrive.errors import InputError
 from foredrive.models.averaging import AveragingEncoder
 from foredrive.models.backbone import ImageBackbone
 from foredrive.models.bev import BevEncoder
+from foredrive.models.ego_mlp import EgoMLP
 from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.nemo import MotionFlow, Nemo, NemoAgent, VolumeRenderer
 from foredrive.models.planner import VolumePlanner
@@ -57,7 +58,7 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
     )
     planner = VolumePlanner(
         channels=size.channels,
-        shape_zyx=clips.voxels.shape_zyx,
+        spec=clips.voxels,
         width=size.planner_width,
         layers=size.planner_layers,
         heads=size.planner_heads,
@@ -66,8 +67,21 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         history=size.planner_history,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
+        ego_mlp=_build_ego_mlp(recipe),
+        look_m=size.planner_look_m,
     )
     return NemoAgent(world_model, planner)
+
+
+def _build_ego_mlp(recipe: Recipe) -> EgoMLP | None:
+    clips = recipe.clips
+    if recipe.model.planner_base == "straight_on":
+        return None
+    return EgoMLP(
+        past_frames=recipe.model.planner_history,
+        horizon_steps=clips.horizon_steps,
+        dt_s=clips.horizon_dt_s,
+    )
 
 
 def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEncoder:

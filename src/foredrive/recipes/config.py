@@ -76,6 +76,11 @@ class NemoSize:
     """How the planner looks at the predicted next volume."""
     planner_history: int = 0
     """Key frames before now whose pose and speed the planner is told; in the paper, now's speed alone."""
+    planner_base: Literal["straight_on", "ego_mlp"] = "straight_on"
+    """What the planner regresses changes from: the speed now, as it is; or what an MLP says that knows ego
+    status alone (`planner_history` frames of it), fitted to the demonstrations before fine-tuning."""
+    planner_look_m: tuple[float, ...] = ()
+    """Distances along that plan at which the planner reads the volume as well; see `PathReading`."""
     checkpoint: tuple[Literal["backbone", "encoder"], ...] = ()
     """Trade time for memory: what these parts compute is not kept but computed again."""
 

@@ -63,7 +63,9 @@ def nemo_tiny() -> Recipe:
 def nemo_town() -> Recipe:
     """NeMo for claims tested on two CPU cores: 20 minutes of pre-training, 10 of fine-tuning on towns.
 
-    As `nemo_tiny`, but wider, seeing further ahead, and trained for longer, in bfloat16.
+    As `nemo_tiny`, but it sees further ahead and is trained for longer. Its planner knows the last key frame
+    too and starts from what ego status alone says, so that what it scores beyond the ego-only MLP is what
+    looking brings; it reads the volume along that plan.
     """
     tiny = nemo_tiny()
     pretrain, finetune = tiny.pretrain, tiny.finetune
@@ -71,14 +73,24 @@ def nemo_town() -> Recipe:
     return dataclasses.replace(
         tiny,
         name="nemo_town",
-        clips=dataclasses.replace(tiny.clips, now_stride_s=0.5),
+        clips=dataclasses.replace(
+            tiny.clips,
+            now_stride_s=0.5,
+            voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
+        ),
+        model=dataclasses.replace(
+            tiny.model,
+            ray_far_m=48.0,
+            planner_history=1,
+            planner_base="ego_mlp",
+            planner_look_m=(2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0),
+        ),
         pretrain=dataclasses.replace(
             pretrain, schedule=dataclasses.replace(pretrain.schedule, steps=1000, warmup_steps=50)
         ),
         finetune=dataclasses.replace(
             finetune, schedule=dataclasses.replace(finetune.schedule, steps=500, warmup_steps=50)
         ),
-        precision="bf16-mixed",
     )
 
 

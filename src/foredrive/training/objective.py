@@ -57,6 +57,8 @@ class NemoObjective(nn.Module):
         self.image_features = image_features
         world, plans = agent.world_model, weights.wpts > 0
         agent.planner.requires_grad_(plans)
+        if agent.planner.ego_mlp is not None:
+            agent.planner.ego_mlp.requires_grad_(False)
         world.motion.requires_grad_(steps > 0 or (plans and agent.planner.looks_ahead > 0))
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)

@@ -1,0 +1,58 @@
+"""A planner that starts from what ego status alone says, as a run."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from miniature import miniature
+from safetensors.torch import load_file
+
+from foredrive.data import LogPath
+from foredrive.recipes import Recipe, Run, evaluate_run, train_run
+from foredrive.recipes.export import export_run
+
+
+def recipe(lr: float) -> Recipe:
+    """Fine-tuned from scratch, with a plan of the ego MLP to begin with."""
+    small = miniature()
+    return dataclasses.replace(
+        small,
+        pretrain=None,
+        model=dataclasses.replace(
+            small.model, planner_base="ego_mlp", planner_history=1, planner_look_m=(2.0, 6.0)
+        ),
+        finetune=dataclasses.replace(
+            small.finetune, schedule=dataclasses.replace(small.finetune.schedule, lr=lr)
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return train_run(recipe(lr=1e-2), [log], tmp_path_factory.mktemp("looks"))
+
+
+def test_with_nothing_learned_it_scores_what_the_ego_mlp_does(log: LogPath, tmp_path: Path) -> None:
+    run = train_run(recipe(lr=0.0), [log], tmp_path)
+    summary = evaluate_run(run, [log], tmp_path).summary
+    for protocol in ("uniad", "vad"):
+        own, rival = (summary[f"planning.{name}{protocol}.l2_avg_m"] for name in ("", "ego_mlp."))
+        assert own == pytest.approx(rival, abs=1e-5)
+        assert own < summary[f"planning.stand_still.{protocol}.l2_avg_m"]
+
+
+def test_fine_tuning_leaves_what_it_starts_from(run: Run, log: LogPath, tmp_path: Path) -> None:
+    first = train_run(recipe(lr=0.0), [log], tmp_path)
+    before, after = load_file(first.weights), load_file(run.weights)
+    base = [name for name in before if name.startswith("planner.ego_mlp.")]
+    assert base
+    assert all(torch.equal(before[name], after[name]) for name in base)
+    assert not torch.equal(before["planner.path.place.0.weight"], after["planner.path.place.0.weight"])
+
+
+def test_it_can_be_exported(run: Run, log: LogPath, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    facts = export_run(run, [log], tmp_path, clips=2)
+    for differences in facts["largest_difference"].values():
+        assert differences["waypoints_xy"] < 1e-3
