@@ -7,7 +7,7 @@ import torch
 
 from foredrive.models.averaging import AveragingEncoder
 from foredrive.models.bev import BevEncoder, PillarCrossAttention
-from foredrive.models.lifting import project_to_cameras
+from foredrive.models.lifting import place_code, project_to_cameras
 from foredrive.scene import CameraRig, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -91,3 +91,18 @@ def test_a_camera_without_an_image_is_not_looked_at(kind: str) -> None:
     one, other = torch.randn(2, 1, 1, 8, 16, 4)
     assert torch.equal(encoder([one], rig(), ~SEEN), encoder([other], rig(), ~SEEN))
     assert not torch.allclose(encoder([one], rig(), SEEN), encoder([other], rig(), SEEN))
+
+
+def test_queries_begin_by_knowing_their_place() -> None:
+    """No two voxels begin alike, those that lie together begin more alike than others, whatever the seed."""
+    centres = SPEC.centres_m().flatten(0, 2)
+    code = place_code(centres, 28)
+    apart = torch.cdist(code, code) + 10 * torch.eye(len(code))
+    assert float(apart.min()) > 0.1
+    away = torch.cdist(centres, centres)
+    assert float(apart[(away > 0) & (away < 1.5)].mean()) < 0.7 * float(apart[away > 6].mean())
+    torch.manual_seed(1)
+    wide = place_code(centres, 40)
+    assert torch.equal(wide[:, :28], code)
+    assert 0.0 < float(wide[:, 28:].std()) < 0.05
+    assert torch.equal(place_code(centres, 8), code[:, :8])

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import LiftingLayer, directions_2d, project_to_cameras, refine
+from foredrive.models.lifting import LiftingLayer, directions_2d, place_code, project_to_cameras, refine
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, VoxelSpec
@@ -135,7 +135,7 @@ class BevEncoder(nn.Module):
         )
         pillars_m = torch.tensor(spec.lower_m) + spec.voxel_m * pillar.flatten(0, 1)
         self.register_buffer("pillars_m", pillars_m, persistent=False)
-        self.query = nn.Parameter(0.02 * torch.randn(ny * nx, width))
+        self.query = nn.Parameter(place_code(spec.centres_m(place.device)[0].flatten(0, 1), width))
         self.layers = nn.ModuleList(
             [
                 LiftingLayer(

@@ -32,6 +32,25 @@ def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
     return grid / grid.abs().amax(-1, keepdim=True)
 
 
+def place_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, "Q D"]:
+    """What a query begins with: sines and cosines of where its voxel lies, as seen from the vehicle.
+
+    Direction, distance and height first, as they decide what cameras show of a place; then x and y. With more
+    channels than these 28 the others begin at random and small, with fewer the last are left out. Queries that
+    all begin at random have to learn first where they are.
+    """
+    x, y, z = centres_m.unbind(-1)
+    distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
+    reach, low, high = distance.max(), z.min(), z.max()
+    waves = [k * azimuth for k in range(1, 4)]
+    waves += [0.5 * math.pi * 2**k * distance / reach for k in range(5)]
+    waves += [0.5 * math.pi * 2**k * (z - low) / (high - low).clamp_min(1.0) for k in range(3)]
+    code = [wave for angle in waves for wave in (angle.sin(), angle.cos())]
+    code += [(math.pi * 2**k * axis / reach).sin() for k in range(3) for axis in (x, y)]
+    rest = 0.02 * torch.randn(len(centres_m), max(channels - len(code), 0), device=centres_m.device)
+    return torch.cat([torch.stack(code, dim=-1), rest], dim=-1)[:, :channels].contiguous()
+
+
 class VolumeSelfAttention(nn.Module):
     """Deformable self-attention in 3-D: each voxel reads P learned places around itself, in H heads."""
 
@@ -197,7 +216,7 @@ class LiftingEncoder(nn.Module):
         self.register_buffer("centres_m", centres, persistent=False)
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
         self.register_buffer("place", place, persistent=False)
-        self.query = nn.Parameter(0.02 * torch.randn(len(centres), channels))
+        self.query = nn.Parameter(place_code(centres, channels))
         self.layers = nn.ModuleList(
             [
                 LiftingLayer(

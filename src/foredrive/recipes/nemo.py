@@ -89,7 +89,7 @@ def nemo_town() -> Recipe:
             pretrain, schedule=dataclasses.replace(pretrain.schedule, steps=1000, warmup_steps=50)
         ),
         finetune=dataclasses.replace(
-            finetune, schedule=dataclasses.replace(finetune.schedule, steps=500, warmup_steps=50)
+            finetune, schedule=dataclasses.replace(finetune.schedule, steps=450, warmup_steps=50)
         ),
     )
 
