@@ -35,9 +35,9 @@ def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
 def place_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, "Q D"]:
     """What a query begins with: sines and cosines of where its voxel lies, as seen from the vehicle.
 
-    Direction, distance and height first, as they decide what cameras show of a place; then x and y. With more
-    channels than these 28 the others begin at random and small, with fewer the last are left out. Queries that
-    all begin at random have to learn first where they are.
+    Direction, distance and height first, as they decide what cameras show of a place; then x and y. With
+    more channels than these 28 the others begin at random and small, with fewer the last are left out.
+    Queries that all begin at random have to learn first where they are.
     """
     x, y, z = centres_m.unbind(-1)
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
