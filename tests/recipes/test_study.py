@@ -1,5 +1,6 @@
 """Studies: what an arm is trained on, and what is kept of its figures."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -36,11 +37,15 @@ def test_occupancy_alone_is_one_stage_as_long_as_pretraining() -> None:
     assert (weights.wpts, weights.recon, weights.occ) == (0.0, 0.0, full.pretrain.weights.occ)
 
 
-def test_an_arm_is_trained_once_and_judged_again(trained: Run, tmp_path: Path) -> None:
+def test_an_arm_is_trained_and_judged_once(trained: Run, tmp_path: Path) -> None:
     logs = StudyLogs(train=trained.logs, test=trained.logs)
     figures = run_arm(trained.recipe, logs, tmp_path / "few", tmp_path / "cache", start=trained.folder)
     again = run_arm(trained.recipe, logs, tmp_path / "few", tmp_path / "cache", start=trained.folder)
     assert again == figures
+    summary = json.loads((tmp_path / "few" / "summary.json").read_text())
+    (tmp_path / "few" / "summary.json").write_text(json.dumps(summary | {"planning.uniad.l2_avg_m": 9.0}))
+    kept = run_arm(trained.recipe, logs, tmp_path / "few", tmp_path / "cache", start=trained.folder)
+    assert kept["l2_avg_m"] == 9.0
     assert figures["failed"] == 0
     assert 0 <= figures["occupancy_iou"] <= 1
     assert figures["l2_avg_m"] == figures["uniad.l2_avg_m"] != figures["vad.l2_avg_m"]

@@ -1,17 +1,17 @@
 """Studies: arms that differ in one thing, trained on the same recorded towns and judged in one held out."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance
-from foredrive.evaluation.totals import Figures
+from foredrive.evaluation import collect_provenance, read_summary
 from foredrive.metrics import PROTOCOLS
 from foredrive.recipes.config import Recipe, Stage
-from foredrive.recipes.evaluate import evaluate_run
+from foredrive.recipes.evaluate import SUMMARY, evaluate_run
 from foredrive.recipes.recording import record_drives
 from foredrive.recipes.train import train_run
 from foredrive.towns.campaign import Campaign, plan_drives
@@ -97,12 +97,16 @@ def run_arm(
 ) -> dict[str, float]:
     """Train one arm, judge it on the test drives, and return its figures; goes on where it stopped.
 
+    An arm that was judged is not judged again: `folder` belongs to one code and one set of test drives.
+
     `occupancy_iou` is that of voxels above the ground, now; `l2_avg_m` and `collision_avg_pct` are those of
     UniAD's protocol, which NeMo's tables follow. Those of the other protocols, of later frames and of what
     has to be beaten stand under longer names. `train_s` is what the steps of this run took.
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
-    summary = evaluate_run(run, logs.test, folder, batch_size=8).summary
+    if not (folder / SUMMARY).is_file():
+        evaluate_run(run, logs.test, folder, batch_size=8)
+    summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
     lines = [
         line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")
     ]
@@ -112,7 +116,7 @@ def run_arm(
     }
 
 
-def study_figures(summary: Figures) -> dict[str, float]:
+def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
     """What a study keeps of a summary: figures by name; those of a recipe that does not plan mean nothing."""
     headline = f"planning.{HEADLINE}"
     kept = {
