@@ -1,0 +1,105 @@
+"""Waypoints to a path that can be driven: near them all, with little jerk, from the pose of now on.
+
+A path through every waypoint has to turn within the first half second for whatever is amiss with the first
+waypoint; with any latency that swings up. Regularised least squares (as in nuPlan's tracker, which fits
+speeds and curvatures so) takes several waypoints' word for it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+KNOT_M = 2.0
+"""Knots are waypoints at least so far apart: nearer ones say how fast, hardly where to."""
+SAMPLE_M = 0.25
+BEYOND_M = 10.0
+"""The path goes straight on beyond its end, for those who overshoot."""
+SMOOTHING_S5 = 3e-4
+"""What jerk weighs: 1 m/s³ for 1 s as much as missing a knot by 1.7 cm."""
+SLOWEST_MPS = 4.0
+"""Slower paths are smoothed as if driven at this speed."""
+STEERING_S = 0.3
+"""Curvature may differ from what is steered now as much as steering changes in this time."""
+
+
+class Path(NamedTuple):
+    """A path seen from above, sampled every `SAMPLE_M`."""
+
+    xy: Float64[np.ndarray, "N 2"]
+    heading_rad: Float64[np.ndarray, "N"]
+    """Continuous: beyond ±π in loops."""
+    curvature: Float64[np.ndarray, "N"]
+    """1/m, positive to the left."""
+
+    def project(self, xy: Float64[np.ndarray, "2"]) -> tuple[float, float]:
+        """Way along the path, m, and offset to its left, m, of a point, in the next sample's axes."""
+        offset = xy - self.xy
+        near = int(np.argmin(np.einsum("ni,ni->n", offset, offset)))
+        cos, sin = np.cos(self.heading_rad[near]), np.sin(self.heading_rad[near])
+        dx, dy = offset[near]
+        return near * SAMPLE_M + float(cos * dx + sin * dy), float(cos * dy - sin * dx)
+
+    def course(self, way_m: float) -> tuple[float, float]:
+        """Heading, rad, and curvature, 1/m, at a way along the path."""
+        way = np.arange(len(self.xy)) * SAMPLE_M
+        heading, curvature = (np.interp(way_m, way, column) for column in (self.heading_rad, self.curvature))
+        return float(heading), float(curvature)
+
+
+def fit_path(waypoints: Float64[np.ndarray, "T 2"], dt_s: float, curvature_now: float) -> Path:
+    """The path of a plan, from the origin along x.
+
+    Its curvature κ is linear between the knots and least in Σ offset² + `SMOOTHING_S5` ∫ (v³ dκ/ds)² dt, the
+    offsets those to each knot, the jerk the lateral one at the plan's speeds. Linearised about the chords:
+    over each the offset grows by the integral of heading less chord's direction, which is exact for circles.
+
+    Args:
+        waypoints: in the ego frame when the plan was made, m, `dt_s` apart; the first at `dt_s`.
+        curvature_now: as steered then, 1/m.
+    """
+    index = _knots(waypoints)
+    if not len(index):
+        return _integrated(np.zeros(1), np.zeros(1))
+    chords = np.diff(waypoints[index], axis=0, prepend=np.zeros((1, 2)))
+    chord_m = np.hypot(chords[:, 0], chords[:, 1])
+    direction = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+    pace_mps = np.hypot(chord_m / (dt_s * np.diff(index, prepend=-1)), SLOWEST_MPS)
+    unit = np.eye(len(index) + 1)
+    heading, offset = np.zeros(len(unit)), np.zeros(len(unit))  # as linear functions of the curvatures
+    firm = np.sqrt(SMOOTHING_S5 / STEERING_S) * pace_mps[0] ** 2
+    rows, wanted = [firm * unit[0]], [firm * curvature_now]
+    for k, (length, pace) in enumerate(zip(chord_m, pace_mps, strict=True)):
+        offset = offset + length * (heading + length * (unit[k] / 3 + unit[k + 1] / 6))
+        heading = heading + 0.5 * length * (unit[k] + unit[k + 1])
+        jerk = pace**3 / length * (unit[k + 1] - unit[k])
+        rows += [offset, np.sqrt(SMOOTHING_S5 * length / pace) * jerk]
+        wanted += [float(chord_m[: k + 1] @ direction[: k + 1]), 0.0]
+    curvature = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
+    return _integrated(np.append(0.0, np.cumsum(chord_m)), curvature)
+
+
+def _knots(waypoints: Float64[np.ndarray, "T 2"]) -> Int[np.ndarray, "K"]:
+    """The waypoints that make the path, each ahead of the one before; if possible the last."""
+    index: list[int] = []
+    at, towards = np.zeros(2), np.array([1.0, 0.0])
+    for k, point in enumerate(waypoints):
+        offset = point - at
+        if np.linalg.norm(offset) >= KNOT_M and offset @ towards > 0:
+            index.append(k)
+            at, towards = point, offset / np.linalg.norm(offset)
+    beyond_m = float((waypoints[-1] - at) @ towards)
+    if beyond_m > (0.0 if index else 0.5 * KNOT_M):
+        index[max(0, len(index) - 1) :] = [len(waypoints) - 1]
+    return np.array(index, dtype=np.int64)
+
+
+def _integrated(along_m: Float64[np.ndarray, "K"], knot_curvature: Float64[np.ndarray, "K"]) -> Path:
+    """The path of a curvature that is given at some ways along it, linear between, and 0 beyond the last."""
+    way_m = np.arange(0.0, along_m[-1] + BEYOND_M, SAMPLE_M)
+    curvature = np.interp(way_m, along_m, knot_curvature, right=0.0)
+    turned = 0.5 * SAMPLE_M * (curvature[1:] + curvature[:-1])
+    heading = np.append(0.0, np.cumsum(turned))
+    midway = heading[:-1] + 0.5 * turned
+    steps = SAMPLE_M * np.stack([np.cos(midway), np.sin(midway)], axis=1)
+    return Path(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), heading, curvature)
