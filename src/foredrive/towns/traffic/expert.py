@@ -5,7 +5,6 @@ It plans its speed as all drivers do, from the exact state of the others, the li
 steers so that the rear axle stays on its path.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,11 +12,10 @@ import numpy as np
 from jaxtyping import Float64, Int
 from scipy.spatial.transform import Rotation
 
-from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.errors import InputError
-from foredrive.scene import Category, Command
+from foredrive.scene import Command
 from foredrive.towns.actors import ActorState
-from foredrive.towns.traffic.fleet import Starts, place
+from foredrive.towns.traffic.fleet import Starts, ego_vehicle
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.recovery import Sway, step_sway
 from foredrive.towns.traffic.routes import Route, draw_route
@@ -26,7 +24,6 @@ from foredrive.towns.traffic.vehicles import (
     MOTION_S,
     Poses,
     Vehicles,
-    empty_slots,
     motion,
     vehicle_poses,
 )
@@ -76,7 +73,9 @@ class Drive:
             raise InputError(f"the steering noise is 0 rad or more, got {steering_noise:g}")
         self._traffic = traffic
         self._planned = plan_route(traffic.lanes, traffic.starts, traffic.seed, seconds)
-        self.state = traffic.start(_ego_vehicle(traffic, self._planned), self._planned.lanes)
+        first, start_m = self._planned.lanes[:1], np.array([self._planned.start_m])
+        ego = ego_vehicle(traffic.lanes, first, start_m)
+        self.state = traffic.start(ego, self._planned.lanes)
         while not self._is_settled():
             self.state = traffic.step(self.state, LONGEST_STEP_S)
         self.route, self._passed = self._remaining(), self.state.route_passed
@@ -161,25 +160,6 @@ def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> R
     rng = np.random.default_rng((seed, 3))
     fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
     return draw_route(lanes, starts, rng, fastest_m, SETTLE_S, SETTLE_S + seconds)
-
-
-def _ego_vehicle(traffic: Traffic, route: Route) -> Vehicles:
-    """The recording vehicle with a calm driver, at the start of its route."""
-    one = {name: value[:1] for name, value in vars(empty_slots(1)).items()}
-    driver = dataclasses.replace(
-        Vehicles(**one),
-        active=np.array([True]),
-        category=np.array([int(Category.CAR)]),
-        size_lwh=np.array([[EGO_VEHICLE.length, EGO_VEHICLE.width, EGO_VEHICLE.height]]),
-        wheelbase_m=np.array([EGO_VEHICLE.wheel_base]),
-        axle_to_centre_m=np.array([EGO_VEHICLE.rear_axle_to_center_longitudinal]),
-        top_speed_mps=np.array([30.0]),
-        haste=np.array([0.97]),
-        time_gap_s=np.array([1.4]),
-        accel_mps2=np.array([1.5]),
-        decel_mps2=np.array([1.8]),
-    )
-    return place(traffic.lanes, driver, route.lanes[:1], np.array([route.start_m]))
 
 
 def _beside(sway: Sway) -> Float64[np.ndarray, "4 4"]:

@@ -1,10 +1,12 @@
 """Which vehicles drive: kinds with their shares, sizes and drivers, and where new ones may start."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots
@@ -134,3 +136,21 @@ def place(
     speed = vehicles.haste * np.minimum(graph.speed(lane, s_m), vehicles.top_speed_mps)
     speed = np.minimum(speed, np.sqrt(2 * BRAKING_MPS2 * to_end))
     return Vehicles(**{**vars(vehicles), "path": path, "s_m": s_m.astype(np.float64), "speed_mps": speed})
+
+
+def ego_vehicle(graph: LaneGraph, lane: Int[np.ndarray, "1"], s_m: Float64[np.ndarray, "1"]) -> Vehicles:
+    """The recording vehicle with a calm driver, on a lane."""
+    driver = dataclasses.replace(
+        empty_slots(1),
+        active=np.array([True]),
+        category=np.array([int(Category.CAR)]),
+        size_lwh=np.array([[EGO_VEHICLE.length, EGO_VEHICLE.width, EGO_VEHICLE.height]]),
+        wheelbase_m=np.array([EGO_VEHICLE.wheel_base]),
+        axle_to_centre_m=np.array([EGO_VEHICLE.rear_axle_to_center_longitudinal]),
+        top_speed_mps=np.array([30.0]),
+        haste=np.array([0.97]),
+        time_gap_s=np.array([1.4]),
+        accel_mps2=np.array([1.5]),
+        decel_mps2=np.array([1.8]),
+    )
+    return place(graph, driver, lane, s_m)

@@ -37,12 +37,12 @@ def extend_paths(
         stretch = column - BEHIND
         if rows[0] == 0 and stretch < len(route):
             before, drawn = int(path[0, column - 1]), int(path[0, column])
-            path[0, column] = _towards(graph, before, int(route[stretch]), drawn)
+            path[0, column] = towards(graph, before, int(route[stretch]), drawn)
     return dataclasses.replace(v, path=path)
 
 
-def _towards(graph: LaneGraph, lane: int, wanted: int, otherwise: int) -> int:
-    """The lane after one that is `wanted`, or one beside it."""
+def towards(graph: LaneGraph, lane: int, wanted: int, otherwise: int) -> int:
+    """The lane after one that is `wanted`, or one beside it; `otherwise` if none is."""
     options = graph.successors[lane, : graph.successor_count[lane]].tolist()
     for side in graph.sides.lane:
         beside = wanted

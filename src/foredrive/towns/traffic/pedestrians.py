@@ -1,6 +1,7 @@
 """People on foot: they wander over walkways, wait for a gap in the traffic, and go first while crossing."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -32,6 +33,10 @@ BEYOND_LIGHT_M = 8.0
 """A crossing within this distance behind the line of a light goes with that light."""
 PATIENCE_S = 25.0
 """People who found no gap for this long walk elsewhere."""
+HESITATE_S = 0.4
+"""People stop so long before they would step in front of a vehicle that is no part of the traffic."""
+
+Danger = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
@@ -114,12 +119,22 @@ def step_pedestrians(
     light: Int[np.ndarray, "L"],
     dt_s: float,
     rng: np.random.Generator,
+    danger: Danger | None = None,
 ) -> Pedestrians:
-    """Where people are one time step later; `light` is what shows at the start of each lane."""
+    """Where people are one time step later.
+
+    Args:
+        light: what shows at the start of each lane.
+        danger: tells of points, seen from above, where nobody should step; who is there already walks on.
+    """
     if not len(people.active) or not len(graph.length_m):
         return people
     s = people.s_m + people.onward * people.pace_mps * dt_s
     s = np.where(_walks_into_vehicle(graph, people, vehicles, starts_m), people.s_m, s)
+    if danger is not None:
+        soon = dataclasses.replace(people, s_m=s + people.onward * people.pace_mps * HESITATE_S)
+        waits = danger(_way(graph, soon)[:, :2]) & ~danger(people.xyz[:, :2])
+        s = np.where(waits, people.s_m, s)
     over = np.maximum(-s, s - graph.length_m[people.walk])
     leaving = people.active & (over >= 0)
     wants_to_cross = leaving & graph.is_crossing[people.next_walk]

@@ -62,8 +62,14 @@ def claim_junctions(
     ahead: Ahead,
     green: Bool[np.ndarray, "L"],
     time_s: float,
+    may_ask: Bool[np.ndarray, "N"] | None = None,
 ) -> RightOfWay:
-    """Serve the requests for right of way; `green` are the lanes that no light forbids to enter."""
+    """Serve the requests for right of way.
+
+    Args:
+        green: the lanes that no light forbids to enter.
+        may_ask: whose requests count; None: everybody's.
+    """
     kept = _withdraw(graph, vehicles, starts_m, green)
     column, line_gap = _next_line(graph, vehicles.path, kept, starts_m, vehicles.front_m)
     lane = vehicles.path[np.arange(len(kept)), column]
@@ -75,6 +81,8 @@ def claim_junctions(
     queued = (leader >= 0) & (ahead.leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
     near = vehicles.active & (line_gap < reach) & ((~queued & (~inside | at_light)) | goes_on)
+    if may_ask is not None:
+        near &= may_ask
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
     asks = near & ((_is_green(graph, vehicles.path, column, green) & stop_made) | goes_on)
     asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)

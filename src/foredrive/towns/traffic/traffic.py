@@ -1,6 +1,7 @@
 """Traffic on a town's lanes and walkways: one pure step from state to state."""
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int
@@ -8,6 +9,7 @@ from jaxtyping import Float64, Int
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
+from foredrive.towns.traffic.driven import Driven, SeenDriven, see_driven
 from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
 from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, find_starts, is_large
 from foredrive.towns.traffic.lane_changes import (
@@ -25,6 +27,7 @@ from foredrive.towns.traffic.lane_changes import (
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
+from foredrive.towns.traffic.near_lanes import NearLanes, near_lanes_of
 from foredrive.towns.traffic.paths import extend_paths
 from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pavement, step_pedestrians
 from foredrive.towns.traffic.right_of_way import claim_junctions
@@ -51,7 +54,8 @@ BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
 class Traffic:
     """The rules of traffic in one town: `step` is a pure function of the state.
 
-    Vehicle 0 is the one the world turns around: traffic appears and disappears out of its sight.
+    Vehicle 0 is the one the world turns around: traffic appears and disappears out of its sight. It drives as
+    the others do, or from outside.
 
     Args:
         town: the map.
@@ -72,6 +76,11 @@ class Traffic:
         self._vehicle_count = vehicle_count
         self._people_count = people_count if len(self.walks.length_m) else 0
         self._turnover = Turnover(self.lanes, self.walks, self.starts, self._for_large)
+
+    @cached_property
+    def near_lanes(self) -> NearLanes:
+        """The town's lanes by place."""
+        return near_lanes_of(self.lanes)
 
     def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
         """Vehicles and people at their start.
@@ -98,15 +107,26 @@ class Traffic:
             state = self._know_path(state, rng)
         return self._turnover.fill(state, rng)
 
-    def step(self, state: TrafficState, dt_s: float) -> TrafficState:
-        """The state one time step later; equal states and steps give equal results."""
+    def step(self, state: TrafficState, dt_s: float, ego: Driven | None = None) -> TrafficState:
+        """The state one time step later; equal arguments give equal results.
+
+        Args:
+            ego: where vehicle 0 is at the time of `state` if somebody outside drives it, on the road or off
+                it: all others react to that, and what becomes of it is not decided here. None: it drives
+                itself, as the others do.
+        """
         rng = np.random.default_rng((self.seed, 2, state.step_index))
+        driven = None if ego is None else self._see_driven(state, ego)
+        if driven is not None:
+            route_passed = driven.route_passed
+            state = dataclasses.replace(state, vehicles=driven.everyone, route_passed=route_passed)
         v = state.vehicles
         starts_m = path_starts(self.lanes, v.path)
         ahead = find_leaders(self.lanes, v, starts_m)
         light = self.signals.shows(state.time_s)
         green = (light == Light.NONE) | (light == Light.GREEN)
-        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s)
+        may_ask = None if driven is None else driven.may_ask
+        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s, may_ask)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
         to_route = self._to_route(state)
@@ -123,19 +143,26 @@ class Traffic:
             rank=way.rank,
             has_stopped=v.has_stopped | halted,
         )
-        people = step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng)
+        danger = None if driven is None else driven.danger
         state = dataclasses.replace(
             state,
             time_s=state.time_s + dt_s,
             step_index=state.step_index + 1,
             vehicles=v,
-            people=people,
+            people=step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng, danger),
         )
-        state = self._begin_change(state, situation, rng)
-        vehicles = drive(state.vehicles, wanted_mps2, dt_s)
-        state = dataclasses.replace(state, vehicles=vehicles)
+        changed = self._begin_change(state, situation, driven)
+        moved = drive(state.vehicles if changed is None else changed, wanted_mps2, dt_s)
+        state = dataclasses.replace(
+            state, vehicles=moved if driven is None else driven.without_shadows(moved)
+        )
+        if changed is not None:
+            state = self._know_path(state, rng)
         state = self._change_lanes_at_ends(state, rng)
-        return self._turnover.renew(state, rng)
+        return self._turnover.renew(state, rng, None if driven is None else driven.centre_m)
+
+    def _see_driven(self, state: TrafficState, ego: Driven) -> SeenDriven:
+        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, state.route, state.route_passed)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """The `Light` of each of the town's stop zones."""
@@ -190,18 +217,17 @@ class Traffic:
         return out
 
     def _begin_change(
-        self, state: TrafficState, situation: Situation, rng: np.random.Generator
-    ) -> TrafficState:
-        """Let the one driver who gains most by it change lanes."""
+        self, state: TrafficState, situation: Situation, driven: SeenDriven | None
+    ) -> Vehicles | None:
+        """Let the one driver who gains most by it change lanes; None if nobody does."""
         v = state.vehicles
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
         urge = self._route_urge(state)
         may = who_may_change(self.lanes, self._stretches, v, fits, urge >= HAS_TO_MPS2)
+        if driven is not None:
+            may &= driven.decides
         change = choose_change(self.lanes, self._stretches, v, situation, may, urge)
-        if change is None:
-            return state
-        changed = begin_change(self.lanes, v, *change)
-        return self._know_path(dataclasses.replace(state, vehicles=changed), rng)
+        return None if change is None else begin_change(self.lanes, v, *change)
 
     def _route_urge(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
         """What lane changes are worth to vehicle 0 for its route."""
@@ -235,7 +261,7 @@ class Traffic:
 
     def _to_route(self, state: TrafficState) -> tuple[int, float] | None:
         """To which side vehicle 0 has to change for its route, and how far ahead it can still begin."""
-        if state.route_passed >= len(state.route):
+        if state.route_passed >= len(state.route) or not state.vehicles.active[0]:
             return None
         wanted = int(state.route[state.route_passed])
         return room_to_change_m(self.lanes, self._stretches, state.vehicles, wanted)

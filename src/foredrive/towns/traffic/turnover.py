@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.traffic.drivers import see_ahead
 from foredrive.towns.traffic.fleet import Starts, draw_fleet, place
@@ -42,31 +42,47 @@ class Turnover:
 
     def fill(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Vehicles and people in all slots, as far as there is room."""
-        state = self._put_vehicles(state, 0.0, len(state.vehicles.active), rng)
-        return self._put_people(state, 0.0, len(state.people.active), rng)
+        ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0] if len(state.route) else None
+        state = self._put_vehicles(state, 0.0, len(state.vehicles.active), rng, ego_m)
+        return self._put_people(state, 0.0, len(state.people.active), rng, ego_m)
 
-    def renew(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+    def renew(
+        self,
+        state: TrafficState,
+        rng: np.random.Generator,
+        ego_m: Float64[np.ndarray, "3"] | None = None,
+    ) -> TrafficState:
         """Let what is far from the ego vehicle go, and let one vehicle and one person appear out of its
-        sight; without an ego vehicle all stay."""
+        sight; without an ego vehicle all stay.
+
+        Args:
+            ego_m: where the ego vehicle is if it is driven from outside.
+        """
         if not len(state.route):
             return state
         centre_m = vehicle_poses(self._lanes, state.vehicles).centre_m
+        if ego_m is not None:
+            centre_m[0] = ego_m
         far = np.linalg.norm(centre_m - centre_m[0], axis=1) > GONE_BEYOND_M
         far_off = np.linalg.norm(state.people.xyz - centre_m[0], axis=1) > PEOPLE_GONE_BEYOND_M
         vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
         people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
         state = dataclasses.replace(state, vehicles=vehicles, people=people)
-        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng)
-        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng)
+        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng, centre_m[0])
+        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng, centre_m[0])
 
     def _put_vehicles(
-        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+        self,
+        state: TrafficState,
+        beyond_m: float,
+        most: int,
+        rng: np.random.Generator,
+        ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
-        """New vehicles in up to `most` free slots, at least `beyond_m` from vehicle 0 if it is the ego."""
+        """New vehicles in up to `most` free slots, at least `beyond_m` from an ego vehicle."""
         rows = np.flatnonzero(~state.vehicles.active)[:most]
         places = np.arange(len(self._starts.lane))
-        if len(state.route) and len(rows):
-            ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0]
+        if ego_m is not None and len(rows):
             distance = np.linalg.norm(self._starts.xyz - ego_m, axis=1)
             places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
         if not len(rows) or not len(places):
@@ -123,7 +139,12 @@ class Turnover:
         return v if wanted[concerned].min() > -NEWCOMER_BRAKING_MPS2 else None
 
     def _put_people(
-        self, state: TrafficState, beyond_m: float, most: int, rng: np.random.Generator
+        self,
+        state: TrafficState,
+        beyond_m: float,
+        most: int,
+        rng: np.random.Generator,
+        ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
         """People in up to `most` free slots."""
         rows = np.flatnonzero(~state.people.active)[:most]
@@ -133,8 +154,7 @@ class Turnover:
         s_m = rng.random(tries.shape) * self._walks.length_m[tries]
         xyz = self._walks.position(tries.ravel(), s_m.ravel()).reshape(*tries.shape, 3)
         ok = np.ones(tries.shape, dtype=np.bool_)
-        if len(state.route):
-            ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0]
+        if ego_m is not None:
             distance = np.linalg.norm(xyz - ego_m, axis=2)
             ok = (distance >= beyond_m) & (distance <= PEOPLE_BORN_WITHIN_M)
         chosen = np.argmax(ok, axis=1)

@@ -1,0 +1,284 @@
+"""Vehicle 0 driven from outside: what the others make of a vehicle that does as it likes.
+
+Where it follows a lane it is taken for one of them, with its way ahead. Besides, a shadow lies on every other
+lane that its outline is in the way of: a vehicle that drives along that lane as fast as this one does. All
+rules hold towards shadows as towards vehicles, so that nobody needs rules of his own for who stands across
+lanes, drives against them or comes out of nowhere.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.scene import Category
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.near_lanes import NearLanes
+from foredrive.towns.traffic.paths import towards
+from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts
+
+LANE_REACH_M = 2.5
+MOST_TURNED_RAD = np.deg2rad(60.0)
+TURNED_M = 2.0
+"""A heading that is off by one radian counts as much as so many metres to the side."""
+KNOWN_M = 0.6
+"""Lanes of the path that is known count as so much nearer."""
+PATH_LOOK = 4
+HALF_CORRIDOR_M = 1.3
+"""What is nearer to the middle of a lane is in the way there."""
+SOON_S = 1.0
+"""Outside of junctions drivers see so early that somebody comes into their lane."""
+SLOWEST_MPS = 0.5
+HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
+"""Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
+COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
+"""Others stand back only for somebody who comes at this speed, and will be at the line within this time."""
+RUN_OVER_S = 1.5
+BESIDE_M = 0.5
+"""People do not step to where a vehicle will be in this time, or this near beside it."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """How vehicle 0 stands and moves now."""
+
+    axle_xyz: Float64[np.ndarray, "3"]
+    """The ground point below the rear axle, world frame."""
+    yaw_rad: float
+    speed_mps: float
+    turn_radps: float = 0.0
+    """Positive to the left."""
+
+    @property
+    def forward(self) -> Float64[np.ndarray, "3"]:
+        """Unit heading, seen from above."""
+        return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad), 0.0])
+
+    def later(self, seconds: float) -> "Driven":
+        """Where it will be at this speed and turn rate."""
+        turned = self.turn_radps * seconds
+        along = self.yaw_rad + 0.5 * turned
+        moved = self.speed_mps * seconds * np.array([np.cos(along), np.sin(along), 0.0])
+        return dataclasses.replace(self, axle_xyz=self.axle_xyz + moved, yaw_rad=self.yaw_rad + turned)
+
+
+@dataclass(frozen=True)
+class SeenDriven:
+    """What the others see of vehicle 0."""
+
+    driven: Driven
+    everyone: Vehicles
+    """All vehicles, then the shadows. Vehicle 0 is on the lane it follows; not active if it follows none."""
+    count: int
+    """Of them without the shadows."""
+    route_passed: int
+    may_ask: Bool[np.ndarray, "M"]
+    """Whose requests for right of way count: those of vehicle 0 only while it really comes."""
+
+    @property
+    def decides(self) -> Bool[np.ndarray, "M"]:
+        """Who drives himself: neither vehicle 0 nor shadows."""
+        every = np.arange(len(self.everyone.active))
+        return (every > 0) & (every < self.count)
+
+    @property
+    def centre_m(self) -> Float64[np.ndarray, "3"]:
+        """The middle of vehicle 0 on the ground."""
+        return self.driven.axle_xyz + self.everyone.axle_to_centre_m[0] * self.driven.forward
+
+    def danger(self, xy: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Which points are where vehicle 0 is, or soon will be."""
+        forward, offset = self.driven.forward[:2], xy - self.centre_m[:2]
+        aside = np.abs(offset @ [-forward[1], forward[0]])
+        half_length, half_width = 0.5 * self.everyone.size_lwh[0, :2]
+        ahead = half_length + BESIDE_M + RUN_OVER_S * self.driven.speed_mps
+        along = offset @ forward
+        return np.asarray((along > -half_length) & (along < ahead) & (aside < half_width + BESIDE_M))
+
+    def without_shadows(self, moved: Vehicles) -> Vehicles:
+        """The vehicles alone, once all have moved; vehicle 0 stays in its slot, wherever it is."""
+        kept = Vehicles(**{name: value[: self.count] for name, value in vars(moved).items()})
+        return _replaced(kept, active=True)
+
+
+def see_driven(
+    graph: LaneGraph,
+    near: NearLanes,
+    vehicles: Vehicles,
+    driven: Driven,
+    route: Int[np.ndarray, "R"],
+    route_passed: int,
+) -> SeenDriven:
+    """Vehicle 0 where somebody outside has driven it.
+
+    Args:
+        route: as in `TrafficState`; off it, vehicle 0 is taken to go on as straight as it can.
+    """
+    centre = driven.axle_xyz + vehicles.axle_to_centre_m[0] * driven.forward
+    found = _find_lane(near, centre, driven.yaw_rad, vehicles.path[0, BEHIND : BEHIND + PATH_LOOK])
+    if found is None:
+        placed = _replaced(vehicles, active=False, speed_mps=0.0, granted=0)
+    else:
+        lane, s_m = found
+        route_passed, to_come = _route_from(graph, route, route_passed, lane)
+        path, passed = _path_on(graph, vehicles.path[0], lane, to_come)
+        placed = _replaced(
+            vehicles,
+            path=path,
+            s_m=min(s_m, float(graph.length_m[lane])),
+            speed_mps=driven.speed_mps,
+            acceleration_mps2=0.0,
+            granted=max(0, int(vehicles.granted[0]) - passed),
+            has_stopped=bool(vehicles.has_stopped[0]) and passed == 0,
+            shift_m=0.0,
+        )
+    beside = _shadows(near, graph, placed, driven)
+    everyone = Vehicles(
+        **{name: np.concatenate([value, getattr(beside, name)]) for name, value in vars(placed).items()}
+    )
+    everyone, may_ask = _on_its_way(graph, everyone)
+    return SeenDriven(driven, everyone, len(vehicles.active), route_passed, may_ask)
+
+
+def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
+    """Vehicles with other values for the first."""
+    values = {}
+    for name, value in changes.items():
+        values[name] = getattr(vehicles, name).copy()
+        values[name][0] = value
+    return dataclasses.replace(vehicles, **values)
+
+
+def _find_lane(
+    near: NearLanes, centre: Float64[np.ndarray, "3"], yaw_rad: float, known: Int[np.ndarray, "k"]
+) -> tuple[int, float] | None:
+    """The lane that somebody follows, and the arc length beside him; None if he follows none."""
+    samples = near.within(centre, LANE_REACH_M)
+    turned = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
+    samples, turned = samples[turned < MOST_TURNED_RAD], turned[turned < MOST_TURNED_RAD]
+    if not len(samples):
+        return None
+    offset = centre[:2] - near.xyz[samples, :2]
+    cost = np.hypot(offset[:, 0], offset[:, 1]) + TURNED_M * turned
+    cost -= KNOWN_M * np.isin(near.lane[samples], known)
+    best = int(np.argmin(cost))
+    along_m = float(offset[best] @ near.ahead[samples[best]])
+    return int(near.lane[samples[best]]), max(0.0, float(near.along_m[samples[best]]) + along_m)
+
+
+def _route_from(
+    graph: LaneGraph, route: Int[np.ndarray, "R"], passed: int, lane: int
+) -> tuple[int, Int[np.ndarray, "_"]]:
+    """How many stretches of its route vehicle 0 has behind it, and those from the one it is on; none if it is
+    off its route."""
+    abreast = {lane}
+    for side in graph.sides.lane:
+        beside = int(side[lane])
+        while beside >= 0 and beside not in abreast:
+            abreast.add(beside)
+            beside = int(side[beside])
+    for index in range(max(0, passed - 1), min(passed + PATH_LOOK, len(route))):
+        if int(route[index]) in abreast:
+            return index, route[index:]
+    return passed, route[:0]
+
+
+def _path_on(
+    graph: LaneGraph, path: Int[np.ndarray, "W"], lane: int, to_come: Int[np.ndarray, "R"]
+) -> tuple[Int[np.ndarray, "W"], int]:
+    """The path of who has come to a lane, and how many lanes further on that is."""
+    ahead = np.flatnonzero(path[BEHIND:] == lane)
+    passed = int(ahead[0]) if len(ahead) else WINDOW
+    if len(ahead):
+        path = np.append(path[passed:], np.full(passed, -1))
+    else:
+        path = np.full(WINDOW, -1)
+        path[BEHIND] = lane
+        for column in range(BEHIND - 1, -1, -1):
+            path[column] = graph.predecessors[path[column + 1], 0] if path[column + 1] >= 0 else -1
+    for column in range(BEHIND + 1, WINDOW):
+        before, stretch = int(path[column - 1]), column - BEHIND
+        if path[column] >= 0 or before < 0 or graph.successor_count[before] == 0:
+            continue
+        options = graph.successors[before, : graph.successor_count[before]]
+        straightest = int(options[np.argmin(np.abs(graph.turn_rad[options]))])
+        on_route = stretch < len(to_come)
+        path[column] = towards(graph, before, int(to_come[stretch]), straightest) if on_route else straightest
+    return path, passed
+
+
+def _shadows(near: NearLanes, graph: LaneGraph, vehicles: Vehicles, driven: Driven) -> Vehicles:
+    """Vehicles on the lanes that vehicle 0 is in the way of, besides the one it follows."""
+    half, axle_to_centre_m = 0.5 * vehicles.size_lwh[0, :2], vehicles.axle_to_centre_m[0]
+    own = vehicles.path[0, BEHIND - 1 : BEHIND + 2] if vehicles.active[0] else np.zeros(0, dtype=np.int64)
+    rows: dict[int, tuple[float, float, float]] = {}
+    times_s = (0.0, SOON_S) if driven.speed_mps > SLOWEST_MPS else (0.0,)
+    for time_s in times_s:
+        then = driven.later(time_s)
+        centre = then.axle_xyz + axle_to_centre_m * then.forward
+        samples = near.within(centre, float(np.hypot(*half)) + HALF_CORRIDOR_M)
+        lane = near.lane[samples]
+        wanted = ~np.isin(lane, own) & ((graph.junction[lane] < 0) if time_s else True)
+        samples = samples[wanted]
+        samples = samples[_is_crossed(near, samples, centre, then.yaw_rad, half)]
+        for here in np.unique(near.lane[samples]).tolist():
+            on_it = samples[near.lane[samples] == here]
+            first, last = near.along_m[on_it[0]], near.along_m[on_it[-1]]
+            mps = float(driven.speed_mps * np.cos(then.yaw_rad - near.heading[on_it[0]]))
+            if here not in rows:  # it is seen where it would be now, were it in that lane already
+                rows[here] = float(first) - mps * time_s, float(last) - mps * time_s, mps
+    one = empty_slots(len(rows))
+    table = np.array(list(rows.values())).reshape(-1, 3)
+    path = one.path.copy()
+    path[:, BEHIND] = list(rows)
+    margin = 0.5 * graph.step_m[path[:, BEHIND]]
+    size = np.tile(vehicles.size_lwh[0], (len(rows), 1))
+    size[:, 0] = table[:, 1] - table[:, 0] + 2 * margin
+    return dataclasses.replace(
+        one,
+        active=np.ones(len(rows), dtype=np.bool_),
+        category=np.full(len(rows), int(Category.CAR)),
+        size_lwh=size,
+        path=path,
+        s_m=0.5 * (table[:, 0] + table[:, 1]),
+        speed_mps=table[:, 2],
+    )
+
+
+def _is_crossed(
+    near: NearLanes,
+    samples: Int[np.ndarray, "n"],
+    centre: Float64[np.ndarray, "3"],
+    yaw_rad: float,
+    half: Float64[np.ndarray, "2"],
+) -> Bool[np.ndarray, "n"]:
+    """At which samples an oriented box reaches into the lane's corridor: the line across it, clipped by the
+    box's two pairs of sides (Liang & Barsky 1984)."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    R_box_world = np.array([[cos, sin], [-sin, cos]])
+    at = (near.xyz[samples, :2] - centre[:2]) @ R_box_world.T
+    ahead = near.ahead[samples]
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) @ R_box_world.T
+    across = np.where(np.abs(across) < 1e-9, 1e-9, across)
+    a, b = (-half - at) / across, (half - at) / across
+    enters = np.minimum(a, b).max(axis=1).clip(-HALF_CORRIDOR_M)
+    leaves = np.maximum(a, b).min(axis=1).clip(max=HALF_CORRIDOR_M)
+    return np.asarray(enters <= leaves)
+
+
+def _on_its_way(graph: LaneGraph, everyone: Vehicles) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
+    """Grant vehicle 0 the junction that it can no longer stop for; who may ask for right of way."""
+    comes = np.ones(len(everyone.active), dtype=np.bool_)
+    speed, path = float(everyone.speed_mps[0]), everyone.path[0]
+    contested = graph.contested[path] & (path >= 0)
+    inside = bool(contested[BEHIND])
+    first = BEHIND + 1 + int(np.argmax(contested[BEHIND + 1 :]))
+    if not everyone.active[0] or inside or not contested[first]:
+        return everyone, comes
+    gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
+    end = first + int(np.argmin(np.append(contested[first:], False)))
+    if gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed and speed > COMES_MPS:
+        return _replaced(everyone, granted=end - 1 - BEHIND), comes
+    comes[0] = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
+    return (everyone if comes[0] else _replaced(everyone, granted=0)), comes

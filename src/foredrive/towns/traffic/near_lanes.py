@@ -1,0 +1,65 @@
+"""Which lanes are where: the samples of all centrelines, found by place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+from scipy.spatial import cKDTree
+
+from foredrive.towns.traffic.lane_graph import LaneGraph
+
+LEVEL_M = 2.5
+"""Lanes whose heights differ by more from a point are on another level than it."""
+HEIGHT_SAMPLES = 12
+"""So many of the nearest samples are asked for one of the right level."""
+
+
+@dataclass(frozen=True)
+class NearLanes:
+    """The P samples of a town's centrelines."""
+
+    xyz: Float64[np.ndarray, "P 3"]
+    lane: Int[np.ndarray, "P"]
+    along_m: Float64[np.ndarray, "P"]
+    """Arc length on the lane."""
+    ahead: Float64[np.ndarray, "P 2"]
+    """Unit heading, seen from above."""
+    heading: Float64[np.ndarray, "P"]
+    slope: Float64[np.ndarray, "P"]
+    tree: cKDTree
+    """Seen from above."""
+
+    def within(self, xyz: Float64[np.ndarray, "3"], reach_m: float) -> Int[np.ndarray, "K"]:
+        """The samples within a distance, seen from above, of a point of the same level; sorted by lane."""
+        found = np.array(self.tree.query_ball_point(xyz[:2], reach_m, return_sorted=True), dtype=np.int64)
+        return found[np.abs(self.xyz[found, 2] - xyz[2]) < LEVEL_M]
+
+    def height_m(self, xy: Float64[np.ndarray, "n 2"], about_m: float) -> Float64[np.ndarray, "n"]:
+        """Height of the road at points, on the level of a height nearby; beside it the same as on it.
+
+        Where no lane of that level is near, the height asked about.
+        """
+        found = np.asarray(self.tree.query(xy, HEIGHT_SAMPLES)[1])
+        level = np.abs(self.xyz[found, 2] - about_m) < LEVEL_M
+        nearest = found[np.arange(len(xy)), np.argmax(level, axis=1)]
+        along_m = np.sum((xy - self.xyz[nearest, :2]) * self.ahead[nearest], axis=1)
+        z = self.xyz[nearest, 2] + along_m.clip(-1.0, 1.0) * self.slope[nearest]
+        return np.where(level.any(axis=1), z, about_m)
+
+
+def near_lanes_of(graph: LaneGraph) -> NearLanes:
+    """The samples of a graph's lanes."""
+    lane = np.repeat(np.arange(len(graph.ids)), graph.count)
+    at = np.arange(len(lane))
+    last = at == (graph.first + graph.count - 1)[lane]
+    step = graph.xyz[np.where(last, at, at + 1)] - graph.xyz[np.where(last, at - 1, at)]
+    flat_m = np.hypot(step[:, 0], step[:, 1]).clip(1e-9)
+    return NearLanes(
+        xyz=graph.xyz,
+        lane=lane,
+        along_m=(at - graph.first[lane]) * graph.step_m[lane],
+        ahead=step[:, :2] / flat_m[:, None],
+        heading=np.arctan2(step[:, 1], step[:, 0]),
+        slope=step[:, 2] / flat_m,
+        tree=cKDTree(graph.xyz[:, :2]),
+    )
