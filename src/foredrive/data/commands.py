@@ -27,14 +27,15 @@ def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None
     """
     lateral_m = _route_offset_m(log, frame)
     if lateral_m is not None:
-        return _command(lateral_m), "route"
+        return command_of(lateral_m), "route"
     valid = future.valid[0].numpy()
     if not valid.any():
         return None, "none"
-    return _command(float(future.xy[0, np.flatnonzero(valid)[-1], 1])), "driven_future"
+    return command_of(float(future.xy[0, np.flatnonzero(valid)[-1], 1])), "driven_future"
 
 
-def _command(lateral_m: float) -> Command:
+def command_of(lateral_m: float) -> Command:
+    """The command for a route, or a path, that bears so far to the left."""
     if lateral_m >= LATERAL_M:
         return Command.LEFT
     return Command.RIGHT if lateral_m <= -LATERAL_M else Command.STRAIGHT

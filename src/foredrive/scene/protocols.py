@@ -84,6 +84,10 @@ class Event:
     t_s: float
     xy_world: tuple[float, float]
     detail: str = ""
+    what: str = ""
+    """What was hit or run."""
+    severity: float = 0.0
+    """Of a collision the speed at which it came about, m/s; of leaving the lanes the way driven so, m."""
 
 
 @dataclass(frozen=True)

@@ -221,6 +221,19 @@ class World:
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in actors]
         return visibility(shaped, sensors, T_world_ego, np.stack(list(frame.pixel_ids.values())))
 
+    def struck(
+        self, origin: Float32[np.ndarray, "N 3"], direction: Float32[np.ndarray, "N 3"]
+    ) -> tuple[Float32[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+        """What stands in the way of rays, parked cars included.
+
+        Returns:
+            How far it is, in lengths of `direction`, and its `Surface`; infinite and -1 if there is nothing.
+        """
+        hits = self._scene.cast(origin, direction)
+        met = hits.triangle != shading.MISS
+        surface = self._looks.surface[self.static.mesh.look[np.where(met, hits.triangle, 0)]]
+        return np.where(met, hits.t, np.float32(np.inf)), np.where(met, surface, SKY)
+
     @cached_property
     def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
         """Points on the lamps of each traffic light, by the index of its stop zone."""

@@ -116,7 +116,7 @@ def see_driven(
         route: as in `TrafficState`; off it, vehicle 0 is taken to go on as straight as it can.
     """
     centre = driven.axle_xyz + vehicles.axle_to_centre_m[0] * driven.forward
-    found = _find_lane(near, centre, driven.yaw_rad, vehicles.path[0, BEHIND : BEHIND + PATH_LOOK])
+    found = find_lane(near, centre, driven.yaw_rad, vehicles.path[0, BEHIND : BEHIND + PATH_LOOK])
     if found is None:
         placed = _replaced(vehicles, active=False, speed_mps=0.0, granted=0)
     else:
@@ -150,10 +150,15 @@ def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
     return dataclasses.replace(vehicles, **values)
 
 
-def _find_lane(
+def find_lane(
     near: NearLanes, centre: Float64[np.ndarray, "3"], yaw_rad: float, known: Int[np.ndarray, "k"]
 ) -> tuple[int, float] | None:
-    """The lane that somebody follows, and the arc length beside him; None if he follows none."""
+    """The lane that somebody follows, and the arc length beside him; None if he follows none.
+
+    Args:
+        centre: his middle, on the ground.
+        known: lanes that he is likely to follow.
+    """
     samples = near.within(centre, LANE_REACH_M)
     turned = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
     samples, turned = samples[turned < MOST_TURNED_RAD], turned[turned < MOST_TURNED_RAD]

@@ -1,0 +1,113 @@
+"""What the ego vehicle runs into: road users by their boxes, and what stands in a town by its meshes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from foredrive.scene import Category, Event
+from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.simulation.road_users import Box, RoadUsers, touched
+from foredrive.towns.place.looks import Surface
+from foredrive.towns.world import World
+
+PASSABLE = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN, Surface.HIDDEN)
+SOLID = np.array([surface not in PASSABLE for surface in Surface])
+RAY_HEIGHTS_M = (0.35, 0.8)
+RAY_SPACING_M = 0.12
+"""Posts are not much thinner."""
+BUMPER_M, FLANK_M = 0.8, 0.3
+"""What this much of the front meets, but for the corners, stops the vehicle; along the rest it scrapes."""
+SAME_S, SAME_M = 5.0, 3.0
+"""A contact is a new collision if the last one with the same road user is so long ago, or the last one with
+something that stands is so far away (CARLA's CollisionTest)."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What has been run into."""
+
+    users: tuple[tuple[int, float], ...] = ()
+    """Track ids, and when they were last in contact, s."""
+    standing_xy: tuple[float, float] | None = None
+    """Where something that stands was met last."""
+
+
+class CollisionSense:
+    """Tells what the ego vehicle runs into in one world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        half_width, length = 0.5 * EGO.width_m, EGO.length_m
+        y = np.linspace(-half_width, half_width, int(np.ceil(EGO.width_m / RAY_SPACING_M)) + 1)
+        start = [[EGO.axle_to_centre_m + 0.5 * length, left, up] for up in RAY_HEIGHTS_M for left in y]
+        self._start_ego: Float64[np.ndarray, "R 3"] = np.array(start)
+        self._in_front = np.abs(self._start_ego[:, 1]) < half_width - FLANK_M
+
+    def check(
+        self,
+        T_world_ego: Float64[np.ndarray, "4 4"],
+        ego: BicycleState,
+        users: RoadUsers,
+        contacts: Contacts,
+        t_s: float,
+    ) -> tuple[list[Event], Contacts, bool]:
+        """New collisions, what is known of contacts from now on, and whether something stops the vehicle."""
+        box = ego_box(T_world_ego, ego)
+        hit = np.flatnonzero(touched(box, users))
+        velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
+        known, events = dict(contacts.users), []
+        for i in hit.tolist():
+            track, category = int(users.track_id[i]), Category(int(users.category[i]))
+            if t_s - known.get(track, -np.inf) > SAME_S:
+                kind = "pedestrian" if category is Category.PEDESTRIAN else "vehicle"
+                impact_mps = float(np.hypot(*(velocity - users.velocity_mps[i])))
+                where = (float(users.foot_m[i, 0]), float(users.foot_m[i, 1]))
+                text = f"{category.name.lower()} {track} at {impact_mps:.1f} m/s"
+                events.append(Event(f"collision_{kind}", t_s, where, text, category.name.lower(), impact_mps))
+            known[track] = t_s
+        stands_in_front, struck = self._standing(T_world_ego)
+        standing_xy = contacts.standing_xy
+        if struck is not None:
+            xy, surface = struck
+            if standing_xy is None or np.hypot(*np.subtract(xy, standing_xy)) > SAME_M:
+                what = "parked car" if surface is Surface.VEHICLE else surface.name.lower()
+                text = f"{what} at {ego.speed_mps:.1f} m/s"
+                events.append(Event("collision_static", t_s, xy, text, what, ego.speed_mps))
+                standing_xy = xy
+        recent = tuple((track, at_s) for track, at_s in known.items() if t_s - at_s <= SAME_S)
+        stopped = stands_in_front or self._runs_into(box, users)
+        return events, Contacts(recent, standing_xy), stopped
+
+    def _runs_into(self, box: Box, users: RoadUsers) -> bool:
+        """Whether there is a vehicle right before the bumper."""
+        forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
+        half = np.array([0.5 * BUMPER_M, box.half_lw[1] - FLANK_M])
+        bumper = Box(box.foot_m + (box.half_lw[0] - half[0]) * forward, box.yaw_rad, half)
+        return bool((touched(bumper, users) & (users.category != Category.PEDESTRIAN)).any())
+
+    def _standing(
+        self, T_world_ego: Float64[np.ndarray, "4 4"]
+    ) -> tuple[bool, tuple[tuple[float, float], Surface] | None]:
+        """Whether the bumper meets something that stands; where and what is the foremost within the outline.
+
+        Rays go from the bumper to the rear.
+        """
+        R, origin = T_world_ego[:3, :3], T_world_ego[:3, 3]
+        start = self._start_ego @ R.T + origin
+        way = np.broadcast_to(-EGO.length_m * R[:, 0], start.shape)
+        rays: list[Float32[np.ndarray, "R 3"]] = [np.ascontiguousarray(x, np.float32) for x in (start, way)]
+        part, surface = self._world.struck(*rays)
+        inside = (part <= 1.0) & SOLID[surface]
+        if not inside.any():
+            return False, None
+        at_front = inside & self._in_front & (part * EGO.length_m < BUMPER_M)
+        first = int(np.argmin(np.where(inside, part, np.inf)))
+        xy = start[first, :2] + part[first] * way[first, :2]
+        return bool(at_front.any()), ((float(xy[0]), float(xy[1])), Surface(int(surface[first])))
+
+
+def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState) -> Box:
+    """The ego vehicle's box."""
+    foot = T_world_ego[:3, 3] + EGO.axle_to_centre_m * T_world_ego[:3, 0]
+    return Box(foot, ego.yaw_rad, 0.5 * np.array([EGO.length_m, EGO.width_m]))

@@ -1,0 +1,79 @@
+"""What an agent gets to see of a town: key frames of the past, put together as a clip."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from torch import Tensor
+
+from foredrive.data.collate import stack_records
+from foredrive.data.lidar import empty_sweep
+from foredrive.scene import Boxes, CameraRig, Clip, Command, LidarSweep, Trajectory
+
+FRAME_DT_S = 0.5
+HORIZON_STEPS = 6
+
+
+@dataclass(frozen=True)
+class KeyFrame:
+    """What was sensed at one time."""
+
+    t_s: float
+    T_world_ego: Float64[np.ndarray, "4 4"]
+    speed_mps: float
+    images: UInt8[Tensor, "C 3 H W"]
+    """No cameras where sensors are off."""
+    sweep: LidarSweep | None
+    boxes: Boxes
+
+
+def make_clip(frames: Sequence[KeyFrame], rig: CameraRig | None, command: Command) -> Clip:
+    """The clip of some key frames, the last of which is now; its future is not known.
+
+    Args:
+        rig: of the images, without leading dimensions; None where there are none.
+    """
+    count, rig = len(frames), rig or _no_cameras()
+    yes = torch.ones(count, dtype=torch.bool)
+    sensed = torch.tensor([frame.sweep is not None for frame in frames])
+    return Clip(
+        t_s=torch.tensor([frame.t_s - frames[-1].t_s for frame in frames]),
+        T_world_ego=torch.from_numpy(np.stack([frame.T_world_ego for frame in frames])),
+        images=torch.stack([frame.images for frame in frames]),
+        image_valid=torch.ones(count, len(rig.names), dtype=torch.bool),
+        rig=rig.map_tensors(lambda tensor: tensor.expand(count, *tensor.shape)),
+        sweeps=stack_records([frame.sweep or empty_sweep() for frame in frames]),
+        sweep_valid=sensed,
+        misses_known=sensed,
+        boxes=stack_records([frame.boxes for frame in frames]),
+        boxes_valid=yes,
+        ego_speed_mps=torch.tensor([frame.speed_mps for frame in frames]),
+        ego_speed_valid=yes,
+        command=torch.tensor(int(command)),
+        command_valid=torch.tensor(True),
+        future=Trajectory(
+            xy=torch.zeros(1, HORIZON_STEPS, 2),
+            yaw=torch.zeros(1, HORIZON_STEPS),
+            valid=torch.zeros(1, HORIZON_STEPS, dtype=torch.bool),
+            log_prob=torch.zeros(1),
+            dt_s=FRAME_DT_S,
+        ),
+    )
+
+
+def no_images() -> UInt8[Tensor, "0 3 0 0"]:
+    """Of no cameras."""
+    return torch.zeros(0, 3, 0, 0, dtype=torch.uint8)
+
+
+def _no_cameras() -> CameraRig:
+    return CameraRig(
+        K=torch.zeros(0, 3, 3),
+        T_ego_cam=torch.zeros(0, 4, 4),
+        dist=torch.zeros(0, 5),
+        readout_s=torch.zeros(0),
+        names=(),
+        size_hw=(0, 0),
+    )

@@ -1,0 +1,83 @@
+"""Everybody on the road as oriented boxes, and which of them touch the ego vehicle."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from foredrive.scene import Category
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.traffic import Traffic
+
+LEVEL_M = 2.0
+"""What is further apart in height passes over or under."""
+
+
+class RoadUsers(NamedTuple):
+    """N slots for all road users but the ego vehicle; world frame."""
+
+    track_id: Int[np.ndarray, "N"]
+    """-1 in slots without anybody."""
+    category: Int[np.ndarray, "N"]
+    foot_m: Float64[np.ndarray, "N 3"]
+    """The middle of the box, on the ground."""
+    yaw: Float64[np.ndarray, "N"]
+    half_lw: Float64[np.ndarray, "N 2"]
+    velocity_mps: Float64[np.ndarray, "N 2"]
+
+    def towards(self, later: "RoadUsers", part: float) -> "RoadUsers":
+        """A part of the way on to where they are later; who is not there then stays."""
+        same = self.track_id == later.track_id
+        moved = np.where(same, part, 0.0)
+        turned = (later.yaw - self.yaw + np.pi) % (2 * np.pi) - np.pi
+        return self._replace(
+            foot_m=self.foot_m + moved[:, None] * (later.foot_m - self.foot_m),
+            yaw=self.yaw + moved * turned,
+            velocity_mps=self.velocity_mps + moved[:, None] * (later.velocity_mps - self.velocity_mps),
+        )
+
+
+class Box(NamedTuple):
+    """An upright box on the ground."""
+
+    foot_m: Float64[np.ndarray, "3"]
+    """Its middle, on the ground."""
+    yaw_rad: float
+    half_lw: Float64[np.ndarray, "2"]
+
+
+def road_users(traffic: Traffic, state: TrafficState) -> RoadUsers:
+    """All road users but vehicle 0."""
+    v, p, poses = state.vehicles, state.people, traffic.poses(state)
+    forward = poses.forward[1:, :2]
+    foot = poses.centre_m[1:] - 0.5 * v.size_lwh[1:, 2:] * [0.0, 0.0, 1.0]
+    return RoadUsers(
+        track_id=np.concatenate([np.where(v.active, v.track_id, -1)[1:], np.where(p.active, p.track_id, -1)]),
+        category=np.concatenate([v.category[1:], np.full(len(p.active), int(Category.PEDESTRIAN))]),
+        foot_m=np.concatenate([foot, p.xyz]),
+        yaw=np.concatenate([poses.yaw[1:], p.yaw]),
+        half_lw=0.5 * np.concatenate([v.size_lwh[1:, :2], p.size_lwh[:, :2]]),
+        velocity_mps=np.concatenate([v.speed_mps[1:, None] * forward, p.velocity_mps[:, :2]]),
+    )
+
+
+def touched(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
+    """Who overlaps a box: no axis of either separates the two (Gottschalk et al. 1996, in the plane)."""
+    offset = users.foot_m - box.foot_m
+    near = (users.track_id >= 0) & (np.abs(offset[:, 2]) < LEVEL_M)
+    reach = np.hypot(*box.half_lw) + np.hypot(users.half_lw[:, 0], users.half_lw[:, 1])
+    near &= np.abs(offset[:, :2]).max(axis=1) < reach
+    hit = np.zeros(len(near), dtype=np.bool_)
+    for i in np.flatnonzero(near).tolist():
+        mine, theirs = _axes(box.yaw_rad), _axes(float(users.yaw[i]))
+        between = np.abs(mine @ theirs.T)
+        apart = np.abs(mine @ offset[i, :2]) > box.half_lw + between @ users.half_lw[i]
+        apart |= np.abs(theirs @ offset[i, :2]) > users.half_lw[i] + between.T @ box.half_lw
+        hit[i] = not apart.any()
+    return hit
+
+
+def _axes(yaw_rad: float) -> Float64[np.ndarray, "2 2"]:
+    """Forward and left, in rows."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[cos, sin], [-sin, cos]])

@@ -1,0 +1,72 @@
+"""How far along its route the ego vehicle is, and what ends a drive."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.data.commands import command_of, route_offset_m
+from foredrive.scene import Command
+
+SPACING_M = 1.0
+AHEAD_M, BACK_M = 20.0, 5.0
+"""Which part of the route is looked at for where the vehicle is: routes may cross themselves."""
+ARRIVED_M = 5.0
+DEVIATION_M = 30.0
+BLOCKED_S, BLOCKED_MPS = 180.0, 0.1
+"""Leaderboard 1.0: who is further from the route has left it, who is slower for so long is blocked."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Along one route."""
+
+    done_m: float = 0.0
+    beside_m: float = 0.0
+    """Distance from the route."""
+    moved_s: float = 0.0
+    """When the vehicle moved last."""
+
+
+class RouteLine:
+    """A route to follow.
+
+    Args:
+        xyz: a polyline in the world frame.
+    """
+
+    def __init__(self, xyz: Float64[np.ndarray, "M 3"]) -> None:
+        arc_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+        self.length_m = float(arc_m[-1])
+        self._arc_m = np.linspace(0.0, self.length_m, max(2, int(np.ceil(self.length_m / SPACING_M)) + 1))
+        self._xy = np.stack([np.interp(self._arc_m, arc_m, xyz[:, axis]) for axis in (0, 1)], axis=1)
+
+    def advance(
+        self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
+    ) -> Progress:
+        """The progress of a vehicle that is at a point now; never backwards."""
+        first, last = np.searchsorted(self._arc_m, [progress.done_m - BACK_M, progress.done_m + AHEAD_M])
+        part = slice(int(first), int(last) + 1)
+        away_m = np.hypot(*(self._xy[part] - xy).T)
+        nearest = int(np.argmin(away_m))
+        return dataclasses.replace(
+            progress,
+            done_m=max(progress.done_m, float(self._arc_m[part][nearest])),
+            beside_m=float(away_m[nearest]),
+            moved_s=t_s if speed_mps >= BLOCKED_MPS else progress.moved_s,
+        )
+
+    def end_of(self, progress: Progress, t_s: float, limit_s: float) -> str | None:
+        """Why a drive is over: "completed", "deviation", "blocked" or "timeout"; None if it is not."""
+        if progress.done_m > self.length_m - ARRIVED_M and progress.beside_m < ARRIVED_M:
+            return "completed"
+        if progress.beside_m > DEVIATION_M:
+            return "deviation"
+        if t_s - progress.moved_s > BLOCKED_S:
+            return "blocked"
+        return "timeout" if t_s >= limit_s else None
+
+    def command(self, progress: Progress) -> Command:
+        """Where the route leads next, as recorded logs tell it."""
+        return command_of(route_offset_m(self._arc_m, self._xy, progress.done_m))

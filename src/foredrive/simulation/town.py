@@ -1,0 +1,262 @@
+"""A town as a simulator: the ego vehicle drives at 20 Hz, everybody reacts to it, sensors see key frames."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from foredrive.errors import InputError
+from foredrive.scene import Clip, Control, Event, Step
+from foredrive.simulation.collisions import CollisionSense, Contacts
+from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, step, yaw_rate_radps
+from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
+from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.road_users import RoadUsers, road_users
+from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.towns.conditions import Conditions
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.recorder import BOXES_WITHIN_M, Crowd, boxes_of
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.traffic.driven import Driven, find_lane
+from foredrive.towns.traffic.fleet import ego_vehicle
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.world import World
+
+TRAFFIC_STEPS = 2
+"""The others decide at 10 Hz what they do, as in recordings; in between they are on their straight way."""
+FRAME_STEPS = round(FRAME_DT_S / STEP_S)
+SETTLE_S = 3.0
+"""A drive begins once traffic has left its first, unlikely state; until then the ego vehicle stands."""
+
+
+@dataclass(frozen=True, eq=False)
+class TownScenario:
+    """Where to drive and under which circumstances. The vehicle starts from rest where the route begins."""
+
+    town: str
+    route_xyz: Float64[np.ndarray, "M 3"]
+    """World frame, along the lanes."""
+    seed: int = 0
+    """Of the place, the traffic and all noise."""
+    lanes: tuple[int, ...] = ()
+    """Where the route has to be at the end of each stretch, as `TrafficState.route`: what the others expect.
+    Without them they expect that it goes straight on."""
+    crowd: Crowd = field(default_factory=Crowd)
+    conditions: Conditions | None = None
+    """None draws bright daylight from the seed."""
+    sensors: SensorSuite | None = None
+    """None: key frames have boxes alone."""
+    past_frames: int = 1
+    """Key frames before now in an observation."""
+    limit_s: float = np.inf
+    """The drive ends after this time."""
+
+
+@dataclass(frozen=True, eq=False)
+class TownState:
+    """A drive at one time: with the scenario, all that its future depends on."""
+
+    step_index: int
+    ego: BicycleState
+    z_m: float
+    """Height of the road below the rear axle."""
+    traffic: TrafficState
+    """At the last time that the others decided."""
+    decided: TrafficState
+    """One decision later, which they are on their way to."""
+    frames: tuple[KeyFrame, ...]
+    contacts: Contacts = field(default_factory=Contacts)
+    rules: RuleState = field(default_factory=RuleState)
+    progress: Progress = field(default_factory=Progress)
+    ended: str | None = None
+    """Why the drive is over, if it is."""
+
+    @property
+    def t_s(self) -> float:
+        """Since the drive began."""
+        return self.step_index * STEP_S
+
+
+@dataclass(frozen=True, eq=False)
+class SavedDrive:
+    """A drive to go on with, in this process or another."""
+
+    scenario: TownScenario
+    state: TownState
+
+
+class TownSimulator:
+    """A `Simulator` over the embedded towns: equal scenarios and controls give equal drives, bit by bit."""
+
+    state: TownState
+    _users: tuple[RoadUsers, RoadUsers]
+    """Of both states of the traffic."""
+
+    def reset(self, scenario: TownScenario) -> Clip:
+        """Start a drive; takes some seconds where the town is not the last one.
+
+        Raises:
+            InputError: there is no such town, or the route has no length or begins on no lane.
+        """
+        self._prepare(scenario)
+        ego = _start(scenario.route_xyz)
+        z_m = float(scenario.route_xyz[0, 2])
+        driven = self._driven(ego, z_m)
+        middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
+        nowhere = np.zeros(0, dtype=np.int64)
+        found = find_lane(self._traffic.near_lanes, middle, driven.yaw_rad, nowhere)
+        if found is None:
+            raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
+        row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))
+        lanes = np.array(scenario.lanes, dtype=np.int64) if scenario.lanes else None
+        traffic = self._traffic.start(row, lanes)
+        decision_s = TRAFFIC_STEPS * STEP_S
+        before = max(round(SETTLE_S / decision_s), scenario.past_frames * FRAME_STEPS // TRAFFIC_STEPS)
+        frames: tuple[KeyFrame, ...] = ()
+        for number in range(-before, 1):
+            if number * TRAFFIC_STEPS % FRAME_STEPS == 0:
+                state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, frames)
+                frames = self._with_frame(state)
+            if number < 0:
+                traffic = self._traffic.step(traffic, decision_s, driven)
+        self._adopt(TownState(0, ego, z_m, traffic, traffic, frames))
+        return self._clip
+
+    def step(self, control: Control) -> Step:
+        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+
+        Raises:
+            InputError: the drive is over, or the control is not finite.
+        """
+        state = self.state
+        if state.ended is not None:
+            raise InputError(f"the drive is over ({state.ended}): reset the simulator")
+        moved = step(state.ego, control)
+        if state.step_index % TRAFFIC_STEPS == 0:
+            driven = self._driven(state.ego, state.z_m)
+            decided = self._traffic.step(state.decided, TRAFFIC_STEPS * STEP_S, driven)
+            state = dataclasses.replace(state, traffic=state.decided, decided=decided)
+            self._users = self._users[1], road_users(self._traffic, decided)
+        state, events = self._drive(state, moved)
+        if state.step_index % FRAME_STEPS == 0:
+            state = dataclasses.replace(state, frames=self._with_frame(state))
+            self.state, self._clip = state, self._make_clip(state)
+        self.state = state
+        return Step(self._clip, events, state.ended is not None)
+
+    def save(self) -> SavedDrive:
+        """The drive as it is now: an immutable value that can be pickled."""
+        return SavedDrive(self._scenario, self.state)
+
+    def restore(self, saved: SavedDrive) -> Clip:
+        """Go on from there, as if nothing had been in between."""
+        self._prepare(saved.scenario)
+        self._adopt(saved.state)
+        return self._clip
+
+    def _prepare(self, scenario: TownScenario) -> None:
+        self._scenario = scenario
+        crowd, town = scenario.crowd, load_town_map(scenario.town)
+        self._world = _grow(scenario.town, scenario.seed)
+        self._traffic = Traffic(town, scenario.seed, crowd.vehicles + 1, crowd.people)
+        if scenario.conditions is not None:
+            self._world = self._world.under(scenario.conditions)
+        self._collisions = CollisionSense(self._world)
+        self._rules = LaneRules(town, self._traffic)
+        self._route = RouteLine(scenario.route_xyz)
+
+    def _adopt(self, state: TownState) -> None:
+        self.state, self._clip = state, self._make_clip(state)
+        self._users = road_users(self._traffic, state.traffic), road_users(self._traffic, state.decided)
+
+    def _drive(self, state: TownState, moved: BicycleState) -> tuple[TownState, list[Event]]:
+        """Move the ego vehicle unless something stops it, and see what comes of that."""
+        index = state.step_index + 1
+        t_s, part = index * STEP_S, (state.step_index % TRAFFIC_STEPS + 1) / TRAFFIC_STEPS
+        users: RoadUsers = self._users[0].towards(self._users[1], part)
+        T = self._pose(moved, state.z_m)
+        events, contacts, stopped = self._collisions.check(T, moved, users, state.contacts, t_s)
+        if stopped:
+            moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
+            T = self._pose(moved, state.z_m)
+        z_m = float(T[2, 3])
+        lights = self._traffic.zone_lights(state.traffic.time_s + part * TRAFFIC_STEPS * STEP_S)
+        more, rules = self._rules.check(state.ego, moved, z_m, lights, state.rules, t_s)
+        progress = self._route.advance(state.progress, T[:2, 3], moved.speed_mps, t_s)
+        ended = self._route.end_of(progress, t_s, self._scenario.limit_s)
+        events += more
+        if ended is not None:
+            if rules.left_at is not None:
+                events.append(left_lanes(rules.left_at, rules.left_m, t_s))
+            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
+            events.append(Event(ended, t_s, (moved.x_m, moved.y_m), text))
+        return dataclasses.replace(
+            state,
+            step_index=index,
+            ego=moved,
+            z_m=z_m,
+            contacts=contacts,
+            rules=rules,
+            progress=progress,
+            ended=ended,
+        ), events
+
+    def _driven(self, ego: BicycleState, z_m: float) -> Driven:
+        axle = np.array([ego.x_m, ego.y_m, z_m])
+        return Driven(axle, ego.yaw_rad, ego.speed_mps, yaw_rate_radps(ego))
+
+    def _pose(self, ego: BicycleState, about_z_m: float) -> Float64[np.ndarray, "4 4"]:
+        """`T_world_ego` on the road: both axles at its height, no roll."""
+        flat = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
+        axles = np.array([ego.x_m, ego.y_m]) + np.array([[0.0], [EGO.wheelbase_m]]) * flat
+        rear_m, front_m = self._traffic.near_lanes.height_m(axles, about_z_m)
+        forward = np.array([*(EGO.wheelbase_m * flat), front_m - rear_m])
+        forward /= np.linalg.norm(forward)
+        left = np.array([-flat[1], flat[0], 0.0])
+        T = np.eye(4)
+        T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
+        T[:3, 3] = ego.x_m, ego.y_m, rear_m
+        return T
+
+    def _with_frame(self, state: TownState) -> tuple[KeyFrame, ...]:
+        """The key frames with the one of now, as many as an observation has."""
+        T, sensors = self._pose(state.ego, state.z_m), self._scenario.sensors
+        actors = self._traffic.actors(state.decided)
+        everyone = [*actors, *self._world.parked]
+        away_m = np.linalg.norm(np.array([a.centre_m for a in everyone]).reshape(-1, 3) - T[:3, 3], axis=1)
+        near = [everyone[i] for i in np.flatnonzero(away_m < BOXES_WITHIN_M)]
+        images, sweep = no_images(), None
+        if sensors is not None:
+            number = state.step_index // FRAME_STEPS + self._scenario.past_frames
+            noise = np.random.SeedSequence((self._scenario.seed, max(number, 0))).generate_state(1)
+            twist = np.array([state.ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(state.ego)])
+            lights = self._traffic.zone_lights(state.decided.time_s)
+            seen = self._world.render(actors, sensors, T, twist, int(noise[0]), lights)
+            images = torch.from_numpy(np.stack(list(seen.images.values()))).permute(0, 3, 1, 2).contiguous()
+            sweep = seen.sweep
+        frame = KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_of(near, T))
+        return (*state.frames, frame)[-1 - self._scenario.past_frames :]
+
+    def _make_clip(self, state: TownState) -> Clip:
+        sensors = self._scenario.sensors
+        rig = None if sensors is None else sensors.rig
+        return make_clip(state.frames, rig, self._route.command(state.progress))
+
+
+@lru_cache(maxsize=1)  # drives in a row are often in one town
+def _grow(town: str, seed: int) -> World:
+    return World(load_town_map(town), seed)
+
+
+def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:
+    """At rest where a route begins, along it."""
+    away_m = np.hypot(*(route_xyz[:, :2] - route_xyz[0, :2]).T)
+    ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
+    if not len(ahead):
+        raise InputError("a route is longer than a vehicle")
+    x, y, _ = route_xyz[ahead[0]] - route_xyz[0]
+    return BicycleState(float(route_xyz[0, 0]), float(route_xyz[0, 1]), float(np.arctan2(y, x)), 0.0)
