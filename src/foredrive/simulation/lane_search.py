@@ -1,0 +1,250 @@
+"""From waypoints to lanes: where each lies on the lane graph, and the shortest way through them all."""
+
+import enum
+import heapq
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.errors import InputError
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.leaders import abreast
+
+ALSO_NEAR, ALSO_NEAR_M, NO_FURTHER_M = 3.0, 1.0, 20.0
+"""A waypoint may mean any lane up to `ALSO_NEAR` times as far from it as the nearest, and `ALSO_NEAR_M`, but
+no more than `NO_FURTHER_M` further: lanes cross and run into each other, and waypoints beside the road (those
+of Town05 short) do not say which of its lanes they mean."""
+ASIDE_WEIGHT = 5.0
+"""A metre from lane to waypoint is as bad as this many metres of way."""
+BACK_M = 0.5
+"""A waypoint may lie this far behind the last on the same lane: both are rounded."""
+CHANGE_M, CHANGE_M2, CLOSED_M = 10.0, 150.0, 50.0
+"""A lane change is as bad as a detour of `CHANGE_M`, of `CHANGE_M2` / room, as hurried ones are worse, and of
+`CLOSED_M` where traffic would not change: over solid lines, and to lanes that are only growing there."""
+SHORTEST_CHANGE_M = 1.0
+"""Where there is less room, nobody changes."""
+
+
+class Place(NamedTuple):
+    """A point on the lane graph."""
+
+    lane: int
+    s_m: float
+    """Arc length on the lane."""
+    aside_m: float
+    """How far the waypoint is from it."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A part of a way: along one lane from one arc length to another, both in m."""
+
+    lane: int
+    from_m: float
+    to_m: float
+    changes: int = 0
+    """How the leg is entered: 0 from the lane before, 1 from the lane to the right by a change to the left,
+    -1 from the lane to the left."""
+
+
+class _Part(enum.IntEnum):
+    """Which part of a way a lane is on: where it ends matters on the last, where it begins on the first."""
+
+    FIRST = 0
+    BETWEEN = 1
+    LAST = 2
+
+
+_Node = tuple[int, _Part]
+
+
+def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
+    """Where on the graph a waypoint may lie: on the lane nearest in space, and on others it may mean."""
+    distance = np.linalg.norm(graph.xyz - xyz, axis=1)
+    nearest = np.minimum.reduceat(distance, graph.first)
+    places = []
+    for lane in np.flatnonzero(
+        nearest <= ALSO_NEAR * nearest.min() + ALSO_NEAR_M + graph.step_m.max()
+    ).tolist():
+        line = graph.samples(lane)
+        start, along = line[:-1], np.diff(line, axis=0)
+        part = np.einsum("ni,ni->n", xyz - start, along) / np.einsum("ni,ni->n", along, along)
+        part = np.clip(part, 0.0, 1.0)
+        off = np.linalg.norm(start + part[:, None] * along - xyz, axis=1)
+        k = int(np.argmin(off))
+        places.append(Place(lane, float((k + part[k]) * graph.step_m[lane]), float(off[k])))
+    least = min(place.aside_m for place in places)
+    return [place for place in places if place.aside_m <= _also(least)]
+
+
+def _also(nearest_m: float) -> float:
+    """How far lanes may be that a waypoint may mean."""
+    return min(ALSO_NEAR * nearest_m, nearest_m + NO_FURTHER_M) + ALSO_NEAR_M
+
+
+def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[list[Leg], list[Place]]:
+    """The shortest way through all waypoints in turn, and where on it each of them lies.
+
+    Of the places each may mean, those are taken that make the whole way shortest (as map matching does,
+    Newson & Krumm 2009): a waypoint within a junction does not say which way through it is meant.
+
+    Raises:
+        InputError: there are fewer than two waypoints, or one cannot be reached from those before.
+    """
+    if len(waypoints) < 2:
+        raise InputError(f"a route has two waypoints or more, got {len(waypoints)}")
+    choices = [places_near(graph, xyz) for xyz in waypoints]
+    ways: list[list[Leg]] = [[] for _ in choices[0]]
+    places = [[place] for place in choices[0]]
+    costs = [ASIDE_WEIGHT * place.aside_m for place in choices[0]]
+    for number, (before, here) in enumerate(itertools.pairwise(choices), start=1):
+        found: list[tuple[float, int, list[Leg]]] = []
+        for end in here:  # the last waypoint has one place in the end: no other may cost more
+            most = (
+                min((total for total, *_ in found), default=np.inf)
+                if number == len(waypoints) - 1
+                else np.inf
+            )
+            found.append(_best_onto(graph, before, costs, end, most))
+        if not any(np.isfinite(total) for total, *_ in found):
+            raise InputError(f"no way leads from waypoint {number} to waypoint {number + 1}")
+        ways = [joined(ways[b], legs) for _, b, legs in found]
+        places = [[*places[b], end] for (_, b, _), end in zip(found, here, strict=True)]
+        costs = [total for total, *_ in found]
+    chosen = int(np.argmin(costs))
+    return ways[chosen], places[chosen]
+
+
+def _best_onto(
+    graph: LaneGraph, starts: Sequence[Place], costs: Sequence[float], end: Place, most: float
+) -> tuple[float, int, list[Leg]]:
+    """The cheapest way to a place from one of some that cost what they do: what it costs with both places,
+    from which it comes, its legs; infinite if none costs less than `most`. The most promising come first."""
+    index, s_m = np.array([place.lane for place in (end, *starts)]), [place.s_m for place in (end, *starts)]
+    here, *there = graph.position(index, np.array(s_m))
+    aside = ASIDE_WEIGHT * end.aside_m
+    promised = aside - BACK_M + np.array(costs) + np.linalg.norm(np.array(there) - here, axis=1)
+    best: tuple[float, int, list[Leg]] = (np.inf, 0, [])
+    for b in np.argsort(promised).tolist():
+        if promised[b] >= min(most, best[0]):
+            break
+        cost, legs = _shortest(graph, starts[b], end, min(most, best[0]) - aside - costs[b])
+        best = min(best, (aside + costs[b] + cost, b, legs), key=lambda item: item[0])
+    return best
+
+
+def joined(first: Sequence[Leg], second: Sequence[Leg]) -> list[Leg]:
+    """One way of two, of which the second begins where the first ends."""
+    if not first or not second or first[-1].lane != second[0].lane:
+        return [*first, *second]
+    middle = Leg(first[-1].lane, first[-1].from_m, second[0].to_m, first[-1].changes)
+    return [*first[:-1], middle, *second[1:]]
+
+
+def _shortest(graph: LaneGraph, start: Place, end: Place, most_m: float) -> tuple[float, list[Leg]]:
+    """The way from one place to another and its cost; infinite where none costs less than `most_m`
+    (Dijkstra 1959).
+
+    A node is a lane and the part of the way that one is on there; its cost is that to the lane's beginning.
+    """
+    first, goals = (start.lane, _Part.FIRST), [(end.lane, _Part.LAST)]
+    if (straight := _legs(graph, start, end, _beside(graph, start.lane, end.lane))) is not None:
+        goals.append((end.lane, _Part.FIRST))
+    cost: dict[_Node, float] = {first: -start.s_m}
+    came_from: dict[_Node, _Node] = {}
+    done: set[_Node] = set()
+    queue: list[tuple[float, _Node]] = [(-start.s_m, first)]
+    while queue:
+        so_far, node = heapq.heappop(queue)
+        if node in goals:
+            break
+        if node in done:
+            continue
+        done.add(node)
+        for onward, price in _steps(graph, node, start, end):
+            if so_far + price < min(cost.get(onward, np.inf), most_m):
+                cost[onward], came_from[onward] = so_far + price, node
+                heapq.heappush(queue, (so_far + price, onward))
+    else:
+        return np.inf, []
+    if node == (end.lane, _Part.FIRST) and straight is not None:
+        return so_far + end.s_m, straight
+    lanes = [node[0]]
+    while node != first:
+        node = came_from[node]
+        lanes.append(node[0])
+    legs = _legs(graph, start, end, lanes[::-1])
+    return (np.inf, []) if legs is None else (so_far + end.s_m, legs)
+
+
+def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[tuple[_Node, float]]:
+    """Where one may go from a node, and what it costs."""
+    lane, part = node
+    length_m = float(graph.length_m[lane])
+    if part is not _Part.LAST:
+        for onward in graph.successors[lane, : graph.successor_count[lane]].tolist():
+            yield (onward, _Part.BETWEEN), length_m
+            yield (onward, _Part.LAST), length_m
+    room_m = {_Part.FIRST: length_m - start.s_m, _Part.BETWEEN: length_m, _Part.LAST: end.s_m}[part]
+    if room_m >= SHORTEST_CHANGE_M:
+        for side in (
+            np.flatnonzero(graph.sides.lane[:, lane] >= 0).tolist() if graph.junction[lane] < 0 else ()
+        ):
+            closed_m = 0.0 if graph.may_cross[side, lane] else CLOSED_M
+            yield (int(graph.sides.lane[side, lane]), part), CHANGE_M + CHANGE_M2 / room_m + closed_m
+
+
+def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:
+    """The lanes from one to another that is the same or on one of its sides; only the first if it is not."""
+    for side in (0, 1):
+        lanes = [first]
+        while lanes[-1] != last and graph.sides.lane[side, lanes[-1]] >= 0:
+            lanes.append(int(graph.sides.lane[side, lanes[-1]]))
+        if lanes[-1] == last:
+            return lanes
+    return [first]
+
+
+def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[Leg] | None:
+    """The legs along lanes that follow each other or lie side by side; None if they do not lead to the end.
+
+    Changes are spread evenly over the part of the road that is driven.
+    """
+    if lanes[-1] != end.lane:
+        return None
+    stretches: list[list[int]] = [[lanes[0]]]
+    for before, lane in itertools.pairwise(lanes):
+        if lane in graph.successors[before, : graph.successor_count[before]]:
+            stretches.append([lane])
+        else:
+            stretches[-1].append(lane)
+    legs: list[Leg] = []
+    for number, stretch in enumerate(stretches):
+        at_m, side = (start.s_m if number == 0 else 0.0), 0
+        for k, lane in enumerate(stretch):
+            until_m = float(graph.length_m[lane])
+            if number == len(stretches) - 1:
+                until_m = _opposite(graph, end, stretch[k:])
+            changes = len(stretch) - 1 - k
+            if k == 0 and until_m - at_m < (SHORTEST_CHANGE_M if changes else -BACK_M):
+                return None
+            # The first and the last lane of several are driven half as long as those between.
+            share = 1.0 if not changes else 0.5 / (changes if k == 0 else changes + 0.5)
+            to_m = max(at_m, at_m + share * (until_m - at_m))
+            legs.append(Leg(lane, at_m, to_m, side))
+            if changes:
+                side = 1 if graph.left[lane] == stretch[k + 1] else -1
+                at_m = float(abreast(lane, to_m, side, graph.sides))
+    return legs
+
+
+def _opposite(graph: LaneGraph, end: Place, lanes: list[int]) -> float:
+    """Arc length on the first of some lanes side by side next to the end, which is on the last."""
+    at_m = end.s_m
+    for lane, before in itertools.pairwise(reversed(lanes)):
+        at_m = abreast(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)
+    return float(at_m)

@@ -1,0 +1,109 @@
+"""Sets of routes: CARLA's route files, and those of Town05 that come with the package."""
+
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+SHIPPED = "route_sets.json"
+SHORT_10, OF = "town05-short-10", "town05-short"
+"""The ten routes of the first Town05 short are the first ten of the 32 in use today."""
+
+
+@dataclass(frozen=True, eq=False)
+class RouteWaypoints:
+    """A route as it is given: W points to pass, in the world frame (right-handed, m)."""
+
+    id: str
+    town: str
+    xyz_m: Float64[np.ndarray, "W 3"]
+
+
+def route_set_names() -> tuple[str, ...]:
+    """The sets that come with the package."""
+    return (*_shipped(), SHORT_10)
+
+
+def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
+    """The routes of a set that comes with the package, or of a CARLA route file (`….xml`).
+
+    Raises:
+        InputError: there is neither, or the file has a mistake.
+    """
+    if name_or_path.endswith(".xml"):
+        return read_carla_routes(Path(name_or_path))
+    sets = _shipped()
+    if name_or_path == SHORT_10:
+        return _routes(sets[OF])[:10]
+    if name_or_path not in sets:
+        known = ", ".join(route_set_names())
+        raise InputError(f"unknown route set {name_or_path!r}: one of {known}, or a CARLA route file (.xml)")
+    return _routes(sets[name_or_path])
+
+
+def read_carla_routes(path: Path) -> list[RouteWaypoints]:
+    """Read a route file of CARLA's leaderboard 1.0: y is mirrored, as CARLA's world is left-handed.
+
+    Raises:
+        InputError: naming file and route, if it is missing, no XML, or not of that form.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise InputError(f"cannot read the routes {path}: {error.strerror}") from None
+    except ElementTree.ParseError as error:
+        raise InputError(f"the routes {path} are no XML: {error}") from None
+    routes = [_route(path, number, element) for number, element in enumerate(root.iter("route"))]
+    if not routes:
+        raise InputError(f"there is no route in {path}")
+    return routes
+
+
+def write_shipped(path: Path, sets: dict[str, Sequence[RouteWaypoints]]) -> None:
+    """Write routes as the package's data file has them: coordinates rounded to centimetres."""
+    content = {
+        name: [
+            {"id": route.id, "town": route.town, "xyz_m": np.round(route.xyz_m, 2).tolist()}
+            for route in routes
+        ]
+        for name, routes in sets.items()
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, separators=(",", ":")).replace('{"id"', '\n{"id"') + "\n")
+
+
+def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoints:
+    name = element.get("id")
+    town = element.get("town")
+    where = f"route {name if name is not None else f'number {number + 1}'} of {path}"
+    if name is None or town is None:
+        raise InputError(f"{where} has no {'id' if name is None else 'town'}")
+    waypoints = element.findall("waypoint")
+    if len(waypoints) < 2:
+        raise InputError(f"{where} has {len(waypoints)} waypoints, a route has two or more")
+    try:
+        xyz = [[float(point.attrib[axis]) for axis in ("x", "y", "z")] for point in waypoints]
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{where} has a waypoint without numbers for x, y and z: {error}") from None
+    if not all(map(math.isfinite, np.ravel(xyz).tolist())):
+        raise InputError(f"{where} has a waypoint that is not finite")
+    return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0])
+
+
+def _shipped() -> dict[str, list[dict[str, object]]]:
+    text = resources.files("foredrive.simulation").joinpath(SHIPPED).read_text()
+    content: dict[str, list[dict[str, object]]] = json.loads(text)
+    return content
+
+
+def _routes(rows: list[dict[str, object]]) -> list[RouteWaypoints]:
+    return [RouteWaypoints(str(r["id"]), str(r["town"]), np.array(r["xyz_m"], dtype=float)) for r in rows]

@@ -1,0 +1,176 @@
+"""Routes to drive: waypoints snapped to lanes, joined into a line to follow, with what to do on the way."""
+
+import enum
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from foredrive.errors import InputError
+from foredrive.simulation.lane_search import Leg, find_way
+from foredrive.simulation.route_sets import RouteWaypoints
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneGraph, build_lane_graph
+from foredrive.towns.traffic.routes import PLANNED_CHANGE_S, SHORTEST_CHANGE_M
+
+SAMPLE_M, SPACING_M = 0.5, 0.75
+"""Lanes are sampled so finely, and of these points those kept that are so far apart."""
+
+
+class RouteOption(enum.IntEnum):
+    """What a route asks for at a point of it: CARLA's road options."""
+
+    LEFT = 0
+    RIGHT = 1
+    STRAIGHT = 2
+    """Straight on through a junction."""
+    FOLLOW = 3
+    """The lane, outside of junctions."""
+    CHANGE_LEFT = 4
+    CHANGE_RIGHT = 5
+
+
+@dataclass(frozen=True, eq=False)
+class DriveRoute:
+    """A route along the lanes of a town: a line of N points about a metre apart."""
+
+    id: str
+    town: str
+    xyz: Float64[np.ndarray, "N 3"]
+    """World frame, m, on the road."""
+    arc_m: Float64[np.ndarray, "N"]
+    """Way from the start to each point, seen from above."""
+    option: Int[np.ndarray, "N"]
+    """A `RouteOption` at each point: from the route alone."""
+    legs: tuple[Leg, ...]
+    """The lanes driven, as indices of the town's lane graph."""
+    aside_m: float
+    """How far from its lane the waypoint is that is furthest from it."""
+
+    @property
+    def length_m(self) -> float:
+        """From the first waypoint to the last."""
+        return float(self.arc_m[-1])
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Where to be at the end of each stretch of road, as the traffic expects it of vehicle 0."""
+        ends = [leg.lane for leg, onward in itertools.pairwise(self.legs) if not onward.changes]
+        return (*ends, self.legs[-1].lane)
+
+
+def snap_route(waypoints: RouteWaypoints) -> DriveRoute:
+    """The route through some waypoints (.1 s, and the town's map).
+
+    Raises:
+        InputError: naming the route, if there is no such town or no way through the waypoints.
+    """
+    try:
+        graph = build_lane_graph(load_town_map(waypoints.town))
+        legs, places = find_way(graph, waypoints.xyz_m)
+    except InputError as error:
+        raise InputError(f"route {waypoints.id} in {waypoints.town}: {error}") from None
+    xyz, option = route_line(graph, legs)
+    arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
+    aside_m = max(place.aside_m for place in places)
+    return DriveRoute(waypoints.id, waypoints.town, xyz, arc_m, option, tuple(legs), aside_m)
+
+
+def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
+    """Points along some legs, led over from lane to lane where they change, and the option at each point."""
+    points, leg_of = _sampled(graph, legs)
+    steps = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))
+    begins = np.append(True, np.diff(leg_of) > 0)
+    steps[begins] = 0.0  # a change of lanes is no way
+    arc_m = np.cumsum(steps)
+    option = np.full(len(points), int(RouteOption.FOLLOW))
+    left = _left_of(points, leg_of)
+    shift_m = np.zeros(len(points))
+    inside = np.array([graph.junction[leg.lane] >= 0 for leg in legs])
+    for in_junction, run in itertools.groupby(range(len(legs)), key=lambda k: bool(inside[k])):
+        of_run = list(run)
+        on_run = (leg_of >= of_run[0]) & (leg_of <= of_run[-1])
+        if in_junction:
+            option[on_run] = _turn(graph, [legs[k] for k in of_run])
+            continue
+        for change, from_m, to_m in _windows(graph, legs, of_run, arc_m, leg_of):
+            at = int(np.argmax(leg_of == change))
+            aside_m = legs[change].changes * float(np.linalg.norm((points[at] - points[at - 1])[:2]))
+            x = np.clip((arc_m - from_m) / max(to_m - from_m, 1e-6), 0.0, 1.0)
+            led = x**3 * (10 - 15 * x + 6 * x**2)
+            shift_m += aside_m * (led - (np.arange(len(points)) >= at))
+            sign = RouteOption.CHANGE_LEFT if aside_m > 0 else RouteOption.CHANGE_RIGHT
+            option[(arc_m >= from_m) & (arc_m <= to_m) & on_run] = sign
+    points[:, :2] += shift_m[:, None] * left
+    kept = _thinned(points[:, :2])
+    return points[kept], option[kept]
+
+
+def _sampled(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
+    """Points along each leg, both ends among them, and the leg of each."""
+    points, leg_of = [], []
+    for number, leg in enumerate(legs):
+        count = max(2, int(np.ceil((leg.to_m - leg.from_m) / SAMPLE_M)) + 1)
+        s = np.linspace(leg.from_m, leg.to_m, count)
+        points.append(graph.position(np.full(count, leg.lane), s))
+        leg_of.append(np.full(count, number))
+    return np.concatenate(points), np.concatenate(leg_of)
+
+
+def _thinned(xy: Float64[np.ndarray, "N 2"]) -> list[int]:
+    """Points that are some way apart, both ends among them: where lanes are changed, they may step back."""
+    kept = [0]
+    for k in range(1, len(xy)):
+        if np.hypot(*(xy[k] - xy[kept[-1]])) >= SPACING_M:
+            kept.append(k)
+    if len(kept) > 1:
+        kept.pop()
+    return [*kept, len(xy) - 1]
+
+
+def _left_of(points: Float64[np.ndarray, "N 3"], leg_of: Int[np.ndarray, "N"]) -> Float64[np.ndarray, "N 2"]:
+    """The unit vector to the left of the lane at each point."""
+    left = np.zeros((len(points), 2))
+    for leg in range(leg_of[-1] + 1):
+        on = np.flatnonzero(leg_of == leg)
+        dx, dy = np.gradient(points[on, :2], axis=0).T
+        left[on] = np.stack([-dy, dx], axis=1) / np.hypot(dx, dy).clip(1e-9)[:, None]
+    return left
+
+
+def _turn(graph: LaneGraph, legs: list[Leg]) -> RouteOption:
+    """Which way legs turn that lead through a junction."""
+    turn_rad = sum(float(graph.turn_rad[leg.lane]) for leg in legs)
+    if abs(turn_rad) < TURN_RAD:
+        return RouteOption.STRAIGHT
+    return RouteOption.LEFT if turn_rad > 0 else RouteOption.RIGHT
+
+
+def _windows(
+    graph: LaneGraph,
+    legs: list[Leg],
+    run: list[int],
+    arc_m: Float64[np.ndarray, "N"],
+    leg_of: Int[np.ndarray, "N"],
+) -> list[tuple[int, float, float]]:
+    """For each change on a run of legs outside of junctions: its leg, and from where to where it is made.
+
+    As long as changes are driven gently if the run has the room; one after the other, and all before its end.
+    """
+    changes = [k for k in run if legs[k].changes]
+    on_run = (leg_of >= run[0]) & (leg_of <= run[-1])
+    first_m, last_m = float(arc_m[on_run][0]), float(arc_m[on_run][-1])
+    wanted = [
+        max(SHORTEST_CHANGE_M, PLANNED_CHANGE_S * float(graph.limit_mps[legs[k].lane])) for k in changes
+    ]
+    scale = min(1.0, (last_m - first_m) / sum(wanted)) if wanted else 1.0
+    windows, free_m = [], first_m
+    room_after = [scale * sum(wanted[j + 1 :]) for j in range(len(wanted))]
+    for k, length_m, after_m in zip(changes, wanted, room_after, strict=True):
+        length_m *= scale
+        centre_m = float(arc_m[np.argmax(leg_of == k)])
+        from_m = max(free_m, min(centre_m - 0.5 * length_m, last_m - after_m - length_m))
+        free_m = from_m + length_m
+        windows.append((k, from_m, free_m))
+    return windows
