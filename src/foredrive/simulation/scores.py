@@ -1,0 +1,213 @@
+"""What a drive is worth, exactly as CARLA's leaderboards 1.0 and 2.1 count it.
+
+Driving score = route completion in % × penalty. Leaderboard 1.0 multiplies a factor for each infraction;
+leaderboard 2.1 adds a coefficient for each and divides by 1 + their sum, so that more infractions always cost
+more but a long route is not worth nothing. Both multiply the share of the way that was driven within the
+lanes. Why a route ended early costs nothing by itself: what is missing of it does.
+"""
+
+import enum
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from foredrive.errors import InputError
+from foredrive.scene import Event
+
+
+class InfractionKind(enum.StrEnum):
+    """What is penalised; the `kind` of the `Event`s that report it."""
+
+    COLLISION_PEDESTRIAN = "collision_pedestrian"
+    COLLISION_VEHICLE = "collision_vehicle"
+    COLLISION_STATIC = "collision_static"
+    RED_LIGHT = "red_light"
+    STOP_SIGN = "stop_sign"
+    SCENARIO_TIMEOUT = "scenario_timeout"
+    """A scenario was not passed in time. Leaderboard 2 only, as are the two that follow."""
+    YIELD_TO_EMERGENCY = "yield_to_emergency"
+    MIN_SPEED = "min_speed"
+    """Slower than the traffic around; weighed by how much slower."""
+
+
+class Ending(enum.StrEnum):
+    """Why a drive ended; the `kind` of the `Event` that reports it."""
+
+    COMPLETED = "completed"
+    DEVIATION = "deviation"
+    """30 m from the route (InRouteTest)."""
+    BLOCKED = "blocked"
+    """Slower than .1 m/s for 180 s (ActorSpeedAboveThresholdTest)."""
+    TIMEOUT = "timeout"
+    """See `timeout_s`."""
+    CRASHED = "crashed"
+    """The agent raised an error or gave no plan: scored by what it drove until then, counted as failed."""
+
+
+FACTOR_1_0 = {
+    InfractionKind.COLLISION_PEDESTRIAN: 0.50,
+    InfractionKind.COLLISION_VEHICLE: 0.60,
+    InfractionKind.COLLISION_STATIC: 0.65,
+    InfractionKind.RED_LIGHT: 0.70,
+    InfractionKind.STOP_SIGN: 0.80,
+}
+COEFFICIENT_2_1 = {
+    InfractionKind.COLLISION_PEDESTRIAN: 1.0,
+    InfractionKind.COLLISION_VEHICLE: 0.70,
+    InfractionKind.COLLISION_STATIC: 0.60,
+    InfractionKind.RED_LIGHT: 0.40,
+    InfractionKind.STOP_SIGN: 0.25,
+    InfractionKind.SCENARIO_TIMEOUT: 0.40,
+    InfractionKind.YIELD_TO_EMERGENCY: 0.40,
+    InfractionKind.MIN_SPEED: 0.40,
+}
+SECONDS_PER_M, SECONDS_TO_START = 0.8, 5.0
+"""Leaderboard 1.0's SECONDS_GIVEN_PER_METERS and INITIAL_SECONDS_DELAY."""
+
+
+def timeout_s(route_m: float) -> float:
+    """How long a route may take."""
+    return float(int(SECONDS_PER_M * route_m + SECONDS_TO_START))
+
+
+@dataclass(frozen=True)
+class Infraction:
+    """Something that is penalised."""
+
+    kind: InfractionKind
+    t_s: float
+    """Since the drive began."""
+    xy_world: tuple[float, float]
+    severity: float = 0.0
+    """Impact speed of a collision, m/s. Of MIN_SPEED the share of the traffic's speed that was reached."""
+    what: str = ""
+    """What was hit or run."""
+    detail: str = ""
+
+
+def infraction_of(event: Event) -> Infraction | None:
+    """The infraction that an event reports; None if it is none."""
+    if event.kind not in set(InfractionKind):
+        return None
+    kind = InfractionKind(event.kind)
+    return Infraction(kind, event.t_s, event.xy_world, event.severity, event.what, event.detail)
+
+
+@dataclass(frozen=True)
+class RouteScore:
+    """One drive of one route."""
+
+    route: str
+    repetition: int
+    completion: float
+    """Share of the route that was driven, 0 to 1."""
+    outside_lanes: float
+    """Share of the way driven outside of the lanes or against them, 0 to 1."""
+    ending: Ending
+    infractions: tuple[Infraction, ...]
+    driven_m: float
+    duration_s: float
+
+    def __post_init__(self) -> None:
+        shares = (self.completion, self.outside_lanes)
+        if not all(0 <= share <= 1 for share in shares):
+            raise InputError(
+                f"route {self.route}: completion and outside_lanes are shares of 1, got {shares}"
+            )
+
+    @property
+    def penalty_1_0(self) -> float:
+        """Product of the factors; kinds that leaderboard 1.0 does not know cost nothing."""
+        factor = 1 - self.outside_lanes
+        for infraction in self.infractions:
+            factor *= FACTOR_1_0.get(infraction.kind, 1.0)
+        return factor
+
+    @property
+    def penalty_2_1(self) -> float:
+        """(1 - outside) / (1 + Σ coefficients)."""
+        return (1 - self.outside_lanes) / (1 + sum(map(_coefficient_2_1, self.infractions)))
+
+    @property
+    def driving_score_1_0(self) -> float:
+        """0 to 100."""
+        return 100 * self.completion * self.penalty_1_0
+
+    @property
+    def driving_score_2_1(self) -> float:
+        """0 to 100."""
+        return 100 * self.completion * self.penalty_2_1
+
+    @property
+    def failed(self) -> bool:
+        """Whether the agent itself crashed."""
+        return self.ending is Ending.CRASHED
+
+
+@dataclass(frozen=True)
+class MeanSpread:
+    """Mean over all drives, and standard deviation of the means of single repetitions, 0 for a single one."""
+
+    mean: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class SuiteScore:
+    """All drives of a set of routes."""
+
+    routes: int
+    repetitions: int
+    driving_score_1_0: MeanSpread
+    driving_score_2_1: MeanSpread
+    completion: MeanSpread
+    """In %."""
+    failed: int
+    endings: dict[Ending, int]
+    infractions: dict[InfractionKind, int]
+    infractions_per_km: dict[InfractionKind, float]
+
+
+def score_suite(drives: Sequence[RouteScore]) -> SuiteScore:
+    """The mean over routes and repetitions: of drives, as CARLA does, not weighed by length.
+
+    Raises:
+        InputError: there is no drive, one is there twice, or a route lacks a repetition that others have.
+    """
+    keys = [(drive.route, drive.repetition) for drive in drives]
+    routes, repetitions = ({key[k] for key in keys} for k in (0, 1))
+    if not keys:
+        raise InputError("there is no drive to score")
+    if len(set(keys)) != len(keys):
+        raise InputError(f"drives are there twice: {sorted({key for key in keys if keys.count(key) > 1})}")
+    if missing := sorted({(r, n) for r in routes for n in repetitions} - set(keys)):
+        raise InputError(f"drives are missing, as failed ones must not: (route, repetition) {missing}")
+    kinds = [infraction.kind for drive in drives for infraction in drive.infractions]
+    driven_km = sum(drive.driven_m for drive in drives) / 1000
+    counts = {kind: kinds.count(kind) for kind in InfractionKind}
+
+    def over_repetitions(values: list[float]) -> MeanSpread:
+        of = [
+            statistics.fmean(v for v, (_, n) in zip(values, keys, strict=True) if n == k) for k in repetitions
+        ]
+        return MeanSpread(statistics.fmean(values), statistics.stdev(of) if len(of) > 1 else 0.0)
+
+    return SuiteScore(
+        routes=len(routes),
+        repetitions=len(repetitions),
+        driving_score_1_0=over_repetitions([drive.driving_score_1_0 for drive in drives]),
+        driving_score_2_1=over_repetitions([drive.driving_score_2_1 for drive in drives]),
+        completion=over_repetitions([100 * drive.completion for drive in drives]),
+        failed=sum(drive.failed for drive in drives),
+        endings={ending: sum(drive.ending is ending for drive in drives) for ending in Ending},
+        infractions=counts,
+        infractions_per_km={kind: n / driven_km if driven_km > 0 else 0.0 for kind, n in counts.items()},
+    )
+
+
+def _coefficient_2_1(infraction: Infraction) -> float:
+    """What an infraction adds to leaderboard 2.1's divisor."""
+    coefficient = COEFFICIENT_2_1[infraction.kind]
+    if infraction.kind is InfractionKind.MIN_SPEED:
+        return coefficient * (1 - min(max(infraction.severity, 0.0), 1.0))
+    return coefficient
