@@ -1,0 +1,101 @@
+"""How a drive feels: accelerations, jerks and turn rates against the bounds of nuPlan's metrics."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.signal import savgol_filter
+
+from foredrive.errors import InputError
+from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, Vehicle, yaw_rate_radps
+
+ACCELERATION_S, JERK_S = 0.8, 1.5
+"""Derivatives are those of quadratics over this much time (Savitzky & Golay 1964), as nuPlan takes them."""
+
+
+class Bounds(NamedTuple):
+    """What is comfortable: nuPlan's ego_is_comfortable (Karnchanachari et al. 2024), from human drives."""
+
+    min_longitudinal_mps2: float = -4.05
+    max_longitudinal_mps2: float = 2.40
+    max_lateral_mps2: float = 4.89
+    max_jerk_mps3: float = 8.37
+    max_longitudinal_jerk_mps3: float = 4.13
+    max_yaw_rate_radps: float = 0.95
+    max_yaw_acceleration_radps2: float = 1.93
+
+
+BOUNDS = Bounds()
+
+
+@dataclass(frozen=True)
+class Comfort:
+    """The extremes of a drive, of the rear axle."""
+
+    braking_mps2: float
+    """Hardest, positive."""
+    acceleration_mps2: float
+    lateral_mps2: float
+    jerk_mps3: float
+    """Of the acceleration as a vector."""
+    longitudinal_jerk_mps3: float
+    yaw_rate_radps: float
+    yaw_acceleration_radps2: float
+    comfortable_share: float
+    """Share of the time in which all bounds were kept, 0 to 1."""
+
+    @property
+    def comfortable(self) -> bool:
+        """Whether all bounds were kept all the time."""
+        return self.comfortable_share == 1.0
+
+
+def comfort_of(
+    states: Sequence[BicycleState], dt_s: float = STEP_S, vehicle: Vehicle = EGO, bounds: Bounds = BOUNDS
+) -> Comfort:
+    """Comfort of a drive.
+
+    Args:
+        states: one each `dt_s`.
+
+    Raises:
+        InputError: the drive is shorter than `JERK_S`.
+    """
+    window = {seconds: 2 * round(0.5 * seconds / dt_s) + 1 for seconds in (ACCELERATION_S, JERK_S)}
+    if len(states) < window[JERK_S]:
+        raise InputError(f"comfort takes {window[JERK_S]} states or more, got {len(states)}")
+
+    def smoothed(values: Float64[np.ndarray, "T"], seconds: float, derivative: int) -> np.ndarray:
+        return savgol_filter(values, window[seconds], 2, deriv=derivative, delta=dt_s)
+
+    speed = np.array([state.speed_mps for state in states])
+    yaw_rate = np.array([yaw_rate_radps(state, vehicle) for state in states])
+    along = smoothed(speed, ACCELERATION_S, 1)
+    aside = smoothed(speed * yaw_rate, ACCELERATION_S, 0)
+    jerk_along = smoothed(speed, JERK_S, 2)
+    jerk = np.hypot(
+        smoothed(along, JERK_S, 1) - yaw_rate * aside, smoothed(aside, JERK_S, 1) + yaw_rate * along
+    )
+    turning = smoothed(yaw_rate, ACCELERATION_S, 0)
+    turning_more = smoothed(yaw_rate, JERK_S, 1)
+    kept = (along >= bounds.min_longitudinal_mps2) & (along <= bounds.max_longitudinal_mps2)
+    for values, most in (
+        (aside, bounds.max_lateral_mps2),
+        (jerk, bounds.max_jerk_mps3),
+        (jerk_along, bounds.max_longitudinal_jerk_mps3),
+        (turning, bounds.max_yaw_rate_radps),
+        (turning_more, bounds.max_yaw_acceleration_radps2),
+    ):
+        kept &= np.abs(values) <= most
+    return Comfort(
+        braking_mps2=max(0.0, float(-along.min())),
+        acceleration_mps2=max(0.0, float(along.max())),
+        lateral_mps2=float(np.abs(aside).max()),
+        jerk_mps3=float(jerk.max()),
+        longitudinal_jerk_mps3=float(np.abs(jerk_along).max()),
+        yaw_rate_radps=float(np.abs(turning).max()),
+        yaw_acceleration_radps2=float(np.abs(turning_more).max()),
+        comfortable_share=float(kept.mean()),
+    )
