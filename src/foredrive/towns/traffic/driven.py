@@ -166,7 +166,7 @@ def find_lane(
         return None
     offset = centre[:2] - near.xyz[samples, :2]
     cost = np.hypot(offset[:, 0], offset[:, 1]) + TURNED_M * turned
-    cost -= KNOWN_M * np.isin(near.lane[samples], known)
+    cost -= KNOWN_M * (near.lane[samples, None] == known).any(axis=1)
     best = int(np.argmin(cost))
     along_m = float(offset[best] @ near.ahead[samples[best]])
     return int(near.lane[samples[best]]), max(0.0, float(near.along_m[samples[best]]) + along_m)
@@ -224,7 +224,7 @@ def _shadows(near: NearLanes, graph: LaneGraph, vehicles: Vehicles, driven: Driv
         centre = then.axle_xyz + axle_to_centre_m * then.forward
         samples = near.within(centre, float(np.hypot(*half)) + HALF_CORRIDOR_M)
         lane = near.lane[samples]
-        wanted = ~np.isin(lane, own) & ((graph.junction[lane] < 0) if time_s else True)
+        wanted = (lane[:, None] != own).all(axis=1) & ((graph.junction[lane] < 0) if time_s else True)
         samples = samples[wanted]
         samples = samples[_is_crossed(near, samples, centre, then.yaw_rad, half)]
         for here in np.unique(near.lane[samples]).tolist():

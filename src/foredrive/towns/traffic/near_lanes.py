@@ -10,7 +10,7 @@ from foredrive.towns.traffic.lane_graph import LaneGraph
 
 LEVEL_M = 2.5
 """Lanes whose heights differ by more from a point are on another level than it."""
-HEIGHT_SAMPLES = 12
+HEIGHT_SAMPLES = 8
 """So many of the nearest samples are asked for one of the right level."""
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -68,10 +69,15 @@ class WalkGraph:
         right = np.stack([ahead[:, 1], -ahead[:, 0], np.zeros(len(ahead))], axis=1)
         return right / np.linalg.norm(right, axis=1, keepdims=True).clip(1e-9)
 
-    def _locate(self, walk: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # One sorted axis for all walks: walk e covers [origin[e], origin[e] + length[e]].
+    @cached_property
+    def _axis(self) -> tuple[Float64[np.ndarray, "E"], Float64[np.ndarray, "P"]]:
+        """One sorted axis for all walks, walk e on [origin[e], origin[e] + length[e]]: origins, and
+        the vertices on it."""
         origin = np.cumsum(self.length_m + 1.0) - self.length_m - 1.0
-        axis = self.along_m + np.repeat(origin, np.diff(self.first))
+        return origin, self.along_m + np.repeat(origin, np.diff(self.first))
+
+    def _locate(self, walk: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        origin, axis = self._axis
         s = np.clip(s_m, 0.0, self.length_m[walk])
         i = np.searchsorted(axis, origin[walk] + s, side="right") - 1
         i = np.clip(i, self.first[walk], self.first[walk + 1] - 2)
