@@ -83,8 +83,12 @@ class EgoMLP(nn.Module):
 
     def forward(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 3"]:
         """x, y (m) and yaw (rad) of each step, in the ego frame at now."""
-        plan = self.layers((status - self.status_mean) / self.status_std)
+        plan = self.layers(self.standardised(status))
         return (plan * self.plan_std + self.plan_mean).unflatten(1, (self.horizon_steps, 3))
+
+    def standardised(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b S"]:
+        """Ego status in numbers of order 1."""
+        return (status - self.status_mean) / self.status_std
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:

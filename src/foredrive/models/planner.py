@@ -53,43 +53,66 @@ class FutureAttention(nn.Module):
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
-class PathReading(nn.Module):
-    """What lies along a path: features of the plane at given distances on it and beside it, put together.
+class PathCorrection(nn.Module):
+    """By how much what lies along a plan changes it.
 
-    The same numbers mean the same place on the way whatever the curve, so that braking for what stands in the
-    lane need not be learned anew for every cell of the plane.
+    Features of the plane are read at given distances on the plan's path and beside it. The same numbers mean
+    the same place on the way whatever the curve, so that braking for what stands in the lane need not be
+    learned anew for every cell of the plane: with the truth from above in place of a volume, 2,000
+    demonstrations teach this something and the decoder's attention nothing (`bench nemo-planning-limits`).
 
     Args:
         spec: grid of the volume whose plane is read.
         width: C.
         distances_m: along the path; it goes on straight where it ends.
+        told: S, how many numbers about the ego vehicle come with it: whether 20 m are near depends on its
+            speed.
+        steps: T, of the plan.
     """
 
     distances_m: Tensor
     aside_m: Tensor
     lower_m: Tensor
 
-    def __init__(self, spec: VoxelSpec, width: int, distances_m: Sequence[float]) -> None:
+    def __init__(
+        self, spec: VoxelSpec, width: int, distances_m: Sequence[float], *, told: int, steps: int
+    ) -> None:
         super().__init__()
         self.voxel_m = spec.voxel_m
         self.register_buffer("distances_m", torch.tensor(distances_m), persistent=False)
         self.register_buffer("aside_m", torch.tensor(ASIDE_M), persistent=False)
         self.register_buffer("lower_m", torch.tensor(spec.lower_m[:2]), persistent=False)
         hidden = width // 4
-        self.place = nn.Sequential(nn.Linear(len(ASIDE_M) * (width + 2), width), nn.ReLU())
-        self.place.append(nn.Linear(width, hidden))
+        self.place = nn.Sequential(
+            nn.Linear(len(ASIDE_M) * (width + 2), width), nn.ReLU(), nn.Linear(width, hidden)
+        )
         self.together = nn.Sequential(nn.Linear(len(distances_m) * hidden, width), nn.ReLU())
+        self.change = nn.Sequential(
+            nn.Linear(width + told, width),
+            nn.ReLU(),
+            nn.Linear(width, 2 * steps),
+            nn.Unflatten(1, (steps, 2)),
+        )
+        for parameter in self.change[-2].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(
-        self, plane: Float[Tensor, "b Y X C"], path_xy: Float[Tensor, "b T 2"]
-    ) -> Float[Tensor, "b C"]:
-        """Args: features, and a path from the origin in the ego frame, m."""
+        self, plane: Float[Tensor, "b Y X C"], path_xy: Float[Tensor, "b T 2"], told: Float[Tensor, "b S"]
+    ) -> Float[Tensor, "b T 2"]:
+        """Changes of the steps, m.
+
+        Args:
+            plane: features.
+            path_xy: waypoints from the origin of the ego frame, m.
+            told: about the ego vehicle, in numbers of order 1.
+        """
         places = self.places(path_xy)  # [b, D, S, 2]
         with full_precision(plane, places) as (values, at):
             cells = F.pad((at - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
             read = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at.shape[1:3])
         seen = torch.cat([read, at / PLACE_SCALE_M], dim=-1).flatten(2)
-        return self.together(self.place(seen).flatten(1))
+        along = self.together(self.place(seen).flatten(1))
+        return self.change(torch.cat([along, told], dim=-1)).float()
 
     def places(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
         """Where is looked: at every distance along the path, at S places across it."""
@@ -128,7 +151,7 @@ class VolumePlanner(nn.Module):
         horizon_steps, dt_s: of the plan.
         ego_mlp: fitted beforehand, knows `history` frames and has the same horizon; it is not trained on.
         look_m: distances along the plan made without looking at which the plane is read as well
-            (`PathReading`); none in the paper.
+            (`PathCorrection`); none in the paper.
     """
 
     def __init__(
@@ -170,13 +193,14 @@ class VolumePlanner(nn.Module):
             width, heads, 2 * width, dropout=0.1, batch_first=True, norm_first=True
         )
         self.decoder = nn.TransformerDecoder(layer, layers)
-        self.path = PathReading(spec, width, look_m) if look_m else None
-        known = 2 * width if look_m else width
-        to_hidden, to_steps = nn.Linear(known, width), nn.Linear(width, 2 * horizon_steps)
+        self.waypoints = nn.Sequential(
+            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
+        )
         if ego_mlp is not None:  # what it says is good already: only what is learned by looking is added
-            nn.init.zeros_(to_steps.weight)
-            nn.init.zeros_(to_steps.bias)
-        self.waypoints = nn.Sequential(to_hidden, nn.ReLU(), to_steps)
+            for parameter in self.waypoints[-1].parameters():
+                nn.init.zeros_(parameter)
+        told = 0 if ego_mlp is None else len(ego_mlp.status_mean)
+        self.path = PathCorrection(spec, width, look_m, told=told, steps=horizon_steps) if look_m else None
         self.ego_mlp = ego_mlp
 
     @property
@@ -205,7 +229,7 @@ class VolumePlanner(nn.Module):
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
-        unseen = self._without_looking(command, command_valid, speed_mps, past)
+        unseen, told = self._without_looking(command, command_valid, speed_mps, past)
         command = torch.where(command_valid, command, len(Command))
         status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
         status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
@@ -213,9 +237,9 @@ class VolumePlanner(nn.Module):
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
         decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        if self.path is not None:
-            decoded = torch.cat([decoded, self.path(plane, unseen)], dim=-1)
         change = STEP_SCALE_M * self.waypoints(decoded).float().unflatten(1, (self.horizon_steps, 2))
+        if self.path is not None:
+            change = change + self.path(plane, unseen, told)
         xy = (unseen + change.cumsum(dim=1))[:, None]
         return Trajectory(
             xy=xy,
@@ -232,14 +256,15 @@ class VolumePlanner(nn.Module):
         command_valid: Bool[Tensor, "b"],
         speed_mps: Float[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
-    ) -> Float[Tensor, "b T 2"]:
-        """The plan that looking changes."""
+    ) -> tuple[Float[Tensor, "b T 2"], Float[Tensor, "b _S"]]:
+        """The plan that looking changes, and ego status in numbers of order 1 (none without an ego MLP)."""
         if self.ego_mlp is None:
             step = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
-            return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1)
+            return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1), step[:, :0]
         told = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
         with full_precision(past, told) as (poses, speeds):
-            return self.ego_mlp(status_row(poses[..., :3], speeds, command, command_valid))[..., :2]
+            status = status_row(poses[..., :3], speeds, command, command_valid)
+            return self.ego_mlp(status)[..., :2], self.ego_mlp.standardised(status)
 
     def _fuse(
         self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"] | None

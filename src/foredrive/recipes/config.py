@@ -80,7 +80,7 @@ class NemoSize:
     """What the planner regresses changes from: the speed now, as it is; or what an MLP says that knows ego
     status alone (`planner_history` frames of it), fitted to the demonstrations before fine-tuning."""
     planner_look_m: tuple[float, ...] = ()
-    """Distances along that plan at which the planner reads the volume as well; see `PathReading`."""
+    """Distances along that plan at which the planner reads the volume as well; see `PathCorrection`."""
     checkpoint: tuple[Literal["backbone", "encoder"], ...] = ()
     """Trade time for memory: what these parts compute is not kept but computed again."""
 
