@@ -2,7 +2,7 @@
 
 The planner of `nemo_town` is trained on the demonstrations of the studies, with the true map and the true
 boxes, drawn from above, in place of what a volume shows: on as few as fine-tuning can afford on two cores,
-and on 32 times as often. What it does not gain here no encoder can bring.
+and on 16 times as many. What it does not gain here no encoder can bring.
 """
 
 import dataclasses
