@@ -180,5 +180,9 @@ def test_progress_counts_along_the_route_and_never_back() -> None:
     assert route.end_of(progress, 200.0, np.inf) == "blocked"  # it last moved at 1 s
     assert route.end_of(progress, 60.0, 60.0) == "timeout"
     assert route.end_of(dataclasses.replace(progress, beside_m=31.0), 2.0, np.inf) == "deviation"
-    arrived = Progress(done_m=196.0, beside_m=1.0, moved_s=1.0)
+    for y in np.arange(0.0, 97.0, 3.0):
+        assert route.end_of(progress, 2.0, np.inf) is None
+        progress = route.advance(progress, np.array([101.0, y]), 10.0, 2.0)
+    arrived = progress
+    assert arrived.done_m == route.length_m
     assert route.end_of(arrived, 2.0, np.inf) == "completed"

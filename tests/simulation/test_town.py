@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
-from foredrive.scene import Clip, Command, Control, Event, Trajectory
+from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
+from foredrive.simulation.collisions import Contacts
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.plans import fixed_in_world
+from foredrive.simulation.road_users import RoadUsers
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import Crowd
@@ -155,6 +157,47 @@ def test_what_stands_before_the_bumper_stops_the_vehicle(
     # It stands where it met it: its bumper at the car's.
     moved = np.hypot(simulator.state.ego.x_m - x, simulator.state.ego.y_m - y)
     assert moved == pytest.approx(away - 2.45 - 0.5 * car.size_lwh[0], abs=0.45)
+
+
+def test_who_is_run_into_is_told_once_with_the_speed_between_both(
+    simulator: TownSimulator, scenario: TownScenario
+) -> None:
+    simulator.reset(scenario)
+    state, sense = simulator.state, simulator._collisions
+    ego = dataclasses.replace(state.ego, speed_mps=8.0)
+    T = state.frames[-1].T_world_ego
+    forward, left = T[:2, 0], T[:2, 1]
+
+    def others(category: Category, ahead_m: float, aside_m: float, velocity: np.ndarray) -> RoadUsers:
+        foot = T[:3, 3] + np.append((1.65 + ahead_m) * forward + aside_m * left, 0.0)
+        return RoadUsers(
+            track_id=np.array([7]),
+            category=np.array([int(category)]),
+            foot_m=foot[None],
+            yaw=np.array([state.ego.yaw_rad]),
+            half_lw=np.array([[0.3, 0.3] if category is Category.PEDESTRIAN else [2.0, 0.9]]),
+            velocity_mps=velocity[None],
+        )
+
+    ahead = others(Category.BUS, 4.3, 0.0, 3.0 * forward)  # its rear .15 m behind our bumper
+    events, contacts, stopped = sense.check(T, ego, ahead, Contacts(), 1.0)
+    assert [(e.kind, e.what, e.t_s) for e in events] == [("collision_vehicle", "bus", 1.0)]
+    assert events[0].severity == pytest.approx(5.0)
+    assert stopped
+    for t_s, count in ((1.05, 0), (5.9, 0), (11.0, 1)):  # in contact still; then not for 5.1 s
+        events, contacts, _ = sense.check(T, ego, ahead, contacts, t_s)
+        assert len(events) == count
+    beside = others(Category.CAR, 0.0, 1.75, 8.0 * forward)  # scraping along
+    events, _, stopped = sense.check(T, ego, beside, Contacts(), 1.0)
+    assert [(e.kind, e.severity) for e in events] == [("collision_vehicle", pytest.approx(0.0, abs=1e-9))]
+    assert not stopped
+    person = others(Category.PEDESTRIAN, 2.6, 0.3, 1.5 * left)
+    events, _, stopped = sense.check(T, ego, person, Contacts(), 1.0)
+    assert [e.kind for e in events] == ["collision_pedestrian"]
+    assert events[0].severity == pytest.approx(np.hypot(8.0, 1.5))
+    assert not stopped
+    apart = others(Category.CAR, 4.6, 0.0, np.zeros(2))
+    assert sense.check(T, ego, apart, Contacts(), 1.0) == ([], Contacts(), False)
 
 
 def test_the_plan_along_the_route_is_driven_to_its_end(

@@ -13,6 +13,7 @@ SPACING_M = 1.0
 AHEAD_M, BACK_M = 20.0, 5.0
 """Which part of the route is looked at for where the vehicle is: routes may cross themselves."""
 ARRIVED_M = 5.0
+"""Who is so near to the end has driven all of the route."""
 DEVIATION_M = 30.0
 BLOCKED_S, BLOCKED_MPS = 180.0, 0.1
 """Leaderboard 1.0: who is further from the route has left it, who is slower for so long is blocked."""
@@ -50,16 +51,18 @@ class RouteLine:
         part = slice(int(first), int(last) + 1)
         away_m = np.hypot(*(self._xy[part] - xy).T)
         nearest = int(np.argmin(away_m))
+        done_m = max(progress.done_m, float(self._arc_m[part][nearest]))
+        arrived = done_m > self.length_m - ARRIVED_M and away_m[nearest] < ARRIVED_M
         return dataclasses.replace(
             progress,
-            done_m=max(progress.done_m, float(self._arc_m[part][nearest])),
+            done_m=self.length_m if arrived else done_m,
             beside_m=float(away_m[nearest]),
             moved_s=t_s if speed_mps >= BLOCKED_MPS else progress.moved_s,
         )
 
     def end_of(self, progress: Progress, t_s: float, limit_s: float) -> str | None:
         """Why a drive is over: "completed", "deviation", "blocked" or "timeout"; None if it is not."""
-        if progress.done_m > self.length_m - ARRIVED_M and progress.beside_m < ARRIVED_M:
+        if progress.done_m >= self.length_m:
             return "completed"
         if progress.beside_m > DEVIATION_M:
             return "deviation"

@@ -160,9 +160,9 @@ class TownSimulator:
 
     def _prepare(self, scenario: TownScenario) -> None:
         self._scenario = scenario
-        crowd, town = scenario.crowd, load_town_map(scenario.town)
+        town, crowd = load_town_map(scenario.town), scenario.crowd
         self._world = _grow(scenario.town, scenario.seed)
-        self._traffic = Traffic(town, scenario.seed, crowd.vehicles + 1, crowd.people)
+        self._traffic = _rules_of(scenario.town, scenario.seed, crowd)
         if scenario.conditions is not None:
             self._world = self._world.under(scenario.conditions)
         self._collisions = CollisionSense(self._world)
@@ -250,6 +250,11 @@ class TownSimulator:
 @lru_cache(maxsize=1)  # drives in a row are often in one town
 def _grow(town: str, seed: int) -> World:
     return World(load_town_map(town), seed)
+
+
+@lru_cache(maxsize=1)
+def _rules_of(town: str, seed: int, crowd: Crowd) -> Traffic:
+    return Traffic(load_town_map(town), seed, crowd.vehicles + 1, crowd.people)
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:
