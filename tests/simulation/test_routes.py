@@ -232,3 +232,21 @@ def test_a_route_that_cannot_be_driven_is_named() -> None:
         snap_route(RouteWaypoints("4", "Town05", here))
     with pytest.raises(InputError, match="route 4 in Town99: unknown town"):
         snap_route(RouteWaypoints("4", "Town99", np.zeros((2, 3))))
+
+
+@pytest.mark.real
+def test_what_is_shipped_is_what_the_route_files_say(real_data: Path) -> None:
+    folder = real_data / "carla" / "routes"
+    if not folder.is_dir():
+        pytest.skip("no route files here")
+    files = {
+        "town05-short": "transfuser_routes_town05_short_32.xml",
+        "town05-short-10": "routes_town05_short.xml",
+        "town05-long": "routes_town05_long.xml",
+        "longest6": "longest6.xml",
+    }
+    for name, file in files.items():
+        given, shipped = read_carla_routes(folder / file), load_route_set(name)
+        assert [(route.id, route.town) for route in given] == [(route.id, route.town) for route in shipped]
+        for one, other in zip(given, shipped, strict=True):
+            np.testing.assert_allclose(one.xyz_m, other.xyz_m, atol=0.00501)
