@@ -102,13 +102,10 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
     places = [[place] for place in choices[0]]
     costs = [ASIDE_WEIGHT * place.aside_m for place in choices[0]]
     for number, (before, here) in enumerate(itertools.pairwise(choices), start=1):
+        is_last = number == len(choices) - 1
         found: list[tuple[float, int, list[Leg]]] = []
-        for end in here:  # the last waypoint has one place in the end: no other may cost more
-            most = (
-                min((total for total, *_ in found), default=np.inf)
-                if number == len(waypoints) - 1
-                else np.inf
-            )
+        for end in here:  # of the last waypoint only the cheapest place counts
+            most = min((total for total, *_ in found), default=np.inf) if is_last else np.inf
             found.append(_best_onto(graph, before, costs, end, most))
         if not any(np.isfinite(total) for total, *_ in found):
             raise InputError(f"no way leads from waypoint {number} to waypoint {number + 1}")
@@ -190,12 +187,12 @@ def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[
             yield (onward, _Part.BETWEEN), length_m
             yield (onward, _Part.LAST), length_m
     room_m = {_Part.FIRST: length_m - start.s_m, _Part.BETWEEN: length_m, _Part.LAST: end.s_m}[part]
-    if room_m >= SHORTEST_CHANGE_M:
-        for side in (
-            np.flatnonzero(graph.sides.lane[:, lane] >= 0).tolist() if graph.junction[lane] < 0 else ()
-        ):
-            closed_m = 0.0 if graph.may_cross[side, lane] else CLOSED_M
-            yield (int(graph.sides.lane[side, lane]), part), CHANGE_M + CHANGE_M2 / room_m + closed_m
+    if room_m < SHORTEST_CHANGE_M or graph.junction[lane] >= 0:
+        return
+    for beside, may_cross in zip(graph.sides.lane[:, lane], graph.may_cross[:, lane], strict=True):
+        if beside >= 0:
+            closed_m = 0.0 if may_cross else CLOSED_M
+            yield (int(beside), part), CHANGE_M + CHANGE_M2 / room_m + closed_m
 
 
 def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:
