@@ -1,5 +1,6 @@
 """The temporal attention planner (NeMo §3.3, eq. 12–14)."""
 
+import copy
 from collections.abc import Sequence
 from typing import Literal
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.models.ego_mlp import EgoMLP, status_row
+from foredrive.models.few_queries import FewQueriesDecoderLayer
 from foredrive.ops.precision import full_precision
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import Command, Trajectory, VoxelSpec
@@ -189,10 +191,8 @@ class VolumePlanner(nn.Module):
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
         # Normalising first keeps an open path for speed and command, which most of a plan follows from.
-        layer = nn.TransformerDecoderLayer(
-            width, heads, 2 * width, dropout=0.1, batch_first=True, norm_first=True
-        )
-        self.decoder = nn.TransformerDecoder(layer, layers)
+        layer = FewQueriesDecoderLayer(width, heads, 2 * width)
+        self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(layers)])  # as torch's decoder
         self.waypoints = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
@@ -236,8 +236,10 @@ class VolumePlanner(nn.Module):
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
-        decoded = self.decoder(self.fuse_query(query)[:, None], memory)[:, 0]
-        change = STEP_SCALE_M * self.waypoints(decoded).float().unflatten(1, (self.horizon_steps, 2))
+        asked = self.fuse_query(query)[:, None]
+        for layer in self.decoder:
+            asked = layer(asked, memory)
+        change = STEP_SCALE_M * self.waypoints(asked[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
         if self.path is not None:
             change = change + self.path(plane, unseen, told)
         xy = (unseen + change.cumsum(dim=1))[:, None]
