@@ -273,17 +273,21 @@ def _is_crossed(
 
 
 def _on_its_way(graph: LaneGraph, everyone: Vehicles) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
-    """Grant vehicle 0 the junction that it can no longer stop for; who may ask for right of way."""
-    comes = np.ones(len(everyone.active), dtype=np.bool_)
+    """Grant vehicle 0 the junction that it can no longer stop for or drives through; who may ask for right of
+    way."""
+    may_ask = np.ones(len(everyone.active), dtype=np.bool_)
     speed, path = float(everyone.speed_mps[0]), everyone.path[0]
     contested = graph.contested[path] & (path >= 0)
     inside = bool(contested[BEHIND])
-    first = BEHIND + 1 + int(np.argmax(contested[BEHIND + 1 :]))
-    if not everyone.active[0] or inside or not contested[first]:
-        return everyone, comes
+    first = BEHIND + 1 + (0 if inside else int(np.argmax(contested[BEHIND + 1 :])))
+    if not everyone.active[0] or not contested[first]:
+        return everyone, may_ask
     gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
-    end = first + int(np.argmin(np.append(contested[first:], False)))
-    if gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed and speed > COMES_MPS:
-        return _replaced(everyone, granted=end - 1 - BEHIND), comes
-    comes[0] = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
-    return (everyone if comes[0] else _replaced(everyone, granted=0)), comes
+    comes = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
+    may_ask[0] = comes
+    if not comes:
+        return _replaced(everyone, granted=0), may_ask
+    if inside or gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed:
+        end = first + int(np.argmin(np.append(contested[first:], False)))
+        return _replaced(everyone, granted=end - 1 - BEHIND), may_ask
+    return everyone, may_ask
