@@ -152,18 +152,19 @@ def test_the_way_through_a_junction_is_taken_by_who_cannot_stop_before_it(
     assert seen.may_ask[1:].all()
 
 
-def test_who_drives_through_a_junction_has_the_rest_of_it(town_of: Callable[[str], TownMap]) -> None:
-    alone = Traffic(town_of("Town05"), 1, vehicle_count=2, people_count=0)
-    graph = alone.lanes
-    lane = int(np.flatnonzero(graph.contested & graph.contested[graph.successors[:, 0]])[0])
-    state = followed(alone, lane, 0.5 * float(graph.length_m[lane]), behind_m=0.0)
-    for mps, goes_on in ((6.0, True), (0.0, False)):
-        ego = driven_at(alone, lane, 0.5 * float(graph.length_m[lane]), mps=mps)
+def test_who_drives_through_a_junction_has_the_rest_of_it(alone: Traffic) -> None:
+    """Two lanes of a junction follow each other, and one that is free comes after them."""
+    lane = longest_lane(alone)
+    state = followed(alone, lane, 30.0, behind_m=10.0)
+    s_m = float(alone.lanes.length_m[lane]) - 10.0
+    rest, free = state.vehicles.path[0, BEHIND + 1 : BEHIND + 3]
+    contested = alone.lanes.contested.copy()
+    contested[[lane, rest]], contested[free] = True, False
+    graph = dataclasses.replace(alone.lanes, contested=contested)
+    for mps, granted in ((6.0, 1), (0.0, 0)):
+        ego = driven_at(alone, lane, s_m, mps=mps)
         seen = see_driven(graph, alone.near_lanes, state.vehicles, ego, state.route, 0)
-        ahead = seen.everyone.path[0, BEHIND + 1 :]
-        end = int(np.argmin(graph.contested[ahead] & (ahead >= 0)))
-        assert end >= 1
-        assert seen.everyone.granted[0] == (end if goes_on else 0)
+        assert seen.everyone.granted[0] == granted
 
 
 def test_cross_traffic_waits_for_who_runs_a_red_light(town_of: Callable[[str], TownMap]) -> None:
