@@ -126,14 +126,15 @@ def train_run(
 
 
 def _fit_base(run: Run, ego_mlp: EgoMLP) -> None:
-    """Fit what the planner starts from, as the rival of that name is fitted; it takes seconds."""
+    """Fit what the planner starts from: the very rival it will be judged beside; it takes seconds.
+
+    Its seed is the rival's, not the stage's: two MLPs differ by as much as looking may bring.
+    """
     clips = dataclasses.replace(run.recipe.clips, cameras=(), future_images=False)
     blind = ClipDataset(run.logs, clips, run.cache_dir)
     batches = (stack_records([blind.clip(index)]) for index in range(len(blind)))
     status = read_status(batches, ego_mlp.past_frames)
-    fitted = fit_ego_mlp(
-        status, past_frames=ego_mlp.past_frames, dt_s=ego_mlp.dt_s, seed=run.recipe.finetune.schedule.seed
-    )
+    fitted = fit_ego_mlp(status, past_frames=ego_mlp.past_frames, dt_s=ego_mlp.dt_s, seed=0)
     ego_mlp.load_state_dict(fitted.state_dict())
 
 
