@@ -13,6 +13,30 @@ from foredrive.scene import VoxelSpec
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
 
 
+def small_planner(
+    future: Literal["attention", "concatenation", "none"],
+    *,
+    history: int,
+    steps: int,
+    ego_mlp: EgoMLP | None = None,
+    look_m: tuple[float, ...] = (),
+) -> VolumePlanner:
+    return VolumePlanner(
+        channels=4,
+        spec=SPEC,
+        width=16,
+        layers=1,
+        heads=2,
+        future=future,
+        pool=(1, 2, 2),
+        history=history,
+        horizon_steps=steps,
+        dt_s=0.5,
+        ego_mlp=ego_mlp,
+        look_m=look_m,
+    ).eval()
+
+
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
     xy = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [2.0, 2.01], [2.0, 2.0], [1.0, 2.0]])
     yaw = _headings(xy[None, None])[0, 0]
@@ -36,18 +60,7 @@ def test_the_next_volume_matters_where_it_is_looked_at(
     future: Literal["attention", "concatenation", "none"],
 ) -> None:
     torch.manual_seed(0)
-    planner = VolumePlanner(
-        channels=4,
-        spec=SPEC,
-        width=16,
-        layers=1,
-        heads=2,
-        future=future,
-        pool=(1, 2, 2),
-        history=0,
-        horizon_steps=6,
-        dt_s=0.5,
-    ).eval()
+    planner = small_planner(future, history=0, steps=6)
     now, one, other = torch.randn(3, 1, 4, 2, 8, 8)
     status = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
     with torch.no_grad():
@@ -60,18 +73,7 @@ def test_the_next_volume_matters_where_it_is_looked_at(
 
 def test_where_nothing_is_learned_it_goes_straight_on() -> None:
     """With a last layer of zeros it is constant velocity, and standing still where the speed is unknown."""
-    planner = VolumePlanner(
-        channels=4,
-        spec=SPEC,
-        width=16,
-        layers=1,
-        heads=2,
-        future="none",
-        pool=(1, 2, 2),
-        history=1,
-        horizon_steps=3,
-        dt_s=0.5,
-    ).eval()
+    planner = small_planner("none", history=1, steps=3)
     torch.nn.init.zeros_(planner.waypoints[-1].weight)
     torch.nn.init.zeros_(planner.waypoints[-1].bias)
     volume, past = torch.randn(2, 4, 2, 8, 8), torch.randn(2, 1, 4)
@@ -85,20 +87,7 @@ def test_where_nothing_is_learned_it_goes_straight_on() -> None:
 def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
     torch.manual_seed(0)
     ego_mlp = EgoMLP(past_frames=1, horizon_steps=3, dt_s=0.5)
-    planner = VolumePlanner(
-        channels=4,
-        spec=SPEC,
-        width=16,
-        layers=1,
-        heads=2,
-        future="none",
-        pool=(1, 2, 2),
-        history=1,
-        horizon_steps=3,
-        dt_s=0.5,
-        ego_mlp=ego_mlp,
-        look_m=(1.0, 3.0),
-    ).eval()
+    planner = small_planner("none", history=1, steps=3, ego_mlp=ego_mlp, look_m=(1.0, 3.0))
     x, y, yaw, before, now, known = -2.5, 0.1, 0.05, 4.0, 6.0, torch.tensor([True, False])
     past, speed = torch.tensor([[[x, y, yaw, before]]]).expand(2, 1, 4), torch.full((2,), now)
     command = torch.tensor([1, 1])

@@ -61,7 +61,7 @@ class PathCorrection(nn.Module):
     Features of the plane are read at given distances on the plan's path and beside it. The same numbers mean
     the same place on the way whatever the curve, so that braking for what stands in the lane need not be
     learned anew for every cell of the plane: with the truth from above in place of a volume, 2,000
-    demonstrations teach this something and the decoder's attention nothing (`bench nemo-planning-limits`).
+    demonstrations taught this something and the decoder's attention nothing (`bench nemo-planning-limits`).
 
     Args:
         spec: grid of the volume whose plane is read.

@@ -25,7 +25,7 @@ BACK_M = 0.5
 CHANGE_M, CHANGE_M2, CLOSED_M = 10.0, 150.0, 50.0
 """A lane change is as bad as a detour of `CHANGE_M`, of `CHANGE_M2` / room, as hurried ones are worse, and of
 `CLOSED_M` where traffic would not change: over solid lines, and to lanes that are only growing there."""
-SHORTEST_CHANGE_M = 1.0
+LEAST_ROOM_M = 1.0
 """Where there is less room, nobody changes."""
 
 
@@ -187,7 +187,7 @@ def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[
             yield (onward, _Part.BETWEEN), length_m
             yield (onward, _Part.LAST), length_m
     room_m = {_Part.FIRST: length_m - start.s_m, _Part.BETWEEN: length_m, _Part.LAST: end.s_m}[part]
-    if room_m < SHORTEST_CHANGE_M or graph.junction[lane] >= 0:
+    if room_m < LEAST_ROOM_M or graph.junction[lane] >= 0:
         return
     for beside, may_cross in zip(graph.sides.lane[:, lane], graph.may_cross[:, lane], strict=True):
         if beside >= 0:
@@ -227,7 +227,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
             if number == len(stretches) - 1:
                 until_m = _opposite(graph, end, stretch[k:])
             changes = len(stretch) - 1 - k
-            if k == 0 and until_m - at_m < (SHORTEST_CHANGE_M if changes else -BACK_M):
+            if k == 0 and until_m - at_m < (LEAST_ROOM_M if changes else -BACK_M):
                 return None
             # The first and the last lane of several are driven half as long as those between.
             share = 1.0 if not changes else 0.5 / (changes if k == 0 else changes + 0.5)
