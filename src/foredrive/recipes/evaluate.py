@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from rich.progress import Progress
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
@@ -19,14 +18,11 @@ from foredrive.evaluation import (
     StandStill,
     collect_provenance,
     evaluate,
-    fit_ego_mlp,
-    read_training_set,
     write_summary,
 )
-from foredrive.metrics import VoxelPrior
 from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.models.ego_mlp import EgoMLP
 from foredrive.recipes.predict import NemoPredictor
+from foredrive.recipes.rivals import fit_rivals
 from foredrive.recipes.train import Run, load_agent, open_clips
 from foredrive.scene import Example, Trajectory
 
@@ -74,8 +70,13 @@ class _Batches(Iterator[Example]):
         return batch
 
 
-def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int = 4) -> EvaluationResult:
+def evaluate_run(
+    run: Run, logs: Sequence[LogPath], out: Path, batch_size: int = 4, *, views: bool = True
+) -> EvaluationResult:
     """Judge a trained run on logs; writes `out/summary.json`. Clips that cannot be read count as failed.
+
+    Args:
+        views: render what the cameras see, and judge that too; a quarter of the time.
 
     Raises:
         InputError: if there is nothing to judge: the run has not finished a stage, no clip can be read.
@@ -85,14 +86,14 @@ def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int =
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs)
-    prior, ego_mlp = _fit_baselines(run)
+    prior, ego_mlp = fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)
     with Progress() as progress:
         task = progress.add_task("evaluate", total=len(dataset))
         result = evaluate(
-            NemoPredictor(agent, clips.future_frames, RENDER_STRIDE),
+            NemoPredictor(agent, clips.future_frames, RENDER_STRIDE if views else 0),
             _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,
             baselines={
@@ -108,15 +109,6 @@ def evaluate_run(run: Run, logs: Sequence[LogPath], out: Path, batch_size: int =
     origin = {"recipe": run.recipe.name, "run": str(run.folder)}
     write_summary(out / SUMMARY, result.summary | collect_provenance() | origin)
     return result
-
-
-def _fit_baselines(run: Run) -> tuple[VoxelPrior, EgoMLP]:
-    """The voxel prior of the training labels and the MLP that sees ego status alone."""
-    clips = run.recipe.clips
-    blind = dataclasses.replace(clips, cameras=(), future_images=False)
-    loader = DataLoader(ClipDataset(run.logs, blind, run.cache_dir), batch_size=16, collate_fn=collate)
-    prior, status = read_training_set(loader, clips.future_frames + 1, clips.past_frames)
-    return prior, fit_ego_mlp(status, past_frames=clips.past_frames, dt_s=clips.horizon_dt_s, seed=0)
 
 
 @torch.no_grad()

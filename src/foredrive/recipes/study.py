@@ -105,7 +105,7 @@ def run_arm(
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
     if not (folder / SUMMARY).is_file():
-        evaluate_run(run, logs.test, folder, batch_size=8)
+        evaluate_run(run, logs.test, folder, batch_size=8, views=False)
     summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
     lines = [
         line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")

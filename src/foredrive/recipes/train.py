@@ -1,6 +1,5 @@
 """Training runs: a folder with the recipe, two stages, their weights."""
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
-from foredrive.data.collate import stack_records
 from foredrive.errors import InputError
-from foredrive.evaluation import fit_ego_mlp, read_status
 from foredrive.files import atomic_path
-from foredrive.models.ego_mlp import EgoMLP
 from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
+from foredrive.recipes.rivals import fit_rivals
 from foredrive.training import load_weights, save_weights, train
 
 if TYPE_CHECKING:
@@ -120,22 +117,12 @@ def train_run(
     elif recipe.pretrain is not None:
         _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
-        _fit_base(run, agent.planner.ego_mlp)
+        # The very rival it will be judged beside.
+        base = agent.planner.ego_mlp
+        _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames)
+        base.load_state_dict(fitted.state_dict())
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     return run
-
-
-def _fit_base(run: Run, ego_mlp: EgoMLP) -> None:
-    """Fit what the planner starts from: the very rival it will be judged beside; it takes seconds.
-
-    Its seed is the rival's, not the stage's: two MLPs differ by as much as looking may bring.
-    """
-    clips = dataclasses.replace(run.recipe.clips, cameras=(), future_images=False)
-    blind = ClipDataset(run.logs, clips, run.cache_dir)
-    batches = (stack_records([blind.clip(index)]) for index in range(len(blind)))
-    status = read_status(batches, ego_mlp.past_frames)
-    fitted = fit_ego_mlp(status, past_frames=ego_mlp.past_frames, dt_s=ego_mlp.dt_s, seed=0)
-    ego_mlp.load_state_dict(fitted.state_dict())
 
 
 def _pretrained(start: Path) -> Path:
