@@ -5,6 +5,7 @@ the cache of labels, and a run folder for every arm and seed.
 """
 
 import dataclasses
+import statistics
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from foredrive.recipes.study import (
     share_of,
     work_folder,
 )
+from foredrive.recipes.train import train_run
 from foredrive.training import read_metrics
 
 WORK = work_folder(Path("runs/nemo_study"))
@@ -28,7 +30,7 @@ SHARES = (0.1, 0.3, 1.0)
 TOWNS = StudyTowns()
 RECIPE = "nemo_town"
 AVERAGING = AveragingEncoderSize(hidden=128)
-PROBE_STEPS = 30
+OCCUPANCY_STEPS, PROBE_STEPS = 400, 30
 
 
 def _logs() -> StudyLogs:
@@ -61,24 +63,25 @@ def _name(pretrained: bool, share: float) -> str:
 
 
 def occupancy(seed: int) -> dict[str, float]:
-    """NeMo's encoder on the occupancy of the present alone, for as many steps as pre-training has."""
-    recipe = occupancy_alone(seeded(find_recipe(RECIPE), seed))
+    """NeMo's encoder on the occupancy of the present alone."""
+    recipe = _of_steps(occupancy_alone(seeded(find_recipe(RECIPE), seed)), OCCUPANCY_STEPS)
     return _seen(run_arm(recipe, _logs(), _folder("occupancy", seed), WORK / "cache"))
 
 
 def occupancy_averaging(seed: int) -> dict[str, float]:
-    """The averaging encoder on the same, for as long as NeMo's encoder took."""
-    recipe = seeded(find_recipe(RECIPE), seed)
-    recipe = dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, encoder=AVERAGING))
-    recipe = occupancy_alone(recipe)
-    logs = _logs()
-    budget_s = occupancy(seed)["train_s"]
-    probe = _folder("occupancy_averaging_probe", seed)
-    run_arm(_of_steps(recipe, PROBE_STEPS), logs, probe, WORK / "cache")
-    took = sorted(line["step_s"] for line in read_metrics(probe / "finetune" / "metrics.jsonl"))
-    steps = round(budget_s / took[len(took) // 2])
+    """The averaging encoder on the same, for as long as NeMo's encoder takes: by steps timed in turns."""
+    nemo = seeded(find_recipe(RECIPE), seed)
+    averaging = dataclasses.replace(nemo, model=dataclasses.replace(nemo.model, encoder=AVERAGING))
+    logs, took_s = _logs(), {}
+    for name, recipe in (("nemo", nemo), ("averaging", averaging)):
+        probe = WORK / "probes" / f"{name}_seed{seed}"
+        train_run(_of_steps(occupancy_alone(recipe), PROBE_STEPS), logs.train, probe, WORK / "cache")
+        lines = read_metrics(probe / "finetune" / "metrics.jsonl")
+        took_s[name] = statistics.median(line["step_s"] for line in lines)
+    steps = round(OCCUPANCY_STEPS * took_s["nemo"] / took_s["averaging"])
     folder = _folder("occupancy_averaging", seed)
-    return _seen(run_arm(_of_steps(recipe, steps), logs, folder, WORK / "cache")) | {"steps": float(steps)}
+    figures = run_arm(_of_steps(occupancy_alone(averaging), steps), logs, folder, WORK / "cache")
+    return _seen(figures) | {"steps": float(steps)}
 
 
 def _of_steps(recipe: Recipe, steps: int) -> Recipe:
