@@ -45,11 +45,16 @@ class Inspection:
     """[1 T]."""
 
 
-def evaluation_data(run: Run, logs: Sequence[LogPath]) -> ClipDataset:
-    """Clips of `logs` as the recipe has them, with the boxes that collisions up to 3 s need."""
+def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = None) -> ClipDataset:
+    """Clips of `logs` as the recipe has them, with the boxes that collisions up to 3 s need.
+
+    Args:
+        stride_s: time between the clips' nows; None for the recipe's.
+    """
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
-    config = dataclasses.replace(clips, future_frames=frames, future_images=False)
+    stride_s = stride_s or clips.now_stride_s
+    config = dataclasses.replace(clips, future_frames=frames, future_images=False, now_stride_s=stride_s)
     return open_clips(logs, config, run.cache_dir)
 
 
@@ -71,12 +76,19 @@ class _Batches(Iterator[Example]):
 
 
 def evaluate_run(
-    run: Run, logs: Sequence[LogPath], out: Path, batch_size: int = 4, *, views: bool = True
+    run: Run,
+    logs: Sequence[LogPath],
+    out: Path,
+    batch_size: int = 4,
+    *,
+    views: bool = True,
+    stride_s: float | None = None,
 ) -> EvaluationResult:
     """Judge a trained run on logs; writes `out/summary.json`. Clips that cannot be read count as failed.
 
     Args:
         views: render what the cameras see, and judge that too; a quarter of the time.
+        stride_s: time between the clips' nows; None for the recipe's.
 
     Raises:
         InputError: if there is nothing to judge: the run has not finished a stage, no clip can be read.
@@ -85,7 +97,7 @@ def evaluate_run(
         raise InputError(f"a batch has at least one clip, got a batch size of {batch_size}")
     agent = load_agent(run)
     clips = run.recipe.clips
-    dataset = evaluation_data(run, logs)
+    dataset = evaluation_data(run, logs, stride_s)
     prior, ego_mlp = fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -19,6 +19,8 @@ from foredrive.training import read_metrics
 
 HEADLINE = "uniad"
 """The protocol of NeMo's own tables."""
+JUDGED_EVERY_S = 1.0
+"""Neighbouring key frames say nearly the same."""
 PLANNERS = ("stand_still", "constant_velocity", "ego_mlp")
 
 
@@ -105,7 +107,7 @@ def run_arm(
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
     if not (folder / SUMMARY).is_file():
-        evaluate_run(run, logs.test, folder, batch_size=8, views=False)
+        evaluate_run(run, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
     summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
     lines = [
         line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")
