@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from foredrive.recipes.recording import Recorded, _results, is_recorded, record_drives, record_plan
+from foredrive.recipes.fan_out import fan_out
+from foredrive.recipes.recording import Recorded, is_recorded, record_drives, record_plan
 from foredrive.towns.campaign import DrivePlan
 
 IMAGE_HW = (36, 64)
@@ -79,8 +80,8 @@ def die_of_the_first(plan: DrivePlan) -> None:
 
 
 def test_a_process_that_dies_takes_its_own_drive_along() -> None:
-    results = dict(_results(PLANS, die_of_the_first, 1, on_ray=False))
-    assert [error is None for error in results.values()] == [False, True, True]
+    results = dict(fan_out(PLANS, die_of_the_first, 1))
+    assert [isinstance(result, BaseException) for result in results.values()] == [True, False, False]
 
 
 @pytest.mark.skipif(

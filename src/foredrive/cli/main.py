@@ -14,6 +14,7 @@ import tyro
 from foredrive.cli.bench import bench
 from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
+from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.record import record
@@ -29,6 +30,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "convert": convert,
     "train": train,
     "evaluate": evaluate,
+    "drive": drive,
     "score": score,
     "export": export,
     "view": view,

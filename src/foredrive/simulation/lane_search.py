@@ -22,9 +22,9 @@ ASIDE_WEIGHT = 5.0
 """A metre from lane to waypoint is as bad as this many metres of way."""
 BACK_M = 0.5
 """A waypoint may lie this far behind the last on the same lane: both are rounded."""
-CHANGE_M, CHANGE_M2, CLOSED_M = 10.0, 150.0, 50.0
-"""A lane change is as bad as a detour of `CHANGE_M`, of `CHANGE_M2` / room, as hurried ones are worse, and of
-`CLOSED_M` where traffic would not change: over solid lines, and to lanes that are only growing there."""
+CHANGE_M, HURRIED_M2, CLOSED_M = 10.0, 250.0, 50.0
+"""A lane change is as bad as a detour of `CHANGE_M`, of `HURRIED_M2` / room, as hurried ones are worse, and
+of `CLOSED_M` where traffic would not change: over solid lines, and to lanes that are only growing there."""
 LEAST_ROOM_M = 1.0
 """Where there is less room, nobody changes."""
 
@@ -192,7 +192,7 @@ def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[
     for beside, may_cross in zip(graph.sides.lane[:, lane], graph.may_cross[:, lane], strict=True):
         if beside >= 0:
             closed_m = 0.0 if may_cross else CLOSED_M
-            yield (int(beside), part), CHANGE_M + CHANGE_M2 / room_m + closed_m
+            yield (int(beside), part), CHANGE_M + HURRIED_M2 / room_m + closed_m
 
 
 def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:

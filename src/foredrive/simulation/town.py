@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Control, Event, Step
 from foredrive.simulation.collisions import CollisionSense, Contacts
+from foredrive.simulation.drive import Standing
 from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, step, yaw_rate_radps
 from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
@@ -147,6 +148,36 @@ class TownSimulator:
             self.state, self._clip = state, self._make_clip(state)
         self.state = state
         return Step(self._clip, events, state.ended is not None)
+
+    @property
+    def scenario(self) -> TownScenario:
+        """What is driven."""
+        return self._scenario
+
+    def ego(self) -> BicycleState:
+        """The ego vehicle now."""
+        return self.state.ego
+
+    @property
+    def traffic(self) -> Traffic:
+        """The rules that the others go by."""
+        return self._traffic
+
+    @property
+    def traffic_now(self) -> TrafficState:
+        """The others now, if they decide now; else when they decide next."""
+        return self.state.decided
+
+    @property
+    def driven(self) -> Driven:
+        """The ego vehicle now, as the others see it."""
+        return self._driven(self.state.ego, self.state.z_m)
+
+    def standing(self) -> Standing:
+        """How far the drive has come."""
+        rules = self.state.rules
+        completion = min(1.0, self.state.progress.done_m / self._route.length_m)
+        return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def save(self) -> SavedDrive:
         """The drive as it is now: an immutable value that can be pickled."""

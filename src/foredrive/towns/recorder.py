@@ -130,15 +130,20 @@ def record(
     world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
     drive = Drive(traffic, seconds)
-    maps = write_map(_map_objects(town), town, out)
+    maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
     sensed = one_ahead(_sensed(world, drive.moments(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
-    with LogWriter(out, split_of(town), name, _specs(sensors.rig), maps, town, route) as writer:
+    with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
         for moment in track(sensed, description=f"recording {name}", total=count):
             writer.write(_frame(world, moment, sensors, labels, narrator))
     return LogPath(writer.folder, maps)
+
+
+def write_town_map(town: str, out: Path) -> Path:
+    """Write the town's map, once for all of its logs; returns where maps lie."""
+    return write_map(_map_objects(town), town, out)
 
 
 def _map_objects(town: str) -> Iterator[BaseMapObject]:
@@ -287,7 +292,8 @@ def _distance_m(actor: ActorState, moment: Moment) -> float:
     return float(np.linalg.norm(actor.centre_m - moment.T_world_ego[:3, 3]))
 
 
-def _specs(rig: CameraRig) -> list[CameraSpec]:
+def camera_specs(rig: CameraRig) -> list[CameraSpec]:
+    """The cameras of a rig as a log declares them."""
     return [
         CameraSpec(name, rig.K[i].numpy(), rig.T_ego_cam[i].numpy(), rig.size_hw, float(rig.readout_s[i]))
         for i, name in enumerate(rig.names)

@@ -24,8 +24,10 @@ SHORTEST_CHANGE_M = 16.0
 STOPPING_MPS2 = 2.5
 """Whoever need not change does so only where there is room to stop this gently after it."""
 NEAREST_M = 2.0
-COURTEOUS_MPS2 = 1.5
-"""Drivers brake no harder than this to let somebody in who has to change lanes."""
+COURTEOUS_MPS2, COURTEOUS_TO_STANDING_MPS2 = 1.5, 3.0
+"""Drivers brake no harder than this to let somebody in who has to change lanes: who stands there would
+have to wait for ever for one who is slow."""
+STANDS_MPS = 0.5
 COURTEOUS_GAP_M = 1.0
 """And leave this much more room than they would behind somebody in their lane."""
 SETTLED_M = 60.0
@@ -291,7 +293,8 @@ def let_in(
     who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= NEAREST_M))
     n = gaps.follower[who]
     wanted = behind(vehicles, n, now.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M)
-    np.minimum.at(limit, n, np.maximum(wanted, -COURTEOUS_MPS2))
+    hardest = np.where(vehicles.speed_mps[who] < STANDS_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2)
+    np.minimum.at(limit, n, np.maximum(wanted, -hardest))
     return limit
 
 

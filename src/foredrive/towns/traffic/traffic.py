@@ -161,6 +161,12 @@ class Traffic:
         state = self._change_lanes_at_ends(state, rng)
         return self._turnover.renew(state, rng, None if driven is None else driven.centre_m)
 
+    def taken_over(self, state: TrafficState, ego: Driven) -> TrafficState:
+        """The state in which vehicle 0, driven from outside until now, is left to drive itself from there."""
+        seen = self._see_driven(state, ego)
+        vehicles = seen.without_shadows(seen.everyone)
+        return dataclasses.replace(state, vehicles=vehicles, route_passed=seen.route_passed)
+
     def _see_driven(self, state: TrafficState, ego: Driven) -> SeenDriven:
         return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, state.route, state.route_passed)
 

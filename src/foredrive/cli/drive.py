@@ -1,0 +1,134 @@
+"""`foredrive drive`."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from foredrive.recipes.driving import DriveJob, Driven, DriveSuite
+
+FAILURES_SHOWN = 3
+
+
+def drive(
+    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|ego-mlp:RUN")],
+    out: Path,
+    routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short",
+    repetitions: int = 1,
+    seed: int = 0,
+    conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    sensors: bool = True,
+    image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256),
+    vehicles: int = 30,
+    people: int = 20,
+    period: Annotated[float, tyro.conf.arg(metavar="S")] = 0.5,
+    latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1,
+    workers: int = 0,
+    ray: bool = False,
+) -> None:
+    """Drive routes in closed loop and score them as CARLA's leaderboards 1.0 and 2.1 do.
+
+    Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
+
+    Args:
+        agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or the MLP that sees
+            ego status alone, fitted to what a run was trained on.
+        out: Folder of the suite: summary.json, report.html, drives, logs.
+        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file.
+        repetitions: How often each route is driven, every time among other traffic.
+        seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog; a bright day if left out.
+        sensors: Log cameras and lidar of agents that need none, too; without, drives are much faster.
+        image_size: Size of the six cameras' images, px.
+        vehicles: How many vehicles share the road near the ego vehicle.
+        people: How many pedestrians do.
+        period: Time between plans.
+        latency: How much later than what it saw a plan takes effect.
+        workers: How many drives run at a time; 0 is one for each core.
+        ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
+    """
+    from foredrive.recipes.driving import DriveSuite, drive_suite
+    from foredrive.view.drive_report import write_drive_report
+
+    suite = DriveSuite(
+        driver=str(Path(agent).absolute()) if Path(agent).is_dir() else agent,
+        routes=routes,
+        repetitions=repetitions,
+        seed=seed,
+        conditions=conditions,
+        sensors=sensors,
+        image_hw=image_size,
+        vehicles=vehicles,
+        people=people,
+        period_s=period,
+        latency_s=latency,
+    )
+    cores = len(os.sched_getaffinity(0))
+    with _Progress(suite) as progress:
+        driven = drive_suite(suite, out, workers or cores, on_ray=ray, tick=progress.tick)
+    _tell(driven)
+    print(f"look: {write_drive_report(out)}")
+
+
+def _tell(driven: "Driven") -> None:
+    """The scores.
+
+    Raises:
+        InputError: some drives could not be driven.
+    """
+    from rich.console import Console
+
+    from foredrive.recipes.driving import summarise
+    from foredrive.view.drive_report import score_table
+
+    if driven.broken:
+        told = [f"{job.name} ({reason})" for job, reason in driven.broken.items()]
+        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
+        whole = len(driven.drives) + len(told)
+        raise InputError(
+            f"{len(told)} of {whole} drives broke off: {', '.join(told[:FAILURES_SHOWN])}{more}; "
+            "the others are kept, and there is no score without them"
+        )
+    if driven.skipped:
+        print(f"{driven.skipped} of {len(driven.drives)} drives were there already")
+    Console().print(score_table(summarise(list(driven.drives.values()))))
+
+
+class _Progress:
+    """A bar over all drives, with the mean driving score so far."""
+
+    def __init__(self, suite: "DriveSuite") -> None:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        from foredrive.simulation.route_sets import load_route_set
+
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self._progress = Progress("driving", *columns, TextColumn("{task.fields[score]}"))
+        total = suite.repetitions * len(load_route_set(suite.routes))
+        self._bar = self._progress.add_task("", total=total, score="")
+        self._scores: list[float] = []
+
+    def __enter__(self) -> "_Progress":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def tick(self, job: "DriveJob", drive: dict[str, Any] | None) -> None:
+        """One drive is done with."""
+        if drive is not None:
+            self._scores.append(drive["driving_score_1_0"])
+        mean = f"score {sum(self._scores) / len(self._scores):.1f}" if self._scores else ""
+        self._progress.update(self._bar, advance=1, score=mean)

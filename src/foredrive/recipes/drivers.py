@@ -1,0 +1,98 @@
+"""Who may drive a town: agents by the names that the command line knows."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from foredrive.data.resizing import shrink_images
+from foredrive.errors import InputError
+from foredrive.models.ego_mlp import EgoMLP
+from foredrive.models.nemo import NemoAgent
+from foredrive.recipes.rivals import fit_rivals
+from foredrive.recipes.train import load_agent, open_run
+from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.town import TownSimulator
+from foredrive.simulation.town_expert import TownExpert
+
+CRUISE_MPS = 5.0
+EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What an agent has to be shown."""
+
+    cameras: bool
+    past_frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Sees:
+    """An agent that was trained on smaller images than the vehicle takes."""
+
+    agent: NemoAgent
+    image_hw: tuple[int, int]
+    device: str
+
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan of the agent."""
+        return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
+
+
+def needs_of(driver: str) -> Needs:
+    """What a driver has to be shown.
+
+    Args:
+        driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN", the MLP that sees ego
+            status alone, fitted to what the run was trained on.
+
+    Raises:
+        InputError: there is no such driver.
+    """
+    if driver in (EXPERT, STOP, CONSTANT_VELOCITY):
+        return Needs(cameras=False, past_frames=1)
+    clips = open_run(_run_folder(driver)).recipe.clips
+    if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
+        raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
+    return Needs(cameras=not driver.startswith(EGO_MLP), past_frames=clips.past_frames)
+
+
+def make_driver(driver: str, simulator: TownSimulator) -> Agent:
+    """A driver for one drive in a simulator.
+
+    Raises:
+        InputError: there is no such driver.
+    """
+    if driver == EXPERT:
+        return TownExpert(simulator)
+    if driver in (STOP, CONSTANT_VELOCITY):
+        return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
+    folder = _run_folder(driver)
+    if driver.startswith(EGO_MLP):
+        return _fitted(folder)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return _Sees(_trained(folder).to(device), open_run(folder).recipe.clips.image_hw, device)
+
+
+def _run_folder(driver: str) -> Path:
+    folder = Path(driver.removeprefix(EGO_MLP))
+    if not folder.is_dir():
+        known = f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder or {EGO_MLP}RUN"
+        raise InputError(f"{driver}: no such driver; there are {known}")
+    return folder
+
+
+@lru_cache(maxsize=1)  # a worker drives many routes
+def _trained(folder: Path) -> NemoAgent:
+    return load_agent(open_run(folder))
+
+
+@lru_cache(maxsize=1)
+def _fitted(folder: Path) -> EgoMLP:
+    run = open_run(folder)
+    clips = run.recipe.clips
+    return fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames)[1]

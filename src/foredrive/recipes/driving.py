@@ -1,0 +1,289 @@
+"""Drives of one driver over a set of routes, over processes or over Ray; each is kept as it ends.
+
+A suite is a folder: drives/NAME.json is all that came of a drive, logs/ has it as a 123D log, summary.json
+has the scores. What lies there is not driven again.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from foredrive.errors import InputError
+from foredrive.evaluation import collect_provenance
+from foredrive.evaluation.summary import write_json, write_summary
+from foredrive.files import atomic_path
+from foredrive.recipes.drivers import make_driver, needs_of
+from foredrive.recipes.fan_out import fan_out, reason
+from foredrive.simulation.drive import Drive, Pace, drive_route
+from foredrive.simulation.drive_log import drive_log, key_frame
+from foredrive.simulation.route_sets import load_route_set
+from foredrive.simulation.routes import DriveRoute, snap_route
+from foredrive.simulation.scores import (
+    Ending,
+    Infraction,
+    InfractionKind,
+    RouteScore,
+    score_suite,
+    timeout_s,
+)
+from foredrive.simulation.time_to_collision import LEAST_S
+from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.towns.conditions import find_conditions
+from foredrive.towns.recorder import Crowd
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+
+SUITE, DRIVES, SUMMARY = "suite.json", "drives", "summary.json"
+TRACK_EVERY = 5
+"""Of the states of a drive one in this many is kept: four a second."""
+
+
+@dataclass(frozen=True)
+class DriveSuite:
+    """Who drives what, and under which circumstances."""
+
+    driver: str
+    """See `drivers.needs_of`."""
+    routes: str
+    """A set that comes with the package, or a CARLA route file."""
+    repetitions: int = 1
+    seed: int = 0
+    """Of the place and the traffic in the first repetition; the next has the next."""
+    conditions: str | None = None
+    """None draws bright daylight from the seed."""
+    sensors: bool = True
+    """Drives of drivers that need none are logged with cameras and lidar all the same."""
+    image_hw: tuple[int, int] = (144, 256)
+    vehicles: int = Crowd.vehicles
+    people: int = Crowd.people
+    period_s: float = Pace.period_s
+    latency_s: float = Pace.latency_s
+
+    def __post_init__(self) -> None:
+        Pace(self.period_s, self.latency_s)
+        if self.repetitions < 1:
+            raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
+        if self.conditions is not None:
+            find_conditions(self.conditions)
+
+
+@dataclass(frozen=True)
+class DriveJob:
+    """One drive of a suite."""
+
+    route: str
+    """Its id in the set."""
+    repetition: int
+
+    @property
+    def name(self) -> str:
+        """Of the drive's files."""
+        return f"route{self.route}_rep{self.repetition}"
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of a suite."""
+
+    drives: dict[DriveJob, dict[str, Any]]
+    """What was kept of each drive."""
+    skipped: int
+    """How many lay there before."""
+    broken: dict[DriveJob, str]
+    """Drives that the simulator, not the driver, failed at; they have no score."""
+
+
+def drive_suite(
+    suite: DriveSuite,
+    out: Path,
+    workers: int,
+    *,
+    on_ray: bool = False,
+    tick: Callable[[DriveJob, dict[str, Any] | None], None] = lambda job, drive: None,
+) -> Driven:
+    """Drive all that does not lie in the folder yet, and write the summary once all are there.
+
+    Args:
+        workers: drives at a time; on Ray as for `fan_out.fan_out`.
+        tick: told of each drive as it is done with, None if it broke.
+
+    Raises:
+        InputError: there is no such driver or set of routes, or the folder holds another suite.
+        OSError: the disk is full.
+    """
+    needs_of(suite.driver)
+    routes = load_route_set(suite.routes)
+    jobs = [DriveJob(route.id, n) for n in range(suite.repetitions) for route in routes]
+    _claim(suite, out)
+    drives, broken = {}, {}
+    for job in jobs:
+        if _file(out, job).is_file():
+            drives[job] = read_drive(_file(out, job))
+            tick(job, drives[job])
+    skipped = len(drives)
+    threads = max(1, torch.get_num_threads() // workers)
+    work = functools.partial(drive_one, suite=suite, out=out, threads=threads)
+    todo = [job for job in jobs if job not in drives]
+    with contextlib.closing(fan_out(todo, work, workers, on_ray=on_ray)) as results:
+        for job, result in results:
+            if isinstance(result, BaseException):
+                broken[job] = reason(job.name, result)
+                tick(job, None)
+            else:
+                drives[job] = result
+                tick(job, result)
+    driven = Driven({job: drives[job] for job in jobs if job in drives}, skipped, broken)
+    if not broken:  # a mean over what happened to work would be none of the suite
+        write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
+    return driven
+
+
+def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict[str, Any]:
+    """Drive one route once; its files are there when this returns."""
+    torch.set_num_threads(threads)
+    began = time.perf_counter()
+    route = snap_route(next(r for r in load_route_set(suite.routes) if r.id == job.route))
+    simulator, scenario = TownSimulator(), scenario_of(suite, route, job.repetition)
+    with drive_log(scenario, out, job.name) as log:
+        drive = drive_route(
+            simulator,
+            scenario,
+            make_driver(suite.driver, simulator),
+            route=job.route,
+            repetition=job.repetition,
+            pace=Pace(suite.period_s, suite.latency_s),
+            on_frame=lambda: log.write(key_frame(simulator)),
+        )
+    kept = _kept(drive, route, time.perf_counter() - began) | {"log": str(log.folder.relative_to(out))}
+    write_json(_file(out, job), kept)
+    return kept
+
+
+def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownScenario:
+    """The circumstances of one drive."""
+    needs = needs_of(suite.driver)
+    seen = needs.cameras or suite.sensors
+    return TownScenario(
+        town=route.town,
+        route_xyz=route.xyz,
+        seed=suite.seed + repetition,
+        lanes=route.lanes,
+        crowd=Crowd(suite.vehicles, suite.people),
+        conditions=None if suite.conditions is None else find_conditions(suite.conditions),
+        sensors=SensorSuite(camera_rig(suite.image_hw), roof_lidar()) if seen else None,
+        past_frames=needs.past_frames,
+        limit_s=timeout_s(route.length_m),
+    )
+
+
+def read_drive(path: Path) -> dict[str, Any]:
+    """What was kept of a drive.
+
+    Raises:
+        InputError: the file is no drive.
+    """
+    try:
+        drive: dict[str, Any] = json.loads(path.read_text())
+        score_of(drive)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not what is kept of a drive ({error}); delete it to drive again") from None
+    return drive
+
+
+def score_of(drive: dict[str, Any]) -> RouteScore:
+    """The score of what was kept of a drive."""
+    fields = drive["score"]
+    infractions = tuple(
+        Infraction(**{**each, "kind": InfractionKind(each["kind"]), "xy_world": tuple(each["xy_world"])})
+        for each in fields["infractions"]
+    )
+    return RouteScore(**{**fields, "ending": Ending(fields["ending"]), "infractions": infractions})
+
+
+def summarise(drives: Sequence[dict[str, Any]]) -> dict[str, float | int | str | None]:
+    """The figures of a suite, flat; a driver who failed by his own fault is scored by what he drove."""
+    suite = score_suite([score_of(drive) for drive in drives])
+    out: dict[str, float | int | str | None] = {
+        "routes": suite.routes,
+        "repetitions": suite.repetitions,
+        "drives": len(drives),
+        "failed": suite.failed,
+    }
+    for name in ("driving_score_1_0", "driving_score_2_1", "completion"):
+        value = getattr(suite, name)
+        out |= {name: value.mean, f"{name}.spread": value.spread}
+    out |= {f"endings.{ending}": count for ending, count in suite.endings.items()}
+    out |= {f"infractions.{kind}": count for kind, count in suite.infractions.items()}
+    out |= {f"infractions_per_km.{kind}": each for kind, each in suite.infractions_per_km.items()}
+    comfortable = [drive["comfort"]["comfortable_share"] for drive in drives if drive["comfort"]]
+    near = [seconds is not None and seconds < LEAST_S for drive in drives for seconds in drive["nearest_s"]]
+    plan_ms = [1000 * seconds for drive in drives for seconds in drive["act_s"]]
+    out["comfortable_share"] = statistics.fmean(comfortable) if comfortable else None
+    out["near_collision_share"] = statistics.fmean(near) if near else None
+    out["plan_ms"] = statistics.median(plan_ms) if plan_ms else None
+    out["driven_s"] = sum(drive["score"]["duration_s"] for drive in drives)
+    out["wall_s"] = sum(drive["wall_s"] for drive in drives)
+    return out | collect_provenance()
+
+
+def _kept(drive: Drive, route: DriveRoute, wall_s: float) -> dict[str, Any]:
+    states = drive.states[::TRACK_EVERY]
+    return {
+        "town": route.town,
+        "length_m": route.length_m,
+        "score": dataclasses.asdict(drive.score),
+        "driving_score_1_0": drive.score.driving_score_1_0,
+        "driving_score_2_1": drive.score.driving_score_2_1,
+        "error": drive.error,
+        "events": [dataclasses.asdict(event) for event in drive.events],
+        "comfort": None if drive.comfort is None else dataclasses.asdict(drive.comfort),
+        "nearest_s": drive.nearest_s,
+        "act_s": drive.act_s,
+        "route_xy": route.xyz[:, :2].round(2).tolist(),
+        "track": {
+            "t_s": [round(0.05 * TRACK_EVERY * k, 2) for k in range(len(states))],
+            "xy": [(round(s.x_m, 2), round(s.y_m, 2)) for s in states],
+            "yaw_rad": [round(s.yaw_rad, 4) for s in states],
+            "speed_mps": [round(s.speed_mps, 3) for s in states],
+        },
+        "wall_s": wall_s,
+    }
+
+
+def _claim(suite: DriveSuite, out: Path) -> None:
+    """Note in the folder whose it is.
+
+    Raises:
+        InputError: it is another's.
+    """
+    wanted = json.loads(json.dumps(dataclasses.asdict(suite)))
+    path = out / SUITE
+    if not path.is_file():
+        if (out / DRIVES).exists():
+            raise InputError(f"{out}: holds drives that nobody knows the suite of; choose another folder")
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+        return
+    try:
+        there = json.loads(path.read_text())
+    except (OSError, ValueError):
+        there = None
+    more = {**wanted, "repetitions": 0}
+    if not isinstance(there, dict) or {**there, "repetitions": 0} != more:
+        raise InputError(f"{out}: holds the drives of another suite; choose another folder")
+    if there["repetitions"] < suite.repetitions:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+
+
+def _file(out: Path, job: DriveJob) -> Path:
+    return out / DRIVES / f"{job.name}.json"

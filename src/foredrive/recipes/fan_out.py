@@ -1,0 +1,172 @@
+"""Many jobs at once, over processes or over Ray; what one of them fails of takes none of the others with it.
+
+An interruption reaches every worker, and what they have half written is cleared away before it is raised.
+"""
+
+import _thread
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+import rich
+
+from foredrive.errors import InputError
+from foredrive.training.interrupts import start_fork_server
+
+LAST_WORDS_S = 60.0
+"""How long Ray's tasks may take to clear away what they have half written."""
+
+_log = logging.getLogger(__name__)
+J = TypeVar("J")
+R = TypeVar("R")
+
+
+def fan_out(
+    jobs: Sequence[J], work: Callable[[J], R], workers: int, *, on_ray: bool = False
+) -> Generator[tuple[J, R | BaseException], None, None]:
+    """Jobs as they end, with what came of them or what they failed of; no more under way than are worked on.
+
+    Close the generator to stop early (`contextlib.closing`).
+
+    Args:
+        work: can be pickled, as jobs and results can.
+        workers: jobs at a time. On Ray that is the size of a cluster which is started here; one that
+            RAY_ADDRESS names is used as it is.
+    """
+    waiting, running = deque(jobs), dict[Future[R], J]()
+    if not jobs:
+        return
+    with (_on_ray if on_ray else _on_processes)(work, workers) as (submit, width):
+        while waiting or running:
+            while waiting and len(running) < width:
+                job = waiting.popleft()
+                running[submit(job)] = job
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future.exception() or future.result()
+
+
+def reason(name: str, error: BaseException) -> str:
+    """Why a job failed, in one line.
+
+    Raises:
+        BaseException: the error itself, if it is no job's own fault: a full disk, an interruption.
+    """
+    error = getattr(error, "cause", None) or error  # Ray wraps it, with its traceback as text
+    if isinstance(error, OSError) or not isinstance(error, Exception):
+        raise error
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, BrokenProcessPool):
+        return "its process died, maybe for want of memory"
+    _log.warning("%s failed", name, exc_info=error)
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
+
+
+@contextlib.contextmanager
+def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
+    """Worker processes, anew after one has died; at the end they have cleared away what is half-written."""
+    start_fork_server(preload=_module_of(work))
+    context = multiprocessing.get_context("forkserver")
+    stop, alive = context.Pipe(duplex=False)  # an event would wait for ever for a process that has died
+    pool: ProcessPoolExecutor | None = None
+
+    def submit(job: J) -> Future[R]:
+        nonlocal pool
+        if pool is not None:
+            with contextlib.suppress(BrokenProcessPool):
+                return pool.submit(_unless_stopped, work, job)
+            pool.shutdown()
+        pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
+        return pool.submit(_unless_stopped, work, job)
+
+    try:
+        yield submit, workers
+    finally:
+        alive.close()
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+        stop.close()
+
+
+class _Worker:
+    """What a worker process knows of itself."""
+
+    is_busy = False
+    has_to_stop = False
+
+
+def _start_worker(stop: Connection) -> None:
+    """Stop when the parent closes its end of a pipe, not by Ctrl-C; clear away what is half-written."""
+    rich.get_console().quiet = True  # the parent shows how far it is
+
+    def interrupt(signum: int, frame: object) -> None:
+        if not _Worker.has_to_stop:
+            _Worker.has_to_stop = True
+            if _Worker.is_busy:
+                raise KeyboardInterrupt
+
+    def watch() -> None:
+        stop.poll(None)
+        _thread.interrupt_main()
+
+    signal.signal(signal.SIGINT, interrupt)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _unless_stopped(work: Callable[[J], R], job: J) -> R:
+    if _Worker.has_to_stop:
+        raise KeyboardInterrupt
+    _Worker.is_busy = True
+    try:
+        return work(job)
+    finally:
+        _Worker.is_busy = False
+
+
+@contextlib.contextmanager
+def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
+    """Ray's tasks of one core each; at the end they have cleared away what is half-written."""
+    import ray  # takes a second
+
+    started_here = not ray.is_initialized()
+    if started_here:
+        cpus = None if "RAY_ADDRESS" in os.environ else workers
+        ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    task: Any = ray.remote(num_cpus=1, max_retries=0)(_quietly)
+    refs = {}
+
+    def submit(job: J) -> Future[R]:
+        ref = task.remote(work, job)
+        future: Future[R] = ref.future()
+        refs[future] = ref
+        return future
+
+    try:
+        yield submit, int(ray.cluster_resources()["CPU"])
+    finally:
+        under_way = [ref for future, ref in refs.items() if not future.done()]
+        for ref in under_way:
+            ray.cancel(ref)
+        if under_way:
+            ray.wait(under_way, num_returns=len(under_way), timeout=LAST_WORDS_S)
+        if started_here:
+            ray.shutdown()
+
+
+def _quietly(work: Callable[[J], R], job: J) -> R:
+    rich.get_console().quiet = True
+    return work(job)
+
+
+def _module_of(work: Any) -> str:
+    """Where a function or a partial of one is defined: what the workers import before they are forked."""
+    return str(getattr(work, "func", work).__module__)

@@ -1,0 +1,180 @@
+"""One drive of one route: an agent plans, a controller follows, a simulator answers, until the route ends."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from foredrive.data.collate import stack_records
+from foredrive.errors import InputError
+from foredrive.scene import Agent, Clip, Control, Event, Step
+from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
+from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.plans import Plan, fixed_in_world
+from foredrive.simulation.scores import Ending, RouteScore, infraction_of
+from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far a drive has come."""
+
+    completion: float
+    """Share of the route, 0 to 1."""
+    outside_lanes: float
+    """Share of the way driven outside of the lanes or against them, 0 to 1."""
+    driven_m: float
+
+
+@runtime_checkable
+class RoadSimulator(Protocol):
+    """A `Simulator` of drives along routes."""
+
+    def reset(self, scenario: Any) -> Clip:
+        """Start a drive and return its first key frame."""
+        ...
+
+    def step(self, control: Control) -> Step:
+        """Drive on for `STEP_S`; an event tells by its kind, an `Ending`, why the drive is over."""
+        ...
+
+    def ego(self) -> BicycleState:
+        """The ego vehicle now."""
+        ...
+
+    def standing(self) -> Standing:
+        """How far the drive has come."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How often an agent plans, and how long it takes for it: in the time of the drive, not of the computer.
+
+    Raises:
+        InputError: it does not plan at key frames, or the latency is negative.
+    """
+
+    period_s: float = FRAME_DT_S
+    latency_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        frames = self.period_s / FRAME_DT_S
+        if not (frames > 0.5 and abs(frames - round(frames)) < 1e-6):
+            raise InputError(f"agents plan every {FRAME_DT_S} s or a multiple of it, got {self.period_s} s")
+        if not 0 <= self.latency_s < math.inf:
+            raise InputError(f"a latency is 0 s or more, got {self.latency_s}")
+
+    @property
+    def steps(self) -> int:
+        """Simulation steps between plans."""
+        return round(self.period_s / STEP_S)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What came of one drive."""
+
+    score: RouteScore
+    states: tuple[BicycleState, ...]
+    """At the start and after each step."""
+    events: tuple[Event, ...]
+    nearest_s: tuple[float, ...]
+    """Least time to collision at each key frame, with everybody at constant velocity; infinite: none."""
+    act_s: tuple[float, ...]
+    """What the computer took for each plan."""
+    comfort: Comfort | None
+    """None of a drive too short to tell."""
+    error: str = ""
+    """What the agent failed of, if it did."""
+
+
+def drive_route(
+    simulator: RoadSimulator,
+    scenario: object,
+    agent: Agent,
+    *,
+    route: str,
+    repetition: int = 0,
+    pace: Pace | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+) -> Drive:
+    """Drive until the route ends; an agent that raises an error or has no plan ends it too: `Ending.CRASHED`.
+
+    Args:
+        scenario: what the simulator is reset to.
+        agent: sees a batch of one clip.
+        route: its name.
+        on_frame: called at each key frame, the first included, before the agent sees it.
+
+    Raises:
+        InputError: the simulator cannot start there.
+    """
+    pace = pace or Pace()
+    clip = simulator.reset(scenario)
+    on_frame()
+    states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
+    following, ending, error = Following(), None, ""
+    while ending is None:
+        index = len(states) - 1
+        if index % pace.steps == 0:
+            began = time.perf_counter()
+            try:
+                plan = _plan(agent, clip, states[-1], index * STEP_S)
+            except Exception as problem:  # whatever an agent does wrong, the route counts
+                ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
+                break
+            act_s.append(time.perf_counter() - began)
+            following = following.expecting(plan, index * STEP_S + pace.latency_s)
+        control, following = follow(following, states[-1], index * STEP_S)
+        step = simulator.step(control)
+        states.append(simulator.ego())
+        events += step.events
+        if step.clip is not clip:
+            clip = step.clip
+            nearest.append(_nearest_s(clip))
+            on_frame()
+        ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
+    standing = simulator.standing()
+    score = RouteScore(
+        route=route,
+        repetition=repetition,
+        completion=standing.completion,
+        outside_lanes=standing.outside_lanes,
+        ending=ending,
+        infractions=tuple(found for event in events if (found := infraction_of(event)) is not None),
+        driven_m=standing.driven_m,
+        duration_s=(len(states) - 1) * STEP_S,
+    )
+    comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None
+    return Drive(score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error)
+
+
+def _plan(agent: Agent, clip: Clip, ego: BicycleState, t_s: float) -> Plan:
+    return fixed_in_world(agent.act(stack_records([clip])), ego, t_s)
+
+
+def _nearest_s(clip: Clip) -> float:
+    """The least time to collision at a clip's now."""
+    boxes = clip.boxes[clip.now]
+    valid = boxes.valid.numpy()
+    if not valid.any():
+        return math.inf
+    others = MovingBoxes(
+        boxes.centre[:, :2].double().numpy()[valid],
+        boxes.size_lwh[:, :2].double().numpy()[valid],
+        boxes.yaw.double().numpy()[valid],
+        boxes.velocity.double().numpy()[valid],
+    )
+    ego = MovingBoxes(
+        np.array([[EGO.axle_to_centre_m, 0.0]]),
+        np.array([[EGO.length_m, EGO.width_m]]),
+        np.zeros(1),
+        np.array([[float(clip.ego_speed_mps[clip.now]), 0.0]]),
+    )
+    return float(time_to_collision_s(ego, others).min())

@@ -1,0 +1,91 @@
+"""The privileged driver of a town: it knows everybody's state and rules, and so what comes of its driving.
+
+Twice a second it lets the town go on in imagination with itself as one of the drivers, by the very rules that
+drive in recordings (`towns.traffic`): right of way, lights, gaps, lane changes for its route. Where that
+brings it is its plan. It is the ceiling of all that learn from recordings.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from foredrive.scene import Clip, Trajectory
+from foredrive.simulation.town import TownSimulator
+from foredrive.towns.traffic.driven import Driven
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.traffic.vehicles import Vehicles
+
+DECISION_S = 0.1
+"""Of the others, as in recordings."""
+EVERY, STEPS = 2, 15
+"""Waypoints lie so many decisions apart: 3 s in all."""
+LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
+"""Who is further from where it meant to be starts anew from the lane that it is on."""
+
+
+class TownExpert:
+    """An `Agent` for one simulator; what it plans to do with a lane change goes on from plan to plan.
+
+    Args:
+        simulator: in which it drives; it looks at nothing but this.
+    """
+
+    def __init__(self, simulator: TownSimulator) -> None:
+        self._simulator = simulator
+        self._imagined: list[TrafficState] = []
+
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan from the simulator's now on, whatever was observed."""
+        traffic, now = self._simulator.traffic, self._simulator.traffic_now
+        here = self._simulator.driven
+        state = self._gone_on(traffic, traffic.taken_over(now, here), here)
+        self._imagined = [state]
+        for _ in range(EVERY * STEPS):
+            self._imagined.append(traffic.step(self._imagined[-1], DECISION_S))
+        ahead = [traffic.poses(then).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]
+        return _in_ego_frame(np.stack(ahead)[:, :2], here)
+
+    def _gone_on(self, traffic: Traffic, state: TrafficState, here: Driven) -> TrafficState:
+        """With the path and the lane change that were meant, if the vehicle is where they lead."""
+        meant = next((s for s in self._imagined if abs(s.time_s - state.time_s) < 0.5 * DECISION_S), None)
+        if meant is None:
+            return state
+        poses = traffic.poses(meant)
+        offset = here.axle_xyz[:2] - poses.axle_xyz[0, :2]
+        ahead_m = float(offset @ here.forward[:2])
+        beside_m = float(offset @ [-here.forward[1], here.forward[0]])
+        if abs(ahead_m) > LOST_AHEAD_M or abs(beside_m) > LOST_BESIDE_M:
+            return state
+        first = np.array([0])
+        wanted, real = _rows(meant.vehicles, first), _rows(state.vehicles, first)
+        row = dataclasses.replace(
+            wanted.moved(np.array([ahead_m])),
+            speed_mps=real.speed_mps,
+            granted=real.granted,
+            asked_s=real.asked_s,
+            rank=real.rank,
+            has_stopped=real.has_stopped,
+        )
+        return dataclasses.replace(state, vehicles=state.vehicles.replace_rows(first, row))
+
+
+def _rows(vehicles: Vehicles, rows: np.ndarray) -> Vehicles:
+    return Vehicles(**{name: value[rows] for name, value in vars(vehicles).items()})
+
+
+def _in_ego_frame(xy_world: Float64[np.ndarray, "T 2"], here: Driven) -> Trajectory:
+    cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+    xy = (xy_world - here.axle_xyz[:2]) @ np.array([[cos, -sin], [sin, cos]])
+    points = torch.tensor(xy, dtype=torch.float32)[None, None]
+    flat = points[..., 0]
+    return Trajectory(
+        xy=points,
+        yaw=torch.zeros_like(flat),
+        valid=torch.ones_like(flat, dtype=torch.bool),
+        log_prob=torch.zeros(1, 1),
+        dt_s=EVERY * DECISION_S,
+    )

@@ -1,0 +1,143 @@
+"""Figures of one closed-loop drive: where it went, and how fast."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.scores import InfractionKind
+from foredrive.simulation.time_to_collision import LEAST_S
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.view import palette
+from foredrive.view.inline_svg import INK_MARK
+
+AROUND_M, SMALLEST_M = 25.0, 45.0
+FASTEST_MPS = 14.0
+SPEED_MAP = "viridis"
+ROAD = "#333d4b"
+LETTERS = {
+    InfractionKind.COLLISION_PEDESTRIAN: "P",
+    InfractionKind.COLLISION_VEHICLE: "V",
+    InfractionKind.COLLISION_STATIC: "S",
+    InfractionKind.RED_LIGHT: "R",
+    InfractionKind.STOP_SIGN: "H",
+    InfractionKind.SCENARIO_TIMEOUT: "T",
+    InfractionKind.YIELD_TO_EMERGENCY: "Y",
+    InfractionKind.MIN_SPEED: "M",
+}
+"""By which infractions are marked in the figures."""
+
+
+def draw_way(drive: Mapping[str, Any]) -> Figure:
+    """The route over the town's lanes, the way driven coloured by speed, infractions marked; north is up."""
+    figure = Figure(figsize=(4.6, 4.6))
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    route, track = np.array(drive["route_xy"]), np.array(drive["track"]["xy"])
+    everything = np.concatenate([route, track])
+    low, high = everything.min(axis=0) - AROUND_M, everything.max(axis=0) + AROUND_M
+    centre, half = 0.5 * (low + high), max(SMALLEST_M, 0.5 * float((high - low).max()))
+    ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, facecolor=palette.PANEL, zorder=0))
+    ax.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
+    ax.set_aspect("equal")
+    ax.set_xticks([])
+    ax.set_yticks([])
+    _draw_lanes(ax, drive["town"], centre, half)
+    ax.plot(*route.T, color=palette.EXPERT, linewidth=5.0, alpha=0.35, solid_capstyle="round", zorder=2)
+    ax.plot(*route[-1], "o", color=palette.EXPERT, markersize=9, markerfacecolor="none", zorder=4)
+    if len(track) > 1:
+        pieces = LineCollection(
+            list(np.stack([track[:-1], track[1:]], axis=1)),
+            array=np.array(drive["track"]["speed_mps"][1:]),
+            cmap=SPEED_MAP,
+            norm=Normalize(0.0, FASTEST_MPS),
+            linewidth=2.4,
+            capstyle="round",
+            zorder=3,
+        )
+        ax.add_collection(pieces)
+    ax.plot(*track[0], "o", color=palette.EGO, markersize=5, zorder=4)
+    for infraction in drive["score"]["infractions"]:
+        _mark(ax, infraction["xy_world"], LETTERS[InfractionKind(infraction["kind"])])
+    scale_m = 20.0 if half < 120 else 100.0
+    x, y = centre[0] - 0.92 * half, centre[1] - 0.92 * half
+    ax.plot([x, x + scale_m], [y, y], color=palette.INK, linewidth=1.5)
+    ax.text(x, y + 0.02 * half, f"{scale_m:.0f} m", color=palette.INK, fontsize=8, va="bottom")
+    return figure
+
+
+def draw_timeline(drive: Mapping[str, Any]) -> Figure:
+    """Speed over time, with what went wrong, and where others came near."""
+    figure = Figure(figsize=(7.6, 2.3))
+    ax = figure.add_axes((0.07, 0.22, 0.92, 0.70))
+    t_s, speed = drive["track"]["t_s"], drive["track"]["speed_mps"]
+    ax.fill_between(t_s, speed, color="#4c8be0", alpha=0.25, linewidth=0)
+    ax.plot(t_s, speed, color="#4c8be0", linewidth=1.6)
+    top = max(6.0, 1.25 * max(speed, default=0.0))
+    ax.set(xlim=(0.0, max(float(drive["score"]["duration_s"]), 1.0)), ylim=(0.0, top))
+    for t0, t1 in _near(drive["nearest_s"]):
+        ax.axvspan(t0, t1, color="#e0a458", alpha=0.3, linewidth=0)
+    for infraction in drive["score"]["infractions"]:
+        ax.axvline(infraction["t_s"], color=palette.PLAN, linewidth=1.4)
+        letter = LETTERS[InfractionKind(infraction["kind"])]
+        ax.text(
+            infraction["t_s"],
+            0.97 * top,
+            letter,
+            color="white",
+            fontsize=8,
+            weight="bold",
+            ha="center",
+            va="top",
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": palette.PLAN, "edgecolor": "none"},
+        )
+    ax.set_xlabel("time, s", color=INK_MARK, fontsize=9)
+    ax.set_ylabel("speed, m/s", color=INK_MARK, fontsize=9)
+    ax.tick_params(colors=INK_MARK, labelsize=8)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(INK_MARK)
+    return figure
+
+
+def _draw_lanes(ax: Axes, town: str, centre: Float[np.ndarray, "2"], half: float) -> None:
+    areas, lines = [], []
+    for lane in load_town_map(town).lanes:
+        line = lane.centreline_xyz[:, :2]
+        if (np.abs(line - centre) < half).all(axis=1).any():
+            left, right = lane.left_boundary_xyz[:, :2], lane.right_boundary_xyz[:, :2]
+            areas.append(np.concatenate([left, right[::-1]]).round(1))
+            lines.append(line.round(1))
+    ax.add_collection(PolyCollection(areas, facecolor=ROAD, edgecolor=ROAD, linewidth=0.8, zorder=1))
+    ax.add_collection(LineCollection(lines, color="#465266", linewidth=0.5, zorder=1.1))
+
+
+def _mark(ax: Axes, xy: Sequence[float], letter: str) -> None:
+    ax.plot(xy[0], xy[1], "o", color=palette.PLAN, markersize=13, markeredgecolor="white", zorder=5)
+    ax.text(
+        xy[0],
+        xy[1],
+        letter,
+        color="white",
+        fontsize=8,
+        weight="bold",
+        ha="center",
+        va="center_baseline",
+        zorder=6,
+    )
+
+
+def _near(nearest_s: Sequence[float | None]) -> list[tuple[float, float]]:
+    """Spans of time in which somebody was less than nuPlan's bound from being touched."""
+    return [
+        (FRAME_DT_S * (k - 0.5), FRAME_DT_S * (k + 0.5))
+        for k, seconds in enumerate(nearest_s)
+        if seconds is not None and seconds < LEAST_S
+    ]

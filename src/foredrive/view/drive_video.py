@@ -1,0 +1,117 @@
+"""A closed-loop drive as an animated picture: what the front cameras saw, and the scene from above."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+
+from foredrive.data.boxes import read_boxes
+from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
+from foredrive.data.logs import Log, LogPath
+from foredrive.files import atomic_path
+from foredrive.geometry.boxes import box_corners
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.view import palette
+from foredrive.view.bev import EGO_OUTLINE_XY
+
+FASTER = 2.0
+"""Than life."""
+FRONT = ("pcam_l0", "pcam_f0", "pcam_r0")
+CAMERA_WH = (256, 144)
+ABOVE_WH = (768, 288)
+PX_PER_M, EGO_AT_X = 5.0, 0.3
+"""From above, driving to the right; the vehicle stands at this part of the width."""
+QUALITY = 55
+ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
+
+
+def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> None:
+    """Write an animated WebP, which browsers play: a frame for each key frame, twice as fast as life.
+
+    Args:
+        log: of the drive.
+        drive: what was kept of it.
+    """
+    opened = Log(log)
+    frames = [_frame(opened, index, drive) for index in range(len(opened))]
+    with atomic_path(path) as temporary:
+        frames[0].save(
+            temporary,
+            format="WEBP",
+            save_all=True,
+            append_images=frames[1:],
+            duration=round(1000 * FRAME_DT_S / FASTER),
+            loop=0,
+            quality=QUALITY,
+        )
+
+
+def _frame(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
+    above = _from_above(log, index, drive)
+    cameras = pinhole_cameras(log)
+    shown = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None]
+    if not shown:
+        return above
+    frame = Image.new("RGB", (ABOVE_WH[0], ABOVE_WH[1] + CAMERA_WH[1]), palette.GROUND)
+    frame.paste(above, (0, CAMERA_WH[1]))
+    for number, camera in enumerate(shown):
+        image = read_camera(log, index, camera, CAMERA_WH[::-1], with_image=True).image
+        if image is not None:
+            frame.paste(Image.fromarray(image.permute(1, 2, 0).numpy()), (number * CAMERA_WH[0], 0))
+    return frame
+
+
+def _from_above(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
+    """The scene around the vehicle, which drives to the right."""
+    twice = 2  # drawn larger and shrunk: PIL's polygons have no smooth edges
+    image = Image.new("RGB", (twice * ABOVE_WH[0], twice * ABOVE_WH[1]), palette.GROUND)
+    pen = ImageDraw.Draw(image)
+    T_ego_world = np.linalg.inv(log.T_world_ego[index])
+
+    def pixels(xy_ego: Float[np.ndarray, "N 2"]) -> list[tuple[float, float]]:
+        x = twice * (EGO_AT_X * ABOVE_WH[0] + PX_PER_M * xy_ego[:, 0])
+        y = twice * (0.5 * ABOVE_WH[1] - PX_PER_M * xy_ego[:, 1])
+        return list(zip(x.tolist(), y.tolist(), strict=True))
+
+    def from_world(xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        return xy @ T_ego_world[:2, :2].T + T_ego_world[:2, 3]
+
+    here = log.T_world_ego[index, :2, 3]
+    for outline in _lane_outlines(drive["town"]):
+        if np.abs(outline - here).max(axis=1).min() < ABOVE_WH[0] / PX_PER_M:
+            pen.polygon(pixels(from_world(outline)), fill=ROAD, outline=EDGE, width=twice)
+    route = from_world(np.array(drive["route_xy"]))
+    pen.line(pixels(route), fill=ROUTE, width=twice * 4, joint="curve")
+    boxes = read_boxes(log, index)
+    if boxes is not None:
+        boxes = boxes[boxes.valid]
+        corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)[:, :4, :2]
+        for outline, category in zip(corners.double().numpy(), boxes.category.tolist(), strict=True):
+            pen.polygon(pixels(outline), fill=palette.box_colour(category))
+    pen.polygon(pixels(EGO_OUTLINE_XY), fill=palette.EGO)
+    image = image.resize(ABOVE_WH, Image.Resampling.BOX)
+    _caption(ImageDraw.Draw(image), log, index, drive)
+    return image
+
+
+def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: Mapping[str, Any]) -> None:
+    t_s = float(log.t_us[index] - log.t_us[0]) * 1e-6
+    font = ImageFont.load_default(size=16)
+    pen.text((10, 8), f"{t_s:5.1f} s   {log.speed_mps[index]:4.1f} m/s", fill=palette.INK, font=font)
+    wrong = [each for each in drive["score"]["infractions"] if each["t_s"] <= t_s + 1e-6]
+    for line, each in enumerate(wrong[-4:]):
+        text = f"{each['t_s']:.1f} s  {each['kind'].replace('_', ' ')} {each['what']}"
+        pen.text((10, 34 + 22 * line), text, fill=palette.PLAN, font=font)
+
+
+@lru_cache(maxsize=2)
+def _lane_outlines(town: str) -> list[Float[np.ndarray, "N 2"]]:
+    return [
+        np.concatenate([lane.left_boundary_xyz[:, :2], lane.right_boundary_xyz[::-1, :2]])
+        for lane in load_town_map(town).lanes
+    ]
