@@ -102,7 +102,7 @@ def test_a_shadow_lies_on_the_lane_that_is_entered_soon(town_of: Callable[[str],
     state = followed(traffic, lane, 50.0, behind_m=30.0)
     for turned_rad, expected in ((0.0, False), (0.15, True)):
         ego = driven_at(traffic, lane, 50.0, turned_rad=turned_rad, mps=12.0)
-        seen = see_driven(graph, traffic.near_lanes, state.vehicles, ego, state.route, 0)
+        seen = see_driven(graph, traffic.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
         shadows = seen.everyone.path[seen.count :, BEHIND]
         assert (beside in shadows) == expected
         if expected:
@@ -116,7 +116,7 @@ def test_against_the_traffic_a_shadow_comes_towards_it(alone: Traffic) -> None:
     lane = longest_lane(alone)
     state = followed(alone, lane, 80.0, behind_m=50.0)
     ego = driven_at(alone, lane, 80.0, turned_rad=np.pi, mps=6.0)
-    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0)
+    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
     ahead = find_leaders(alone.lanes, seen.everyone, path_starts(alone.lanes, seen.everyone.path))
     assert ahead.leader[1] >= seen.count
     assert seen.everyone.speed_mps[ahead.leader[1]] == pytest.approx(-6.0, abs=0.05)
@@ -135,18 +135,25 @@ def before_a_light(traffic: Traffic) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(
-    ("to_line_m", "mps", "way_taken", "asks"),
-    [(3.0, 12.0, True, True), (30.0, 9.0, False, True), (3.0, 0.0, False, False), (12.0, 1.5, False, False)],
-    ids=["cannot stop", "comes", "stands at the line", "crawls up to it"],
+    ("to_line_m", "mps", "time_s", "way_taken", "asks"),
+    [
+        (3.0, 12.0, 5.0, True, True),
+        (30.0, 9.0, 5.0, False, True),
+        (3.0, 0.0, 5.0, False, False),
+        (3.0, 0.0, 9.0, False, True),
+        (12.0, 0.0, 9.0, False, False),
+        (12.0, 1.5, 9.0, False, False),
+    ],
+    ids=["cannot stop", "comes", "stands at the line", "has its turn there", "stands far off", "crawls"],
 )
 def test_the_way_through_a_junction_is_taken_by_who_cannot_stop_before_it(
-    alone: Traffic, to_line_m: float, mps: float, way_taken: bool, asks: bool
+    alone: Traffic, to_line_m: float, mps: float, time_s: float, way_taken: bool, asks: bool
 ) -> None:
     before, _ = before_a_light(alone)
     s_m = float(alone.lanes.length_m[before]) - to_line_m - 2.45
     state = followed(alone, before, s_m, behind_m=10.0)
     ego = driven_at(alone, before, s_m, mps=mps)
-    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0)
+    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, time_s)
     assert (seen.everyone.granted[0] > 0) == way_taken
     assert seen.may_ask[0] == asks
     assert seen.may_ask[1:].all()
@@ -163,7 +170,7 @@ def test_who_drives_through_a_junction_has_the_rest_of_it(alone: Traffic) -> Non
     graph = dataclasses.replace(alone.lanes, contested=contested)
     for mps, granted in ((6.0, 1), (0.0, 0)):
         ego = driven_at(alone, lane, s_m, mps=mps)
-        seen = see_driven(graph, alone.near_lanes, state.vehicles, ego, state.route, 0)
+        seen = see_driven(graph, alone.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
         assert seen.everyone.granted[0] == granted
 
 

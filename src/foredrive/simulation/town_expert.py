@@ -44,6 +44,8 @@ class TownExpert:
         here = self._simulator.driven
         state = self._gone_on(traffic, traffic.taken_over(now, here), here)
         self._imagined = [state]
+        if traffic.stands_back(state):
+            return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
             self._imagined.append(traffic.step(self._imagined[-1], DECISION_S))
         ahead = [traffic.poses(then).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]

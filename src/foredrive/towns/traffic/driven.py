@@ -33,7 +33,9 @@ SLOWEST_MPS = 0.5
 HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
 """Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
 COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
-"""Others stand back only for somebody who comes at this speed, and will be at the line within this time."""
+"""Others stand back only for somebody who comes at this speed, and will be at the line within this time; or"""
+AT_LINE_M, TURN_S, TURNS_EVERY_S = 4.0, 4.0, 8.0
+"""who stands so near to it, for so long in every so many seconds: he may want to go, or not."""
 RUN_OVER_S = 1.5
 BESIDE_M = 0.5
 """People do not step to where a vehicle will be in this time, or this near beside it."""
@@ -109,6 +111,7 @@ def see_driven(
     driven: Driven,
     route: Int[np.ndarray, "R"],
     route_passed: int,
+    time_s: float,
 ) -> SeenDriven:
     """Vehicle 0 where somebody outside has driven it.
 
@@ -137,7 +140,7 @@ def see_driven(
     everyone = Vehicles(
         **{name: np.concatenate([value, getattr(beside, name)]) for name, value in vars(placed).items()}
     )
-    everyone, may_ask = _on_its_way(graph, everyone)
+    everyone, may_ask = _on_its_way(graph, everyone, time_s)
     return SeenDriven(driven, everyone, len(vehicles.active), route_passed, may_ask)
 
 
@@ -272,7 +275,9 @@ def _is_crossed(
     return np.asarray(enters <= leaves)
 
 
-def _on_its_way(graph: LaneGraph, everyone: Vehicles) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
+def _on_its_way(
+    graph: LaneGraph, everyone: Vehicles, time_s: float
+) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
     """Grant vehicle 0 the junction that it can no longer stop for or drives through; who may ask for right of
     way."""
     may_ask = np.ones(len(everyone.active), dtype=np.bool_)
@@ -284,8 +289,9 @@ def _on_its_way(graph: LaneGraph, everyone: Vehicles) -> tuple[Vehicles, Bool[np
         return everyone, may_ask
     gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
     comes = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
-    may_ask[0] = comes
-    if not comes:
+    has_its_turn = speed <= COMES_MPS and gap_m < AT_LINE_M and time_s % TURNS_EVERY_S < TURN_S
+    may_ask[0] = comes or has_its_turn
+    if not may_ask[0]:
         return _replaced(everyone, granted=0), may_ask
     if inside or gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed:
         end = first + int(np.argmin(np.append(contested[first:], False)))

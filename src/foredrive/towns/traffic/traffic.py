@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.driven import Driven, SeenDriven, see_driven
+from foredrive.towns.traffic.driven import AT_LINE_M, Driven, SeenDriven, see_driven
 from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
 from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, find_starts, is_large
 from foredrive.towns.traffic.lane_changes import (
@@ -46,7 +46,6 @@ from foredrive.towns.traffic.vehicles import (
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
-AT_LINE_M = 4.0
 BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
 """Drivers have a foot on the brake when they slow down by more than the engine does, and when they stand."""
 
@@ -167,8 +166,19 @@ class Traffic:
         vehicles = seen.without_shadows(seen.everyone)
         return dataclasses.replace(state, vehicles=vehicles, route_passed=seen.route_passed)
 
+    def stands_back(self, state: TrafficState) -> bool:
+        """Whether vehicle 0 stands at a line that it has not been given the right of way at."""
+        v = state.vehicles
+        if v.speed_mps[0] > HALT_MPS or v.granted[0] > 0:
+            return False
+        ahead = v.path[0, BEHIND + 1 :]
+        contested = (ahead >= 0) & self.lanes.contested[ahead]
+        gap_m = path_starts(self.lanes, v.path[:1])[0, BEHIND + 1 :] - v.front_m[0]
+        return bool((contested & (gap_m < AT_LINE_M)).any()) and not self.lanes.contested[v.lane[0]]
+
     def _see_driven(self, state: TrafficState, ego: Driven) -> SeenDriven:
-        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, state.route, state.route_passed)
+        to_drive = state.route, state.route_passed
+        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, *to_drive, state.time_s)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """The `Light` of each of the town's stop zones."""
@@ -233,7 +243,12 @@ class Traffic:
         if driven is not None:
             may &= driven.decides
         change = choose_change(self.lanes, self._stretches, v, situation, may, urge)
-        return None if change is None else begin_change(self.lanes, v, *change)
+        if change is None:
+            return None
+        begun = begin_change(self.lanes, v, *change)
+        if change[0] == 0 and state.route_passed < len(state.route):
+            begun.path[0, BEHIND + 1 :] = -1  # where to go from the new lane, the route says
+        return begun
 
     def _route_urge(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
         """What lane changes are worth to vehicle 0 for its route."""
