@@ -165,7 +165,7 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict
         )
     kept = _kept(drive, route, time.perf_counter() - began) | {"log": str(log.folder.relative_to(out))}
     write_json(_file(out, job), kept)
-    return kept
+    return read_drive(_file(out, job))
 
 
 def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownScenario:

@@ -33,9 +33,9 @@ SLOWEST_MPS = 0.5
 HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
 """Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
 COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
-"""Others stand back only for somebody who comes at this speed, and will be at the line within this time; or"""
+"""Others stand back only for somebody who comes at this speed, and will be at the line within this time,"""
 AT_LINE_M, TURN_S, TURNS_EVERY_S = 4.0, 4.0, 8.0
-"""who stands so near to it, for so long in every so many seconds: he may want to go, or not."""
+"""or stands so near to it, for so long in every so many seconds: he may want to go, or not."""
 RUN_OVER_S = 1.5
 BESIDE_M = 0.5
 """People do not step to where a vehicle will be in this time, or this near beside it."""

@@ -1,0 +1,112 @@
+"""A drive from its start to its end: who fails is counted, who is late is late, and the expert arrives."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from foredrive.errors import InputError
+from foredrive.scene import Clip, Trajectory
+from foredrive.simulation.drive import Drive, Pace, drive_route
+from foredrive.simulation.dynamics import STEP_S
+from foredrive.simulation.scores import Ending
+from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.simulation.town_expert import TownExpert
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.recorder import Crowd
+from foredrive.towns.traffic.traffic import Traffic
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def scenario() -> TownScenario:
+    """45 m along the longest lane of Town02 outside of junctions."""
+    graph = Traffic(load_town_map("Town02"), SEED, 1, 0).lanes
+    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
+    route = graph.position(np.full(45, lane), 20.0 + np.arange(45))
+    return TownScenario("Town02", route, SEED, lanes=(lane,), crowd=Crowd(6, 4), limit_s=40.0)
+
+
+@pytest.fixture(scope="module")
+def simulator() -> TownSimulator:
+    return TownSimulator()
+
+
+class Failing:
+    """Drives straight on, and raises an error or plans nonsense at its fifth plan."""
+
+    def __init__(self, nonsense: bool) -> None:
+        self._plans, self._nonsense = 0, nonsense
+
+    def act(self, observation: Clip) -> Trajectory:
+        self._plans += 1
+        plan = Straight(4.0).act(observation)
+        if self._plans < 5:
+            return plan
+        if self._nonsense:
+            return dataclasses.replace(plan, xy=torch.full_like(plan.xy, math.nan))
+        raise RuntimeError("out of ideas")
+
+
+@pytest.mark.parametrize(("nonsense", "told"), [(False, "RuntimeError: out of ideas"), (True, "finite")])
+def test_an_agent_that_fails_ends_the_drive_and_is_scored_by_what_it_drove(
+    simulator: TownSimulator, scenario: TownScenario, nonsense: bool, told: str
+) -> None:
+    drive = drive_route(simulator, scenario, Failing(nonsense), route="r")
+    assert drive.score.ending is Ending.CRASHED
+    assert drive.score.failed
+    assert told in drive.error
+    assert drive.score.duration_s == pytest.approx(4 * 0.5)
+    driven_m = drive.states[-1].x_m - drive.states[0].x_m, drive.states[-1].y_m - drive.states[0].y_m
+    assert drive.score.driven_m == pytest.approx(math.hypot(*driven_m), abs=0.05)
+    assert 0.02 < drive.score.completion < 0.25
+    assert drive.score.driving_score_1_0 == pytest.approx(100 * drive.score.completion)
+
+
+def test_a_plan_takes_effect_after_its_latency(simulator: TownSimulator, scenario: TownScenario) -> None:
+    brief = dataclasses.replace(scenario, limit_s=1.4)
+    moves = {}
+    for latency_s in (0.0, 0.6):
+        drive = drive_route(simulator, brief, Straight(4.0), route="r", pace=Pace(latency_s=latency_s))
+        moves[latency_s] = next(k for k, state in enumerate(drive.states) if state.speed_mps > 0)
+        assert drive.score.ending is Ending.TIMEOUT
+        assert len(drive.act_s) == 3
+    assert moves[0.6] - moves[0.0] == round(0.6 / STEP_S)
+
+
+def test_who_plans_less_often_is_asked_less_often(simulator: TownSimulator, scenario: TownScenario) -> None:
+    brief = dataclasses.replace(scenario, limit_s=1.9)
+    frames: list[float] = []
+
+    def on_frame() -> None:
+        frames.append(simulator.state.t_s)
+
+    pace = Pace(period_s=1.0)
+    drive = drive_route(simulator, brief, Straight(0.0), route="r", pace=pace, on_frame=on_frame)
+    assert len(drive.act_s) == 2
+    assert frames == [0.0, 0.5, 1.0, 1.5]
+    assert drive.score.completion == pytest.approx(0.0, abs=0.02)
+    for wrong in ({"period_s": 0.3}, {"period_s": 0.0}, {"latency_s": -0.1}, {"latency_s": math.nan}):
+        with pytest.raises(InputError):
+            Pace(**wrong)
+
+
+def test_the_expert_arrives_and_drives_the_same_again(
+    simulator: TownSimulator, scenario: TownScenario
+) -> None:
+    def drive(limit_s: float) -> Drive:
+        limited = dataclasses.replace(scenario, limit_s=limit_s)
+        return drive_route(simulator, limited, TownExpert(simulator), route="r")
+
+    first = drive(40.0)
+    assert first.score.ending is Ending.COMPLETED
+    assert first.score.driving_score_1_0 == first.score.driving_score_2_1 == 100.0
+    assert first.comfort is not None
+    assert first.comfort.comfortable
+    assert min(first.nearest_s) > 0.95
+    again = drive(4.0)
+    assert again.states == first.states[: len(again.states)]
