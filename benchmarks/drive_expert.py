@@ -1,0 +1,44 @@
+"""What the privileged expert scores on Town05: the ceiling of every learner. `foredrive bench drive-expert`.
+
+Drives are kept in runs/drive_expert/COMMIT, so that an interrupted benchmark goes on route by route.
+"""
+
+import functools
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from foredrive.errors import InputError
+from foredrive.evaluation import Benchmark
+from foredrive.recipes.driving import DriveSuite, drive_suite, summarise
+from foredrive.recipes.study import work_folder
+
+WORK = work_folder(Path("runs/drive_expert"))
+SETS = {"short": "town05-short", "long": "town05-long"}
+FIGURES = (
+    "driving_score_1_0",
+    "driving_score_2_1",
+    "completion",
+    "comfortable_share",
+    "near_collision_share",
+)
+
+
+def scores(seed: int, name: str) -> Mapping[str, float]:
+    """The figures of one repetition of a set of routes."""
+    suite = DriveSuite("expert", SETS[name], seed=seed, sensors=False)
+    driven = drive_suite(suite, WORK / f"{name}_seed{seed}", workers=len(os.sched_getaffinity(0)))
+    if driven.broken:
+        job, why = next(iter(driven.broken.items()))
+        raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
+    summary = summarise(list(driven.drives.values()))
+    kept = [key for key in summary if key in FIGURES or key.startswith(("infractions.", "endings."))]
+    short = {"driving_score_1_0": "ds", "driving_score_2_1": "ds_2_1", "completion": "rc"}
+    return {f"{short.get(key, key)}_{name}": float(summary[key] or 0.0) for key in kept}  # type: ignore[arg-type]
+
+
+BENCHMARK = Benchmark(
+    question="How well does the privileged expert drive Town05's routes?",
+    arms={name: functools.partial(scores, name=name) for name in SETS},
+    config={"sets": SETS},
+)

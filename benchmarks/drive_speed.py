@@ -1,0 +1,109 @@
+"""How fast closed-loop driving is, with sensors and without, and whether its memory stays.
+
+`foredrive bench drive-speed`.
+
+The expert drives Town05's long routes among 40 vehicles and 20 people; only the simulator's steps are timed.
+"""
+
+import time
+from collections.abc import Iterator, Mapping
+from itertools import cycle
+
+import numpy as np
+import torch
+
+from foredrive.data.collate import stack_records
+from foredrive.data.resizing import shrink_images
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.measuring import held_mib
+from foredrive.recipes import find_recipe
+from foredrive.recipes.build import build_agent
+from foredrive.scene import Clip
+from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.dynamics import STEP_S
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.plans import fixed_in_world
+from foredrive.simulation.route_sets import load_route_set
+from foredrive.simulation.routes import snap_route
+from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.simulation.town_expert import TownExpert
+from foredrive.towns.recorder import Crowd
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+
+CROWD = Crowd(vehicles=40, people=20)
+ROUTES = "town05-long"
+SECONDS, HOUR_S, WARM_UP_S = 60.0, 3600.0, 300.0
+PLANS = 20
+
+
+def _suite() -> SensorSuite:
+    return SensorSuite(camera_rig((144, 256)), roof_lidar(channels=32, azimuth_steps=720))
+
+
+def _steps(seed: int, sensors: SensorSuite | None, seconds: float) -> Iterator[tuple[float, Clip]]:
+    """What each simulation step takes and what it shows, over one drive after another."""
+    simulator, left_s = TownSimulator(), seconds
+    for waypoints in cycle(load_route_set(ROUTES)):
+        route = snap_route(waypoints)
+        scenario = TownScenario(route.town, route.xyz, seed, route.lanes, CROWD, sensors=sensors)
+        clip, following, expert, done = simulator.reset(scenario), Following(), TownExpert(simulator), False
+        while not done:
+            t_s = simulator.state.t_s
+            if simulator.state.step_index % round(FRAME_DT_S / STEP_S) == 0:
+                plan = fixed_in_world(expert.act(stack_records([clip])), simulator.ego(), t_s)
+                following = following.expecting(plan, t_s)
+            control, following = follow(following, simulator.ego(), t_s)
+            began = time.perf_counter()
+            step = simulator.step(control)
+            yield time.perf_counter() - began, step.clip
+            clip, done = step.clip, step.done
+            left_s -= STEP_S
+            if left_s <= 0:
+                return
+
+
+def sensors(seed: int) -> Mapping[str, float]:
+    """Key frames a second, everything between them included; and what a plan of nemo_tiny takes."""
+    took, clip = 0.0, None
+    for step_s, seen in _steps(seed, _suite(), SECONDS):
+        took, clip = took + step_s, seen
+    assert clip is not None
+    recipe = find_recipe("nemo_tiny")
+    agent, plan_s = build_agent(recipe, load_backbone=False).eval(), []
+    for _ in range(PLANS):
+        began = time.perf_counter()
+        agent.act(shrink_images(stack_records([clip]), recipe.clips.image_hw))
+        plan_s.append(time.perf_counter() - began)
+    return {
+        "town_hz": SECONDS / FRAME_DT_S / took,
+        "realtime_factor": SECONDS / took,
+        "plan_ms": 1000 * float(np.median(plan_s)),
+        "threads": float(torch.get_num_threads()),
+    }
+
+
+def bare(seed: int) -> Mapping[str, float]:
+    """How much faster than life the simulator is without sensors."""
+    took = sum(step_s for step_s, _ in _steps(seed, None, SECONDS))
+    return {"bare_realtime_factor": SECONDS / took, "step_ms": 1000 * took * STEP_S / SECONDS}
+
+
+def hour(seed: int) -> Mapping[str, float]:
+    """Growth of memory over an hour of driving with sensors, after the first minutes."""
+    t_s, before, most = 0.0, 0.0, 0.0
+    for _ in _steps(seed, _suite(), HOUR_S):
+        t_s += STEP_S
+        if before == 0.0 and t_s >= WARM_UP_S:
+            before = held_mib("cpu")
+        if round(t_s / STEP_S) % 1200 == 0:
+            most = max(most, held_mib("cpu"))
+    return {"rss_after_warm_up_mib": before, "rss_growth_mib": held_mib("cpu") - before, "rss_most_mib": most}
+
+
+BENCHMARK = Benchmark(
+    question="How fast is closed-loop driving in a town, and does its memory stay?",
+    arms={"sensors": sensors, "bare": bare, "hour": hour},
+    seeds=(0,),
+    config={"routes": ROUTES, "vehicles": 40, "people": 20, "seconds": SECONDS, "hour_s": HOUR_S},
+)
