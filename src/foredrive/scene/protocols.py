@@ -22,6 +22,8 @@ class Belief(Record):
     """Latent state, for models that have one."""
     history: Float[Tensor, "b T D Z Y X"] | None = None
     """Volumes of the past frames, now last, where imagining needs them."""
+    statics: Float[Tensor, "b _C Y X"] | None = None
+    """What stands, as features of the plane, for models that hand it on without warping."""
     T_now_ego: Float[Tensor, "b 4 4"] | None = None
     """Predicted ego motion: this belief's ego frame -> the ego frame at now; None for now's belief."""
 

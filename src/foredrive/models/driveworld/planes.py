@@ -1,0 +1,128 @@
+"""From planes to vectors and back: what DriveWorld's latent dynamics see, and what is decoded from them."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class AdaptiveNorm(nn.Module):
+    """Instance normalisation whose scale and shift come from a vector (Huang & Belongie 2017, AdaIN)."""
+
+    def __init__(self, channels: int, vector: int) -> None:
+        super().__init__()
+        self.norm = nn.InstanceNorm2d(channels)
+        self.style = nn.Linear(vector, 2 * channels)
+
+    def forward(
+        self, plane: Float[Tensor, "b C Y X"], vector: Float[Tensor, "b V"]
+    ) -> Float[Tensor, "b C Y X"]:
+        """(1 + scale) ⊙ norm(plane) + shift."""
+        scale, shift = self.style(vector)[..., None, None].chunk(2, dim=1)
+        return (1 + scale) * self.norm(plane) + shift
+
+
+class PlaneToVector(nn.Module):
+    """x_t: a plane as one vector, by strided convolutions that keep where things are until the end.
+
+    Args:
+        channels: of the plane.
+        hidden: of the convolutions.
+        vector: width of x_t (512 in the paper).
+    """
+
+    def __init__(self, channels: int, hidden: int, vector: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Conv2d(channels, hidden, 3, stride=2, padding=1),
+            nn.GroupNorm(4, hidden),
+            nn.ReLU(),
+            nn.Conv2d(hidden, 2 * hidden, 3, stride=2, padding=1),
+            nn.GroupNorm(4, 2 * hidden),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool2d((4, 4)),
+            nn.Flatten(),
+            nn.Linear(32 * hidden, vector),
+        )
+
+    def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b V"]:
+        """The vector."""
+        return self.net(plane)
+
+
+class VectorToPlane(nn.Module):
+    """A vector expanded to a plane: a learned constant that grows twofold step by step, styled by the vector
+    (m_θ; MILE's decoder).
+
+    Args:
+        vector: width of what it is expanded from.
+        widths: channels of each step, coarsest first; the last is the plane's.
+        size_yx: of the plane.
+    """
+
+    def __init__(self, vector: int, widths: Sequence[int], size_yx: tuple[int, int]) -> None:
+        super().__init__()
+        shrunk = 2 ** (len(widths) - 1)
+        self.sizes = [tuple(-(-n * 2**k // shrunk) for n in size_yx) for k in range(len(widths))]
+        self.constant = nn.Parameter(torch.randn(1, widths[0], *self.sizes[0]))
+        before = (widths[0], *widths[:-1])
+        self.convolve = nn.ModuleList(
+            [nn.Conv2d(i, o, 3, padding=1) for i, o in zip(before, widths, strict=True)]
+        )
+        self.style = nn.ModuleList([AdaptiveNorm(width, vector) for width in widths])
+
+    def forward(self, vector: Float[Tensor, "b V"]) -> Float[Tensor, "b C Y X"]:
+        """The plane."""
+        plane = self.constant.expand(len(vector), -1, -1, -1)
+        for size, convolve, style in zip(self.sizes, self.convolve, self.style, strict=True):
+            if plane.shape[-2:] != size:
+                plane = F.interpolate(plane, size=size, mode="bilinear", align_corners=False)
+            plane = F.leaky_relu(style(convolve(plane), vector), 0.2)
+        return plane
+
+
+class StaticScene(nn.Module):
+    """b̂ = z_θ(b'): what stands, read off the plane of one frame and handed on without warping (§3.1)."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Conv2d(channels, out, 3, padding=1),
+            nn.GroupNorm(4, out),
+            nn.ReLU(),
+            nn.Conv2d(out, out, 3, padding=1),
+        )
+
+    def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b _O Y X"]:
+        """Latent statics."""
+        return self.net(plane)
+
+
+class PlanesToVolume(nn.Module):
+    """l_θ up to its last layer: planes, put together channel by channel, unfolded into a volume of features.
+
+    Args:
+        channels: of all planes together.
+        hidden: channels of the volume's convolutions' input.
+        out: D.
+        height: Z.
+    """
+
+    def __init__(self, channels: int, hidden: int, out: int, height: int) -> None:
+        super().__init__()
+        self.height = height
+        self.unfold = nn.Sequential(
+            nn.Conv2d(channels, hidden * height, 3, padding=1),
+            nn.GroupNorm(height, hidden * height),
+            nn.ReLU(),
+        )
+        self.convolve = nn.Sequential(
+            nn.Conv3d(hidden, out, 3, padding=1), nn.ReLU(), nn.Conv3d(out, out, 3, padding=1)
+        )
+
+    def forward(self, planes: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b D Z Y X"]:
+        """The volume."""
+        unfolded = self.unfold(planes).unflatten(1, (-1, self.height))
+        return self.convolve(unfolded)

@@ -1,0 +1,188 @@
+"""DriveWorld's Memory State-Space Model without its planes: latent dynamics in vectors (§3.1, eq. 1–2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from foredrive.models.driveworld.gaussian import DiagonalGaussian
+from foredrive.scene.record import Record
+
+ACTIONS = 2
+"""Velocity, m/s, and steering angle, rad, of the bicycle."""
+ACTION_SCALE = (10.0, 0.1)
+"""What actions are divided by on their way in and multiplied by on their way out."""
+
+
+@dataclass(frozen=True)
+class Latent(Record):
+    """What the model carries from one time to the next."""
+
+    history: Float[Tensor, "b H"]
+    """h_t, deterministic."""
+    state: Float[Tensor, "b S"]
+    """s_t, stochastic."""
+    memory: Float[Tensor, "b M H"]
+    """h_1 … h_t, newest last; of more than M the oldest are forgotten."""
+    remembered: Bool[Tensor, "b M"]
+    """Which places of the memory are filled."""
+
+
+class MotionAwareNorm(nn.Module):
+    """s̃ = γ ⊙ LN(s) + β with γ, β from the velocities of K objects and the time that passes (§3.1).
+
+    As in StreamPETR (Wang et al. 2023) it starts as plain normalisation: γ at 1, β at 0.
+
+    Args:
+        state: S.
+        objects: K.
+    """
+
+    def __init__(self, state: int, objects: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(state, elementwise_affine=False)
+        self.reduce = nn.Sequential(nn.Linear(2 * objects + 1, state), nn.ReLU())
+        self.gamma, self.beta = nn.Linear(state, state), nn.Linear(state, state)
+        for layer, bias in ((self.gamma, 1.0), (self.beta, 0.0)):
+            nn.init.zeros_(layer.weight)
+            nn.init.constant_(layer.bias, bias)
+
+    def forward(
+        self, state: Float[Tensor, "b S"], velocity_mps: Float[Tensor, "b K 2"], dt_s: Float[Tensor, "b"]
+    ) -> Float[Tensor, "b S"]:
+        """The motion-aware state."""
+        motion = self.reduce(torch.cat([velocity_mps.flatten(1) / ACTION_SCALE[0], dt_s[:, None]], dim=-1))
+        return self.gamma(motion) * self.norm(state) + self.beta(motion)
+
+
+class Recall(nn.Module):
+    """h̃_t: the history refined by attention to all that the memory holds (§3.1).
+
+    Args:
+        history: H.
+        heads: of the attention.
+    """
+
+    def __init__(self, history: int, heads: int) -> None:
+        super().__init__()
+        self.attention = nn.MultiheadAttention(history, heads, batch_first=True)
+        self.norm = nn.LayerNorm(history)
+
+    def forward(self, latent: Latent) -> Float[Tensor, "b H"]:
+        """The refined history."""
+        asked = latent.history[:, None]
+        read, _ = self.attention(
+            asked, latent.memory, latent.memory, key_padding_mask=~latent.remembered, need_weights=False
+        )
+        return self.norm(asked + read)[:, 0]
+
+
+class StateSpace(nn.Module):
+    """Posterior, prior, policy and transition.
+
+    Where the velocities of the K objects come from the paper leaves open: here they are estimated from s_t,
+    so that they can be in imagination too, and learned from labelled boxes where there are any.
+
+    Args:
+        observation: width of x_t (512 in the paper).
+        state: S (512, MILE).
+        history: H (1024, MILE).
+        objects: K.
+        heads: of the attention to the memory.
+        memory: M.
+        hidden: width of the MLPs.
+        memory_bank: the Dynamic Memory Bank; without it h̃ is h.
+        motion_norm: motion-aware layer normalisation; without it s̃ is s.
+    """
+
+    def __init__(
+        self,
+        *,
+        observation: int,
+        state: int,
+        history: int,
+        objects: int,
+        heads: int,
+        memory: int,
+        hidden: int,
+        action: int = 64,
+        memory_bank: bool = True,
+        motion_norm: bool = True,
+    ) -> None:
+        super().__init__()
+        self.sizes = (history, state, memory)
+        self.objects = objects
+        self.action_in = nn.Linear(ACTIONS, action)
+        self.posterior_net = _mlp(history + action + observation, hidden, 2 * state)
+        self.prior_net = _mlp(history + action, hidden, 2 * state)
+        self.policy = _mlp(history + state, hidden, ACTIONS)
+        self.velocity = nn.Linear(state, 2 * objects)
+        self.motion_norm = MotionAwareNorm(state, objects) if motion_norm else None
+        self.recall = Recall(history, heads) if memory_bank else None
+        self.into = nn.Sequential(nn.Linear(state, history), nn.LeakyReLU())
+        self.cell = nn.GRUCell(history, history)
+        self.register_buffer("action_scale", torch.tensor(ACTION_SCALE), persistent=False)
+
+    action_scale: Tensor
+
+    def begin(self, batch: int, device: torch.device) -> Latent:
+        """h_1 = 0, and nothing remembered but that."""
+        history, state, memory = self.sizes
+        zeros = torch.zeros(batch, history, device=device)
+        latent = Latent(
+            history=zeros,
+            state=torch.zeros(batch, state, device=device),
+            memory=torch.zeros(batch, memory, history, device=device),
+            remembered=torch.zeros(batch, memory, dtype=torch.bool, device=device),
+        )
+        return _remembering(latent, zeros)
+
+    def transition(self, latent: Latent, dt_s: Float[Tensor, "b"]) -> Latent:
+        """h_{t+1} = f(h̃_t, s̃_t), remembered; the state is still that of before."""
+        state = latent.state
+        if self.motion_norm is not None:
+            state = self.motion_norm(state, self.velocities_mps(state), dt_s)
+        refined = latent.history if self.recall is None else self.recall(latent)
+        return _remembering(latent, self.cell(self.into(state), refined))
+
+    def posterior(
+        self, latent: Latent, last_action: Float[Tensor, "b 2"], x: Float[Tensor, "b X"]
+    ) -> DiagonalGaussian:
+        """q(s_t | o_≤t, a_<t) from (h_t, a_{t-1}, x_t) (eq. 1)."""
+        told = torch.cat([latent.history, self.action_in(last_action / self.action_scale), x], dim=-1)
+        return DiagonalGaussian.of(self.posterior_net(told))
+
+    def prior(self, latent: Latent, last_action: Float[Tensor, "b 2"]) -> DiagonalGaussian:
+        """p(s_t | h_{t-1}, s_{t-1}) from (h_t, â_{t-1}) (eq. 2)."""
+        told = torch.cat([latent.history, self.action_in(last_action / self.action_scale)], dim=-1)
+        return DiagonalGaussian.of(self.prior_net(told))
+
+    def action(self, latent: Latent) -> Float[Tensor, "b 2"]:
+        """â_t = π(h_t, s_t): velocity, m/s, and steering angle, rad."""
+        return self.policy(torch.cat([latent.history, latent.state], dim=-1)).float() * self.action_scale
+
+    def velocities_mps(self, state: Float[Tensor, "b S"]) -> Float[Tensor, "b K 2"]:
+        """Estimated velocities over ground of the K nearest moving objects, in the ego axes."""
+        return self.velocity(state).unflatten(-1, (self.objects, 2)).float() * ACTION_SCALE[0]
+
+
+def _remembering(latent: Latent, history: Float[Tensor, "b H"]) -> Latent:
+    """With a new history, which is remembered."""
+    filled = torch.ones_like(latent.remembered[:, :1])
+    return Latent(
+        history=history,
+        state=latent.state,
+        memory=torch.cat([latent.memory[:, 1:], history[:, None].to(latent.memory)], dim=1),
+        remembered=torch.cat([latent.remembered[:, 1:], filled], dim=1),
+    )
+
+
+def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, hidden),
+        nn.LeakyReLU(),
+        nn.Linear(hidden, hidden),
+        nn.LeakyReLU(),
+        nn.Linear(hidden, outputs),
+    )

@@ -1,0 +1,95 @@
+"""Lift, splat (Philion & Fidler 2020): image features to a plane by a distribution over depth."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.scene import CameraRig, VoxelSpec
+
+
+class LiftSplatEncoder(nn.Module):
+    """Each feature of the finest level is put at every depth along its ray, as far as it is likely to belong
+    there; what falls into a cell of the plane is summed up.
+
+    Args:
+        spec: the grid whose plane (and range of heights) is filled.
+        channels: D of the image features.
+        width: C of the plane.
+        near_m, far_m, step_m: of the depths (4 to 45 m by 1 m in the paper).
+    """
+
+    depths_m: Tensor
+
+    def __init__(
+        self, spec: VoxelSpec, *, channels: int, width: int, near_m: float, far_m: float, step_m: float
+    ) -> None:
+        super().__init__()
+        self.spec, self.width = spec, width
+        self.register_buffer("depths_m", torch.arange(near_m, far_m, step_m), persistent=False)
+        self.depth_and_context = nn.Linear(channels, len(self.depths_m) + width)
+        self.out = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GroupNorm(4, width),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 1),
+        )
+
+    def forward(
+        self,
+        features: Sequence[Float[Tensor, "b C _h _w D"]],
+        rig: CameraRig,
+        image_valid: Bool[Tensor, "b C"],
+    ) -> Float[Tensor, "b _W Y X"]:
+        """Image features to a plane."""
+        finest = features[0]
+        told = self.depth_and_context(finest).float()
+        depth, context = told.split([len(self.depths_m), self.width], dim=-1)
+        lifted = depth.softmax(-1)[..., None] * context[..., None, :]  # [b C h w K W]
+        lifted = lifted * image_valid[:, :, None, None, None, None]
+        cell, inside = self.cells(rig, (finest.shape[2], finest.shape[3]))
+        return self.out(splat(lifted.flatten(1, 4), cell, inside, self.spec.shape_zyx[1:]))
+
+    def cells(self, rig: CameraRig, feature_hw: tuple[int, int]) -> tuple[Tensor, Bool[Tensor, "b P"]]:
+        """The cell of the plane (y · X + x) that each depth of each feature lies in, and whether in any."""
+        points = self.points_m(rig, feature_hw)
+        lower = points.new_tensor(self.spec.lower_m)
+        index = ((points - lower) / self.spec.voxel_m).floor().long()
+        shape_xyz = torch.tensor(self.spec.shape_zyx[::-1], device=points.device)
+        inside = ((index >= 0) & (index < shape_xyz)).all(-1)
+        cell = index[..., 1] * self.spec.shape_zyx[2] + index[..., 0]
+        return cell, inside
+
+    def points_m(self, rig: CameraRig, feature_hw: tuple[int, int]) -> Float[Tensor, "b P 3"]:
+        """Ego coordinates of each depth of each feature: cameras, rows, columns, depths."""
+        h, w = feature_hw
+        scale = rig.K.new_tensor([rig.size_hw[1] / w, rig.size_hw[0] / h])
+        uv = pixel_centres((h, w)).to(rig.K).flatten(0, 1) * scale
+        b, c = rig.K.shape[:2]
+        rays = pixels_to_rays(uv.expand(b, c, -1, 2), rig.K, rig.dist)
+        rays = rays / rays[..., 2:]  # by depth, not by range
+        in_camera = rays[..., None, :] * self.depths_m[:, None]
+        R, t = rig.T_ego_cam[..., :3, :3], rig.T_ego_cam[..., :3, 3]
+        in_ego = torch.einsum("bcij,bcnkj->bcnki", R.float(), in_camera.float()) + t[:, :, None, None].float()
+        return in_ego.flatten(1, 3)
+
+
+def splat(
+    values: Float[Tensor, "b P W"],
+    cell: Tensor,
+    inside: Bool[Tensor, "b P"],
+    size_yx: tuple[int, int],
+) -> Float[Tensor, "b W Y X"]:
+    """Sums of what falls into each cell of a plane.
+
+    Args:
+        cell: index y · X + x of each of P values, of any value where not `inside`.
+    """
+    b, _, width = values.shape
+    count = size_yx[0] * size_yx[1]
+    batch = torch.arange(b, device=cell.device)[:, None] * count
+    plane = values.new_zeros(b * count, width)
+    plane = plane.index_add(0, (batch + cell)[inside], values[inside])
+    return plane.view(b, *size_yx, width).permute(0, 3, 1, 2)
