@@ -98,7 +98,7 @@ def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
 
 def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
     """3 m ahead, then 4 m to the left: distances 1.5, 5 and 9 m lie on both legs and 2 m beyond."""
-    reading = PathCorrection(SPEC, 8, (1.5, 5.0, 9.0), told=0, steps=2)
+    reading = PathCorrection(SPEC, channels=3, width=8, distances_m=(1.5, 5.0, 9.0), told=0, steps=2)
     places = reading.places(torch.tensor([[[3.0, 0.0], [3.0, 4.0]]]))[0]
     right, middle, left = places.unbind(1)
     torch.testing.assert_close(middle, torch.tensor([[1.5, 0.0], [3.0, 2.0], [3.0, 6.0]]))
@@ -110,15 +110,21 @@ def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
 
 def test_what_stands_on_the_path_matters_and_what_stands_elsewhere_does_not() -> None:
     torch.manual_seed(0)
-    reading = PathCorrection(SPEC, 8, (1.0, 2.5), told=1, steps=1)
+    reading = PathCorrection(SPEC, channels=3, width=8, distances_m=(1.0, 2.5), told=1, steps=1).eval()
     torch.nn.init.normal_(reading.change[-2].weight)
-    told = torch.ones(1, 1)
-    plane, path = torch.randn(1, 8, 8, 8), torch.tensor([[[2.5, 0.0]]])
-    on_path, elsewhere = plane.clone(), plane.clone()
-    on_path[0, 4, 6] += 1  # x 2 to 3 m, y 0 to 1 m
-    elsewhere[0, 4, 1] += 1  # behind
-    assert not torch.allclose(reading(on_path, path, told), reading(plane, path, told))
-    torch.testing.assert_close(reading(elsewhere, path, told), reading(plane, path, told))
+    path = torch.tensor([[[2.5, 0.0]]])
+
+    def change(volume: torch.Tensor) -> torch.Tensor:
+        return reading(reading.read(volume, path), torch.ones(1, 1))
+
+    volume = torch.randn(1, 3, 2, 8, 8)
+    on_path, elsewhere = volume.clone(), volume.clone()
+    on_path[0, :, 1, 4, 6] += 1  # x 2 to 3 m, y 0 to 1 m
+    elsewhere[0, :, 1, 4, 1] += 1  # behind
+    assert not torch.allclose(change(on_path), change(volume))
+    torch.testing.assert_close(change(elsewhere), change(volume))
+    read = reading.read(volume, path).values[0, 1, 1]  # at x 2.5 m, y 0: between two cells
+    torch.testing.assert_close(read, volume[0, :, :, 3:5, 6].mean(-1).T.flatten())
 
 
 SEEN = torch.ones(1, dtype=torch.bool)

@@ -12,9 +12,10 @@ from foredrive.data import LogPath
 from foredrive.recipes import Recipe, Run, evaluate_run, train_run
 from foredrive.recipes.export import export_run
 from foredrive.recipes.study import seeded
+from foredrive.training import PathFit
 
 
-def recipe(lr: float) -> Recipe:
+def recipe(lr: float, path: PathFit | None = None) -> Recipe:
     """Fine-tuned from scratch, with a plan of the ego MLP to begin with."""
     small = miniature()
     return dataclasses.replace(
@@ -23,6 +24,7 @@ def recipe(lr: float) -> Recipe:
         model=dataclasses.replace(
             small.model, planner_base="ego_mlp", planner_history=1, planner_look_m=(2.0, 6.0)
         ),
+        path=path,
         finetune=dataclasses.replace(
             small.finetune, schedule=dataclasses.replace(small.finetune.schedule, lr=lr)
         ),
@@ -51,6 +53,19 @@ def test_fine_tuning_leaves_what_it_starts_from(run: Run, log: LogPath, tmp_path
     assert base
     assert all(torch.equal(before[name], after[name]) for name in base)
     assert not torch.equal(before["planner.path.place.0.weight"], after["planner.path.place.0.weight"])
+
+
+def test_what_is_read_along_the_path_is_fitted_first_and_read_once(log: LogPath, tmp_path: Path) -> None:
+    fitted = recipe(lr=0.0, path=PathFit(stride_s=0.5, steps=20))
+    run = train_run(fitted, [log], tmp_path / "first", tmp_path / "cache")
+    kept = list((tmp_path / "cache" / "paths").glob("*.safetensors"))
+    assert len(kept) == 1
+    again = train_run(fitted, [log], tmp_path / "second", tmp_path / "cache")
+    assert list((tmp_path / "cache" / "paths").glob("*.safetensors")) == kept
+    one, other = load_file(run.weights), load_file(again.weights)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert one["planner.path.change.2.weight"].abs().max() > 0  # it began at 0
+    assert one["planner.path.mean"].abs().max() > 0
 
 
 def test_it_can_be_exported(run: Run, log: LogPath, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +21,7 @@ PAST_SCALE = (5.0, 5.0, 1.0, SPEED_SCALE_MPS)
 STEP_SCALE_M = 1.0
 """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
 PLACE_SCALE_M = 20.0
+PATH_DROPOUT = 0.2
 ASIDE_M = (-3.0, 0.0, 3.0)
 """Where beside a path it is looked: on it and in the lanes next to it."""
 
@@ -55,40 +56,66 @@ class FutureAttention(nn.Module):
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
+class PathReads(NamedTuple):
+    """What a volume says along a plan, at D distances and S places across it."""
+
+    values: Float[Tensor, "b D S F"]
+    """The columns of the volume there, F = Z·D features."""
+    places_m: Float[Tensor, "b D S 2"]
+    """Where, in the ego frame."""
+
+
 class PathCorrection(nn.Module):
     """By how much what lies along a plan changes it.
 
-    Features of the plane are read at given distances on the plan's path and beside it. The same numbers mean
+    Columns of the volume are read at given distances on the plan's path and beside it. The same numbers mean
     the same place on the way whatever the curve, so that braking for what stands in the lane need not be
-    learned anew for every cell of the plane: with the truth from above in place of a volume, 2,000
-    demonstrations taught this something and the decoder's attention nothing (`bench nemo-planning-limits`).
+    learned anew for every cell of the plane. What is read can be kept, so that many thousand demonstrations
+    are looked at in seconds (`training.fit_path`): from the thousand of fine-tuning it would learn nothing
+    (`bench nemo-planning-limits`).
 
     Args:
-        spec: grid of the volume whose plane is read.
-        width: C.
+        spec: grid of the volume.
+        channels: of the volume.
+        width: of the layers.
         distances_m: along the path; it goes on straight where it ends.
-        told: S, how many numbers about the ego vehicle come with it: whether 20 m are near depends on its
-            speed.
+        told: how many numbers about the ego vehicle come with it: whether 20 m are near depends on its speed.
         steps: T, of the plan.
     """
 
     distances_m: Tensor
     aside_m: Tensor
     lower_m: Tensor
+    mean: Tensor
+    std: Tensor
 
     def __init__(
-        self, spec: VoxelSpec, width: int, distances_m: Sequence[float], *, told: int, steps: int
+        self,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        width: int,
+        distances_m: Sequence[float],
+        told: int,
+        steps: int,
     ) -> None:
         super().__init__()
         self.voxel_m = spec.voxel_m
         self.register_buffer("distances_m", torch.tensor(distances_m), persistent=False)
         self.register_buffer("aside_m", torch.tensor(ASIDE_M), persistent=False)
         self.register_buffer("lower_m", torch.tensor(spec.lower_m[:2]), persistent=False)
-        hidden = width // 4
+        features, hidden = spec.shape_zyx[0] * channels, width // 2
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("std", torch.ones(features))
         self.place = nn.Sequential(
-            nn.Linear(len(ASIDE_M) * (width + 2), width), nn.ReLU(), nn.Linear(width, hidden)
+            nn.Linear(len(ASIDE_M) * (features + 2), width),
+            nn.ReLU(),
+            nn.Dropout(PATH_DROPOUT),
+            nn.Linear(width, hidden),
         )
-        self.together = nn.Sequential(nn.Linear(len(distances_m) * hidden, width), nn.ReLU())
+        self.together = nn.Sequential(
+            nn.Linear(len(distances_m) * hidden, width), nn.ReLU(), nn.Dropout(PATH_DROPOUT)
+        )
         self.change = nn.Sequential(
             nn.Linear(width + told, width),
             nn.ReLU(),
@@ -98,23 +125,26 @@ class PathCorrection(nn.Module):
         for parameter in self.change[-2].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(
-        self, plane: Float[Tensor, "b Y X C"], path_xy: Float[Tensor, "b T 2"], told: Float[Tensor, "b S"]
-    ) -> Float[Tensor, "b T 2"]:
-        """Changes of the steps, m.
+    def forward(self, reads: PathReads, told: Float[Tensor, "b S"]) -> Float[Tensor, "b T 2"]:
+        """Changes of the steps between waypoints, m.
 
         Args:
-            plane: features.
-            path_xy: waypoints from the origin of the ego frame, m.
+            reads: see `read`.
             told: about the ego vehicle, in numbers of order 1.
         """
-        places = self.places(path_xy)  # [b, D, S, 2]
-        with full_precision(plane, places) as (values, at):
-            cells = F.pad((at - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
-            read = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at.shape[1:3])
-        seen = torch.cat([read, at / PLACE_SCALE_M], dim=-1).flatten(2)
+        values = (reads.values.float() - self.mean) / self.std
+        seen = torch.cat([values, reads.places_m / PLACE_SCALE_M], dim=-1).flatten(2)
         along = self.together(self.place(seen).flatten(1))
         return self.change(torch.cat([along, told], dim=-1)).float()
+
+    def read(self, volume: Float[Tensor, "b D Z Y X"], path_xy: Float[Tensor, "b T 2"]) -> PathReads:
+        """What lies along a path, from the origin of the ego frame through waypoints."""
+        places = self.places(path_xy)
+        columns = volume.permute(0, 3, 4, 2, 1).flatten(3).contiguous()
+        with full_precision(columns, places) as (values, at):
+            cells = F.pad((at - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
+            read = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at.shape[1:3])
+        return PathReads(read, places)
 
     def places(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
         """Where is looked: at every distance along the path, at S places across it."""
@@ -152,7 +182,7 @@ class VolumePlanner(nn.Module):
             speed at now alone, from which nobody can tell who brakes.
         horizon_steps, dt_s: of the plan.
         ego_mlp: fitted beforehand, knows `history` frames and has the same horizon; it is not trained on.
-        look_m: distances along the plan made without looking at which the plane is read as well
+        look_m: distances along the plan made without looking at which the volume of now is read as well
             (`PathCorrection`); none in the paper.
     """
 
@@ -200,7 +230,10 @@ class VolumePlanner(nn.Module):
             for parameter in self.waypoints[-1].parameters():
                 nn.init.zeros_(parameter)
         told = 0 if ego_mlp is None else len(ego_mlp.status_mean)
-        self.path = PathCorrection(spec, width, look_m, told=told, steps=horizon_steps) if look_m else None
+        self.path: PathCorrection | None = None
+        if look_m:
+            sizes = {"channels": channels, "width": width // 2, "told": told, "steps": horizon_steps}
+            self.path = PathCorrection(spec, distances_m=look_m, **sizes)
         self.ego_mlp = ego_mlp
 
     @property
@@ -229,7 +262,7 @@ class VolumePlanner(nn.Module):
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
-        unseen, told = self._without_looking(command, command_valid, speed_mps, past)
+        unseen, told = self.without_looking(command, command_valid, speed_mps, past)
         command = torch.where(command_valid, command, len(Command))
         status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
         status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
@@ -241,7 +274,7 @@ class VolumePlanner(nn.Module):
             asked = layer(asked, memory)
         change = STEP_SCALE_M * self.waypoints(asked[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
         if self.path is not None:
-            change = change + self.path(plane, unseen, told)
+            change = change + self.path(self.path.read(now, unseen), told)
         xy = (unseen + change.cumsum(dim=1))[:, None]
         return Trajectory(
             xy=xy,
@@ -252,7 +285,7 @@ class VolumePlanner(nn.Module):
         )
 
     @torch.no_grad()
-    def _without_looking(
+    def without_looking(
         self,
         command: Int[Tensor, "b"],
         command_valid: Bool[Tensor, "b"],

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from foredrive.data import ClipConfig
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training import LossWeights, Schedule
+from foredrive.training import LossWeights, PathFit, Schedule
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,9 @@ class Recipe:
     pretrain: Stage | None
     """None: fine-tuning starts from scratch, or from weights that are given."""
     finetune: Stage
+    path: PathFit | None = None
+    """How the planner's `PathCorrection` is fitted before fine-tuning to what the pre-trained world model
+    sees; None leaves that to fine-tuning."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
 
 

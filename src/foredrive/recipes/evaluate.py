@@ -21,9 +21,10 @@ from foredrive.evaluation import (
     write_summary,
 )
 from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.recipes.open_clips import open_clips
 from foredrive.recipes.predict import NemoPredictor
 from foredrive.recipes.rivals import fit_rivals
-from foredrive.recipes.train import Run, load_agent, open_clips
+from foredrive.recipes.train import Run, load_agent
 from foredrive.scene import Example, Trajectory
 
 SUMMARY = "summary.json"

@@ -20,7 +20,8 @@ from foredrive.evaluation import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path
 from foredrive.models.nemo import NemoAgent
-from foredrive.recipes.train import Run, load_agent, open_clips
+from foredrive.recipes.open_clips import open_clips
+from foredrive.recipes.train import Run, load_agent
 from foredrive.scene import Clip
 
 PROGRAM, MODEL, FACTS = "model.pt2", "model.onnx", "export.json"

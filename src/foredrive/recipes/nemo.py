@@ -5,7 +5,7 @@ import dataclasses
 from foredrive.data import ClipConfig
 from foredrive.recipes.config import BackboneSize, BevEncoderSize, NemoSize, Recipe, Stage, VolumeEncoderSize
 from foredrive.scene import VoxelSpec
-from foredrive.training import LossWeights, Schedule
+from foredrive.training import LossWeights, PathFit, Schedule
 
 
 def nemo_tiny() -> Recipe:
@@ -85,11 +85,12 @@ def nemo_town() -> Recipe:
             planner_base="ego_mlp",
             planner_look_m=(2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0),
         ),
+        path=PathFit(),
         pretrain=dataclasses.replace(
             pretrain, schedule=dataclasses.replace(pretrain.schedule, steps=600, warmup_steps=50)
         ),
         finetune=dataclasses.replace(
-            finetune, schedule=dataclasses.replace(finetune.schedule, steps=250, warmup_steps=50)
+            finetune, schedule=dataclasses.replace(finetune.schedule, steps=150, warmup_steps=20)
         ),
     )
 

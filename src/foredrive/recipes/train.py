@@ -8,20 +8,23 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
+from foredrive.data import ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
+from foredrive.recipes.open_clips import open_clips
+from foredrive.recipes.path_reads import read_paths
 from foredrive.recipes.rivals import fit_rivals
-from foredrive.training import load_weights, save_weights, train
+from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 STAGES = ("pretrain", "finetune")
+PATH_STAGE = "path"
 
 
 @dataclass(frozen=True)
@@ -61,19 +64,6 @@ def open_run(folder: Path) -> Run:
         return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
-
-
-def open_clips(logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path) -> ClipDataset:
-    """Clips that a model can see something in; cameras that some of the logs lack are masked.
-
-    Raises:
-        InputError: if none of the logs has a camera.
-    """
-    dataset = ClipDataset(logs, config, cache_dir)
-    if not dataset.camera_names:
-        others = f" and {len(logs) - 1} more logs" if len(logs) > 1 else ""
-        raise InputError(f"{logs[0].folder}{others}: no pinhole camera, and NeMo sees by cameras alone")
-    return dataset
 
 
 def train_run(
@@ -121,8 +111,22 @@ def train_run(
         base = agent.planner.ego_mlp
         _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames)
         base.load_state_dict(fitted.state_dict())
+        if recipe.path is not None and agent.planner.path is not None:
+            _fit_path(run, recipe.path, agent.to(fabric.device))
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     return run
+
+
+def _fit_path(run: Run, fit: PathFit, agent: NemoAgent) -> None:
+    """Fit what the planner reads along its path, unless an interrupted run has done so."""
+    assert agent.planner.path is not None
+    weights = run.folder / PATH_STAGE / WEIGHTS
+    if not weights.is_file():
+        shown = read_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
+        fit_path(agent.planner.path, shown, fit, run.recipe.finetune.schedule.seed)
+        with atomic_path(weights) as temporary:
+            save_weights(agent.planner.path, temporary)
+    load_weights(agent.planner.path, weights)
 
 
 def _pretrained(start: Path) -> Path:

@@ -9,13 +9,17 @@ if TYPE_CHECKING:
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective
+    from foredrive.training.path_fit import PathDemonstrations, PathFit, fit_path
     from foredrive.training.rays import ImageRays, thinned_rays
 
 __all__ = [
     "ImageRays",
     "LossWeights",
     "NemoObjective",
+    "PathDemonstrations",
+    "PathFit",
     "Schedule",
+    "fit_path",
     "load_weights",
     "make_fabric",
     "read_metrics",
@@ -31,6 +35,7 @@ __getattr__ = on_demand(
         "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective"),
+        "path_fit": ("PathDemonstrations", "PathFit", "fit_path"),
         "rays": ("ImageRays", "thinned_rays"),
     },
 )
