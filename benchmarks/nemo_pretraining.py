@@ -30,7 +30,7 @@ SHARES = (0.1, 0.3, 1.0)
 TOWNS = StudyTowns()
 RECIPE = "nemo_town"
 AVERAGING = AveragingEncoderSize(hidden=128)
-OCCUPANCY_STEPS, PROBE_STEPS = 250, 30
+OCCUPANCY_STEPS, PROBE_STEPS = 300, 30
 
 
 def _logs() -> StudyLogs:

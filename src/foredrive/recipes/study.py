@@ -91,7 +91,7 @@ def occupancy_alone(recipe: Recipe) -> Recipe:
     assert recipe.pretrain is not None
     weights = dataclasses.replace(recipe.pretrain.weights, wpts=0.0, recon=0.0)
     stage = dataclasses.replace(recipe.pretrain, weights=weights, imagine=False)
-    return dataclasses.replace(recipe, pretrain=None, finetune=stage)
+    return dataclasses.replace(recipe, pretrain=None, finetune=stage, path=None)
 
 
 def run_arm(
