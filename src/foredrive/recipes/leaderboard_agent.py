@@ -39,7 +39,7 @@ def _base_class() -> Any:
 _AutonomousAgent: Any = _base_class()
 
 
-class ForedriveAgent(_AutonomousAgent):  # type: ignore[misc]
+class ForedriveAgent(_AutonomousAgent):
     """`AutonomousAgent` of a run folder.
 
     Leaderboard 1.0 calls `setup` while it makes the agent and gives the route afterwards, 2.x and
@@ -82,7 +82,8 @@ class ForedriveAgent(_AutonomousAgent):  # type: ignore[misc]
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as temporary:
                 temporary.write_text(json.dumps(self._metrics))
-        self._driver, self._metrics = None, {}
+        del self._driver  # the next route makes another one
+        self._metrics = {}
 
 
 def run_folder(path_to_conf_file: str) -> tuple[Path, str]:

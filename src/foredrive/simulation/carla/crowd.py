@@ -52,7 +52,7 @@ def _add_vehicles(
 
 def _add_people(session: Session, count: int, rng: np.random.Generator) -> None:
     kinds = sorted(thing.id for thing in session.world.get_blueprint_library().filter("walker.pedestrian.*"))
-    controllers = []
+    controllers = list[Any]()
     for _ in range(count * TRIES):
         place = session.world.get_random_location_from_navigation()
         if place is None or not kinds or len(controllers) == count:

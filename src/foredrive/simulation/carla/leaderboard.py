@@ -105,7 +105,8 @@ class LeaderboardDriver:
         self._where = locate(self._where, self._geo.xy(lat, lon), yaw_rad, speed_mps, t_s)
         here = np.array([self._where.x_m, self._where.y_m])
         self._progress = self._plan.advance(self._progress, here, speed_mps, t_s)
-        ego = BicycleState(*here.tolist(), self._where.yaw_rad, speed_mps, steering_rad_of(self._steer))
+        where, steering_rad = self._where, steering_rad_of(self._steer)
+        ego = BicycleState(where.x_m, where.y_m, where.yaw_rad, speed_mps, steering_rad)
         if t_s > self._next_frame_s - 0.5 * STEP_S:
             self._next_frame_s = t_s + FRAME_DT_S
             self._see(input_data, self._where, speed_mps)
