@@ -1,6 +1,5 @@
 """The agent file as CARLA's leaderboards load it, with an untrained run."""
 
-import dataclasses
 import importlib.util
 import json
 import sys
@@ -16,7 +15,7 @@ import foredrive.recipes.leaderboard_agent as agent_file
 from foredrive.errors import InputError
 from foredrive.recipes.build import build_agent
 from foredrive.recipes.config import save_recipe
-from foredrive.recipes.leaderboard_agent import rig_of, run_folder
+from foredrive.recipes.leaderboard_agent import driver_of
 from foredrive.training import save_weights
 
 
@@ -73,7 +72,7 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
     by_satellite = [({"lat": 0.0, "lon": x / 111_319.49, "z": 0.0}, straight) for x in (0.0, 40.0)]
     agent.set_global_plan(by_satellite, [(place, straight) for place in places])
     agent.setup(f"{run}+Route1_rep0_Town02+Route2_rep0_Town02")
-    data = {s["id"]: (1, np.zeros((32, 64, 4), dtype=np.uint8)) for s in agent.sensors() if "width" in s}
+    data = {s["id"]: (1, np.zeros((144, 256, 4), dtype=np.uint8)) for s in agent.sensors() if "width" in s}
     data |= {
         "GPS": (1, np.zeros(3)),
         "IMU": (1, np.array([0, 0, 9.8, 0, 0, 0, 1.57])),
@@ -90,24 +89,21 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
 
 
 def test_the_route_may_be_appended_to_the_run(tmp_path: Path) -> None:
-    assert run_folder("runs/a+r1+r2") == (Path("runs/a"), "r2")
-    assert run_folder("runs/a") == (Path("runs/a"), "")
+    assert driver_of("runs/a+r1+r2") == ("runs/a", "r2")
+    assert driver_of("runs/a") == ("runs/a", "")
     (tmp_path / "a+b").mkdir()
-    assert run_folder(str(tmp_path / "a+b")) == (tmp_path / "a+b", "")
+    assert driver_of(str(tmp_path / "a+b")) == (str(tmp_path / "a+b"), "")
 
 
-def test_the_rig_is_the_recipes() -> None:
-    recipe = miniature()
-    rig = rig_of(recipe)
-    assert rig.size_hw == (32, 64)
-    assert len(rig.names) == 6
-    clips = dataclasses.replace(recipe.clips, cameras=("pcam_b0", "pcam_f0"))
-    chosen = rig_of(dataclasses.replace(recipe, clips=clips))
-    assert chosen.names == ("PCAM_B0", "PCAM_F0")
-    assert chosen.T_ego_cam[1, 0, 3] == pytest.approx(1.70)
-    clips = dataclasses.replace(recipe.clips, cameras=("CAM_FRONT",))
-    with pytest.raises(InputError, match="CAM_FRONT"):
-        rig_of(dataclasses.replace(recipe, clips=clips))
+def test_drivers_that_see_nothing_carry_no_cameras() -> None:
+    pytest.importorskip("carla")
+    agent = agent_file.ForedriveAgent()
+    agent.setup("constant-velocity")
+    assert [sensor["id"] for sensor in agent.sensors()] == ["GPS", "IMU", "SPEED"]
+    with pytest.raises(InputError, match="expert"):
+        agent.setup("expert")
+    with pytest.raises(InputError, match="no such driver"):
+        agent.setup("runs/there-is-none")
 
 
 def test_where_no_leaderboard_is_the_file_can_be_read() -> None:

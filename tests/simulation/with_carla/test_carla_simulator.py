@@ -11,7 +11,10 @@ from carla_stand_in import Client, Light, World
 from foredrive.errors import InputError
 from foredrive.scene import Category, Command, Control
 from foredrive.simulation.carla.simulator import CarlaSimulator
+from foredrive.simulation.drive import drive_route
 from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.scores import Ending
+from foredrive.simulation.simple_agents import Straight
 from foredrive.simulation.town import TownScenario
 from foredrive.towns.conditions import find_conditions
 from foredrive.towns.recorder import Crowd
@@ -81,20 +84,20 @@ def test_what_is_asked_for_is_driven_although_the_engine_is_weaker(
         clip = simulator.reset(dataclasses.replace(scenario, sensors=SENSORS))
         clips = [simulator.step(Control(1.5, 0.0)).clip for _ in range(40)]
         assert simulator.state.t_s == pytest.approx(2.0)
-        assert simulator.ego.speed_mps == pytest.approx(3.0, abs=0.25)
+        assert simulator.ego().speed_mps == pytest.approx(3.0, abs=0.25)
         assert simulator.state.progress.done_m == pytest.approx(3.0, abs=1.0)
         assert all(c is clip for c in clips[:9])
         assert clips[9] is clips[18] is not clips[19]
         assert clips[19].t_s.tolist() == [-0.5, 0.0]
-        before = simulator.ego.yaw_rad
+        before = simulator.ego().yaw_rad
         for _ in range(20):
             simulator.step(Control(0.0, 0.1))
         # 3 m further at a curvature of tan(.1) / 2.86 m: .105 rad to the left.
-        assert simulator.ego.yaw_rad - before == pytest.approx(0.105, abs=0.015)
-        assert simulator.ego.steering_rad == pytest.approx(0.1, abs=1e-6)
+        assert simulator.ego().yaw_rad - before == pytest.approx(0.105, abs=0.015)
+        assert simulator.ego().steering_rad == pytest.approx(0.1, abs=1e-6)
         for _ in range(60):
             simulator.step(Control(-3.0, 0.0))
-        assert simulator.ego.speed_mps == 0.0
+        assert simulator.ego().speed_mps == 0.0
 
 
 def test_the_route_ends_where_it_ends(world: World, scenario: TownScenario) -> None:
@@ -141,6 +144,16 @@ def test_a_stop_sign_wants_a_stop(
     assert [e.kind for e in events if e.kind == "stop_sign"] == ["stop_sign"] * (not stops)
 
 
+def test_an_agent_drives_and_is_scored_as_in_a_town(world: World, scenario: TownScenario) -> None:
+    route = dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:40])
+    with CarlaSimulator(Client(world)) as simulator:
+        drive = drive_route(simulator, route, Straight(5.0), route="0")
+    assert drive.score.ending is Ending.COMPLETED
+    assert drive.score.driving_score_1_0 == 100.0
+    assert drive.score.infractions == ()
+    assert drive.score.duration_s == pytest.approx(34.0 / 5.0 + 2.0, abs=2.0)
+
+
 def waited(simulator: CarlaSimulator) -> bool:
     return bool(simulator.state.rules.stopped_at)
 
@@ -168,7 +181,7 @@ def test_who_is_hit_is_told_once(carla: Any, world: World, scenario: TownScenari
         assert simulator.step(Control(2.0, 0.0)).events == []  # who stands hits nobody
         for _ in range(30):
             simulator.step(Control(2.0, 0.0))
-        speed = simulator.ego.speed_mps
+        speed = simulator.ego().speed_mps
         for _ in range(3):  # in contact for some steps
             world.collide(other(41, "vehicle.bh.crossbike", "bicycle"))
         hits = list(simulator.step(Control(0.0, 0.0)).events)

@@ -30,7 +30,7 @@ from foredrive.simulation.carla.localization import (
 from foredrive.simulation.carla.sensors import camera_specs, image_of, mounting
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S, BicycleState
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip
+from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_progress import Progress
 from foredrive.towns.recorder import boxes_of
@@ -45,19 +45,20 @@ class LeaderboardDriver:
 
     Args:
         agent: sees batches of one clip.
-        rig: its cameras, without leading dimensions. Leaderboard 1.0 allows four, 2.x and Bench2Drive eight.
+        rig: its cameras, without leading dimensions; None for an agent that needs none. Leaderboard 1.0
+            allows four, 2.x and Bench2Drive eight.
         past_frames: key frames before now that it looks at; until it has them the vehicle stands.
 
     Raises:
         InputError: CARLA has no such cameras.
     """
 
-    def __init__(self, agent: Agent, rig: CameraRig, past_frames: int) -> None:
+    def __init__(self, agent: Agent, rig: CameraRig | None, past_frames: int) -> None:
         T_actor_ego = ego_in_actor()
         self._agent, self._rig, self._past_frames = agent, rig, past_frames
         axle = mounting(pose_of(T_actor_ego))
         self._sensors = [
-            *camera_specs(rig, T_actor_ego),
+            *([] if rig is None else camera_specs(rig, T_actor_ego)),
             {"type": "sensor.other.gnss", "id": GPS} | axle,
             {"type": "sensor.other.imu", "id": IMU} | axle,
             {"type": "sensor.speedometer", "id": SPEED},
@@ -119,17 +120,20 @@ class LeaderboardDriver:
         return pedals
 
     def _see(self, input_data: Mapping[str, tuple[int, Any]], at: Whereabouts, speed_mps: float) -> None:
-        images = torch.stack([self._image(name, input_data[name][1]) for name in self._rig.names])
+        images = no_images()
+        if self._rig is not None:
+            images = torch.stack([_image(self._rig, name, input_data[name][1]) for name in self._rig.names])
         T = at.T_world_ego
         frame = KeyFrame(at.t_s, T, speed_mps, images, None, boxes_of([], T))
         self._frames = (*self._frames, frame)[-1 - self._past_frames :]
-
-    def _image(self, name: str, sent: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:
-        if sent.shape[:2] != self._rig.size_hw:
-            raise InputError(f"camera {name} sent {sent.shape[:2]} pixels instead of {self._rig.size_hw}")
-        return image_of(sent)
 
     def _clip(self) -> Clip:
         assert self._plan is not None
         clip = make_clip(self._frames, self._rig, self._plan.command(self._progress))
         return dataclasses.replace(clip, boxes_valid=torch.zeros_like(clip.boxes_valid))
+
+
+def _image(rig: CameraRig, name: str, sent: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:
+    if sent.shape[:2] != rig.size_hw:
+        raise InputError(f"camera {name} sent {sent.shape[:2]} pixels instead of {rig.size_hw}")
+    return image_of(sent)

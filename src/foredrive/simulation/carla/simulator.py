@@ -1,4 +1,4 @@
-"""CARLA as a simulator: scenarios, steps, key frames and events as those of a town."""
+"""CARLA as a simulator (`simulation.drive.RoadSimulator`): scenarios, steps and events as those of a town."""
 
 import dataclasses
 import math
@@ -24,6 +24,7 @@ from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of
 from foredrive.simulation.carla.road import CarlaRoad
 from foredrive.simulation.carla.session import TRAFFIC_PORT, Receiver, Session
 from foredrive.simulation.carla.weather import weather_of
+from foredrive.simulation.drive import Standing
 from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
 from foredrive.simulation.lane_rules import RuleState, left_lanes
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
@@ -86,10 +87,15 @@ class CarlaSimulator:
         self._client, self._timeout_s, self._traffic_port = client, timeout_s, traffic_port
         self._session: Session | None = None
 
-    @property
     def ego(self) -> BicycleState:
         """The ego vehicle now."""
         return self.state.ego
+
+    def standing(self) -> Standing:
+        """How far the drive has come."""
+        rules = self.state.rules
+        completion = min(1.0, self.state.progress.done_m / self._route.length_m)
+        return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def reset(self, scenario: TownScenario) -> Clip:
         """Load the town and start a drive; the vehicle stands until traffic has set in.
