@@ -161,9 +161,22 @@ class Traffic:
         self.seed = seed
 
 
+class MapOfServer:
+    """A `carla.Map`; where vehicles may start only a server knows."""
+
+    def __init__(self, town: Any) -> None:
+        self._town = town
+
+    def get_spawn_points(self) -> list[Any]:
+        return [waypoint.transform for waypoint in self._town.generate_waypoints(15.0)]
+
+    def get_waypoint(self, *where: Any, **kinds: Any) -> Any:
+        return self._town.get_waypoint(*where, **kinds)
+
+
 class World:
     def __init__(self, carla: Any, town: Any) -> None:
-        self._carla, self._map, self.settings = carla, town, carla.WorldSettings()
+        self._carla, self._map, self.settings = carla, MapOfServer(town), carla.WorldSettings()
         self.frame, self.actors, self.furniture = 100, list[Actor](), list[Any]()
         self.full, self.mute, self.dead_at = False, False, math.inf
         self.weather: Any = None

@@ -1,6 +1,7 @@
 """Pedals and steering for CARLA, and where a vehicle is by satellites and compass."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,14 +32,18 @@ def test_the_speed_asked_for_comes_about_with_any_engine(strength: float, drag_m
         pedals, asked = actuate(Control(1.5, 0.0), speed, asked)
         force = strength * (4.0 * pedals.throttle - 8.0 * pedals.brake)
         speed = max(0.0, speed + (force - (drag_mps2 if speed > 0 else 0.0)) * STEP_S)
-    assert speed == pytest.approx(6.0, abs=0.6)
+    assert speed == pytest.approx(6.0, abs=0.8)  # while it accelerates; then it catches up
+    for _ in range(40):
+        pedals, asked = actuate(Control(0.0, 0.0), speed, asked)
+        speed += (strength * (4.0 * pedals.throttle - 8.0 * pedals.brake) - drag_mps2) * STEP_S
+    assert speed == pytest.approx(6.0, abs=0.4)
 
 
 def test_who_waits_with_the_brake_on_does_not_start_with_a_jerk() -> None:
     asked = Asked()
     for _ in range(100):
         _, asked = actuate(Control(-1.0, 0.0), 0.0, asked)
-    assert actuate(Control(1.0, 0.0), 0.0, asked)[0].throttle == pytest.approx(0.25, abs=0.02)
+    assert actuate(Control(1.0, 0.0), 0.0, asked)[0].throttle == pytest.approx(0.25)
 
 
 def test_steering_is_mirrored_and_gives_the_curvature() -> None:
@@ -64,25 +69,23 @@ def lat_lon(x: float, y: float, lat_0: float, lon_0: float) -> tuple[float, floa
 def test_satellites_are_read_by_the_route_alone(origin: tuple[float, float]) -> None:
     route = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, -150.0]])
     frame = fit_geo_frame(np.array([lat_lon(x, y, *origin) for x, y in route]), route)
-    assert frame.xy(*lat_lon(-250.0, 321.0, *origin)) == pytest.approx((-250.0, 321.0), abs=0.01)
+    near = np.array([-245.0, 330.0])
+    assert frame.xy(*lat_lon(-250.0, 321.0, *origin), near) == pytest.approx((-250.0, 321.0), abs=0.01)
     straight = route[:2]
     frame = fit_geo_frame(np.array([lat_lon(x, y, *origin) for x, y in straight]), straight)
-    assert frame.xy(*lat_lon(-250.0, 321.0, *origin)) == pytest.approx((-250.0, 321.0), abs=0.05)
+    assert frame.xy(*lat_lon(-250.0, 321.0, *origin), near) == pytest.approx((-250.0, 321.0), abs=0.05)
     with pytest.raises(InputError, match="one place"):
         fit_geo_frame(np.zeros((2, 2)), np.zeros((2, 2)))
 
 
-def test_carla_and_we_read_satellites_alike(town02: object) -> None:
-    import carla
-
+def test_carlas_satellites_are_read_although_its_north_is_the_routes_south(carla: Any, town02: Any) -> None:
+    """The route as the leaderboard writes it, the satellites as CARLA 0.9.16 projects."""
     route = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, -150.0]])
-
-    def seen(x: float, y: float) -> tuple[float, float]:
-        place = town02.transform_to_geolocation(carla.Location(x, -y, 0.0))  # type: ignore[attr-defined]
-        return place.latitude, place.longitude
-
-    frame = fit_geo_frame(np.array([seen(x, y) for x, y in route]), route)
-    assert frame.xy(*seen(-120.0, 90.0)) == pytest.approx((-120.0, 90.0), abs=0.05)
+    frame = fit_geo_frame(np.array([lat_lon(x, y, 0.0, 0.0) for x, y in route]), route)
+    for x, y in ((-120.0, 90.0), (60.0, -150.0), (150.0, 3.0)):
+        place = town02.transform_to_geolocation(carla.Location(x, -y, 0.0))
+        found = frame.xy(place.latitude, place.longitude, np.array([x + 2.0, y - 2.0]))
+        assert found == pytest.approx((x, y), abs=0.1)
 
 
 def test_whereabouts_are_steadier_than_satellites() -> None:

@@ -42,28 +42,24 @@ class Pedals(NamedTuple):
 class Asked:
     """What has been asked for so far."""
 
-    behind_mps: float = 0.0
-    """How much faster the vehicle would be by now if it had done as it was asked to."""
-    last: Control | None = None
-    last_speed_mps: float = 0.0
+    speed_mps: float | None = None
+    """The speed that the vehicle would have by now if it had done as it was asked to; None at first."""
 
 
 def actuate(control: Control, speed_mps: float, asked: Asked) -> tuple[Pedals, Asked]:
     """Pedals and steering for the step that begins now, and what to remember for the next one."""
-    behind = 0.0
-    if asked.last is not None:
-        gained = speed_mps - asked.last_speed_mps
-        behind = asked.behind_mps + asked.last.acceleration_mps2 * STEP_S - gained
-        behind = min(max(behind, -MOST_BEHIND_MPS), MOST_BEHIND_MPS)
-    wanted = control.acceleration_mps2
-    wanted = min(max(wanted, -EGO.max_braking_mps2), EGO.max_acceleration_mps2)
-    if speed_mps < STANDING_MPS and wanted <= 0:
-        behind = 0.0  # who stands and is to stand is not behind
-    now = Asked(behind, Control(wanted, control.steering_rad), speed_mps)
-    coasting = COASTING_MPS2 + COASTING_PER_M * speed_mps**2 if speed_mps > STANDING_MPS else 0.0
+    wanted = min(max(control.acceleration_mps2, -EGO.max_braking_mps2), EGO.max_acceleration_mps2)
+    behind = 0.0 if asked.speed_mps is None else asked.speed_mps - speed_mps
+    behind = min(max(behind, -MOST_BEHIND_MPS), MOST_BEHIND_MPS)
+    stands = speed_mps < STANDING_MPS
+    if stands and wanted <= 0:  # as it is to
+        behind, due = 0.0, speed_mps
+    else:
+        due = speed_mps + behind + wanted * STEP_S
+    coasting = 0.0 if stands else COASTING_MPS2 + COASTING_PER_M * speed_mps**2
     force = wanted + CATCH_UP_PER_S * behind + coasting
     throttle, brake = max(force, 0.0) / FULL_THROTTLE_MPS2, max(-force, 0.0) / FULL_BRAKE_MPS2
-    return Pedals(min(throttle, 1.0), min(brake, 1.0), steer_of(control.steering_rad)), now
+    return Pedals(min(throttle, 1.0), min(brake, 1.0), steer_of(control.steering_rad)), Asked(due)
 
 
 def steer_of(steering_rad: float) -> float:

@@ -103,7 +103,9 @@ class LeaderboardDriver:
         lat, lon, _ = (float(value) for value in input_data[GPS][1])
         speed_mps = max(float(input_data[SPEED][1]["speed"]), 0.0)
         yaw_rad = yaw_of_compass(float(input_data[IMU][1][COMPASS_AT]))
-        self._where = locate(self._where, self._geo.xy(lat, lon), yaw_rad, speed_mps, t_s)
+        last = self._where
+        near = self._plan.xy[0] if last is None else np.array([last.x_m, last.y_m])
+        self._where = locate(last, self._geo.xy(lat, lon, near), yaw_rad, speed_mps, t_s)
         here = np.array([self._where.x_m, self._where.y_m])
         self._progress = self._plan.advance(self._progress, here, speed_mps, t_s)
         where, steering_rad = self._where, steering_rad_of(self._steer)

@@ -1,7 +1,10 @@
 """Where a vehicle is by what the leaderboard lets it carry: satellites, a compass, a speedometer.
 
-No map is needed to read the satellites: the route comes both as coordinates of the world and as latitudes and
-longitudes, and CARLA's projection (Mercator) is known up to a scale and an origin.
+No map is needed to read the satellites: the route comes both as coordinates of the world and as latitudes
+and longitudes, by a projection (Mercator) that is known up to a scale and an origin. CARLA 0.9.16 projects
+in other ways than the leaderboard writes its routes: 0.04 % larger, and with north where the route has
+south. So a reading may mean either of two places, and the one that is nearer to where the vehicle has to be
+is taken.
 """
 
 import dataclasses
@@ -30,10 +33,15 @@ class GeoFrame:
     x_m: float
     y_m: float
 
-    def xy(self, lat_deg: float, lon_deg: float) -> Float64[np.ndarray, "2"]:
-        """A place in our world, m."""
+    def xy(
+        self, lat_deg: float, lon_deg: float, near_xy: Float64[np.ndarray, "2"]
+    ) -> Float64[np.ndarray, "2"]:
+        """The place in our world or its mirror image in y, whichever is nearer to `near_xy`."""
         east, north = _mercator(lat_deg, lon_deg)
-        return np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
+        there = np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
+        mirrored = there * [1.0, -1.0]
+        is_nearer = np.hypot(*(mirrored - near_xy)) < np.hypot(*(there - near_xy))
+        return mirrored if is_nearer else there
 
 
 def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarray, "N 2"]) -> GeoFrame:
