@@ -183,7 +183,7 @@ class World:
 
     def get_settings(self) -> Any:
         settings = self._carla.WorldSettings()
-        for name in ("synchronous_mode", "fixed_delta_seconds", "deterministic_ragdolls"):
+        for name in ("synchronous_mode", "fixed_delta_seconds"):
             setattr(settings, name, getattr(self.settings, name))
         return settings
 
@@ -263,3 +263,13 @@ class Client:
         gone = {command.actor_id for command in commands}
         assert gone <= {actor.id for actor in self.world.actors}
         self.world.actors = [actor for actor in self.world.actors if actor.id not in gone]
+
+
+def lat_lon(x: float, y: float, lat_0: float, lon_0: float) -> tuple[float, float]:
+    """As the leaderboard writes a place of CARLA's left-handed world (so y is mirrored) by satellite."""
+    radius_m, scale = 6378137.0, math.cos(math.radians(lat_0))
+    east_m = scale * math.radians(lon_0) * radius_m + x
+    north_m = scale * radius_m * math.log(math.tan(math.radians(90.0 + lat_0) / 2)) + y
+    lon = math.degrees(east_m / (radius_m * scale))
+    lat = math.degrees(2 * math.atan(math.exp(north_m / (radius_m * scale)))) - 90.0
+    return lat, lon

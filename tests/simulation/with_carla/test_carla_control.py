@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from carla_stand_in import lat_lon
 
 from foredrive.errors import InputError
 from foredrive.scene import Control
@@ -53,16 +54,6 @@ def test_steering_is_mirrored_and_gives_the_curvature() -> None:
     assert steering_rad_of(steer) == pytest.approx(left)
     assert steer_of(-left) == -steer
     assert -1.0 <= steer_of(9.9) < 0.0
-
-
-def lat_lon(x: float, y: float, lat_0: float, lon_0: float) -> tuple[float, float]:
-    """As the leaderboard writes a place of CARLA's left-handed world (so y is mirrored) by satellite."""
-    radius_m, scale = 6378137.0, math.cos(math.radians(lat_0))
-    east_m = scale * math.radians(lon_0) * radius_m + x
-    north_m = scale * radius_m * math.log(math.tan(math.radians(90.0 + lat_0) / 2)) + y
-    lon = math.degrees(east_m / (radius_m * scale))
-    lat = math.degrees(2 * math.atan(math.exp(north_m / (radius_m * scale)))) - 90.0
-    return lat, lon
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (42.0, 2.0), (48.99, 8.0)])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_carla_control import lat_lon
+from carla_stand_in import lat_lon
 
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Command, Trajectory

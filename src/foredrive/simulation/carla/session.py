@@ -1,5 +1,6 @@
 """A world on CARLA's server for as long as it is needed: in step with us, and left as it was found."""
 
+import atexit
 import contextlib
 import logging
 import queue
@@ -32,6 +33,7 @@ class Session:
     def __init__(self, client: Any, town: str, seed: int, traffic_port: int = TRAFFIC_PORT) -> None:
         self._client, self._carla, self._end = client, import_carla(), contextlib.ExitStack()
         self._actors: list[Any] = []
+        atexit.register(self.close)
         try:
             with answering(f"loading {town}"):
                 self.world = _load(client, town)
@@ -44,7 +46,6 @@ class Session:
     def _go_synchronous(self, seed: int) -> None:
         settings = self.world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, STEP_S
-        settings.deterministic_ragdolls = True
         self._end.callback(self._go_asynchronous)
         self.world.apply_settings(settings)
         self._end.callback(self.traffic.set_synchronous_mode, False)
@@ -101,6 +102,7 @@ class Session:
 
     def close(self) -> None:
         """Destroy what was put into the world and let it run by itself; warns if the server is gone."""
+        atexit.unregister(self.close)
         try:
             self._end.close()
         except RuntimeError as error:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -108,7 +107,6 @@ class CarlaSimulator:
         self._scenario, self._route = scenario, RouteLine(scenario.route_xyz)
         start = _start(scenario.route_xyz)
         self._session = Session(self._client, scenario.town, scenario.seed, self._traffic_port)
-        self._finalizer = weakref.finalize(self, self._session.close)
         try:
             with answering("setting the scene"):
                 return self._set_scene(self._session, start)
@@ -136,7 +134,6 @@ class CarlaSimulator:
     def close(self) -> None:
         """Leave the server as it was found."""
         if self._session is not None:
-            self._finalizer.detach()
             session, self._session = self._session, None
             session.close()
 
@@ -153,6 +150,7 @@ class CarlaSimulator:
         session.world.reset_all_traffic_lights()
         self._ego = self._spawn_ego(session, start)
         add_crowd(session, scenario.crowd, scenario.route_xyz, rng)
+        session.tick()  # what a new world holds is listed from the next frame on
         self._road = CarlaRoad(session.world)
         before = max(round(SETTLE_S / STEP_S), scenario.past_frames * FRAME_STEPS)
         self.state = CarlaState(-before, BicycleState(0.0, 0.0, 0.0, 0.0), np.eye(4))
