@@ -1,7 +1,6 @@
 """CARLA's client without a server: what it says then, its maps beside ours, its weather."""
 
 import sys
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 
 from foredrive.errors import InputError
 from foredrive.simulation.carla.client import connect, import_carla, require_same_version
-from foredrive.simulation.carla.frames import matrix_of
+from foredrive.simulation.carla.frames import CarlaPose, matrix_of
 from foredrive.simulation.carla.road import CarlaRoad
 from foredrive.simulation.carla.session import Session
 from foredrive.simulation.carla.weather import weather_of
@@ -83,12 +82,12 @@ def test_weather_is_carlas(carla: Any) -> None:
 def test_an_unknown_blueprint_or_attribute_is_named(carla: Any, town02: Any) -> None:
     world = World(carla, town02)
     client = Client(world)
-    pose = SimpleNamespace()
+    pose = CarlaPose(0.0, 0.0, 0.0)
     with Session(client, "Town02", 1) as session:
         with pytest.raises(InputError, match=r"no blueprint 'vehicle.none'"):
-            session.spawn("vehicle.none", pose, {})  # type: ignore[arg-type]
+            session.spawn("vehicle.none", pose, {})
         with pytest.raises(InputError, match="no attribute 'colour'"):
-            session.spawn("sensor.camera.rgb", pose, {"colour": "red"})  # type: ignore[arg-type]
+            session.spawn("sensor.camera.rgb", pose, {"colour": "red"})
     assert not world.settings.synchronous_mode
 
 
