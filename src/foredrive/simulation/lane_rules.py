@@ -1,5 +1,6 @@
 """Lights run, stop signs run, lanes left: what CARLA's leaderboard 1.0 watches on the road."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -105,56 +106,10 @@ class LaneRules:
         Args:
             lights: a `Light` for each of the town's stop zones.
         """
-        events, stopped_at = self._check_lines(before, after, z_m, lights, state.stopped_at, t_s)
-        moved_m = float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
-        middle = _point(after, EGO.axle_to_centre_m)
-        outside = self._is_outside(np.append(middle, z_m), after.yaw_rad)
-        left_at, left_m = state.left_at, state.left_m
-        if outside:
-            left_at = left_at or (float(middle[0]), float(middle[1]))
-            left_m += moved_m
-        elif left_at is not None:
-            if left_m > LEAST_LEFT_M:
-                events.append(left_lanes(left_at, left_m, t_s))
-            left_at, left_m = None, 0.0
-        return events, RuleState(
-            stopped_at=stopped_at,
-            driven_m=state.driven_m + moved_m,
-            outside_m=state.outside_m + (moved_m if outside else 0.0),
-            left_at=left_at,
-            left_m=left_m,
-        )
-
-    def _check_lines(
-        self,
-        before: BicycleState,
-        after: BicycleState,
-        z_m: float,
-        lights: Int[np.ndarray, "Z"],
-        stopped_at: frozenset[int],
-        t_s: float,
-    ) -> tuple[list[Event], frozenset[int]]:
-        middle = _point(after, EGO.axle_to_centre_m)
-        lines = _near_lines(self._lines, np.append(middle, z_m))
-        if lines is None:
-            return [], frozenset()
-        events, xy = [], (float(middle[0]), float(middle[1]))
-        tail_m = EGO.axle_to_centre_m - TAIL * 0.5 * EGO.length_m
-        run = ~lines.is_sign & (lights[lines.zone] == Light.RED) & _crossed(lines, before, after, tail_m)
-        for zone in np.unique(lines.zone[run]).tolist():
-            events.append(Event("red_light", t_s, xy, f"at {after.speed_mps:.1f} m/s", f"light {zone}"))
-        if not lines.is_sign.any():
-            return events, stopped_at
-        along, aside = _beside(lines, middle)
-        front_m = along + 0.5 * EGO.length_m
-        waits = lines.is_sign & (aside < lines.half_width_m) & (front_m > -STOP_WITHIN_M) & (along < 0)
-        if after.speed_mps < STOPPED_MPS:
-            stopped_at = stopped_at | set(lines.zone[waits].tolist())
-        passed = lines.is_sign & _crossed(lines, before, after, EGO.axle_to_centre_m)
-        zones = set(lines.zone[passed].tolist())
-        for zone in sorted(zones - stopped_at):
-            events.append(Event("stop_sign", t_s, xy, f"at {after.speed_mps:.1f} m/s", f"sign {zone}"))
-        return events, stopped_at - zones
+        events, stopped_at = lines_run(self._lines, before, after, z_m, lights, state.stopped_at, t_s)
+        outside = self._is_outside(np.append(body_middle(after), z_m), after.yaw_rad)
+        more, state = way_driven(state, before, after, outside, t_s)
+        return events + more, dataclasses.replace(state, stopped_at=stopped_at)
 
     def _is_outside(self, xyz: Float64[np.ndarray, "3"], yaw_rad: float) -> bool:
         samples = self._near.within(xyz, LANES_WITHIN_M)
@@ -169,6 +124,77 @@ class LaneRules:
             return False  # between lanes, or in a junction, where they cross
         turned = np.abs((yaw_rad - self._near.heading[samples[inside]] + np.pi) % (2 * np.pi) - np.pi)
         return bool((turned > WRONG_WAY_RAD).all())
+
+
+def lines_run(
+    lines: Lines,
+    before: BicycleState,
+    after: BicycleState,
+    z_m: float,
+    lights: Int[np.ndarray, "Z"],
+    stopped_at: frozenset[int],
+    t_s: float,
+) -> tuple[list[Event], frozenset[int]]:
+    """Red lights and stop signs run in one step, and the stop zones at which the vehicle has stopped.
+
+    Args:
+        lines: those that may be met.
+        lights: a `Light` for each stop zone.
+        stopped_at: what the last step returned.
+    """
+    middle = body_middle(after)
+    near = _near_lines(lines, np.append(middle, z_m))
+    if near is None:
+        return [], frozenset()
+    events, xy = [], (float(middle[0]), float(middle[1]))
+    tail_m = EGO.axle_to_centre_m - TAIL * 0.5 * EGO.length_m
+    run = ~near.is_sign & (lights[near.zone] == Light.RED) & _crossed(near, before, after, tail_m)
+    for zone in np.unique(near.zone[run]).tolist():
+        events.append(Event("red_light", t_s, xy, f"at {after.speed_mps:.1f} m/s", f"light {zone}"))
+    if not near.is_sign.any():
+        return events, stopped_at
+    along, aside = _beside(near, middle)
+    front_m = along + 0.5 * EGO.length_m
+    waits = near.is_sign & (aside < near.half_width_m) & (front_m > -STOP_WITHIN_M) & (along < 0)
+    if after.speed_mps < STOPPED_MPS:
+        stopped_at = stopped_at | set(near.zone[waits].tolist())
+    passed = near.is_sign & _crossed(near, before, after, EGO.axle_to_centre_m)
+    zones = set(near.zone[passed].tolist())
+    for zone in sorted(zones - stopped_at):
+        events.append(Event("stop_sign", t_s, xy, f"at {after.speed_mps:.1f} m/s", f"sign {zone}"))
+    return events, stopped_at - zones
+
+
+def way_driven(
+    state: RuleState, before: BicycleState, after: BicycleState, outside: bool, t_s: float
+) -> tuple[list[Event], RuleState]:
+    """What is remembered of the lanes after one step, and the event of having come back to them.
+
+    Args:
+        outside: whether the vehicle is outside of all lanes now, or goes against them.
+    """
+    events, middle = [], body_middle(after)
+    moved_m = float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
+    left_at, left_m = state.left_at, state.left_m
+    if outside:
+        left_at = left_at or (float(middle[0]), float(middle[1]))
+        left_m += moved_m
+    elif left_at is not None:
+        if left_m > LEAST_LEFT_M:
+            events.append(left_lanes(left_at, left_m, t_s))
+        left_at, left_m = None, 0.0
+    return events, dataclasses.replace(
+        state,
+        driven_m=state.driven_m + moved_m,
+        outside_m=state.outside_m + (moved_m if outside else 0.0),
+        left_at=left_at,
+        left_m=left_m,
+    )
+
+
+def body_middle(state: BicycleState) -> Float64[np.ndarray, "2"]:
+    """The middle of the vehicle, seen from above."""
+    return _point(state, EGO.axle_to_centre_m)
 
 
 def _near_lines(lines: Lines, xyz: Float64[np.ndarray, "3"]) -> Lines | None:

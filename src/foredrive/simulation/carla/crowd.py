@@ -1,0 +1,84 @@
+"""Traffic and people in CARLA: its traffic manager drives, its navigation mesh walks."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.simulation.carla.frames import CarlaPose, xyz_of
+from foredrive.simulation.carla.session import Session
+from foredrive.towns.recorder import Crowd
+
+NEAR_ROUTE_M = 140.0
+"""Vehicles start on roads that are no further from the route."""
+FREE_M = 12.0
+"""Nobody starts so near to where the ego vehicle does."""
+ABOVE_M = 0.5
+"""Let down onto the road from this high."""
+WALKING_MPS = (0.8, 1.8)
+TRIES = 5
+"""For each pedestrian, where the place is taken."""
+
+
+def add_crowd(
+    session: Session, crowd: Crowd, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
+) -> None:
+    """As many vehicles and people as there is room for, at most what `crowd` asks for."""
+    _add_vehicles(session, crowd.vehicles, route_xyz, rng)
+    if crowd.people:
+        _add_people(session, crowd.people, rng)
+
+
+def _add_vehicles(
+    session: Session, count: int, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
+) -> None:
+    library = session.world.get_blueprint_library().filter("vehicle.*")
+    kinds = sorted(thing.id for thing in library if thing.has_attribute("number_of_wheels"))
+    spots = []
+    for spot in session.world.get_map().get_spawn_points():
+        xy = xyz_of(spot.location)[:2]
+        away_m = np.hypot(*(route_xyz[:, :2] - xy).T)
+        if away_m.min() < NEAR_ROUTE_M and away_m[0] > FREE_M:
+            spots.append(spot)
+    for i in rng.permutation(len(spots)).tolist():
+        if count <= 0 or not kinds:
+            break
+        kind = kinds[int(rng.integers(len(kinds)))]
+        vehicle = session.spawn(kind, _pose_at(spots[i]), {"role_name": "autopilot"})
+        if vehicle is not None:
+            vehicle.set_autopilot(True, session.traffic.get_port())
+            count -= 1
+
+
+def _add_people(session: Session, count: int, rng: np.random.Generator) -> None:
+    kinds = sorted(thing.id for thing in session.world.get_blueprint_library().filter("walker.pedestrian.*"))
+    controllers = list[Any]()
+    for _ in range(count * TRIES):
+        place = session.world.get_random_location_from_navigation()
+        if place is None or not kinds or len(controllers) == count:
+            break
+        kind = kinds[int(rng.integers(len(kinds)))]
+        pose = CarlaPose(place.x, place.y, place.z + ABOVE_M, yaw_deg=float(rng.uniform(-180.0, 180.0)))
+        walker = session.spawn(kind, pose, {"is_invincible": "false"})
+        if walker is None:
+            continue
+        controller = session.spawn("controller.ai.walker", CarlaPose(0.0, 0.0, 0.0), {}, attach_to=walker)
+        if controller is not None:
+            controllers.append(controller)
+    session.tick()  # walkers exist for the navigation from here on
+    for controller in controllers:
+        _let_walk(session, controller, rng)
+
+
+def _let_walk(session: Session, controller: Any, rng: np.random.Generator) -> None:
+    controller.start()
+    controller.set_max_speed(float(rng.uniform(*WALKING_MPS)))
+    goal = session.world.get_random_location_from_navigation()
+    if goal is not None:
+        controller.go_to_location(goal)
+
+
+def _pose_at(transform: Any) -> CarlaPose:
+    location, rotation = transform.location, transform.rotation
+    pose = CarlaPose(location.x, location.y, location.z, rotation.roll, rotation.pitch, rotation.yaw)
+    return pose._replace(z=pose.z + ABOVE_M)

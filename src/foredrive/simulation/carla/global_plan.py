@@ -1,0 +1,61 @@
+"""The route as the leaderboard gives it: few points, each with what to do from there on."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.data.commands import LOOKAHEAD_M
+from foredrive.errors import InputError
+from foredrive.scene import Command
+from foredrive.simulation.carla.frames import xyz_of
+from foredrive.simulation.route_progress import Progress, RouteLine
+
+COMMAND_OF_OPTION = {
+    "LEFT": Command.LEFT,
+    "RIGHT": Command.RIGHT,
+    "CHANGELANELEFT": Command.LEFT,
+    "CHANGELANERIGHT": Command.RIGHT,
+}
+"""By the names of CARLA's `RoadOption`; all others (STRAIGHT, LANEFOLLOW, VOID) go straight on."""
+
+
+class GlobalPlan:
+    """A route of N points.
+
+    Args:
+        plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` leaves them. An
+        option
+            holds from its point to the next.
+
+    Raises:
+        InputError: it has less than two points, or no length.
+    """
+
+    def __init__(self, plan: Sequence[tuple[Any, Any]]) -> None:
+        self.xy: Float64[np.ndarray, "N 2"] = np.array(
+            [xyz_of(transform.location)[:2] for transform, _ in plan], dtype=float
+        ).reshape(-1, 2)
+        self._arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.xy, axis=0).T)))
+        if len(plan) < 2 or not self._arc_m[-1] > 0:
+            raise InputError(f"a route has two points or more at different places, got {len(plan)}")
+        self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]
+        self._line = RouteLine(np.column_stack([self.xy, np.zeros(len(plan))]))
+
+    def advance(
+        self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
+    ) -> Progress:
+        """The progress of a vehicle that is at a point now."""
+        return self._line.advance(progress, xy, speed_mps, t_s)
+
+    def command(self, progress: Progress) -> Command:
+        """The first turn or change of lanes that is under way or begins within `LOOKAHEAD_M`.
+
+        That is about when commands turn in training (`data.commands`), but for bends outside of junctions, of
+        which the few points do not tell.
+        """
+        first = int(np.searchsorted(self._arc_m, progress.done_m, side="right")) - 1
+        last = int(np.searchsorted(self._arc_m, progress.done_m + LOOKAHEAD_M))
+        soon = self._commands[max(first, 0) : max(last, 1)]
+        return next((command for command in soon if command is not Command.STRAIGHT), Command.STRAIGHT)

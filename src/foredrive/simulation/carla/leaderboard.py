@@ -1,0 +1,141 @@
+"""A Foredrive agent by the interface of CARLA's leaderboards 1.0, 2.0 and 2.1, and of Bench2Drive's fork.
+
+What they hand over in `run_step` becomes a `Clip`, twice a second; the agent's plan is followed by our
+controller at 20 Hz. Nothing is used that the track SENSORS does not have: cameras, satellites, IMU,
+speedometer, the route.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from foredrive.data.collate import stack_records
+from foredrive.errors import InputError
+from foredrive.scene import Agent, CameraRig, Clip
+from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
+from foredrive.simulation.carla.frames import ego_in_actor, pose_of, yaw_of_compass
+from foredrive.simulation.carla.global_plan import GlobalPlan
+from foredrive.simulation.carla.localization import (
+    GeoFrame,
+    Whereabouts,
+    fit_geo_frame,
+    lat_lon_of,
+    locate,
+)
+from foredrive.simulation.carla.sensors import camera_specs, image_of, mounting
+from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.dynamics import STEP_S, BicycleState
+from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.plans import fixed_in_world
+from foredrive.simulation.route_progress import Progress
+from foredrive.towns.recorder import boxes_of
+
+GPS, IMU, SPEED = "GPS", "IMU", "SPEED"
+COMPASS_AT = 6
+"""In what the IMU sends, after three accelerations and three turn rates."""
+
+
+class LeaderboardDriver:
+    """Drives one route.
+
+    Args:
+        agent: sees batches of one clip.
+        rig: its cameras, without leading dimensions; None for an agent that needs none. Leaderboard 1.0
+            allows four, 2.x and Bench2Drive eight.
+        past_frames: key frames before now that it looks at; until it has them the vehicle stands.
+
+    Raises:
+        InputError: CARLA has no such cameras.
+    """
+
+    def __init__(self, agent: Agent, rig: CameraRig | None, past_frames: int) -> None:
+        T_actor_ego = ego_in_actor()
+        self._agent, self._rig, self._past_frames = agent, rig, past_frames
+        axle = mounting(pose_of(T_actor_ego))
+        self._sensors = [
+            *([] if rig is None else camera_specs(rig, T_actor_ego)),
+            {"type": "sensor.other.gnss", "id": GPS} | axle,
+            {"type": "sensor.other.imu", "id": IMU} | axle,
+            {"type": "sensor.speedometer", "id": SPEED},
+        ]
+        self._plan: GlobalPlan | None = None
+        self._frames: tuple[KeyFrame, ...] = ()
+        self._where: Whereabouts | None = None
+        self._following, self._asked, self._progress = Following(), Asked(), Progress()
+        self._steer = 0.0
+        self._next_frame_s = 0.0
+
+    def sensors(self) -> list[dict[str, Any]]:
+        """What the leaderboard is to mount."""
+        return [dict(sensor) for sensor in self._sensors]
+
+    def set_route(
+        self, plan_gps: Sequence[tuple[dict[str, float], Any]], plan_world: Sequence[tuple[Any, Any]]
+    ) -> None:
+        """The route, as the base class keeps it in `_global_plan` and `_global_plan_world_coord`.
+
+        Raises:
+            InputError: it has no length, or the two do not go together.
+        """
+        if len(plan_gps) != len(plan_world):
+            raise InputError(f"a route of {len(plan_world)} points, but {len(plan_gps)} by satellite")
+        self._plan = GlobalPlan(plan_world)
+        self._geo: GeoFrame = fit_geo_frame(lat_lon_of(plan_gps), self._plan.xy)
+
+    def step(self, input_data: Mapping[str, tuple[int, Any]], t_s: float) -> Pedals:
+        """What to do in the step that begins now.
+
+        Args:
+            input_data: for each sensor the number of the frame, and what it sent.
+
+        Raises:
+            InputError: there is no route, or a sensor has sent nothing.
+        """
+        if self._plan is None:
+            raise InputError("the leaderboard has given no route")
+        if missing := sorted({sensor["id"] for sensor in self._sensors} - set(input_data)):
+            raise InputError(f"sensors that sent nothing: {', '.join(missing)}")
+        lat, lon, _ = (float(value) for value in input_data[GPS][1])
+        speed_mps = max(float(input_data[SPEED][1]["speed"]), 0.0)
+        yaw_rad = yaw_of_compass(float(input_data[IMU][1][COMPASS_AT]))
+        last = self._where
+        near = self._plan.xy[0] if last is None else np.array([last.x_m, last.y_m])
+        self._where = locate(last, self._geo.xy(lat, lon, near), yaw_rad, speed_mps, t_s)
+        here = np.array([self._where.x_m, self._where.y_m])
+        self._progress = self._plan.advance(self._progress, here, speed_mps, t_s)
+        where, steering_rad = self._where, steering_rad_of(self._steer)
+        ego = BicycleState(where.x_m, where.y_m, where.yaw_rad, speed_mps, steering_rad)
+        if t_s > self._next_frame_s - 0.5 * STEP_S:
+            self._next_frame_s = t_s + FRAME_DT_S
+            self._see(input_data, self._where, speed_mps)
+            if len(self._frames) > self._past_frames:
+                plan = fixed_in_world(self._agent.act(stack_records([self._clip()])), ego, t_s)
+                self._following = self._following.expecting(plan, t_s)
+        control, self._following = follow(self._following, ego, t_s)
+        pedals, self._asked = actuate(control, speed_mps, self._asked)
+        self._steer = pedals.steer
+        return pedals
+
+    def _see(self, input_data: Mapping[str, tuple[int, Any]], at: Whereabouts, speed_mps: float) -> None:
+        images = no_images()
+        if self._rig is not None:
+            images = torch.stack([_image(self._rig, name, input_data[name][1]) for name in self._rig.names])
+        T = at.T_world_ego
+        frame = KeyFrame(at.t_s, T, speed_mps, images, None, boxes_of([], T))
+        self._frames = (*self._frames, frame)[-1 - self._past_frames :]
+
+    def _clip(self) -> Clip:
+        assert self._plan is not None
+        clip = make_clip(self._frames, self._rig, self._plan.command(self._progress))
+        return dataclasses.replace(clip, boxes_valid=torch.zeros_like(clip.boxes_valid))
+
+
+def _image(rig: CameraRig, name: str, sent: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:
+    if sent.shape[:2] != rig.size_hw:
+        raise InputError(f"camera {name} sent {sent.shape[:2]} pixels instead of {rig.size_hw}")
+    return image_of(sent)

@@ -1,0 +1,131 @@
+"""Our sensors as CARLA mounts them, and what they send as our tensors."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int, UInt8
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.scene import CameraRig, LidarSweep
+from foredrive.sensors import SpinningLidar
+from foredrive.simulation.carla.frames import CarlaPose, camera_pose, mirrored, pose_of
+from foredrive.simulation.dynamics import STEP_S
+
+CAMERA, LIDAR = "sensor.camera.rgb", "sensor.lidar.ray_cast"
+PIXEL_TOLERANCE = 0.01
+
+
+def camera_specs(rig: CameraRig, T_actor_ego: Float64[np.ndarray, "4 4"]) -> list[dict[str, Any]]:
+    """The cameras of a rig in the form of the leaderboard's `sensors()`: m and degrees on CARLA's actor.
+
+    Args:
+        rig: without leading dimensions.
+
+    Raises:
+        InputError: CARLA has no such camera: it knows pinholes with square pixels, the principal point in the
+            middle of the image and a global shutter.
+    """
+    height, width = rig.size_hw
+    specs = []
+    for i, name in enumerate(rig.names):
+        fx, fy, cx, cy = (float(rig.K[i][at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        wrong = max(abs(fy - fx), abs(cx - 0.5 * width), abs(cy - 0.5 * height))
+        if wrong > PIXEL_TOLERANCE or bool(rig.dist[i].any()) or float(rig.readout_s[i]) > 0:
+            raise InputError(
+                f"camera {name}: CARLA's have square pixels, a centred principal point, no distortion and a "
+                f"global shutter; this one has fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f} of {width}, cy {cy:.2f} "
+                f"of {height}, dist {rig.dist[i].tolist()}, readout {float(rig.readout_s[i])} s"
+            )
+        fov_deg = math.degrees(2 * math.atan(0.5 * width / fx))
+        pose = camera_pose(rig.T_ego_cam[i].double().numpy(), T_actor_ego)
+        what = {"type": CAMERA, "id": name, "width": width, "height": height, "fov": fov_deg}
+        specs.append(what | mounting(pose))
+    return specs
+
+
+def camera_attributes(spec: dict[str, Any]) -> dict[str, str]:
+    """The attributes of a camera's blueprint: its pictures are what falls in, without effects of a lens.
+
+    Rendered at every step; only those of key frames are looked at. `sensor_tick` would spare the others, but
+    counts in floating point and may miss the frame that is waited for.
+    """
+    return {
+        "image_size_x": str(spec["width"]),
+        "image_size_y": str(spec["height"]),
+        "fov": repr(float(spec["fov"])),
+        "lens_k": "0.0",
+        "lens_kcube": "0.0",
+        "lens_circle_falloff": "0.0",
+        "sensor_tick": "0.0",
+    }
+
+
+def lidar_attributes(lidar: SpinningLidar) -> dict[str, str]:
+    """The attributes of a lidar's blueprint: one revolution a simulation step, without random dropout.
+
+    CARLA's channels lie evenly between the highest and the lowest, all beams of a step leave at once.
+    """
+    channels = len(lidar.elevation_rad)
+    return {
+        "channels": str(channels),
+        "range": repr(lidar.max_range_m),
+        "points_per_second": str(round(channels * lidar.azimuth_steps / STEP_S)),
+        "rotation_frequency": repr(1 / STEP_S),
+        "upper_fov": repr(round(math.degrees(max(lidar.elevation_rad)), 4)),
+        "lower_fov": repr(round(math.degrees(min(lidar.elevation_rad)), 4)),
+        "dropoff_general_rate": "0.0",
+        "dropoff_intensity_limit": "1.0",
+        "dropoff_zero_intensity": "0.0",
+        "noise_stddev": repr(lidar.range_noise_m),
+        "sensor_tick": "0.0",
+    }
+
+
+def lidar_pose(lidar: SpinningLidar, T_actor_ego: Float64[np.ndarray, "4 4"]) -> CarlaPose:
+    """Where a lidar is mounted on CARLA's actor."""
+    return pose_of(T_actor_ego @ lidar.T_ego_lidar.double().numpy())
+
+
+def mounting(pose: CarlaPose) -> dict[str, float]:
+    """A pose under the leaderboard's names."""
+    x, y, z, roll, pitch, yaw = pose
+    return {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
+
+
+def image_of(bgra: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:
+    """A picture as CARLA's cameras send it: B, G, R, and an alpha that means nothing."""
+    return torch.from_numpy(np.ascontiguousarray(bgra[..., 2::-1].transpose(2, 0, 1)))
+
+
+def bgra_of(image: Any) -> UInt8[np.ndarray, "H W 4"]:
+    """The pixels of a `carla.Image`."""
+    return np.frombuffer(image.raw_data, dtype=np.uint8).reshape(image.height, image.width, 4)
+
+
+def sweep_of(
+    points: Float32[np.ndarray, "N 4"], counts: Int[np.ndarray, "C"], lidar: SpinningLidar
+) -> LidarSweep:
+    """What a lidar has sent in one step: returns alone, CARLA tells nothing of beams that meet nothing.
+
+    Args:
+        points: x, y, z, intensity in the lidar's left-handed axes, channel by channel, highest first.
+        counts: returns of each channel.
+    """
+    T = lidar.T_ego_lidar.double().numpy()
+    along = mirrored(points[:, :3].astype(np.float64))
+    range_m = np.linalg.norm(along, axis=1)
+    direction = along / np.maximum(range_m, 1e-6)[:, None] @ T[:3, :3].T
+    known = (range_m >= lidar.min_range_m).tolist()
+    return LidarSweep(
+        origin_ego=torch.from_numpy(np.tile(T[:3, 3], (len(points), 1))).float(),
+        dir_ego=torch.from_numpy(direction).float(),
+        range_m=torch.from_numpy(range_m).float(),
+        returned=torch.tensor(known, dtype=torch.bool),
+        intensity=torch.from_numpy(points[:, 3].copy()),
+        dt_s=torch.zeros(len(points)),
+        beam=torch.from_numpy(np.repeat(np.arange(len(counts)), counts)),
+        valid=torch.tensor(known, dtype=torch.bool),
+    )

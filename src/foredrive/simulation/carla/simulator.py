@@ -1,0 +1,290 @@
+"""CARLA as a simulator (`simulation.drive.RoadSimulator`): scenarios, steps and events as those of a town."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.scene import Boxes, Clip, Control, Event, LidarSweep, Step
+from foredrive.sensors import SpinningLidar
+from foredrive.simulation.carla import sensors as carla_sensors
+from foredrive.simulation.carla.actors import Contact, actor_state, collision
+from foredrive.simulation.carla.client import answering, import_carla
+from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
+from foredrive.simulation.carla.crowd import ABOVE_M, add_crowd
+from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of, pose_of, xyz_of
+from foredrive.simulation.carla.road import CarlaRoad
+from foredrive.simulation.carla.session import TRAFFIC_PORT, Receiver, Session
+from foredrive.simulation.carla.weather import weather_of
+from foredrive.simulation.drive import Standing
+from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
+from foredrive.simulation.lane_rules import RuleState, left_lanes
+from foredrive.simulation.observation import KeyFrame, make_clip, no_images
+from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.town import FRAME_STEPS, SETTLE_S, TownScenario
+from foredrive.towns.conditions import draw_daylight
+from foredrive.towns.recorder import BOXES_WITHIN_M, boxes_of
+
+EGO_BLUEPRINT = "vehicle.lincoln.mkz_2020"
+"""The vehicle whose sizes `dynamics.EGO` has."""
+HOLD = Pedals(throttle=0.0, brake=1.0, steer=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CarlaState:
+    """A drive at one time, as far as it is known here: the world itself is on the server."""
+
+    step_index: int
+    ego: BicycleState
+    T_world_ego: Float64[np.ndarray, "4 4"]
+    frames: tuple[KeyFrame, ...] = ()
+    asked: Asked = field(default_factory=Asked)
+    contact: Contact = field(default_factory=Contact)
+    rules: RuleState = field(default_factory=RuleState)
+    progress: Progress = field(default_factory=Progress)
+    ended: str | None = None
+    """Why the drive is over, if it is."""
+
+    @property
+    def t_s(self) -> float:
+        """Since the drive began."""
+        return self.step_index * STEP_S
+
+
+class _Ego(NamedTuple):
+    """The vehicle and what it carries."""
+
+    vehicle: Any
+    T_actor_ego: Float64[np.ndarray, "4 4"]
+    cameras: Sequence[Receiver]
+    lidar: Receiver | None
+    collisions: Receiver
+
+
+class CarlaSimulator:
+    """A `Simulator` over a server of CARLA; drives are not repeatable bit by bit, and cannot be saved.
+
+    A context manager: at the end, whatever has happened, the server has its actors destroyed and runs by
+    itself again. An interrupt between two steps is covered by that, or by the end of the process.
+
+    Args:
+        client: a `carla.Client`, see `client.connect`.
+        timeout_s: how long to wait for what a sensor sends.
+        traffic_port: of the traffic manager; one for each simulator on a machine.
+    """
+
+    state: CarlaState
+
+    def __init__(self, client: Any, timeout_s: float = 20.0, traffic_port: int = TRAFFIC_PORT) -> None:
+        self._client, self._timeout_s, self._traffic_port = client, timeout_s, traffic_port
+        self._session: Session | None = None
+
+    def ego(self) -> BicycleState:
+        """The ego vehicle now."""
+        return self.state.ego
+
+    def standing(self) -> Standing:
+        """How far the drive has come."""
+        rules = self.state.rules
+        completion = min(1.0, self.state.progress.done_m / self._route.length_m)
+        return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
+
+    def reset(self, scenario: TownScenario) -> Clip:
+        """Load the town and start a drive; the vehicle stands until traffic has set in.
+
+        Raises:
+            InputError: the server lacks the town, a blueprint or an answer; there is no room for the vehicle;
+                the rig has cameras that CARLA has not.
+        """
+        self.close()
+        self._scenario, self._route = scenario, RouteLine(scenario.route_xyz)
+        start = _start(scenario.route_xyz)
+        self._session = Session(self._client, scenario.town, scenario.seed, self._traffic_port)
+        try:
+            with answering("setting the scene"):
+                return self._set_scene(self._session, start)
+        except BaseException:
+            self.close()
+            raise
+
+    def step(self, control: Control) -> Step:
+        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+
+        Raises:
+            InputError: the drive is over, the control is not finite, or the server does not answer.
+        """
+        if self._session is None or self.state.ended is not None:
+            raise InputError("there is no drive under way: reset the simulator")
+        if not math.isfinite(control.acceleration_mps2 + control.steering_rad):
+            raise InputError(f"a step needs finite controls, got {control}")
+        try:
+            with answering("a simulation step"):
+                return self._drive(self._session, control)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the server as it was found."""
+        if self._session is not None:
+            session, self._session = self._session, None
+            session.close()
+
+    def __enter__(self) -> "CarlaSimulator":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _set_scene(self, session: Session, start: CarlaPose) -> Clip:
+        scenario, rng = self._scenario, np.random.default_rng(self._scenario.seed)
+        self._make_control = import_carla().VehicleControl
+        session.world.set_weather(weather_of(scenario.conditions or draw_daylight(rng)))
+        session.world.reset_all_traffic_lights()
+        self._ego = self._spawn_ego(session, start)
+        add_crowd(session, scenario.crowd, scenario.route_xyz, rng)
+        session.tick()  # what a new world holds is listed from the next frame on
+        self._road = CarlaRoad(session.world)
+        before = max(round(SETTLE_S / STEP_S), scenario.past_frames * FRAME_STEPS)
+        self.state = CarlaState(-before, BicycleState(0.0, 0.0, 0.0, 0.0), np.eye(4))
+        for index in range(-before + 1, 1):
+            frame, T, ego = self._advance(session, HOLD)
+            self.state = dataclasses.replace(self.state, step_index=index, ego=ego, T_world_ego=T)
+            if index % FRAME_STEPS == 0:
+                self.state = dataclasses.replace(
+                    self.state, frames=self._with_frame(session, self.state, frame)
+                )
+        self._ego.collisions.all()  # where it was let down
+        self._clip = self._make_clip(self.state)
+        return self._clip
+
+    def _spawn_ego(self, session: Session, start: CarlaPose) -> _Ego:
+        vehicle = session.spawn(EGO_BLUEPRINT, start, {"role_name": "hero"})
+        if vehicle is None:
+            raise InputError(f"there is no room for the ego vehicle in {self._scenario.town} at {start}")
+        T_actor_ego = ego_in_actor(vehicle.bounding_box.location.x)
+        suite, cameras, lidar = self._scenario.sensors, list[Receiver](), None
+
+        def mount(kind: str, name: str, pose: CarlaPose, attributes: dict[str, str]) -> Receiver:
+            sensor = session.spawn(kind, pose, attributes, attach_to=vehicle)
+            if sensor is None:
+                raise InputError(f"CARLA cannot mount {name} at {pose}")
+            return Receiver(sensor, name)
+
+        if suite is not None:
+            for spec in carla_sensors.camera_specs(suite.rig, T_actor_ego):
+                pose = CarlaPose(*(spec[key] for key in ("x", "y", "z", "roll", "pitch", "yaw")))
+                attributes = carla_sensors.camera_attributes(spec)
+                cameras.append(mount(carla_sensors.CAMERA, spec["id"], pose, attributes))
+            pose = carla_sensors.lidar_pose(suite.lidar, T_actor_ego)
+            attributes = carla_sensors.lidar_attributes(suite.lidar)
+            lidar = mount(carla_sensors.LIDAR, "lidar", pose, attributes)
+        collisions = mount("sensor.other.collision", "collisions", CarlaPose(0.0, 0.0, 0.0), {})
+        return _Ego(vehicle, T_actor_ego, cameras, lidar, collisions)
+
+    def _advance(
+        self, session: Session, pedals: Pedals
+    ) -> tuple[int, Float64[np.ndarray, "4 4"], BicycleState]:
+        """One step with some pedals: the frame's number and where the vehicle is then."""
+        vehicle = self._ego.vehicle
+        vehicle.apply_control(self._make_control(**pedals._asdict()))
+        frame = session.tick()
+        T = matrix_of(vehicle.get_transform()) @ self._ego.T_actor_ego
+        speed = max(float(xyz_of(vehicle.get_velocity()) @ T[:3, 0]), 0.0)
+        gained = (speed - self.state.ego.speed_mps) / STEP_S
+        heading = math.atan2(T[1, 0], T[0, 0])
+        steering = steering_rad_of(pedals.steer)
+        return frame, T, BicycleState(float(T[0, 3]), float(T[1, 3]), heading, speed, steering, gained)
+
+    def _drive(self, session: Session, control: Control) -> Step:
+        state = self.state
+        pedals, asked = actuate(control, state.ego.speed_mps, state.asked)
+        frame, T, ego = self._advance(session, pedals)
+        index = state.step_index + 1
+        t_s = index * STEP_S
+        events, contact = self._collisions(state, T, t_s)
+        more, rules = self._road.check(state.ego, ego, float(T[2, 3]), state.rules, t_s)
+        progress = self._route.advance(state.progress, T[:2, 3], ego.speed_mps, t_s)
+        ended = self._route.end_of(progress, t_s, self._scenario.limit_s)
+        events += more
+        if ended is not None:
+            if rules.left_at is not None:
+                events.append(left_lanes(rules.left_at, rules.left_m, t_s))
+            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
+            events.append(Event(ended, t_s, (ego.x_m, ego.y_m), text))
+        state = CarlaState(index, ego, T, state.frames, asked, contact, rules, progress, ended)
+        if index % FRAME_STEPS == 0:
+            state = dataclasses.replace(state, frames=self._with_frame(session, state, frame))
+            self._clip = self._make_clip(state)
+        self.state = state
+        return Step(self._clip, events, ended is not None)
+
+    def _collisions(
+        self, before: CarlaState, T: Float64[np.ndarray, "4 4"], t_s: float
+    ) -> tuple[list[Event], Contact]:
+        middle = T[:2, 3] + EGO.axle_to_centre_m * T[:2, 0]
+        velocity = before.ego.speed_mps * np.array([np.cos(before.ego.yaw_rad), np.sin(before.ego.yaw_rad)])
+        events, contact = list[Event](), before.contact
+        for event in self._ego.collisions.all():
+            found, contact = collision(event, middle, velocity, t_s, contact)
+            if found is not None:
+                events.append(found)
+        return events, contact
+
+    def _with_frame(self, session: Session, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
+        """The key frames with the one of now, as many as an observation has."""
+        suite, images, sweep = self._scenario.sensors, no_images(), None
+        if suite is not None and self._ego.lidar is not None:
+            images = self._images(frame)
+            sweep = _sweep(self._ego.lidar.at(frame, self._timeout_s), suite.lidar)
+        boxes = self._boxes(session, state.T_world_ego)
+        now = KeyFrame(state.t_s, state.T_world_ego, state.ego.speed_mps, images, sweep, boxes)
+        return (*state.frames, now)[-1 - self._scenario.past_frames :]
+
+    def _images(self, frame: int) -> UInt8[Tensor, "C 3 H W"]:
+        sent = [camera.at(frame, self._timeout_s) for camera in self._ego.cameras]
+        return torch.stack([carla_sensors.image_of(carla_sensors.bgra_of(image)) for image in sent])
+
+    def _boxes(self, session: Session, T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
+        found = [actor_state(a) for a in session.world.get_actors() if a.id != self._ego.vehicle.id]
+        near = [
+            actor
+            for actor in found
+            if actor is not None and np.linalg.norm(actor.centre_m - T_world_ego[:3, 3]) < BOXES_WITHIN_M
+        ]
+        return boxes_of(near, T_world_ego)
+
+    def _make_clip(self, state: CarlaState) -> Clip:
+        suite = self._scenario.sensors
+        rig = None if suite is None else suite.rig
+        clip = make_clip(state.frames, rig, self._route.command(state.progress))
+        return dataclasses.replace(clip, misses_known=torch.zeros_like(clip.misses_known))
+
+
+def _sweep(measurement: Any, lidar: SpinningLidar) -> LidarSweep:
+    points = np.frombuffer(measurement.raw_data, dtype=np.float32).reshape(-1, 4)
+    counts = np.array([measurement.get_point_count(k) for k in range(measurement.channels)])
+    return carla_sensors.sweep_of(points, counts, lidar)
+
+
+def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> CarlaPose:
+    """Where CARLA's actor is put so that the rear axle stands where the route begins, along it."""
+    away_m = np.hypot(*(route_xyz[:, :2] - route_xyz[0, :2]).T)
+    ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
+    if not len(ahead):
+        raise InputError("a route is longer than a vehicle")
+    forward = route_xyz[ahead[0]] - route_xyz[0]
+    forward /= np.linalg.norm(forward)
+    left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(*forward[:2])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
+    T[:3, 3] = route_xyz[0] + EGO.axle_to_centre_m * forward
+    pose = pose_of(T)
+    return pose._replace(z=pose.z + ABOVE_M)
