@@ -78,7 +78,7 @@ class CarlaRoad:
         if lane.is_junction or aside_m > 0.5 * lane.lane_width or lane.lane_type != self._lane_type.Driving:
             return False
         turned = math.remainder(yaw_rad - math.atan2(forward[1], forward[0]), 2 * math.pi)
-        return abs(turned) > WRONG_WAY_RAD
+        return bool(abs(turned) > WRONG_WAY_RAD)
 
 
 def lines_at(waypoints: Sequence[tuple[int, Any]], lights: int) -> Lines:
