@@ -51,7 +51,7 @@ def drive(
         workers: How many drives run at a time; 0 is one for each core.
         ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
     """
-    from foredrive.recipes.driving import DriveSuite, drive_suite
+    from foredrive.recipes.driving import DriveSuite, claim, drive_suite
     from foredrive.view.drive_report import write_drive_report
 
     suite = DriveSuite(
@@ -67,6 +67,7 @@ def drive(
         period_s=period,
         latency_s=latency,
     )
+    claim(suite, out)
     cores = len(os.sched_getaffinity(0))
     with _Progress(suite) as progress:
         driven = drive_suite(suite, out, workers or cores, on_ray=ray, tick=progress.tick)

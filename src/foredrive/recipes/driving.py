@@ -120,10 +120,9 @@ def drive_suite(
         InputError: there is no such driver or set of routes, or the folder holds another suite.
         OSError: the disk is full.
     """
-    needs_of(suite.driver)
     routes = load_route_set(suite.routes)
     jobs = [DriveJob(route.id, n) for n in range(suite.repetitions) for route in routes]
-    _claim(suite, out)
+    claim(suite, out)
     drives, broken = {}, {}
     for job in jobs:
         if _file(out, job).is_file():
@@ -259,12 +258,13 @@ def _kept(drive: Drive, route: DriveRoute, wall_s: float) -> dict[str, Any]:
     }
 
 
-def _claim(suite: DriveSuite, out: Path) -> None:
-    """Note in the folder whose it is.
+def claim(suite: DriveSuite, out: Path) -> None:
+    """Note in a folder whose it is.
 
     Raises:
-        InputError: it is another's.
+        InputError: it is another's, or there is no such driver.
     """
+    needs_of(suite.driver)
     wanted = json.loads(json.dumps(dataclasses.asdict(suite)))
     path = out / SUITE
     if not path.is_file():
