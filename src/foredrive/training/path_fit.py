@@ -44,7 +44,7 @@ def fit_path(correction: PathCorrection, shown: PathDemonstrations, fit: PathFit
     optimizer = torch.optim.AdamW(correction.parameters(), lr=fit.lr, weight_decay=fit.weight_decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)
     order = torch.Generator().manual_seed(seed)
-    correction.train()
+    correction.train().requires_grad_(True)  # pre-training has left planners out
     with torch.random.fork_rng():
         torch.manual_seed(seed)  # of dropout
         for _ in range(fit.steps):
