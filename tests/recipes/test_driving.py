@@ -11,9 +11,21 @@ from foredrive.data.logs import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.recipes.drivers import needs_of
-from foredrive.recipes.driving import DriveJob, Driven, DriveSuite, drive_suite, read_drive, score_of
+from foredrive.recipes.driving import (
+    DriveJob,
+    Driven,
+    DriveSuite,
+    drive_suite,
+    read_drive,
+    scenario_of,
+    score_of,
+)
 from foredrive.scene import VoxelSpec
+from foredrive.simulation.route_sets import RouteWaypoints
+from foredrive.simulation.routes import snap_route
+from foredrive.simulation.scenarios.places import scenarios_on
 from foredrive.simulation.scores import Ending
+from foredrive.simulation.town import grow
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.drive_report import write_drive_report
@@ -69,8 +81,22 @@ def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> Non
     assert len(find_logs(out)) == 2
     summary = read_summary(out / "summary.json")
     assert (summary["routes"], summary["drives"], summary["failed"]) == (2, 2, 0)
+    assert summary["scenarios.cut_in"] == 0  # routes are too short for any
     mean = np.mean([score_of(kept).driving_score_1_0 for kept in driven.drives.values()])
     assert summary["driving_score_1_0"] == pytest.approx(mean)
+
+
+def test_scenarios_are_those_of_the_drives_seed(suite: DriveSuite) -> None:
+    graph = build_lane_graph(load_town_map("Town02"))
+    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
+    ends = graph.position(np.full(2, lane), np.array([5.0, graph.length_m[lane] - 5.0]))
+    route = snap_route(RouteWaypoints("straight", "Town02", ends))
+    first, second = (scenario_of(suite, route, repetition) for repetition in (0, 1))
+    expected = scenarios_on(route, grow("Town02", 1), 1)
+    assert [(s.kind, s.at_m) for s in second.scenarios] == [(s.kind, s.at_m) for s in expected]
+    assert len(first.scenarios) >= 1
+    without = scenario_of(dataclasses.replace(suite, scenarios=False), route, 0)
+    assert without.scenarios == ()
 
 
 def test_what_lies_there_is_not_driven_again(driven: Driven, suite: DriveSuite, out: Path) -> None:

@@ -25,6 +25,7 @@ def drive(
     image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256),
     vehicles: int = 30,
     people: int = 20,
+    scenarios: bool = True,
     period: Annotated[float, tyro.conf.arg(metavar="S")] = 0.5,
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1,
     workers: int = 0,
@@ -46,6 +47,7 @@ def drive(
         image_size: Size of the six cameras' images, px.
         vehicles: How many vehicles share the road near the ego vehicle.
         people: How many pedestrians do.
+        scenarios: Let others brake, cut in, run lights and step out on the way, in CARLA's manner.
         period: Time between plans.
         latency: How much later than what it saw a plan takes effect.
         workers: How many drives run at a time; 0 is one for each core.
@@ -64,6 +66,7 @@ def drive(
         image_hw=image_size,
         vehicles=vehicles,
         people=people,
+        scenarios=scenarios,
         period_s=period,
         latency_s=latency,
     )

@@ -10,6 +10,7 @@ import functools
 import json
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ from foredrive.simulation.drive import Drive, Pace, drive_route
 from foredrive.simulation.drive_log import drive_log, key_frame
 from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
+from foredrive.simulation.scenarios.kinds import ScenarioKind
+from foredrive.simulation.scenarios.places import scenarios_on
 from foredrive.simulation.scores import (
     Ending,
     Infraction,
@@ -36,7 +39,7 @@ from foredrive.simulation.scores import (
     timeout_s,
 )
 from foredrive.simulation.time_to_collision import LEAST_S
-from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.simulation.town import TownScenario, TownSimulator, grow
 from foredrive.towns.conditions import find_conditions
 from foredrive.towns.recorder import Crowd
 from foredrive.towns.sensing.capture import SensorSuite
@@ -65,6 +68,8 @@ class DriveSuite:
     image_hw: tuple[int, int] = (144, 256)
     vehicles: int = Crowd.vehicles
     people: int = Crowd.people
+    scenarios: bool = True
+    """Whether others brake, cut in, run lights and step out on the way, as the seed decides."""
     period_s: float = Pace.period_s
     latency_s: float = Pace.latency_s
 
@@ -171,16 +176,19 @@ def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownSc
     """The circumstances of one drive."""
     needs = needs_of(suite.driver)
     seen = needs.cameras or suite.sensors
+    seed = suite.seed + repetition
+    happens = scenarios_on(route, grow(route.town, seed), seed) if suite.scenarios else ()
     return TownScenario(
         town=route.town,
         route_xyz=route.xyz,
-        seed=suite.seed + repetition,
+        seed=seed,
         lanes=route.lanes,
         crowd=Crowd(suite.vehicles, suite.people),
         conditions=None if suite.conditions is None else find_conditions(suite.conditions),
         sensors=SensorSuite(camera_rig(suite.image_hw), roof_lidar()) if seen else None,
         past_frames=needs.past_frames,
         limit_s=timeout_s(route.length_m),
+        scenarios=happens,
     )
 
 
@@ -223,6 +231,8 @@ def summarise(drives: Sequence[dict[str, Any]]) -> dict[str, float | int | str |
     out |= {f"endings.{ending}": count for ending, count in suite.endings.items()}
     out |= {f"infractions.{kind}": count for kind, count in suite.infractions.items()}
     out |= {f"infractions_per_km.{kind}": each for kind, each in suite.infractions_per_km.items()}
+    begun = Counter(e["what"] for drive in drives for e in drive["events"] if e["kind"] == "scenario")
+    out |= {f"scenarios.{kind}": begun[kind] for kind in ScenarioKind}
     comfortable = [drive["comfort"]["comfortable_share"] for drive in drives if drive["comfort"]]
     near = [seconds is not None and seconds < LEAST_S for drive in drives for seconds in drive["nearest_s"]]
     plan_ms = [1000 * seconds for drive in drives for seconds in drive["act_s"]]

@@ -31,7 +31,7 @@ def key_frame(simulator: TownSimulator) -> Frame:
     names = () if simulator.scenario.sensors is None else simulator.scenario.sensors.rig.names
     images = frame.images.permute(0, 2, 3, 1).numpy()
     aside_mps2 = ego.speed_mps * yaw_rate_radps(ego)
-    lights = simulator.traffic.zone_lights(simulator.traffic_now.time_s)
+    lights = simulator.traffic.zone_lights(simulator.state.decided.time_s)
     return Frame(
         t_us=FIRST_TIME_US + round(frame.t_s * 1e6),
         T_world_ego=frame.T_world_ego,

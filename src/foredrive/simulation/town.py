@@ -17,6 +17,9 @@ from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users
 from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.scenarios.kinds import Scenario
+from foredrive.simulation.scenarios.play import Director
+from foredrive.simulation.scenarios.scene import Ego, Play
 from foredrive.towns.conditions import Conditions
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import BOXES_WITHIN_M, Crowd, boxes_of
@@ -29,7 +32,10 @@ from foredrive.towns.world import World
 
 TRAFFIC_STEPS = 2
 """The others decide at 10 Hz what they do, as in recordings; in between they are on their straight way."""
+DECISION_S = TRAFFIC_STEPS * STEP_S
 FRAME_STEPS = round(FRAME_DT_S / STEP_S)
+GUESTS = 6
+"""So many vehicles of scenarios are on the road at one time at most."""
 SETTLE_S = 3.0
 """A drive begins once traffic has left its first, unlikely state; until then the ego vehicle stands."""
 
@@ -55,6 +61,8 @@ class TownScenario:
     """Key frames before now in an observation."""
     limit_s: float = np.inf
     """The drive ends after this time."""
+    scenarios: tuple[Scenario, ...] = ()
+    """What happens on the way, in the order it is met, as `scenarios_on` finds it for route and seed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +77,8 @@ class TownState:
     """At the last time that the others decided."""
     decided: TrafficState
     """One decision later, which they are on their way to."""
+    play: Play
+    """Of the scenarios, when that was decided."""
     frames: tuple[KeyFrame, ...]
     contacts: Contacts = field(default_factory=Contacts)
     rules: RuleState = field(default_factory=RuleState)
@@ -80,6 +90,16 @@ class TownState:
     def t_s(self) -> float:
         """Since the drive began."""
         return self.step_index * STEP_S
+
+
+@dataclass(frozen=True, eq=False)
+class Foresight:
+    """What would be, did the traffic's own rules drive the ego vehicle, which is vehicle 0 here."""
+
+    t_s: float
+    traffic: TrafficState
+    play: Play
+    progress: Progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,17 +134,18 @@ class TownSimulator:
             raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
         row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))
         lanes = np.array(scenario.lanes, dtype=np.int64) if scenario.lanes else None
-        traffic = self._traffic.start(row, lanes)
-        decision_s = TRAFFIC_STEPS * STEP_S
-        before = max(round(SETTLE_S / decision_s), scenario.past_frames * FRAME_STEPS // TRAFFIC_STEPS)
+        play, traffic = self._director.set_up(
+            self._traffic.start(row, lanes), self._seen(ego, Progress(), z_m, 0.0), DECISION_S
+        )
+        before = max(round(SETTLE_S / DECISION_S), scenario.past_frames * FRAME_STEPS // TRAFFIC_STEPS)
         frames: tuple[KeyFrame, ...] = ()
         for number in range(-before, 1):
+            state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, play, frames)
             if number * TRAFFIC_STEPS % FRAME_STEPS == 0:
-                state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, frames)
                 frames = self._with_frame(state)
             if number < 0:
-                traffic = self._traffic.step(traffic, decision_s, driven)
-        self._adopt(TownState(0, ego, z_m, traffic, traffic, frames))
+                play, traffic = self._decide(state)
+        self._adopt(TownState(0, ego, z_m, traffic, traffic, play, frames))
         return self._clip
 
     def step(self, control: Control) -> Step:
@@ -138,16 +159,21 @@ class TownSimulator:
             raise InputError(f"the drive is over ({state.ended}): reset the simulator")
         moved = step(state.ego, control)
         if state.step_index % TRAFFIC_STEPS == 0:
-            driven = self._driven(state.ego, state.z_m)
-            decided = self._traffic.step(state.decided, TRAFFIC_STEPS * STEP_S, driven)
-            state = dataclasses.replace(state, traffic=state.decided, decided=decided)
+            play, decided = self._decide(state)
+            state = dataclasses.replace(state, traffic=state.decided, decided=decided, play=play)
             self._users = self._users[1], road_users(self._traffic, decided)
+        begun = state.play.begun[len(self.state.play.begun) :]
         state, events = self._drive(state, moved)
+        events = [*(self._begin_of(number) for number, _ in begun), *events]
         if state.step_index % FRAME_STEPS == 0:
             state = dataclasses.replace(state, frames=self._with_frame(state))
             self.state, self._clip = state, self._make_clip(state)
         self.state = state
         return Step(self._clip, events, state.ended is not None)
+
+    def _begin_of(self, number: int) -> Event:
+        state, kind = self.state, self._scenario.scenarios[number].kind
+        return Event("scenario", state.t_s, (state.ego.x_m, state.ego.y_m), what=kind.value)
 
     @property
     def scenario(self) -> TownScenario:
@@ -163,10 +189,22 @@ class TownSimulator:
         """The rules that the others go by."""
         return self._traffic
 
-    @property
-    def traffic_now(self) -> TrafficState:
-        """The others now, if they decide now; else when they decide next."""
-        return self.state.decided
+    def foresight(self) -> Foresight:
+        """Now, if the others decide now; else when they decide next."""
+        state = self.state
+        traffic = self._traffic.taken_over(state.decided, self.driven)
+        return Foresight(state.t_s, traffic, state.play, state.progress)
+
+    def foreseen(self, now: Foresight) -> Foresight:
+        """What comes `DECISION_S` later."""
+        v, poses, route = now.traffic.vehicles, self._traffic.poses(now.traffic), self._route
+        xyz, speed, t_s = poses.axle_xyz[0], float(v.speed_mps[0]), now.t_s
+        progress = route.advance(now.progress, xyz[:2], speed, t_s)
+        motion = speed, float(v.acceleration_mps2[0])
+        ego = Ego(t_s, progress.done_m, *motion, poses.centre_m[0], float(poses.yaw[0]))
+        play, traffic, orders = self._director.direct(now.play, now.traffic, ego, DECISION_S)
+        after = self._traffic.step(traffic, DECISION_S, orders=orders)
+        return Foresight(t_s + DECISION_S, after, play, progress)
 
     @property
     def driven(self) -> Driven:
@@ -192,17 +230,31 @@ class TownSimulator:
     def _prepare(self, scenario: TownScenario) -> None:
         self._scenario = scenario
         town, crowd = load_town_map(scenario.town), scenario.crowd
-        self._world = _grow(scenario.town, scenario.seed)
+        self._world = grow(scenario.town, scenario.seed)
         self._traffic = _rules_of(scenario.town, scenario.seed, crowd)
         if scenario.conditions is not None:
             self._world = self._world.under(scenario.conditions)
         self._collisions = CollisionSense(self._world)
         self._rules = LaneRules(town, self._traffic)
         self._route = RouteLine(scenario.route_xyz)
+        self._director = Director(self._traffic, scenario.scenarios)
 
     def _adopt(self, state: TownState) -> None:
         self.state, self._clip = state, self._make_clip(state)
         self._users = road_users(self._traffic, state.traffic), road_users(self._traffic, state.decided)
+
+    def _decide(self, state: TownState) -> tuple[Play, TrafficState]:
+        """What the others do next."""
+        seen = self._seen(state.ego, state.progress, state.z_m, state.t_s)
+        play, traffic, orders = self._director.direct(state.play, state.decided, seen, DECISION_S)
+        driven = self._driven(state.ego, state.z_m)
+        return play, self._traffic.step(traffic, DECISION_S, driven, orders)
+
+    def _seen(self, ego: BicycleState, progress: Progress, z_m: float, t_s: float) -> Ego:
+        """The ego vehicle as scenarios see it."""
+        driven = self._driven(ego, z_m)
+        middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
+        return Ego(t_s, progress.done_m, ego.speed_mps, ego.acceleration_mps2, middle, ego.yaw_rad)
 
     def _drive(self, state: TownState, moved: BicycleState) -> tuple[TownState, list[Event]]:
         """Move the ego vehicle unless something stops it, and see what comes of that."""
@@ -215,7 +267,7 @@ class TownSimulator:
             moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
             T = self._pose(moved, state.z_m)
         z_m = float(T[2, 3])
-        lights = self._traffic.zone_lights(state.traffic.time_s + part * TRAFFIC_STEPS * STEP_S)
+        lights = self._traffic.zone_lights(state.traffic.time_s + part * DECISION_S)
         more, rules = self._rules.check(state.ego, moved, z_m, lights, state.rules, t_s)
         progress = self._route.advance(state.progress, T[:2, 3], moved.speed_mps, t_s)
         ended = self._route.end_of(progress, t_s, self._scenario.limit_s)
@@ -279,13 +331,14 @@ class TownSimulator:
 
 
 @lru_cache(maxsize=1)  # drives in a row are often in one town
-def _grow(town: str, seed: int) -> World:
+def grow(town: str, seed: int) -> World:
+    """The place of drives in a town with a seed, in bright daylight."""
     return World(load_town_map(town), seed)
 
 
 @lru_cache(maxsize=1)
 def _rules_of(town: str, seed: int, crowd: Crowd) -> Traffic:
-    return Traffic(load_town_map(town), seed, crowd.vehicles + 1, crowd.people)
+    return Traffic(load_town_map(town), seed, crowd.vehicles + 1, crowd.people, GUESTS)
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:

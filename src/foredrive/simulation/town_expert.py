@@ -1,8 +1,9 @@
 """The privileged driver of a town: it knows everybody's state and rules, and so what comes of its driving.
 
 Twice a second it lets the town go on in imagination with itself as one of the drivers, by the very rules that
-drive in recordings (`towns.traffic`): right of way, lights, gaps, lane changes for its route. Where that
-brings it is its plan. It is the ceiling of all that learn from recordings.
+drive in recordings (`towns.traffic`): right of way, lights, gaps, lane changes for its route; what scenarios
+hold ready for it happens there as well. Where that brings it is its plan. It is the ceiling of all that learn
+from recordings.
 """
 
 import dataclasses
@@ -13,14 +14,12 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.town import TownSimulator
+from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator
 from foredrive.towns.traffic.driven import Driven
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import Vehicles
 
-DECISION_S = 0.1
-"""Of the others, as in recordings."""
 EVERY, STEPS = 2, 15
 """Waypoints lie so many decisions apart: 3 s in all."""
 LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
@@ -36,24 +35,25 @@ class TownExpert:
 
     def __init__(self, simulator: TownSimulator) -> None:
         self._simulator = simulator
-        self._imagined: list[TrafficState] = []
+        self._imagined: list[Foresight] = []
 
     def act(self, observation: Clip) -> Trajectory:
         """The plan from the simulator's now on, whatever was observed."""
-        traffic, now = self._simulator.traffic, self._simulator.traffic_now
-        here = self._simulator.driven
-        state = self._gone_on(traffic, traffic.taken_over(now, here), here)
-        self._imagined = [state]
-        if traffic.stands_back(state):
+        simulator, traffic = self._simulator, self._simulator.traffic
+        here, now = simulator.driven, simulator.foresight()
+        now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
+        self._imagined = [now]
+        if traffic.stands_back(now.traffic):
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
-            self._imagined.append(traffic.step(self._imagined[-1], DECISION_S))
-        ahead = [traffic.poses(then).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]
+            self._imagined.append(simulator.foreseen(self._imagined[-1]))
+        ahead = [traffic.poses(then.traffic).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]
         return _in_ego_frame(np.stack(ahead)[:, :2], here)
 
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: Driven) -> TrafficState:
         """With the path and the lane change that were meant, if the vehicle is where they lead."""
-        meant = next((s for s in self._imagined if abs(s.time_s - state.time_s) < 0.5 * DECISION_S), None)
+        known = (then.traffic for then in self._imagined)
+        meant = next((then for then in known if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
         if meant is None:
             return state
         poses = traffic.poses(meant)

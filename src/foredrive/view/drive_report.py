@@ -184,11 +184,16 @@ def _drive_row(name: str, drive: Mapping[str, Any]) -> str:
 def _drive(name: str, drive: Mapping[str, Any]) -> str:
     score = score_of(dict(drive))
     error = f'<p class="alert">{escape(drive["error"])}</p>' if drive["error"] else ""
-    told = "".join(
-        f"<li>{infraction.t_s:.1f} s: {_words(infraction.kind)} {escape(infraction.what)} "
-        f"{escape(infraction.detail)}</li>"
+    lines = [
+        (
+            infraction.t_s,
+            f"<b>{_words(infraction.kind)}</b> {escape(infraction.what)} {escape(infraction.detail)}",
+        )
         for infraction in score.infractions
-    )
+    ]
+    scenarios = (event for event in drive["events"] if event["kind"] == "scenario")
+    lines += [(event["t_s"], f"scenario: {_words(event['what'])}") for event in scenarios]
+    told = "".join(f"<li>{t_s:.1f} s: {text}</li>" for t_s, text in sorted(lines))
     return (
         f'<h3 id="{name}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'
         f"{error}"

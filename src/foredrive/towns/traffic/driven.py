@@ -7,6 +7,7 @@ lanes, drives against them or comes out of nowhere.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from foredrive.scene import Category
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.near_lanes import NearLanes
 from foredrive.towns.traffic.paths import towards
+from foredrive.towns.traffic.strays import Stray
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts
 
 LANE_REACH_M = 2.5
@@ -28,7 +30,9 @@ PATH_LOOK = 4
 HALF_CORRIDOR_M = 1.3
 """What is nearer to the middle of a lane is in the way there."""
 SOON_S = 1.0
-"""Outside of junctions drivers see so early that somebody comes into their lane."""
+"""Outside of junctions drivers see so early that a vehicle comes into their lane,"""
+STRAYS_SOON_S = (1.0, 2.0, 3.0)
+"""and up to so early that somebody on foot or on a bicycle does."""
 SLOWEST_MPS = 0.5
 HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
 """Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
@@ -79,12 +83,6 @@ class SeenDriven:
     """Whose requests for right of way count: those of vehicle 0 only while it really comes."""
 
     @property
-    def decides(self) -> Bool[np.ndarray, "M"]:
-        """Who drives himself: neither vehicle 0 nor shadows."""
-        every = np.arange(len(self.everyone.active))
-        return (every > 0) & (every < self.count)
-
-    @property
     def centre_m(self) -> Float64[np.ndarray, "3"]:
         """The middle of vehicle 0 on the ground."""
         return self.driven.axle_xyz + self.everyone.axle_to_centre_m[0] * self.driven.forward
@@ -100,8 +98,7 @@ class SeenDriven:
 
     def without_shadows(self, moved: Vehicles) -> Vehicles:
         """The vehicles alone, once all have moved; vehicle 0 stays in its slot, wherever it is."""
-        kept = Vehicles(**{name: value[: self.count] for name, value in vars(moved).items()})
-        return _replaced(kept, active=True)
+        return _replaced(moved.first(self.count), active=True)
 
 
 def see_driven(
@@ -136,11 +133,9 @@ def see_driven(
             has_stopped=bool(vehicles.has_stopped[0]) and passed == 0,
             shift_m=0.0,
         )
-    beside = _shadows(near, graph, placed, driven)
-    everyone = Vehicles(
-        **{name: np.concatenate([value, getattr(beside, name)]) for name, value in vars(placed).items()}
-    )
-    everyone, may_ask = _on_its_way(graph, everyone, time_s)
+    own = placed.path[0, BEHIND - 1 : BEHIND + 2] if placed.active[0] else np.zeros(0, dtype=np.int64)
+    beside = _shadows(near, graph, driven, placed.axle_to_centre_m[0], placed.size_lwh[0], own)
+    everyone, may_ask = _on_its_way(graph, placed.and_more(beside), time_s)
     return SeenDriven(driven, everyone, len(vehicles.active), route_passed, may_ask)
 
 
@@ -216,12 +211,30 @@ def _path_on(
     return path, passed
 
 
-def _shadows(near: NearLanes, graph: LaneGraph, vehicles: Vehicles, driven: Driven) -> Vehicles:
-    """Vehicles on the lanes that vehicle 0 is in the way of, besides the one it follows."""
-    half, axle_to_centre_m = 0.5 * vehicles.size_lwh[0, :2], vehicles.axle_to_centre_m[0]
-    own = vehicles.path[0, BEHIND - 1 : BEHIND + 2] if vehicles.active[0] else np.zeros(0, dtype=np.int64)
+def stray_shadows(graph: LaneGraph, near: NearLanes, strays: Sequence[Stray]) -> Vehicles:
+    """Vehicles on the lanes that strays under way are in the way of, or soon will be."""
+    shadows, nobodys = empty_slots(0), np.zeros(0, dtype=np.int64)
+    for stray in strays:
+        if stray.is_under_way:
+            as_driven = Driven(stray.xyz, stray.yaw_rad, stray.speed_mps)
+            size = stray.size_lwh
+            shadows = shadows.and_more(_shadows(near, graph, as_driven, 0.0, size, nobodys, STRAYS_SOON_S))
+    return shadows
+
+
+def _shadows(
+    near: NearLanes,
+    graph: LaneGraph,
+    driven: Driven,
+    axle_to_centre_m: float,
+    size_lwh: Float64[np.ndarray, "3"],
+    own: Int[np.ndarray, "k"],
+    soon_s: tuple[float, ...] = (SOON_S,),
+) -> Vehicles:
+    """Vehicles on the lanes that somebody is in the way of, besides those of his own."""
+    half = 0.5 * size_lwh[:2]
     rows: dict[int, tuple[float, float, float]] = {}
-    times_s = (0.0, SOON_S) if driven.speed_mps > SLOWEST_MPS else (0.0,)
+    times_s = (0.0, *soon_s) if driven.speed_mps > SLOWEST_MPS else (0.0,)
     for time_s in times_s:
         then = driven.later(time_s)
         centre = then.axle_xyz + axle_to_centre_m * then.forward
@@ -241,7 +254,7 @@ def _shadows(near: NearLanes, graph: LaneGraph, vehicles: Vehicles, driven: Driv
     path = one.path.copy()
     path[:, BEHIND] = list(rows)
     margin = 0.5 * graph.step_m[path[:, BEHIND]]
-    size = np.tile(vehicles.size_lwh[0], (len(rows), 1))
+    size = np.tile(size_lwh, (len(rows), 1))
     size[:, 0] = table[:, 1] - table[:, 0] + 2 * margin
     return dataclasses.replace(
         one,

@@ -4,7 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.traffic.car_following import (
     CRAWL_MPS,
@@ -38,6 +38,20 @@ class Situation(NamedTuple):
         every, ahead = np.arange(len(self.free_mps2)), self.ahead
         following = behind(vehicles, every, self.free_mps2, ahead.limiting, ahead.limiting_gap_m)
         return np.minimum(following, self.halt_mps2)
+
+
+class Choice(NamedTuple):
+    """What N drivers decide."""
+
+    standing: dict[str, np.ndarray]
+    """Their new `granted`, `asked_s`, `rank` and `has_stopped`."""
+    wanted_mps2: Float64[np.ndarray, "N"]
+    situation: Situation
+
+    def where(self, who: Bool[np.ndarray, "N"], other: "Choice") -> "Choice":
+        """For some drivers what is decided otherwise; the situation stays that of all."""
+        standing = {name: np.where(who, other.standing[name], value) for name, value in self.standing.items()}
+        return Choice(standing, np.where(who, other.wanted_mps2, self.wanted_mps2), self.situation)
 
 
 def see_ahead(

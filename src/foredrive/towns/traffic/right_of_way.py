@@ -63,14 +63,17 @@ def claim_junctions(
     green: Bool[np.ndarray, "L"],
     time_s: float,
     may_ask: Bool[np.ndarray, "N"] | None = None,
+    runs: Bool[np.ndarray, "N"] | None = None,
 ) -> RightOfWay:
     """Serve the requests for right of way.
 
     Args:
         green: the lanes that no light forbids to enter.
         may_ask: whose requests count; None: everybody's.
+        runs: who does not heed lights; None: nobody.
     """
-    kept = _withdraw(graph, vehicles, starts_m, green)
+    runs = np.zeros(len(vehicles.active), dtype=np.bool_) if runs is None else runs
+    kept = np.where(runs, vehicles.granted, _withdraw(graph, vehicles, starts_m, green))
     column, line_gap = _next_line(graph, vehicles.path, kept, starts_m, vehicles.front_m)
     lane = vehicles.path[np.arange(len(kept)), column]
     inside = graph.contested[vehicles.lane]
@@ -84,7 +87,8 @@ def claim_junctions(
     if may_ask is not None:
         near &= may_ask
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
-    asks = near & ((_is_green(graph, vehicles.path, column, green) & stop_made) | goes_on)
+    let_go = runs | _is_green(graph, vehicles.path, column, green)
+    asks = near & ((let_go & stop_made) | goes_on)
     asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
     turn = graph.turn_rad[lane]
     waits = np.where(turn > TURN_RAD, LEFT_WAITS_S, np.where(turn < -TURN_RAD, RIGHT_WAITS_S, 0.0))

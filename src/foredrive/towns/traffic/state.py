@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from foredrive.towns.traffic.pedestrians import Pedestrians
+from foredrive.towns.traffic.strays import Stray
 from foredrive.towns.traffic.vehicles import Vehicles
 
 
@@ -23,3 +24,5 @@ class TrafficState:
     others."""
     route_passed: int
     """How many it has left behind."""
+    strays: tuple[Stray, ...] = ()
+    """Whoever goes where no walkway leads."""

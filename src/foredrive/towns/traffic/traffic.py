@@ -4,13 +4,14 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.driven import AT_LINE_M, Driven, SeenDriven, see_driven
-from foredrive.towns.traffic.drivers import Situation, drive, see_ahead
+from foredrive.towns.traffic.appearance import people_actors, stray_actor, vehicle_actors
+from foredrive.towns.traffic.driven import AT_LINE_M, Driven, SeenDriven, see_driven, stray_shadows
+from foredrive.towns.traffic.drivers import Choice, Situation, drive, see_ahead
 from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, find_starts, is_large
 from foredrive.towns.traffic.lane_changes import (
     HAS_TO_MPS2,
@@ -28,14 +29,15 @@ from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph, lane
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
 from foredrive.towns.traffic.near_lanes import NearLanes, near_lanes_of
+from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.paths import extend_paths
 from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pavement, step_pedestrians
 from foredrive.towns.traffic.right_of_way import claim_junctions
 from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.strays import moved_strays
 from foredrive.towns.traffic.turnover import Turnover
 from foredrive.towns.traffic.vehicles import (
     BEHIND,
-    MOTION_S,
     Poses,
     Vehicles,
     empty_slots,
@@ -46,8 +48,6 @@ from foredrive.towns.traffic.vehicles import (
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
-BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
-"""Drivers have a foot on the brake when they slow down by more than the engine does, and when they stand."""
 
 
 class Traffic:
@@ -61,9 +61,12 @@ class Traffic:
         seed: everything random follows from it.
         vehicle_count: vehicles on the road at one time, vehicle 0 included.
         people_count: people on foot at one time, where the town has walkways.
+        guest_count: slots, behind those of the vehicles, for what somebody else puts on the road.
     """
 
-    def __init__(self, town: TownMap, seed: int, vehicle_count: int, people_count: int) -> None:
+    def __init__(
+        self, town: TownMap, seed: int, vehicle_count: int, people_count: int, guest_count: int = 0
+    ) -> None:
         self.seed = seed
         self.lanes: LaneGraph = build_lane_graph(town)
         self.walks: WalkGraph = build_walk_graph(town, self.lanes)
@@ -72,9 +75,10 @@ class Traffic:
         self._zone_count = len(town.stop_zones)
         self._stretches = find_stretches(self.lanes)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
-        self._vehicle_count = vehicle_count
+        self._slot_count = vehicle_count + guest_count
+        self.guest_slots = range(vehicle_count, self._slot_count)
         self._people_count = people_count if len(self.walks.length_m) else 0
-        self._turnover = Turnover(self.lanes, self.walks, self.starts, self._for_large)
+        self._turnover = Turnover(self.lanes, self.walks, self.starts, self._for_large, vehicle_count)
 
     @cached_property
     def near_lanes(self) -> NearLanes:
@@ -94,7 +98,7 @@ class Traffic:
         state = TrafficState(
             time_s=0.0,
             step_index=0,
-            vehicles=empty_slots(self._vehicle_count),
+            vehicles=empty_slots(self._slot_count),
             people=empty_pavement(self._people_count),
             next_track_id=1,
             route=lanes,
@@ -106,42 +110,40 @@ class Traffic:
             state = self._know_path(state, rng)
         return self._turnover.fill(state, rng)
 
-    def step(self, state: TrafficState, dt_s: float, ego: Driven | None = None) -> TrafficState:
+    def step(
+        self, state: TrafficState, dt_s: float, ego: Driven | None = None, orders: Orders | None = None
+    ) -> TrafficState:
         """The state one time step later; equal arguments give equal results.
 
         Args:
             ego: where vehicle 0 is at the time of `state` if somebody outside drives it, on the road or off
                 it: all others react to that, and what becomes of it is not decided here. None: it drives
                 itself, as the others do.
+            orders: for some of the others; None: there are none, and strays stand still.
         """
         rng = np.random.default_rng((self.seed, 2, state.step_index))
         driven = None if ego is None else self._see_driven(state, ego)
+        may_ask = None if driven is None else driven.may_ask
         if driven is not None:
             route_passed = driven.route_passed
             state = dataclasses.replace(state, vehicles=driven.everyone, route_passed=route_passed)
-        v = state.vehicles
-        starts_m = path_starts(self.lanes, v.path)
-        ahead = find_leaders(self.lanes, v, starts_m)
+        known = len(state.vehicles.active)
+        if state.strays:
+            shadows = stray_shadows(self.lanes, self.near_lanes, state.strays)
+            state = dataclasses.replace(state, vehicles=state.vehicles.and_more(shadows))
+            if may_ask is not None:
+                may_ask = np.pad(may_ask, (0, len(shadows.active)), constant_values=True)
+        starts_m = path_starts(self.lanes, state.vehicles.path)
+        orders = (orders or Orders.none(self._slot_count)).padded(len(state.vehicles.active))
         light = self.signals.shows(state.time_s)
-        green = (light == Light.NONE) | (light == Light.GREEN)
-        may_ask = None if driven is None else driven.may_ask
-        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s, may_ask)
-        halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
-        halt_gap = np.minimum(halt_gap, way.inside_gap_m)
-        to_route = self._to_route(state)
-        if to_route is not None:
-            halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
-        situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
-        courtesy_mps2 = self._courtesy_mps2(v, to_route, situation, starts_m)
-        wanted_mps2 = np.minimum(situation.wanted_mps2(v), courtesy_mps2)
-        halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
-        v = dataclasses.replace(
-            v,
-            granted=way.granted,
-            asked_s=way.asked_s,
-            rank=way.rank,
-            has_stopped=v.has_stopped | halted,
-        )
+        choice = self._choose(state, starts_m, light, may_ask, orders.runs)
+        if orders.blind.any():
+            active = state.vehicles.active.copy()
+            active[[0, *range(self._slot_count, known)]] = False
+            unseen = dataclasses.replace(state, vehicles=dataclasses.replace(state.vehicles, active=active))
+            blindly = self._choose(unseen, starts_m, light, may_ask, orders.runs)
+            choice = choice.where(orders.blind, blindly)
+        v = dataclasses.replace(state.vehicles, **choice.standing)
         danger = None if driven is None else driven.danger
         state = dataclasses.replace(
             state,
@@ -149,12 +151,13 @@ class Traffic:
             step_index=state.step_index + 1,
             vehicles=v,
             people=step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng, danger),
+            strays=moved_strays(state.strays, orders.pace_mps, dt_s),
         )
-        changed = self._begin_change(state, situation, driven)
+        changed = self._begin_change(state, choice.situation, driven, orders)
+        wanted_mps2 = np.minimum(choice.wanted_mps2, orders.most_mps2)
         moved = drive(state.vehicles if changed is None else changed, wanted_mps2, dt_s)
-        state = dataclasses.replace(
-            state, vehicles=moved if driven is None else driven.without_shadows(moved)
-        )
+        vehicles = moved.first(self._slot_count) if driven is None else driven.without_shadows(moved)
+        state = dataclasses.replace(state, vehicles=vehicles)
         if changed is not None:
             state = self._know_path(state, rng)
         state = self._change_lanes_at_ends(state, rng)
@@ -176,9 +179,39 @@ class Traffic:
         gap_m = path_starts(self.lanes, v.path[:1])[0, BEHIND + 1 :] - v.front_m[0]
         return bool((contested & (gap_m < AT_LINE_M)).any()) and not self.lanes.contested[v.lane[0]]
 
+    def _choose(
+        self,
+        state: TrafficState,
+        starts_m: Float64[np.ndarray, "M W"],
+        light: Int[np.ndarray, "L"],
+        may_ask: Bool[np.ndarray, "M"] | None,
+        runs: Bool[np.ndarray, "M"],
+    ) -> Choice:
+        """What all drivers make of their situation."""
+        v = state.vehicles
+        ahead = find_leaders(self.lanes, v, starts_m)
+        green = (light == Light.NONE) | (light == Light.GREEN)
+        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s, may_ask, runs)
+        halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
+        halt_gap = np.minimum(halt_gap, way.inside_gap_m)
+        to_route = self._to_route(state)
+        if to_route is not None:
+            halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
+        situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
+        courtesy_mps2 = self._courtesy_mps2(v, to_route, situation, starts_m)
+        wanted_mps2 = np.minimum(situation.wanted_mps2(v), courtesy_mps2)
+        halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
+        standing = {
+            "granted": way.granted,
+            "asked_s": way.asked_s,
+            "rank": way.rank,
+            "has_stopped": v.has_stopped | halted,
+        }
+        return Choice(standing, wanted_mps2, situation)
+
     def _see_driven(self, state: TrafficState, ego: Driven) -> SeenDriven:
-        to_drive = state.route, state.route_passed
-        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, *to_drive, state.time_s)
+        known = state.route, state.route_passed, state.time_s
+        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, *known)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """The `Light` of each of the town's stop zones."""
@@ -193,55 +226,28 @@ class Traffic:
 
     def actors(self, state: TrafficState, skip_ego: bool = True) -> list[ActorState]:
         """All road users; vehicle 0 is left out where it is the ego vehicle."""
-        v, poses = state.vehicles, self.poses(state)
-        before, after = motion(self.lanes, v)
-        velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
-        slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDS_MPS)
-        braking = slows & (v.category != Category.BICYCLE)
-        ego = skip_ego and len(state.route) > 0
-        out = [
-            ActorState(
-                track_id=int(v.track_id[i]),
-                category=Category(int(v.category[i])),
-                centre_m=poses.centre_m[i],
-                yaw=float(poses.yaw[i]),
-                pitch=float(poses.pitch[i]),
-                size_lwh=v.size_lwh[i],
-                velocity_mps=velocity_mps[i],
-                style=int(v.style[i]),
-                parked=False,
-                braking=bool(braking[i]),
-            )
-            for i in np.flatnonzero(v.active)
-            if i > 0 or not ego
+        v = state.vehicles
+        kept = v.active.copy()
+        kept[0] &= not (skip_ego and len(state.route) > 0)
+        return [
+            *vehicle_actors(v, self.poses(state), motion(self.lanes, v), kept),
+            *people_actors(state.people),
+            *map(stray_actor, state.strays),
         ]
-        p = state.people
-        for i in np.flatnonzero(p.active):
-            out.append(
-                ActorState(
-                    track_id=int(p.track_id[i]),
-                    category=Category.PEDESTRIAN,
-                    centre_m=p.xyz[i] + [0.0, 0.0, 0.5 * p.size_lwh[i, 2]],
-                    yaw=float(p.yaw[i]),
-                    pitch=0.0,
-                    size_lwh=p.size_lwh[i],
-                    velocity_mps=p.velocity_mps[i],
-                    style=int(p.style[i]),
-                    parked=False,
-                )
-            )
-        return out
 
     def _begin_change(
-        self, state: TrafficState, situation: Situation, driven: SeenDriven | None
+        self, state: TrafficState, situation: Situation, driven: SeenDriven | None, orders: Orders
     ) -> Vehicles | None:
-        """Let the one driver who gains most by it change lanes; None if nobody does."""
+        """Let the one driver who has to, or gains most by it, change lanes; None if nobody does."""
         v = state.vehicles
+        if orders.change is not None:
+            return begin_change(self.lanes, v, *orders.change)
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
         urge = self._route_urge(state)
         may = who_may_change(self.lanes, self._stretches, v, fits, urge >= HAS_TO_MPS2)
-        if driven is not None:
-            may &= driven.decides
+        may &= np.isinf(orders.most_mps2)
+        may[:, self._slot_count :] = False  # shadows
+        may[:, 0] &= driven is None
         change = choose_change(self.lanes, self._stretches, v, situation, may, urge)
         if change is None:
             return None

@@ -30,11 +30,17 @@ NEWCOMER_BRAKING_MPS2 = 1.0
 
 
 class Turnover:
-    """Fills the free slots of a town's traffic."""
+    """Fills the free slots of a town's traffic, of vehicles the first `vehicle_count`."""
 
     def __init__(
-        self, lanes: LaneGraph, walks: WalkGraph, starts: Starts, for_large: Bool[np.ndarray, "L"]
+        self,
+        lanes: LaneGraph,
+        walks: WalkGraph,
+        starts: Starts,
+        for_large: Bool[np.ndarray, "L"],
+        vehicle_count: int,
     ) -> None:
+        self._vehicle_count = vehicle_count
         self._lanes, self._walks, self._starts, self._for_large = lanes, walks, starts, for_large
         self._for_bicycles = lanes.limit_mps <= MOTORWAY_LIMIT_MPS
         walkable = np.where(walks.is_crossing, 0.0, walks.length_m)
@@ -80,7 +86,7 @@ class Turnover:
         ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
         """New vehicles in up to `most` free slots, at least `beyond_m` from an ego vehicle."""
-        rows = np.flatnonzero(~state.vehicles.active)[:most]
+        rows = np.flatnonzero(~state.vehicles.active[: self._vehicle_count])[:most]
         places = np.arange(len(self._starts.lane))
         if ego_m is not None and len(rows):
             distance = np.linalg.norm(self._starts.xyz - ego_m, axis=1)

@@ -111,6 +111,16 @@ class Vehicles:
         """These vehicles further along."""
         return dataclasses.replace(self, s_m=self.s_m + distance_m, changed_m=self.changed_m + distance_m)
 
+    def first(self, count: int) -> "Vehicles":
+        """The first so many of them."""
+        return Vehicles(**{name: value[:count] for name, value in vars(self).items()})
+
+    def and_more(self, more: "Vehicles") -> "Vehicles":
+        """With others behind them."""
+        return Vehicles(
+            **{name: np.concatenate([value, getattr(more, name)]) for name, value in vars(self).items()}
+        )
+
     def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Vehicles") -> "Vehicles":
         """These vehicles with some slots taken over by the k vehicles of `other`."""
         changed = {}

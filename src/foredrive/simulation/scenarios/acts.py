@@ -1,0 +1,225 @@
+"""What the vehicles of a scenario are told to do."""
+
+import dataclasses
+
+import numpy as np
+
+from foredrive.simulation.scenarios.cast import RUN_UP_M, is_let_go
+from foredrive.simulation.scenarios.kinds import SPARE_M, ScenarioKind, arrival_s, cruise_mps, stopping_m
+from foredrive.simulation.scenarios.scene import Scene
+from foredrive.towns.traffic.guests import granted_through
+
+MOVES_MPS = 1.0
+"""Who comes to meet the ego vehicle looks at it only while it is slower."""
+PASSED_M = 6.0
+SETS_OFF_M, SLOW = 48.0, 0.55
+"""Who drives ahead stands until the ego vehicle is so near, and then drives at this part of the limit."""
+BRAKES_MPS2, BRAKES_S = 6.0, 4.5
+FOLLOWED_M, FOLLOWED_S = 40.0, 4.0
+"""A lead vehicle brakes when it is followed so near for so long, or before the ego vehicle comes too near."""
+STANDS_MPS, STANDS_WITHIN_M, STANDS_S, BLOCKS_S = 0.3, 25.0, 3.0, 40.0
+"""A vehicle that blocks the lane drives on when it has been waited behind for so long, or after all."""
+CUTS_IN_S, LEAST_CUT_M = 5.0, 4.0
+BESIDE_M, ASIDE_M = 9.0, 2.0
+RUNS_MPS2 = 2.5
+"""Who would have to brake harder than this for a line can be seen not to stop."""
+ROOM_M = 3.4
+"""Half the road that crossing vehicles need."""
+GATHERS_MPS2, FASTEST = 3.0, 1.15
+EASY, SETS_OUT_S = 0.6, 0.5
+"""Who waits to run a light counts on this part of the limit, and on so long until he really accelerates."""
+CREEP_MPS, NEAR_M = 4.0, 35.0
+LONGEST_WAIT_S = 60.0
+RESERVES_M = 50.0
+"""Others stand back for a vehicle that runs a light once it is so near."""
+
+
+def act(scene: Scene, dt_s: float) -> Scene:
+    """The scene with the orders for its vehicles; a scenario that is over gives way to the next."""
+    play, ego = scene.play, scene.ego
+    if scene.scenario.kind is ScenarioKind.CUT_IN and play.since_s is not None:
+        return _come_over(scene, play.since_s)
+    places_m = [scene.along_m(slot) for slot in play.cast]
+    lead_m = places_m[0] if places_m else None
+    if ego.front_gap_m(scene.scenario.at_m) < -PASSED_M or (play.cast and places_m[-1] is None):
+        return scene._replace(play=play.after())
+    if lead_m is None:
+        return scene if not play.cast else scene._replace(play=play.after())
+    match scene.scenario.kind:
+        case ScenarioKind.LEAD_BRAKES:
+            follows = _follows(scene, _gap_m(scene, lead_m))
+            return _lead(_waiting(scene, dt_s, follows), lead_m, dt_s)
+        case ScenarioKind.OBSTACLE_BEHIND_CORNER:
+            return _block(_waiting(scene, dt_s, _stands_behind(scene)))
+        case ScenarioKind.CUT_IN:
+            return _cut_in(scene, lead_m)
+        case _:
+            return _meet(_waiting(scene, dt_s, True), lead_m)
+
+
+def _waiting(scene: Scene, dt_s: float, goes_on: bool) -> Scene:
+    """With the time that has been waited counted on, or from now."""
+    waited_s = scene.play.waited_s + dt_s if goes_on else 0.0
+    return scene._replace(play=dataclasses.replace(scene.play, waited_s=waited_s))
+
+
+def _over(scene: Scene) -> Scene:
+    return scene._replace(play=scene.play.after())
+
+
+def _begun(scene: Scene) -> Scene:
+    return scene._replace(play=scene.play.beginning(scene.ego.t_s))
+
+
+def _gap_m(scene: Scene, lead_m: float) -> float:
+    """From the ego vehicle's bumper to the rear of a vehicle ahead on the route or beside it."""
+    on_route_m = scene.scenario.at_m - (scene.way.meet_m - lead_m)
+    return scene.ego.front_gap_m(on_route_m) - scene.half_m(scene.play.cast[0])
+
+
+def _cruise_ahead(scene: Scene, gap_m: float) -> None:
+    """Slowly, once the ego vehicle is near."""
+    slot = scene.play.cast[0]
+    goes = scene.ego.has_set_out and (gap_m < SETS_OFF_M or scene.speed_mps(slot) > MOVES_MPS)
+    scene.towards_mps(slot, SLOW * scene.scenario.limit_mps if goes else 0.0)
+
+
+def _lead(scene: Scene, lead_m: float, dt_s: float) -> Scene:
+    play, ego, slot = scene.play, scene.ego, scene.play.cast[0]
+    if play.since_s is not None:
+        if ego.t_s - play.since_s > BRAKES_S:
+            return _over(scene)
+        scene.orders.most_mps2[slot] = -BRAKES_MPS2
+        return scene
+    gap_m, lead_mps = _gap_m(scene, lead_m), scene.speed_mps(slot)
+    _cruise_ahead(scene, gap_m)
+    least_m = ego.stopping_m() - lead_mps**2 / (2 * BRAKES_MPS2)
+    soon_m = least_m + SPARE_M + ego.speed_mps * dt_s
+    if _follows(scene, gap_m) and gap_m >= least_m and (gap_m < soon_m or play.waited_s > FOLLOWED_S):
+        scene.orders.most_mps2[slot] = -BRAKES_MPS2
+        return _begun(scene)
+    return scene
+
+
+def _follows(scene: Scene, gap_m: float) -> bool:
+    lead_mps = scene.speed_mps(scene.play.cast[0])
+    return 0.0 < gap_m < FOLLOWED_M and scene.ego.speed_mps > MOVES_MPS and lead_mps > MOVES_MPS
+
+
+def _block(scene: Scene) -> Scene:
+    play, ego, slot = scene.play, scene.ego, scene.play.cast[0]
+    gap_m = ego.front_gap_m(scene.scenario.at_m) - scene.half_m(slot)
+    if play.since_s is None and gap_m < ego.stopping_m() + SPARE_M and ego.speed_mps > MOVES_MPS:
+        scene = _begun(scene)
+    if play.waited_s > STANDS_S or (play.since_s is not None and ego.t_s - play.since_s > BLOCKS_S):
+        return _over(scene)
+    scene.orders.most_mps2[slot] = -BRAKES_MPS2
+    return scene
+
+
+def _stands_behind(scene: Scene) -> bool:
+    ego = scene.ego
+    gap_m = ego.front_gap_m(scene.scenario.at_m)
+    return ego.speed_mps < STANDS_MPS and gap_m < STANDS_WITHIN_M and ego.has_set_out
+
+
+def _cut_in(scene: Scene, lead_m: float) -> Scene:
+    ego, slot, gap_m = scene.ego, scene.play.cast[0], _gap_m(scene, lead_m)
+    _cruise_ahead(scene, gap_m)
+    closing_mps = ego.speed_mps - scene.speed_mps(slot)
+    # It goes on as it does: what counts is by how much the ego vehicle is faster.
+    least_m = max(stopping_m(closing_mps, ego.acceleration_mps2), LEAST_CUT_M)
+    spare_m = gap_m - least_m
+    if closing_mps > MOVES_MPS and 0.0 < spare_m < SPARE_M + closing_mps and _is_free(scene, slot):
+        change = (slot, scene.scenario.side)
+        return _begun(scene)._replace(orders=dataclasses.replace(scene.orders, change=change))
+    return scene
+
+
+def _come_over(scene: Scene, since_s: float) -> Scene:
+    if scene.ego.t_s - since_s > CUTS_IN_S:
+        return _over(scene)
+    _cruise_ahead(scene, 0.0)
+    return scene
+
+
+def _is_free(scene: Scene, slot: int) -> bool:
+    """Whether nobody is where a vehicle would go over to."""
+    poses, v = scene.traffic.poses(scene.state), scene.state.vehicles
+    ahead = poses.forward[slot, :2]
+    left = np.array([-ahead[1], ahead[0]]) * (1.0 if scene.scenario.side == 0 else -1.0)
+    offset = poses.centre_m[:, :2] - poses.centre_m[slot, :2]
+    there = v.active & (np.abs(offset @ ahead) < BESIDE_M) & (offset @ left > ASIDE_M)
+    there &= offset @ left < 3 * ASIDE_M
+    there[[0, slot]] = False
+    return not there.any()
+
+
+def _meet(scene: Scene, lead_m: float) -> Scene:
+    """Be there when the ego vehicle is. Who runs a light cares for it only until he can be seen to run it;
+    oncoming traffic is never faster than allowed, and drives on as it likes where it is waited for."""
+    scenario, play, ego, slot = scene.scenario, scene.play, scene.ego, scene.play.cast[0]
+    runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
+    scene.orders.blind[list(play.cast)] = ego.speed_mps > MOVES_MPS
+    line_m, room_m = scene.way.line_m - lead_m - scene.half_m(slot), ego.front_gap_m(scenario.at_m - ROOM_M)
+    comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
+    if play.since_s is not None:
+        last_m = scene.along_m(play.cast[-1])
+        if last_m is None or last_m > scene.way.meet_m + scene.half_m(slot) + ROOM_M:
+            return _over(scene)
+        if runs:
+            scene.towards_mps(slot, play.cruise_mps)
+            return _run(scene, slot, line_m)
+        return _synchronised(scene, lead_m, 1.0) if comes and room_m > 0.0 else scene
+    if play.waited_s > LONGEST_WAIT_S:
+        return _over(scene)
+    if not comes or not is_let_go(scene, ego.arrival_s(scenario)) or (runs and _has_time(scene, lead_m)):
+        _wait(scene, slot, line_m if runs else scene.way.meet_m - lead_m)
+        return scene
+    scene = _synchronised(scene, lead_m, FASTEST if runs else 1.0)
+    spare_m = room_m - ego.stopping_m()
+    if not runs:
+        return _begun(scene) if spare_m < SPARE_M else scene
+    if line_m < scene.speed_mps(slot) ** 2 / (2 * RUNS_MPS2):
+        return _run(_begun(scene), slot, line_m)
+    return _over(scene) if spare_m < 0.0 else _run(scene, slot, line_m)
+
+
+def _has_time(scene: Scene, lead_m: float) -> bool:
+    """Whether it is early to set out for a vehicle that stands."""
+    speed, way_m = scene.speed_mps(scene.play.cast[0]), scene.way.meet_m - lead_m
+    needs_s = SETS_OUT_S + arrival_s(way_m, speed, GATHERS_MPS2, EASY * scene.scenario.limit_mps)
+    return speed < MOVES_MPS and scene.ego.arrival_s(scene.scenario) > needs_s
+
+
+def _synchronised(scene: Scene, lead_m: float, fastest: float) -> Scene:
+    """With orders to meet the ego vehicle, no faster than a part of the limit."""
+    slot, scenario = scene.play.cast[0], scene.scenario
+    arrives_s = max(scene.ego.arrival_s(scenario), 0.1)
+    wanted = cruise_mps(scene.way.meet_m - lead_m, arrives_s, scene.speed_mps(slot), GATHERS_MPS2)
+    wanted = min(wanted, fastest * scenario.limit_mps)
+    scene.towards_mps(slot, wanted)
+    return scene._replace(play=dataclasses.replace(scene.play, cruise_mps=wanted))
+
+
+def _wait(scene: Scene, slot: int, to_go_m: float) -> None:
+    """Before the line of a light that will be run; of all others the lights take care."""
+    if scene.scenario.kind is ScenarioKind.RED_LIGHT_RUNNER:
+        scene.towards_mps(slot, min(max((to_go_m - RUN_UP_M) / 3.0, 0.0), CREEP_MPS))
+    elif to_go_m > NEAR_M:
+        scene.towards_mps(slot, CREEP_MPS if scene.ego.has_set_out else 0.0)
+
+
+def _run(scene: Scene, slot: int, line_m: float) -> Scene:
+    scene.orders.runs[slot] = True
+    if line_m > RESERVES_M:
+        return scene
+    lane = next(n for n in scene.way.lanes if scene.traffic.lanes.contested[n] and _begins_m(scene, n) >= 0.0)
+    return scene._replace(state=granted_through(scene.traffic, scene.state, slot, lane))
+
+
+def _begins_m(scene: Scene, lane: int) -> float:
+    """Where on the way a lane begins, from the line on."""
+    lanes = scene.way.lanes
+    length_m = scene.traffic.lanes.length_m[list(lanes[: lanes.index(lane)])].sum()
+    return float(length_m) - scene.way.line_m + 1e-6

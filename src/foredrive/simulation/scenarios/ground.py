@@ -1,0 +1,71 @@
+"""The places of a route: which lane it is on where, which way it points there."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.simulation.lane_search import Leg
+from foredrive.simulation.routes import DriveRoute
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.near_lanes import NearLanes
+from foredrive.towns.world import World
+
+AROUND_M = 25.0
+"""Routes may cross themselves: a place is looked for so near to where it should be."""
+
+
+class Stretch(NamedTuple):
+    """A part of a route on one lane."""
+
+    leg: Leg
+    from_m: float
+    """On the route."""
+    to_m: float
+
+
+class Ground(NamedTuple):
+    """What there is to know of a place."""
+
+    route: DriveRoute
+    graph: LaneGraph
+    near: NearLanes
+    world: World
+
+
+def stretches_of(ground: Ground) -> list[Stretch]:
+    """The route's legs and where on it they begin and end."""
+    route, graph, at_m, found = ground.route, ground.graph, 0.0, []
+    for leg in route.legs:
+        ends = graph.position(np.array([leg.lane, leg.lane]), np.array([leg.from_m, leg.to_m]))
+        from_m = arc_m(route, ends[0], at_m)
+        at_m = arc_m(route, ends[1], from_m + leg.to_m - leg.from_m)
+        found.append(Stretch(leg, from_m, at_m))
+    return found
+
+
+def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> float:
+    """Where a route passes a point, around a place of it."""
+    away_m = np.hypot(*(route.xyz[:, :2] - xyz[:2]).T)
+    away_m[np.abs(route.arc_m - about_m) > AROUND_M] = np.inf
+    return float(route.arc_m[np.argmin(away_m)]) if np.isfinite(away_m).any() else about_m
+
+
+def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]]:
+    """A point of a route, and its heading there."""
+    at, before, after = (
+        np.array([np.interp(at_m + ds, route.arc_m, axis) for axis in route.xyz.T]) for ds in (0.0, -1.5, 1.5)
+    )
+    step = (after - before)[:2]
+    return at, step / np.hypot(*step)
+
+
+def onward(graph: LaneGraph, lane: int, count: int = 4) -> list[int]:
+    """Where a lane leads straight on."""
+    lanes = [lane]
+    for _ in range(count):
+        options = graph.successors[lanes[-1], : graph.successor_count[lanes[-1]]]
+        if not len(options):
+            break
+        lanes.append(int(options[np.argmin(np.abs(graph.turn_rad[options]))]))
+    return lanes[1:]

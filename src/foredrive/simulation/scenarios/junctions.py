@@ -1,0 +1,96 @@
+"""Whom a route meets in junctions: oncoming traffic, and who runs a light."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.simulation.scenarios.ground import Ground, Stretch, arc_m, onward
+from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind, Way
+from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
+
+UPSTREAM_M, LEAST_UPSTREAM_M = 120.0, 62.0
+"""How much straight road vehicles have to come along: what is looked for, and what will do."""
+AHEAD_COS, ACROSS_COS = -0.7, 0.7
+LEAST_APPROACH_M, LEAST_THROUGH_MPS = 50.0, 4.5
+"""Of who has less way to it, or is slower in its turn, nobody knows early enough when he will be there."""
+MEET_M = 2.0
+"""Lanes whose centrelines come so near to each other cross."""
+
+
+def at_junctions(ground: Ground, stretches: list[Stretch]) -> Iterator[Scenario]:
+    """Oncoming traffic at left turns, and who comes from the side at lights."""
+    graph = ground.graph
+    heading = _start_headings(graph)
+    for leg, from_m, to_m in stretches:
+        lane = leg.lane
+        if graph.junction[lane] < 0 or from_m < 1.0:
+            continue
+        ways: dict[ScenarioKind, list[tuple[float, Way]]] = {}
+        for other in np.unique(_conflicting(graph, lane)).tolist():
+            facing = float(np.cos(heading[other] - heading[lane]))
+            lit = graph.control[lane] == Control.LIGHT and graph.control[other] == Control.LIGHT
+            guarded = graph.control[[lane, other]].max() > Control.LIGHT
+            if abs(graph.turn_rad[other]) > TURN_RAD or guarded:
+                continue
+            if graph.turn_rad[lane] > TURN_RAD and facing < AHEAD_COS:
+                kind = ScenarioKind.ONCOMING_TRAFFIC
+            elif lit and abs(facing) < ACROSS_COS:
+                kind = ScenarioKind.RED_LIGHT_RUNNER
+            else:
+                continue
+            met = _met(ground, lane, other, 0.5 * (from_m + to_m))
+            if met is not None:
+                ways.setdefault(kind, []).append(met)
+        limit = float(graph.limit_mps[lane])
+        for kind, found in ways.items():
+            first_m = min(at_m for at_m, _ in found)
+            nearest = tuple(way for at_m, way in found if at_m < first_m + MEET_M)
+            through = float(graph.speed_mps[graph.first[lane] : graph.first[lane] + graph.count[lane]].min())
+            predictable = first_m > LEAST_APPROACH_M and through > LEAST_THROUGH_MPS
+            if kind is ScenarioKind.RED_LIGHT_RUNNER and not predictable:
+                continue
+            yield Scenario(kind, first_m, limit, through, nearest, ego_lane=lane)
+
+
+def _conflicting(graph: LaneGraph, lane: int) -> np.ndarray:
+    return graph.conflicts.other[graph.conflicts.first[lane] : graph.conflicts.first[lane + 1]]
+
+
+def _start_headings(graph: LaneGraph) -> Float64[np.ndarray, "L"]:
+    step = graph.xyz[graph.first + 1] - graph.xyz[graph.first]
+    return np.asarray(np.arctan2(step[:, 1], step[:, 0]))
+
+
+def _met(ground: Ground, lane: int, other: int, about_m: float) -> tuple[float, Way] | None:
+    """Where the route meets another lane, and a way along that; None if it does not or there is no room."""
+    graph = ground.graph
+    mine, theirs = graph.samples(lane), graph.samples(other)
+    apart_m = np.hypot(*(mine[:, None, :2] - theirs[None, :, :2]).transpose(2, 0, 1))
+    i, j = np.unravel_index(int(np.argmin(apart_m)), apart_m.shape)
+    before = _upstream(graph, other)
+    upstream_m = float(graph.length_m[before].sum())
+    if apart_m[i, j] > MEET_M or upstream_m < LEAST_UPSTREAM_M:
+        return None
+    meet_m = upstream_m + float(j * graph.step_m[other])
+    way = Way((*before, other, *onward(graph, other)), meet_m, upstream_m)
+    return arc_m(ground.route, mine[i], about_m), way
+
+
+def _upstream(graph: LaneGraph, lane: int) -> list[int]:
+    """The lanes that lead straight to one, the furthest first."""
+    before: list[int] = []
+    length_m = 0.0
+    while length_m < UPSTREAM_M:
+        options = graph.predecessors[before[0] if before else lane]
+        options = options[options >= 0]
+        if not len(options):
+            break
+        straightest = int(options[np.argmin(np.abs(graph.turn_rad[options]))])
+        if abs(graph.turn_rad[straightest]) > TURN_RAD:
+            break
+        before.insert(0, straightest)
+        length_m += float(graph.length_m[straightest])
+    while before and graph.contested[before[0]]:
+        before.pop(0)
+    return before

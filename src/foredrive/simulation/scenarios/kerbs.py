@@ -1,0 +1,127 @@
+"""Who may come into the road from its edge, and from between parked cars."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.scene import Category
+from foredrive.simulation.collisions import SOLID
+from foredrive.simulation.scenarios.ground import Ground, pose
+from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.towns.actors import ActorState
+from foredrive.towns.traffic.strays import FIRST_TRACK_ID, Stray
+from foredrive.towns.world import World
+
+STEP_M, OFF_LANES_M = 0.5, 1.0
+"""The road ends where there have been no lanes for so long."""
+FURTHEST_RIGHT_M, FURTHEST_LEFT_M = 12.0, 26.0
+RUN_UP_M = 3.0
+"""Cyclists start further from the road."""
+HEIGHTS_M = (0.4, 0.9)
+"""Nothing may stand in the way at these heights."""
+EYE_M = 1.4
+CLEAR_OF_END_M = 5.0
+PARKED_ASIDE_M, PARKED_SKEW_RAD = (1.7, 4.2), 0.3
+"""How far beside the route cars stand, and how much askew, that somebody steps out from."""
+STRAIGHT_M, STRAIGHT_COS = 20.0, 0.97
+"""And how straight the route has to be so far before."""
+STEPS_OUT_M = 0.6
+"""So far before the car."""
+INTO_LANE_M = 0.7
+"""And stops so far right of the route."""
+PEDESTRIAN_LWH, CYCLIST_LWH = (0.5, 0.55, 1.72), (1.75, 0.6, 1.7)
+
+
+def crossing(
+    ground: Ground, at_m: float, limit_mps: float, category: Category, seen_m: float
+) -> Iterator[Scenario]:
+    """Somebody crosses from the right, if the way is clear, and can be seen from so far before it."""
+    point, ahead = pose(ground.route, at_m)
+    left = np.array([-ahead[1], ahead[0], 0.0])
+    right_m = _to_edge_m(ground, point, -left, FURTHEST_RIGHT_M)
+    left_m = _to_edge_m(ground, point, left, FURTHEST_LEFT_M)
+    if right_m is None or left_m is None:
+        return
+    cycles = category is Category.BICYCLE
+    start_m = right_m + (RUN_UP_M if cycles else 0.0)
+    way = np.stack([point - start_m * left, point + left_m * left])
+    eye, _ = pose(ground.route, max(at_m - seen_m, 0.0))
+    if not _is_clear(ground.world, way[0], way[1]) or not _is_seen(ground.world, eye, way[0]):
+        return
+    kind = ScenarioKind.CROSSING_CYCLIST if cycles else ScenarioKind.CROSSING_PEDESTRIAN
+    size = np.array(CYCLIST_LWH if cycles else PEDESTRIAN_LWH)
+    stray = Stray(FIRST_TRACK_ID, category, 0, size, way)
+    yield Scenario(kind, at_m, limit_mps, stray=stray, meet_m=start_m)
+
+
+def _to_edge_m(
+    ground: Ground, point: Float64[np.ndarray, "3"], aside: Float64[np.ndarray, "3"], furthest_m: float
+) -> float | None:
+    """How far it is, straight to one side, to where there are no lanes any more."""
+    graph, near, free_m = ground.graph, ground.near, 0.0
+    for away_m in np.arange(0.0, furthest_m, STEP_M).tolist():
+        here = point + away_m * aside
+        samples = near.within(here, 3.0)
+        off_m = np.hypot(*(near.xyz[samples, :2] - here[:2]).T) - 0.5 * graph.width_m[near.lane[samples]]
+        free_m = 0.0 if (off_m < 0.0).any() else free_m + STEP_M
+        if free_m > OFF_LANES_M:
+            return float(away_m)
+    return None
+
+
+def beside_parked(ground: Ground) -> Iterator[Scenario]:
+    """Who may step out before parked cars."""
+    route, graph = ground.route, ground.graph
+    for car in ground.world.parked:
+        away_m = np.hypot(*(route.xyz[:, :2] - car.centre_m[:2]).T)
+        if away_m.min() > PARKED_ASIDE_M[1]:
+            continue
+        at_m = float(route.arc_m[np.argmin(away_m)]) + 0.5 * float(car.size_lwh[0]) + STEPS_OUT_M
+        scenario = _before_car(ground, car, at_m) if 0.0 < at_m < route.length_m - CLEAR_OF_END_M else None
+        if scenario is not None and graph.junction[_lane_at(ground, at_m)] < 0:
+            yield scenario
+
+
+def _before_car(ground: Ground, car: ActorState, at_m: float) -> Scenario | None:
+    point, ahead = pose(ground.route, at_m)
+    right = np.array([ahead[1], -ahead[0], 0.0])
+    aside_m = float((car.centre_m - point) @ right)
+    skew = (car.yaw - np.arctan2(ahead[1], ahead[0]) + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+    _, before = pose(ground.route, max(at_m - STRAIGHT_M, 0.0))
+    is_beside = PARKED_ASIDE_M[0] < aside_m < PARKED_ASIDE_M[1] and abs(skew) < PARKED_SKEW_RAD
+    if not is_beside or before @ ahead < STRAIGHT_COS:
+        return None
+    start, out = point + aside_m * right, point + INTO_LANE_M * right
+    if not _is_clear(ground.world, start, out):
+        return None
+    limit = float(ground.graph.limit_mps[_lane_at(ground, at_m)])
+    stray = Stray(
+        FIRST_TRACK_ID, Category.PEDESTRIAN, 0, np.array(PEDESTRIAN_LWH), np.stack([start, out, start])
+    )
+    return Scenario(ScenarioKind.DOOR_ZONE, at_m, limit, stray=stray, meet_m=aside_m - INTO_LANE_M)
+
+
+def _lane_at(ground: Ground, at_m: float) -> int:
+    point, _ = pose(ground.route, at_m)
+    _, sample = ground.near.tree.query(point[:2])
+    return int(ground.near.lane[sample])
+
+
+def _is_clear(world: World, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:
+    """Whether nothing stands between two points on the ground."""
+    up = np.array([[0.0, 0.0, height] for height in HEIGHTS_M])
+    origins = np.concatenate([start + up, end + up])
+    way = np.concatenate([np.tile(end - start, (len(up), 1)), np.tile(start - end, (len(up), 1))])
+    return not _is_struck(world, origins, way)
+
+
+def _is_seen(world: World, eye: Float64[np.ndarray, "3"], foot: Float64[np.ndarray, "3"]) -> bool:
+    """Whether a driver sees who stands at a point."""
+    up = np.array([0.0, 0.0, EYE_M])
+    return not _is_struck(world, (eye + up)[None], (foot - eye)[None])
+
+
+def _is_struck(world: World, origin: Float64[np.ndarray, "n 3"], way: Float64[np.ndarray, "n 3"]) -> bool:
+    part, surface = world.struck(origin.astype(np.float32), way.astype(np.float32))
+    return bool(((part <= 1.0) & SOLID[surface]).any())

@@ -1,0 +1,143 @@
+"""Which scenarios a route makes possible where, and those drawn of them from a seed."""
+
+import dataclasses
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from foredrive.scene import Category
+from foredrive.simulation.routes import DriveRoute
+from foredrive.simulation.scenarios.cast import can_drive_ahead, can_stand
+from foredrive.simulation.scenarios.ground import Ground, Stretch, onward, stretches_of
+from foredrive.simulation.scenarios.junctions import at_junctions
+from foredrive.simulation.scenarios.kerbs import beside_parked, crossing
+from foredrive.simulation.scenarios.kinds import SPARE_M, Scenario, ScenarioKind, Way, stopping_m
+from foredrive.towns.traffic.lane_graph import TURN_RAD, build_lane_graph
+from foredrive.towns.traffic.leaders import abreast
+from foredrive.towns.traffic.near_lanes import near_lanes_of
+from foredrive.towns.traffic.strays import FIRST_TRACK_ID
+from foredrive.towns.world import World
+
+FIRST_M, CLEAR_OF_END_M = 28.0, 8.0
+"""The route's begin and end are left alone."""
+ENDS_BEFORE = (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN)
+"""Where these are met is where they have to be over."""
+APART_M, STAGED_APART_M = 80.0, 120.0
+"""Between scenarios: vehicles have to come up out of sight."""
+CHOICE_M = 70.0
+"""Of the scenarios possible on so much of the route one is drawn, of a kind that there were fewest of."""
+STRAY_EVERY_M = 9.0
+AFTER_TURN_M, SEEN_AFTER_TURN_M = 9.0, 8.0
+"""Who crosses behind a corner is so far behind it, and seen so far before."""
+BEHIND_CORNER_M = 16.0
+"""Who stands there is further: in a turn one drives slowly, but is hardly through it."""
+BEFORE_LINE_M = 14.0
+LEAST_STRETCH_M = 45.0
+
+
+def scenarios_on(route: DriveRoute, world: World, seed: int) -> tuple[Scenario, ...]:
+    """Scenarios along a route, in the order they are met, 80 m or more from each other.
+
+    Args:
+        world: the town as the drive has it: grown from the drive's seed.
+        seed: equal seeds give equal scenarios.
+    """
+    rng = np.random.default_rng((seed, *route.id.encode()))
+    drawn = _drawn(possible_scenarios(route, world, rng), rng)
+    return tuple(_numbered(scenario, number, rng) for number, scenario in enumerate(drawn))
+
+
+def possible_scenarios(route: DriveRoute, world: World, rng: np.random.Generator) -> list[Scenario]:
+    """All that could happen on a route, in the order it would be met; of who may cross where, a draw."""
+    graph = build_lane_graph(world.town)
+    ground = Ground(route, graph, near_lanes_of(graph), world)
+    stretches = stretches_of(ground)
+    possible = [*at_junctions(ground, stretches), *_on_stretches(ground, stretches, rng)]
+    possible += beside_parked(ground)
+    last_m = route.length_m - CLEAR_OF_END_M
+    within = [s for s in possible if s.at_m >= FIRST_M and (s.at_m <= last_m or s.kind in ENDS_BEFORE)]
+    return sorted(within, key=lambda scenario: scenario.at_m)
+
+
+def _drawn(possible: Sequence[Scenario], rng: np.random.Generator) -> list[Scenario]:
+    drawn: list[Scenario] = []
+    count: Counter[ScenarioKind] = Counter()
+    while True:
+        last_m = drawn[-1].at_m if drawn else FIRST_M - APART_M
+        apart_m = STAGED_APART_M if drawn else APART_M
+        open_to = [s for s in possible if s.at_m >= last_m + (APART_M if s.stray else apart_m)]
+        if not open_to:
+            return drawn
+        near = [s for s in open_to if s.at_m <= open_to[0].at_m + CHOICE_M]
+        fewest = min(count[s.kind] for s in near)
+        kinds = sorted({s.kind for s in near if count[s.kind] == fewest})
+        kind = kinds[int(rng.integers(len(kinds)))]
+        of_kind = [s for s in near if s.kind == kind]
+        drawn.append(of_kind[int(rng.integers(len(of_kind)))])
+        count[kind] += 1
+
+
+def _numbered(scenario: Scenario, number: int, rng: np.random.Generator) -> Scenario:
+    """With an identity of its own for who crosses."""
+    if scenario.stray is None:
+        return scenario
+    style = int(rng.integers(2**31))
+    stray = dataclasses.replace(scenario.stray, track_id=FIRST_TRACK_ID + number, style=style)
+    return dataclasses.replace(scenario, stray=stray)
+
+
+def _on_stretches(ground: Ground, stretches: list[Stretch], rng: np.random.Generator) -> Iterator[Scenario]:
+    """What may happen outside of junctions, on runs of lanes without a change."""
+    graph = ground.graph
+    for is_inside, group in itertools.groupby(stretches, key=lambda s: bool(graph.junction[s.leg.lane] >= 0)):
+        run = list(group)
+        if is_inside:
+            continue
+        first = stretches.index(run[0])
+        turned = first > 0 and abs(graph.turn_rad[stretches[first - 1].leg.lane]) > TURN_RAD
+        from_m, to_m = run[0].from_m, run[-1].to_m
+        if turned:
+            yield from _after_turn(ground, run)
+        yield from _along(ground, from_m + 1.5 * AFTER_TURN_M, to_m - BEFORE_LINE_M, run, rng)
+        for stretch in run:
+            yield from _lead_and_cut_in(ground, stretch)
+
+
+def _after_turn(ground: Ground, run: list[Stretch]) -> Iterator[Scenario]:
+    graph, leg, from_m = ground.graph, run[0].leg, run[0].from_m
+    limit = float(graph.limit_mps[leg.lane])
+    if leg.to_m - leg.from_m > BEHIND_CORNER_M + 3.0 and can_stand(ground, from_m + BEHIND_CORNER_M):
+        way = Way((leg.lane, *onward(graph, leg.lane)), leg.from_m + BEHIND_CORNER_M)
+        yield Scenario(ScenarioKind.OBSTACLE_BEHIND_CORNER, from_m + BEHIND_CORNER_M, limit, ways=(way,))
+    if run[-1].to_m > from_m + AFTER_TURN_M:
+        for category in (Category.PEDESTRIAN, Category.BICYCLE):
+            yield from crossing(ground, from_m + AFTER_TURN_M, limit, category, SEEN_AFTER_TURN_M)
+
+
+def _along(
+    ground: Ground, from_m: float, to_m: float, run: list[Stretch], rng: np.random.Generator
+) -> Iterator[Scenario]:
+    """Who may cross on a stretch."""
+    for at_m in np.arange(from_m + rng.uniform(0.0, 3.0), to_m, STRAY_EVERY_M).tolist():
+        lane = next((s.leg.lane for s in run if at_m <= s.to_m), run[-1].leg.lane)
+        limit = float(ground.graph.limit_mps[lane])
+        category = Category.PEDESTRIAN if rng.random() < 0.5 else Category.BICYCLE
+        yield from crossing(ground, at_m, limit, category, min(stopping_m(limit) + SPARE_M, at_m))
+
+
+def _lead_and_cut_in(ground: Ground, stretch: Stretch) -> Iterator[Scenario]:
+    graph, (leg, from_m, to_m) = ground.graph, stretch
+    lane, limit = leg.lane, float(graph.limit_mps[leg.lane])
+    if leg.to_m - leg.from_m < LEAST_STRETCH_M or not can_drive_ahead(ground, from_m, to_m):
+        return
+    way = Way((lane, *onward(graph, lane)), leg.to_m)
+    yield Scenario(ScenarioKind.LEAD_BRAKES, to_m, limit, ways=(way,))
+    for side in (0, 1):
+        beside = int(graph.sides.lane[side, lane])
+        if beside < 0 or not graph.may_cross[1 - side, beside] or graph.contested[beside]:
+            continue
+        meet_m = float(abreast(lane, leg.to_m, 1 if side == 0 else -1, graph.sides))
+        way = Way((beside, *onward(graph, beside)), meet_m)
+        yield Scenario(ScenarioKind.CUT_IN, to_m, limit, ways=(way,), side=1 - side)

@@ -1,0 +1,77 @@
+"""When those who cross set out, and how they go on without walking into others."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.scene import Category
+from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.scenarios.kinds import SPARE_M, Scenario, ScenarioKind, cruise_mps
+from foredrive.simulation.scenarios.scene import Ego
+from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.strays import ACCELERATION_MPS2, Stray
+from foredrive.towns.traffic.traffic import Traffic
+
+SLOWEST_EGO_MPS = 1.5
+PREFERRED_MPS = {Category.PEDESTRIAN: 1.4, Category.BICYCLE: 3.5}
+SLOWEST_MPS, FASTEST_MPS = 0.8, {Category.PEDESTRIAN: 3.0, Category.BICYCLE: 6.0}
+STEP_OUT_MPS = 1.5
+STAYS_S = 9.0
+"""Who steps out before a parked car goes back after this time."""
+HALF_WIDTH_M = 0.5
+NEARLY_M = 0.3
+STANDS_MPS = 0.5
+LATE_M = 3.0
+SAFE_S = 4.0
+BESIDE_M = 0.4
+
+
+def pace_to_begin(scenario: Scenario, stray: Stray, ego: Ego) -> float | None:
+    """How fast somebody sets out now to meet the ego vehicle; None: it is too early, or no longer fair."""
+    gap_m, speed = ego.front_gap_m(scenario.at_m) - HALF_WIDTH_M, ego.speed_mps
+    spare_m = gap_m - ego.stopping_m()
+    if speed < SLOWEST_EGO_MPS:
+        return None
+    if scenario.kind is ScenarioKind.DOOR_ZONE:  # in the lane for all to see while one can still stop
+        spare_m -= speed * scenario.meet_m / STEP_OUT_MPS
+        return STEP_OUT_MPS if SPARE_M - LATE_M < spare_m < SPARE_M else None
+    arrives_s = ego.arrival_s(scenario)
+    early = arrives_s > scenario.meet_m / PREFERRED_MPS[stray.category] and spare_m > SPARE_M
+    if spare_m < 0 or early:
+        return None
+    pace = cruise_mps(scenario.meet_m, arrives_s, 0.0, ACCELERATION_MPS2)
+    return min(max(pace, SLOWEST_MPS), FASTEST_MPS[stray.category])
+
+
+def is_on_the_spot(scenario: Scenario, stray: Stray, since_s: float) -> bool:
+    """Whether somebody stays where he is for now: who has stepped out before a parked car."""
+    waits = scenario.kind is ScenarioKind.DOOR_ZONE and since_s < STAYS_S
+    return waits and stray.s_m >= scenario.meet_m - NEARLY_M
+
+
+def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
+    """Whether somebody who goes on meets a vehicle that he would not meet if he stood."""
+    left_s = (stray.length_m - stray.s_m) / pace_mps
+    goes = time_to_collision_s(_box(stray, pace_mps), others).min(initial=np.inf)
+    stands = time_to_collision_s(_box(stray, 0.0), others).min(initial=np.inf)
+    return bool(goes < min(left_s, SAFE_S) and stands > goes)
+
+
+def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxes:
+    """What nobody walks into: all vehicles but vehicle 0, and that as well while it stands."""
+    v, poses = state.vehicles, traffic.poses(state)
+    rows = np.flatnonzero(v.active)
+    rows = rows[rows > 0]
+    velocity: Float64[np.ndarray, "M 2"] = v.speed_mps[rows, None] * poses.forward[rows, :2]
+    boxes = MovingBoxes(poses.centre_m[rows, :2], v.size_lwh[rows, :2], poses.yaw[rows], velocity)
+    if ego.speed_mps > STANDS_MPS:
+        return boxes
+    size = np.array([EGO.length_m, EGO.width_m])
+    own = MovingBoxes(ego.centre_m[None, :2], size[None], np.array([ego.yaw_rad]), np.zeros((1, 2)))
+    return MovingBoxes(*(np.concatenate(pair) for pair in zip(boxes, own, strict=True)))
+
+
+def _box(stray: Stray, pace_mps: float) -> MovingBoxes:
+    size = stray.size_lwh[:2] + 2 * BESIDE_M
+    velocity = pace_mps * stray.ahead
+    return MovingBoxes(stray.xyz[None, :2], size[None], np.array([stray.yaw_rad]), velocity[None])

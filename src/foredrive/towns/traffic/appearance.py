@@ -1,0 +1,75 @@
+"""What the renderer and the labels get to see of traffic."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+from foredrive.towns.traffic.pedestrians import Pedestrians
+from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.vehicles import MOTION_S, Poses, Vehicles
+
+BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
+"""Drivers have a foot on the brake when they slow down by more than the engine does, and when they stand."""
+
+
+def vehicle_actors(
+    v: Vehicles, poses: Poses, around: tuple[Poses, Poses], kept: Bool[np.ndarray, "N"]
+) -> list[ActorState]:
+    """Some vehicles.
+
+    Args:
+        around: what `motion` tells.
+    """
+    before, after = around
+    velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
+    slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDS_MPS)
+    braking = slows & (v.category != Category.BICYCLE)
+    return [
+        ActorState(
+            track_id=int(v.track_id[i]),
+            category=Category(int(v.category[i])),
+            centre_m=poses.centre_m[i],
+            yaw=float(poses.yaw[i]),
+            pitch=float(poses.pitch[i]),
+            size_lwh=v.size_lwh[i],
+            velocity_mps=velocity_mps[i],
+            style=int(v.style[i]),
+            parked=False,
+            braking=bool(braking[i]),
+        )
+        for i in np.flatnonzero(kept)
+    ]
+
+
+def people_actors(p: Pedestrians) -> list[ActorState]:
+    """All people on walkways and crossings."""
+    return [
+        ActorState(
+            track_id=int(p.track_id[i]),
+            category=Category.PEDESTRIAN,
+            centre_m=p.xyz[i] + [0.0, 0.0, 0.5 * p.size_lwh[i, 2]],
+            yaw=float(p.yaw[i]),
+            pitch=0.0,
+            size_lwh=p.size_lwh[i],
+            velocity_mps=p.velocity_mps[i],
+            style=int(p.style[i]),
+            parked=False,
+        )
+        for i in np.flatnonzero(p.active)
+    ]
+
+
+def stray_actor(stray: Stray) -> ActorState:
+    """Somebody who goes where no walkway leads."""
+    return ActorState(
+        track_id=stray.track_id,
+        category=stray.category,
+        centre_m=stray.xyz + np.array([0.0, 0.0, 0.5 * stray.size_lwh[2]]),
+        yaw=stray.yaw_rad,
+        pitch=0.0,
+        size_lwh=stray.size_lwh,
+        velocity_mps=np.append(stray.speed_mps * stray.ahead, 0.0),
+        style=stray.style,
+        parked=False,
+    )

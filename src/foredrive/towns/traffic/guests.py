@@ -1,0 +1,94 @@
+"""Vehicles that somebody puts on the road for a purpose."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from foredrive.scene import Category
+from foredrive.towns.traffic.fleet import draw_fleet, place
+from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.paths import extend_paths
+from foredrive.towns.traffic.state import TrafficState
+from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.traffic.vehicles import AHEAD, BEHIND
+
+CANDIDATES = 16
+ACCELERATION_MPS2, TIME_GAP_S, HASTE = 3.0, 1.0, 1.1
+"""They can be where they are wanted in time."""
+CLEAR_M = 7.0
+
+
+def point_on(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[int, float]:
+    """Which of some lanes in a row a way leads to, and the arc length on that."""
+    starts_m = np.append(0.0, np.cumsum(graph.length_m[list(lanes)]))
+    at = min(max(int(np.searchsorted(starts_m, along_m, side="right")) - 1, 0), len(lanes) - 1)
+    return at, along_m - float(starts_m[at])
+
+
+def points_on(
+    graph: LaneGraph, lanes: Sequence[int], along_m: Float64[np.ndarray, "n"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Points along some lanes in a row."""
+    at = [point_on(graph, lanes, m) for m in along_m.tolist()]
+    return graph.position(np.array([lanes[k] for k, _ in at]), np.array([s for _, s in at]))
+
+
+def invited(
+    traffic: Traffic, state: TrafficState, slot: int, lanes: Sequence[int], along_m: float, speed_mps: float
+) -> TrafficState:
+    """With a car in a slot, so far along some lanes in a row, which it will follow."""
+    graph = traffic.lanes
+    rng = np.random.default_rng((traffic.seed, 3, state.step_index, slot))
+    no = np.zeros(CANDIDATES, dtype=np.bool_)
+    drawn = draw_fleet(rng, np.full(CANDIDATES, state.next_track_id), no, no)
+    car = int(np.argmax((drawn.category == Category.CAR) & (drawn.size_lwh[:, 0] < 5.0)))
+    one = dataclasses.replace(drawn, **{name: value[[car]] for name, value in vars(drawn).items()})
+    at, s_m = point_on(graph, lanes, along_m)
+    one = place(graph, one, np.array([lanes[at]]), np.array([s_m]))
+    path = one.path.copy()
+    onward = list(lanes[at + 1 : at + 1 + AHEAD])
+    path[0, BEHIND + 1 : BEHIND + 1 + len(onward)] = onward
+    one = dataclasses.replace(
+        one,
+        path=path,
+        speed_mps=np.array([speed_mps]),
+        accel_mps2=np.array([ACCELERATION_MPS2]),
+        time_gap_s=np.array([TIME_GAP_S]),
+        haste=np.array([HASTE]),
+    )
+    vehicles = state.vehicles.replace_rows(np.array([slot]), one)
+    everywhere, nowhere = np.ones(len(graph.ids), dtype=np.bool_), np.zeros(0, dtype=np.int64)
+    vehicles = extend_paths(graph, everywhere, vehicles, nowhere, rng)
+    return dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + 1)
+
+
+def cleared(
+    traffic: Traffic, state: TrafficState, xyz: Float64[np.ndarray, "n 3"], seen_within_m: float
+) -> TrafficState | None:
+    """Without the vehicles near some points; None if one of them could be seen to vanish.
+
+    Args:
+        seen_within_m: how near to vehicle 0 things are seen.
+    """
+    v, centre = state.vehicles, traffic.poses(state).centre_m
+    near = (np.linalg.norm(centre[:, None] - xyz, axis=2) < CLEAR_M).any(axis=1) & v.active
+    if near[0] or (near & (np.linalg.norm(centre - centre[0], axis=1) < seen_within_m)).any():
+        return None
+    return dataclasses.replace(state, vehicles=dataclasses.replace(v, active=v.active & ~near))
+
+
+def granted_through(traffic: Traffic, state: TrafficState, slot: int, lane: int) -> TrafficState:
+    """With right of way, before everybody else, for a vehicle up to a lane of its path and out of that
+    junction."""
+    v, graph = state.vehicles, traffic.lanes
+    ahead = v.path[slot, BEHIND:]
+    if lane not in ahead:
+        return state
+    last = int(np.argmax(ahead == lane))
+    while last + 1 < len(ahead) and ahead[last + 1] >= 0 and graph.contested[ahead[last + 1]]:
+        last += 1
+    granted, rank = v.granted.copy(), v.rank.copy()
+    granted[slot], rank[slot] = last, -1.0
+    return dataclasses.replace(state, vehicles=dataclasses.replace(v, granted=granted, rank=rank))
