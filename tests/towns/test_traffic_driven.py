@@ -135,25 +135,39 @@ def before_a_light(traffic: Traffic) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(
-    ("to_line_m", "mps", "time_s", "way_taken", "asks"),
+    ("to_line_m", "mps", "turn_came_s", "way_taken", "asks"),
     [
-        (3.0, 12.0, 5.0, True, True),
-        (30.0, 9.0, 5.0, False, True),
-        (3.0, 0.0, 5.0, False, False),
-        (3.0, 0.0, 9.0, False, True),
-        (12.0, 0.0, 9.0, False, False),
-        (12.0, 1.5, 9.0, False, False),
+        (3.0, 12.0, 0.0, True, True),
+        (30.0, 9.0, 0.0, False, True),
+        (3.0, 0.0, 0.0, False, True),
+        (-0.5, 0.0, 0.0, False, True),
+        (3.0, 0.0, 13.0, False, True),
+        (3.0, 0.0, 11.0, False, False),
+        (3.0, 0.0, 7.0, False, True),
+        (12.0, 0.0, 0.0, False, False),
+        (12.0, 1.5, 0.0, False, False),
     ],
-    ids=["cannot stop", "comes", "stands at the line", "has its turn there", "stands far off", "crawls"],
+    ids=[
+        "cannot stop",
+        "comes",
+        "stands at the line",
+        "stands with its bumper over it",
+        "has its turn there",
+        "has missed it",
+        "gets another",
+        "stands far off",
+        "crawls",
+    ],
 )
 def test_the_way_through_a_junction_is_taken_by_who_cannot_stop_before_it(
-    alone: Traffic, to_line_m: float, mps: float, time_s: float, way_taken: bool, asks: bool
+    alone: Traffic, to_line_m: float, mps: float, turn_came_s: float, way_taken: bool, asks: bool
 ) -> None:
     before, _ = before_a_light(alone)
     s_m = float(alone.lanes.length_m[before]) - to_line_m - 2.45
     state = followed(alone, before, s_m, behind_m=10.0)
     ego = driven_at(alone, before, s_m, mps=mps)
-    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, time_s)
+    state.vehicles.rank[0] = turn_came_s
+    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, 20.0)
     assert (seen.everyone.granted[0] > 0) == way_taken
     assert seen.may_ask[0] == asks
     assert seen.may_ask[1:].all()

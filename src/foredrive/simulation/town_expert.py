@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.scene import Clip, Trajectory
+from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.road_users import Box, road_users, touched
 from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator
 from foredrive.towns.traffic.driven import Driven
 from foredrive.towns.traffic.state import TrafficState
@@ -22,6 +24,10 @@ from foredrive.towns.traffic.vehicles import Vehicles
 
 EVERY, STEPS = 2, 15
 """Waypoints lie so many decisions apart: 3 s in all."""
+HALT_MPS = 0.3
+EDGES_MPS, EDGES_MPS2 = 2.5, 1.0
+"""Where there is no room for a lane change that the route needs, it edges over along the route's line."""
+CLEAR_M, LOOK_M = 0.5, 2.0
 LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
 """Who is further from where it meant to be starts anew from the lane that it is on."""
 
@@ -47,8 +53,32 @@ class TownExpert:
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
             self._imagined.append(simulator.foreseen(self._imagined[-1]))
+        halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
+        if halts and traffic.lacks_room(now.traffic):
+            return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
         ahead = [traffic.poses(then.traffic).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]
         return _in_ego_frame(np.stack(ahead)[:, :2], here)
+
+    def _edged_over(self, traffic: Traffic, here: Driven) -> Float64[np.ndarray, "T 2"]:
+        """Slowly along the line of the route, as long as nobody comes near; for each imagined step."""
+        now, xyz = self._imagined[0], self._simulator.scenario.route_xyz
+        arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
+        most_m = traffic.to_light_m(now.traffic)
+        way_m, speed, points = 0.0, here.speed_mps, [here.axle_xyz[:2]]
+        for then in self._imagined[1:]:
+            speed = min(speed + EDGES_MPS2 * DECISION_S, EDGES_MPS)
+            way_m = min(way_m + speed * DECISION_S, max(most_m, way_m))
+            at = now.progress.done_m + way_m + np.array([0.0, LOOK_M])
+            (x, ahead_x), (y, ahead_y) = (np.interp(at, arc_m, axis) for axis in xyz.T[:2])
+            yaw = math.atan2(ahead_y - y, ahead_x - x)
+            middle = np.array([x, y, here.axle_xyz[2]])
+            middle[:2] += EGO.axle_to_centre_m * np.array([math.cos(yaw), math.sin(yaw)])
+            half = 0.5 * np.array([EGO.length_m, EGO.width_m]) + CLEAR_M
+            if touched(Box(middle, yaw, half), road_users(traffic, then.traffic)).any():
+                break
+            points.append(np.array([x, y]))
+        points += [points[-1]] * (len(self._imagined) - len(points))
+        return np.stack(points[1:])
 
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: Driven) -> TrafficState:
         """With the path and the lane change that were meant, if the vehicle is where they lead."""

@@ -118,7 +118,12 @@ def _block(scene: Scene) -> Scene:
 
 
 def _stands_behind(scene: Scene) -> bool:
-    ego = scene.ego
+    """Whether the ego vehicle does, or somebody else, who may leave it no room to come that far."""
+    ego, v, slot = scene.ego, scene.state.vehicles, scene.play.cast[0]
+    behind_m = v.s_m[slot] - v.s_m
+    others = v.active & (v.lane == v.lane[slot]) & (v.speed_mps < STANDS_MPS)
+    if (others & (behind_m > 0.0) & (behind_m < STANDS_WITHIN_M))[1:].any():
+        return True
     gap_m = ego.front_gap_m(scene.scenario.at_m)
     return ego.speed_mps < STANDS_MPS and gap_m < STANDS_WITHIN_M and ego.has_set_out
 

@@ -24,7 +24,7 @@ LANE_REACH_M = 2.5
 MOST_TURNED_RAD = np.deg2rad(60.0)
 TURNED_M = 2.0
 """A heading that is off by one radian counts as much as so many metres to the side."""
-KNOWN_M = 0.6
+KNOWN_M = 1.5
 """Lanes of the path that is known count as so much nearer."""
 PATH_LOOK = 4
 HALF_CORRIDOR_M = 1.3
@@ -38,8 +38,9 @@ HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
 """Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
 COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
 """Others stand back only for somebody who comes at this speed, and will be at the line within this time,"""
-AT_LINE_M, TURN_S, TURNS_EVERY_S = 4.0, 4.0, 8.0
-"""or stands so near to it, for so long in every so many seconds: he may want to go, or not."""
+AT_LINE_M, TURN_S, MISSED_S = 4.0, 8.0, 4.0
+"""or stands so near to it and waits his turn. He may not want to go: who has not used it for so long has to
+wait for so long before he gets another."""
 RUN_OVER_S = 1.5
 BESIDE_M = 0.5
 """People do not step to where a vehicle will be in this time, or this near beside it."""
@@ -302,11 +303,12 @@ def _on_its_way(
         return everyone, may_ask
     gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
     comes = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
-    has_its_turn = speed <= COMES_MPS and gap_m < AT_LINE_M and time_s % TURNS_EVERY_S < TURN_S
-    may_ask[0] = comes or has_its_turn
+    granted_s = float(everyone.rank[0])  # when its last turn came; 0: it has had none
+    has_missed = granted_s > 0 and TURN_S <= time_s - granted_s < TURN_S + MISSED_S
+    may_ask[0] = comes or (speed <= COMES_MPS and gap_m < AT_LINE_M and not has_missed)
     if not may_ask[0]:
         return _replaced(everyone, granted=0), may_ask
-    if inside or gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed:
+    if inside or (comes and gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed):
         end = first + int(np.argmin(np.append(contested[first:], False)))
         return _replaced(everyone, granted=end - 1 - BEHIND), may_ask
     return everyone, may_ask

@@ -48,6 +48,9 @@ from foredrive.towns.traffic.vehicles import (
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
+STOPPED_MPS = 0.1
+"""As leaderboards want it at stop signs."""
+LACKS_ROOM_M = 1.0
 
 
 class Traffic:
@@ -179,6 +182,20 @@ class Traffic:
         gap_m = path_starts(self.lanes, v.path[:1])[0, BEHIND + 1 :] - v.front_m[0]
         return bool((contested & (gap_m < AT_LINE_M)).any()) and not self.lanes.contested[v.lane[0]]
 
+    def lacks_room(self, state: TrafficState) -> bool:
+        """Whether vehicle 0 needs another lane for its route where a lane change no longer fits."""
+        to_route = self._to_route(state)
+        return to_route is not None and to_route[1] < LACKS_ROOM_M
+
+    def to_light_m(self, state: TrafficState) -> float:
+        """The way of vehicle 0 to the next junction of its route, infinite if no light closes that."""
+        v, ahead = state.vehicles, state.route[state.route_passed :]
+        on_it = np.flatnonzero(self.lanes.contested[ahead])
+        shows = self.signals.shows(state.time_s)
+        if not len(on_it) or shows[ahead[on_it[0]]] in (Light.NONE, Light.GREEN):
+            return np.inf
+        return float(path_starts(self.lanes, v.path[:1])[0, BEHIND + 1] - v.front_m[0])
+
     def _choose(
         self,
         state: TrafficState,
@@ -200,7 +217,7 @@ class Traffic:
         situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
         courtesy_mps2 = self._courtesy_mps2(v, to_route, situation, starts_m)
         wanted_mps2 = np.minimum(situation.wanted_mps2(v), courtesy_mps2)
-        halted = (v.speed_mps < HALT_MPS) & (way.line_gap_m < AT_LINE_M)
+        halted = (v.speed_mps < STOPPED_MPS) & (way.line_gap_m < AT_LINE_M)
         standing = {
             "granted": way.granted,
             "asked_s": way.asked_s,
