@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 LEAST_S = 0.95
 """nuPlan's bound: nearer is not safe (Karnchanachari et al. 2024, time_to_collision_within_bound)."""
@@ -18,6 +18,10 @@ class MovingBoxes(NamedTuple):
     size_lw_m: Float64[np.ndarray, "M 2"]
     yaw_rad: Float64[np.ndarray, "M"]
     velocity_mps: Float64[np.ndarray, "M 2"]
+
+    def only(self, which: Bool[np.ndarray, "M"]) -> "MovingBoxes":
+        """Some of them."""
+        return MovingBoxes(*(values[which] for values in self))
 
 
 def time_to_collision_s(ego: MovingBoxes, others: MovingBoxes) -> Float64[np.ndarray, "M"]:

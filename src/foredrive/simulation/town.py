@@ -129,7 +129,7 @@ class TownSimulator:
         driven = self._driven(ego, z_m)
         middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
         nowhere = np.zeros(0, dtype=np.int64)
-        found = find_lane(self._traffic.near_lanes, middle, driven.yaw_rad, nowhere)
+        found = find_lane(self._traffic.near_lanes, middle, driven.yaw_rad, nowhere, nowhere)
         if found is None:
             raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
         row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))

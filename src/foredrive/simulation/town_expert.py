@@ -24,6 +24,8 @@ from foredrive.towns.traffic.vehicles import Vehicles
 
 EVERY, STEPS = 2, 15
 """Waypoints lie so many decisions apart: 3 s in all."""
+REJOINS_M = 5.0
+"""Who is beside where it imagines itself is back there to 1/e after this way."""
 HALT_MPS = 0.3
 EDGES_MPS, EDGES_MPS2 = 2.5, 1.0
 """Where there is no room for a lane change that the route needs, it edges over along the route's line."""
@@ -56,8 +58,8 @@ class TownExpert:
         halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
         if halts and traffic.lacks_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
-        ahead = [traffic.poses(then.traffic).axle_xyz[0] for then in self._imagined[EVERY::EVERY]]
-        return _in_ego_frame(np.stack(ahead)[:, :2], here)
+        path = np.stack([traffic.poses(then.traffic).axle_xyz[0, :2] for then in self._imagined])
+        return _in_ego_frame(_rejoined(path, here.axle_xyz[:2])[EVERY::EVERY], here)
 
     def _edged_over(self, traffic: Traffic, here: Driven) -> Float64[np.ndarray, "T 2"]:
         """Slowly along the line of the route, as long as nobody comes near; for each imagined step."""
@@ -107,6 +109,12 @@ class TownExpert:
 
 def _rows(vehicles: Vehicles, rows: np.ndarray) -> Vehicles:
     return Vehicles(**{name: value[rows] for name, value in vars(vehicles).items()})
+
+
+def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "K 2"]:
+    """A path that begins where the vehicle is, and comes to the imagined one little by little."""
+    way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    return path + np.exp(-way_m / REJOINS_M)[:, None] * (here - path[0])
 
 
 def _in_ego_frame(xy_world: Float64[np.ndarray, "T 2"], here: Driven) -> Trajectory:

@@ -6,7 +6,7 @@ import numpy as np
 
 from foredrive.simulation.scenarios.cast import RUN_UP_M, is_let_go
 from foredrive.simulation.scenarios.kinds import SPARE_M, ScenarioKind, arrival_s, cruise_mps, stopping_m
-from foredrive.simulation.scenarios.scene import Scene
+from foredrive.simulation.scenarios.scene import STANDS_MPS, Scene
 from foredrive.towns.traffic.guests import granted_through
 
 MOVES_MPS = 1.0
@@ -17,7 +17,7 @@ SETS_OFF_M, SLOW = 48.0, 0.55
 BRAKES_MPS2, BRAKES_S = 6.0, 4.5
 FOLLOWED_M, FOLLOWED_S = 40.0, 4.0
 """A lead vehicle brakes when it is followed so near for so long, or before the ego vehicle comes too near."""
-STANDS_MPS, STANDS_WITHIN_M, STANDS_S, BLOCKS_S = 0.3, 25.0, 3.0, 40.0
+STANDS_WITHIN_M, STANDS_S, BLOCKS_S = 25.0, 3.0, 40.0
 """A vehicle that blocks the lane drives on when it has been waited behind for so long, or after all."""
 CUTS_IN_S, LEAST_CUT_M = 5.0, 4.0
 BESIDE_M, ASIDE_M = 9.0, 2.0
@@ -34,6 +34,10 @@ RESERVES_M = 50.0
 """Others stand back for a vehicle that runs a light once it is so near."""
 
 
+STANDING = (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN, ScenarioKind.OBSTACLE_BEHIND_CORNER)
+"""Their vehicles stand in a lane until the ego vehicle comes, but not for long in the way of others."""
+
+
 def act(scene: Scene, dt_s: float) -> Scene:
     """The scene with the orders for its vehicles; a scenario that is over gives way to the next."""
     play, ego = scene.play, scene.ego
@@ -45,6 +49,9 @@ def act(scene: Scene, dt_s: float) -> Scene:
         return scene._replace(play=play.after())
     if lead_m is None:
         return scene if not play.cast else scene._replace(play=play.after())
+    if play.since_s is None and scene.scenario.kind in STANDING:
+        held_s = play.holds_up_s + dt_s if scene.holds_up() else 0.0
+        scene = scene._replace(play=dataclasses.replace(play, holds_up_s=held_s))
     match scene.scenario.kind:
         case ScenarioKind.LEAD_BRAKES:
             follows = _follows(scene, _gap_m(scene, lead_m))
@@ -81,6 +88,7 @@ def _cruise_ahead(scene: Scene, gap_m: float) -> None:
     """Slowly, once the ego vehicle is near."""
     slot = scene.play.cast[0]
     goes = scene.ego.has_set_out and (gap_m < SETS_OFF_M or scene.speed_mps(slot) > MOVES_MPS)
+    goes |= scene.play.holds_up_s > STANDS_S
     scene.towards_mps(slot, SLOW * scene.scenario.limit_mps if goes else 0.0)
 
 
@@ -119,11 +127,9 @@ def _block(scene: Scene) -> Scene:
 
 def _stands_behind(scene: Scene) -> bool:
     """Whether the ego vehicle does, or somebody else, who may leave it no room to come that far."""
-    ego, v, slot = scene.ego, scene.state.vehicles, scene.play.cast[0]
-    behind_m = v.s_m[slot] - v.s_m
-    others = v.active & (v.lane == v.lane[slot]) & (v.speed_mps < STANDS_MPS)
-    if (others & (behind_m > 0.0) & (behind_m < STANDS_WITHIN_M))[1:].any():
+    if scene.play.holds_up_s > 0.0:
         return True
+    ego = scene.ego
     gap_m = ego.front_gap_m(scene.scenario.at_m)
     return ego.speed_mps < STANDS_MPS and gap_m < STANDS_WITHIN_M and ego.has_set_out
 

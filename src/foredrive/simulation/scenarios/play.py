@@ -9,6 +9,7 @@ from foredrive.simulation.scenarios.kinds import Scenario
 from foredrive.simulation.scenarios.scene import Ego, Play, Scene
 from foredrive.simulation.scenarios.strays import (
     is_on_the_spot,
+    pace_among,
     pace_to_begin,
     vehicle_boxes,
     walks_into,
@@ -69,6 +70,5 @@ class Director:
                 continue
             boxes = boxes or vehicle_boxes(self._traffic, state, ego)
             waits = is_on_the_spot(self._scenarios[number], stray, ego.t_s - begun[number])
-            if waits or walks_into(stray, paces[index], boxes):
-                paces[index] = 0.0
+            paces[index] = 0.0 if waits else pace_among(stray, paces[index], boxes)
         return tuple(paces)

@@ -9,12 +9,14 @@ from jaxtyping import Float64
 
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.scenarios.kinds import FRONT_M, Scenario, Way, arrival_s, stopping_m
+from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
-from foredrive.towns.traffic.vehicles import BEHIND
+from foredrive.towns.traffic.vehicles import BEHIND, path_starts
 
 SET_OUT_M = 1.0
+STANDS_MPS = 0.3
 ROUNDED_M = 0.5
 
 
@@ -34,6 +36,8 @@ class Play:
     """How fast a vehicle goes that is on its way to meet the ego vehicle, from then on."""
     waited_s: float = 0.0
     """How long it has been waited for."""
+    holds_up_s: float = 0.0
+    """For how long others have stood behind its vehicles."""
     begun: tuple[tuple[int, float], ...] = ()
     """The numbers of all that have begun, and when in the drive, s."""
     pace_mps: tuple[float, ...] = ()
@@ -113,6 +117,12 @@ class Scene(NamedTuple):
     def speed_mps(self, slot: int) -> float:
         """Of a vehicle."""
         return float(self.state.vehicles.speed_mps[slot])
+
+    def holds_up(self) -> bool:
+        """Whether somebody else stands because of the first vehicle."""
+        v, graph = self.state.vehicles, self.traffic.lanes
+        leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
+        return bool((v.active & (leader == self.play.cast[0]) & (v.speed_mps < STANDS_MPS))[1:].any())
 
     def half_m(self, slot: int) -> float:
         """Half a vehicle's length."""

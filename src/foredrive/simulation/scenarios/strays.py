@@ -23,6 +23,8 @@ NEARLY_M = 0.3
 STANDS_MPS = 0.5
 LATE_M = 3.0
 SAFE_S = 4.0
+BACK_MPS = -0.8
+"""Who cannot go on because somebody stands in his way makes room."""
 BESIDE_M = 0.4
 
 
@@ -51,10 +53,22 @@ def is_on_the_spot(scenario: Scenario, stray: Stray, since_s: float) -> bool:
 
 def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
     """Whether somebody who goes on meets a vehicle that he would not meet if he stood."""
-    left_s = (stray.length_m - stray.s_m) / pace_mps
+    to_go_m = stray.length_m - stray.s_m if pace_mps > 0 else stray.s_m
+    left_s = to_go_m / abs(pace_mps)
     goes = time_to_collision_s(_box(stray, pace_mps), others).min(initial=np.inf)
     stands = time_to_collision_s(_box(stray, 0.0), others).min(initial=np.inf)
     return bool(goes < min(left_s, SAFE_S) and stands > goes)
+
+
+def pace_among(stray: Stray, pace_mps: float, others: MovingBoxes) -> float:
+    """How fast somebody goes on among vehicles: he waits for those that come, and makes room before
+    those that stand in his way."""
+    if not walks_into(stray, pace_mps, others):
+        return pace_mps
+    stand = np.hypot(*others.velocity_mps.T) < STANDS_MPS
+    if walks_into(stray, pace_mps, others.only(stand)) and not walks_into(stray, BACK_MPS, others):
+        return BACK_MPS
+    return 0.0
 
 
 def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxes:

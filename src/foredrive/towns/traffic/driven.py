@@ -24,8 +24,10 @@ LANE_REACH_M = 2.5
 MOST_TURNED_RAD = np.deg2rad(60.0)
 TURNED_M = 2.0
 """A heading that is off by one radian counts as much as so many metres to the side."""
-KNOWN_M = 1.5
-"""Lanes of the path that is known count as so much nearer."""
+KNOWN_M = 0.6
+"""Lanes of the path that is known count as so much nearer,"""
+KNOWN_INSIDE_M, MOST_TURNED_INSIDE_RAD = 3.0, np.deg2rad(90.0)
+"""in junctions so much, turned by up to so much: who turns in wide is not taken to have changed his mind."""
 PATH_LOOK = 4
 HALF_CORRIDOR_M = 1.3
 """What is nearer to the middle of a lane is in the way there."""
@@ -117,7 +119,8 @@ def see_driven(
         route: as in `TrafficState`; off it, vehicle 0 is taken to go on as straight as it can.
     """
     centre = driven.axle_xyz + vehicles.axle_to_centre_m[0] * driven.forward
-    found = find_lane(near, centre, driven.yaw_rad, vehicles.path[0, BEHIND : BEHIND + PATH_LOOK])
+    known = vehicles.path[0, BEHIND : BEHIND + PATH_LOOK]
+    found = find_lane(near, centre, driven.yaw_rad, known, known[graph.junction[known] >= 0])
     if found is None:
         placed = _replaced(vehicles, active=False, speed_mps=0.0, granted=0)
     else:
@@ -150,22 +153,29 @@ def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
 
 
 def find_lane(
-    near: NearLanes, centre: Float64[np.ndarray, "3"], yaw_rad: float, known: Int[np.ndarray, "k"]
+    near: NearLanes,
+    centre: Float64[np.ndarray, "3"],
+    yaw_rad: float,
+    known: Int[np.ndarray, "k"],
+    inside: Int[np.ndarray, "j"],
 ) -> tuple[int, float] | None:
     """The lane that somebody follows, and the arc length beside him; None if he follows none.
 
     Args:
         centre: his middle, on the ground.
         known: lanes that he is likely to follow.
+        inside: those of them that are in junctions.
     """
     samples = near.within(centre, LANE_REACH_M)
     turned = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
-    samples, turned = samples[turned < MOST_TURNED_RAD], turned[turned < MOST_TURNED_RAD]
+    surely = (near.lane[samples, None] == inside).any(axis=1)
+    may = turned < np.where(surely, MOST_TURNED_INSIDE_RAD, MOST_TURNED_RAD)
+    samples, turned, surely = samples[may], turned[may], surely[may]
     if not len(samples):
         return None
     offset = centre[:2] - near.xyz[samples, :2]
     cost = np.hypot(offset[:, 0], offset[:, 1]) + TURNED_M * turned
-    cost -= KNOWN_M * (near.lane[samples, None] == known).any(axis=1)
+    cost -= np.where(surely, KNOWN_INSIDE_M, KNOWN_M * (near.lane[samples, None] == known).any(axis=1))
     best = int(np.argmin(cost))
     along_m = float(offset[best] @ near.ahead[samples[best]])
     return int(near.lane[samples[best]]), max(0.0, float(near.along_m[samples[best]]) + along_m)

@@ -61,12 +61,12 @@ class Stray:
         return float(np.arctan2(*self.ahead[::-1]))
 
     def moved(self, pace_mps: float, dt_s: float) -> "Stray":
-        """Later, having gone on towards a pace; it stands where its way ends."""
+        """Later, having gone on towards a pace, or back if that is negative; it stands where its way ends."""
         most = ACCELERATION_MPS2 * dt_s
         speed = min(max(pace_mps, self.speed_mps - most), self.speed_mps + most)
         s_m = self.s_m + 0.5 * (self.speed_mps + speed) * dt_s
-        if s_m >= self.length_m:
-            s_m, speed = self.length_m, 0.0
+        if not 0.0 < s_m < self.length_m:
+            s_m, speed = min(max(s_m, 0.0), self.length_m), 0.0
         return dataclasses.replace(self, s_m=s_m, speed_mps=speed)
 
 
