@@ -8,10 +8,13 @@ import torch
 from miniature import miniature
 from safetensors.torch import load_file
 
-from foredrive.data import LogPath
+from foredrive.data import LogPath, collate
 from foredrive.recipes import Recipe, Run, evaluate_run, train_run
 from foredrive.recipes.export import export_run
+from foredrive.recipes.open_clips import open_clips
+from foredrive.recipes.path_reads import read_paths
 from foredrive.recipes.study import seeded
+from foredrive.recipes.train import load_agent
 from foredrive.training import PathFit
 
 
@@ -67,6 +70,23 @@ def test_what_is_read_along_the_path_is_fitted_first_and_read_once(log: LogPath,
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert one["planner.path.change.2.weight"].abs().max() > 0  # it began at 0
     assert one["planner.path.mean"].abs().max() > 0
+
+
+def test_what_the_decoder_says_is_not_said_twice(log: LogPath, tmp_path: Path) -> None:
+    """What the correction is fitted to is all that is planned but itself."""
+    fitted = recipe(lr=1e-2, path=PathFit(stride_s=0.5, steps=20))
+    run = train_run(fitted, [log], tmp_path / "run")
+    joint = load_file(run.folder / "finetune" / "model.safetensors")
+    assert joint["planner.path.change.2.weight"].abs().max() == 0  # left alone until its turn
+    agent = load_agent(run)
+    shown = read_paths(agent, [log], fitted.clips, tmp_path / "cache", stride_s=0.5)
+    agent.planner.path.change[2].weight.data.zero_()
+    agent.planner.path.change[2].bias.data.zero_()
+    again = read_paths(agent, [log], fitted.clips, tmp_path / "other", stride_s=0.5)
+    torch.testing.assert_close(shown.planned_xy, again.planned_xy, atol=1e-4, rtol=0)
+    dataset = open_clips([log], dataclasses.replace(fitted.clips, now_stride_s=0.5), tmp_path / "other")
+    planned = agent.act(collate([dataset[0]]).clip.observed()).xy[0, 0]
+    torch.testing.assert_close(again.planned_xy[0], planned, atol=1e-4, rtol=0)
 
 
 def test_it_can_be_exported(run: Run, log: LogPath, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def shown() -> PathDemonstrations:
         values=values.half(),
         places_m=torch.zeros(COUNT, len(DISTANCES), 3, 2),
         told=torch.zeros(COUNT, 1),
-        unseen_xy=unseen,
+        planned_xy=unseen,
         driven_xy=unseen - short,
         valid=torch.ones(COUNT, 2, dtype=torch.bool),
     )
@@ -39,7 +39,7 @@ def shown() -> PathDemonstrations:
 def errors_m(path: PathCorrection, shown: PathDemonstrations) -> torch.Tensor:
     with torch.no_grad():
         change = path(PathReads(shown.values, shown.places_m), shown.told).cumsum(dim=1)
-    return (shown.unseen_xy + change - shown.driven_xy).norm(dim=-1)
+    return (shown.planned_xy + change - shown.driven_xy).norm(dim=-1)
 
 
 def test_it_finds_what_the_plan_depends_on(shown: PathDemonstrations) -> None:

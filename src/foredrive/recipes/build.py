@@ -120,10 +120,13 @@ def build_objective(recipe: Recipe, stage: Stage, agent: NemoAgent) -> NemoObjec
             features = Vgg16Features(stage.vgg16)
         except (OSError, InputError) as error:
             warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=2)
-    return NemoObjective(
+    objective = NemoObjective(
         agent,
         stage.weights,
         steps=recipe.clips.future_frames if stage.imagine else 0,
         ray_stride=stage.ray_stride,
         image_features=features,
     )
+    if recipe.path is not None and agent.planner.path is not None:
+        agent.planner.path.requires_grad_(False)  # it has its turn after the last stage
+    return objective

@@ -109,8 +109,8 @@ class Recipe:
     """None: fine-tuning starts from scratch, or from weights that are given."""
     finetune: Stage
     path: PathFit | None = None
-    """How the planner's `PathCorrection` is fitted before fine-tuning to what the pre-trained world model
-    sees; None leaves that to fine-tuning."""
+    """How the planner's `PathCorrection` is fitted to what the fine-tuned world model sees, which joint
+    fine-tuning then leaves alone; None leaves it to joint fine-tuning."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
 
 

@@ -14,6 +14,7 @@ from foredrive.recipes.rivals import fit_rivals
 from foredrive.recipes.train import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.restarts import Restarting
 from foredrive.simulation.simple_agents import Straight
 from foredrive.simulation.town import TownSimulator
 from foredrive.simulation.town_expert import TownExpert
@@ -71,11 +72,8 @@ def make_driver(driver: str, simulator: TownSimulator) -> Agent:
         return TownExpert(simulator)
     if driver in (STOP, CONSTANT_VELOCITY):
         return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
-    folder = _run_folder(driver)
-    if driver.startswith(EGO_MLP):
-        return _fitted(folder)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return _Sees(_trained(folder).to(device), open_run(folder).recipe.clips.image_hw, device)
+    folder, learned = _run_folder(driver), _fitted if driver.startswith(EGO_MLP) else _seeing
+    return Restarting(learned(folder), lambda: simulator.state.t_s)
 
 
 def _run_folder(driver: str) -> Path:
@@ -87,8 +85,9 @@ def _run_folder(driver: str) -> Path:
 
 
 @lru_cache(maxsize=1)  # a worker drives many routes
-def _trained(folder: Path) -> NemoAgent:
-    return load_agent(open_run(folder))
+def _seeing(folder: Path) -> _Sees:
+    run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
+    return _Sees(load_agent(run).to(device), run.recipe.clips.image_hw, device)
 
 
 @lru_cache(maxsize=1)

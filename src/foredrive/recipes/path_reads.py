@@ -27,7 +27,8 @@ BATCH = 8
 def read_paths(
     agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
 ) -> PathDemonstrations:
-    """Read the present volume of clips `stride_s` apart along their plans; half precision is kept.
+    """Read the present volume of clips `stride_s` apart along the plans made without looking; half precision
+    is kept.
 
     Runs that look at the same logs with the same weights read once.
 
@@ -60,19 +61,20 @@ def _row(agent: NemoAgent, example: Example) -> dict[str, Tensor]:
     planner, world = agent.planner, agent.world_model
     assert planner.path is not None
     clip = example.clip.observed()
-    now = clip.now
-    seen = clip.frames(slice(now, now + 1))
-    volume = world.encode(seen.images, seen.image_valid, seen.rig).volume
+    belief = world.observe(clip)
+    ahead = world.imagine(belief, planner.looks_ahead) if planner.looks_ahead else []
+    plan = agent.plan(clip, [belief, *ahead])
     poses, speeds = ego_motion(clip, planner.history)
     past = torch.cat([poses, speeds[:, :-1, None]], dim=-1)
     unseen_xy, told = planner.without_looking(clip.command, clip.command_valid, speeds[:, -1], past)
-    reads = planner.path.read(volume, unseen_xy)
+    reads = planner.path.read(belief.volume, unseen_xy)
+    change = planner.path(reads, told).cumsum(dim=1)
     future = example.clip.future
     row = {
         "values": reads.values.half(),
         "places_m": reads.places_m,
         "told": told,
-        "unseen_xy": unseen_xy,
+        "planned_xy": plan.xy[:, 0] - change,
         "driven_xy": future.xy[:, 0],
         "valid": future.valid[:, 0],
     }
@@ -83,12 +85,10 @@ def _key(agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, stride_s:
     digest = hashlib.blake2b(digest_size=16)
     read = (str(logs), repr(dataclasses.asdict(clips)), repr(stride_s))
     digest.update("\n".join(read).encode())
-    parts = (agent.world_model.backbone, agent.world_model.encoder, agent.planner.ego_mlp)
-    for part in parts:
-        if part is not None:
-            for name, tensor in sorted(part.state_dict().items()):
-                digest.update(name.encode())
-                digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    for name, tensor in sorted(agent.state_dict().items()):
+        if not name.startswith("planner.path."):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     assert agent.planner.path is not None
     digest.update(agent.planner.path.distances_m.cpu().numpy().tobytes())
     return digest.hexdigest()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 STAGES = ("pretrain", "finetune")
-PATH_STAGE = "path"
+PATH = "path"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Run:
     @property
     def weights(self) -> Path:
         """Weights of the last finished stage."""
-        for stage in reversed(STAGES):
+        for stage in (PATH, *reversed(STAGES)):
             if (self.folder / stage / WEIGHTS).is_file():
                 return self.folder / stage / WEIGHTS
         raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
@@ -111,22 +111,24 @@ def train_run(
         base = agent.planner.ego_mlp
         _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames)
         base.load_state_dict(fitted.state_dict())
-        if recipe.path is not None and agent.planner.path is not None:
-            _fit_path(run, recipe.path, agent.to(fabric.device))
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
+    if recipe.path is not None:
+        _fit_path(run, recipe.path, agent, fabric)
     return run
 
 
-def _fit_path(run: Run, fit: PathFit, agent: NemoAgent) -> None:
-    """Fit what the planner reads along its path, unless an interrupted run has done so."""
-    assert agent.planner.path is not None
-    weights = run.folder / PATH_STAGE / WEIGHTS
-    if not weights.is_file():
+def _fit_path(run: Run, fit: PathFit, agent: NemoAgent, fabric: "Fabric") -> None:
+    """Fit what the planner reads along its path in the volume as it has become."""
+    path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
+    if path is None or weights.is_file():
+        return
+    if fabric.is_global_zero:
+        agent.to(fabric.device)
         shown = read_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
-        fit_path(agent.planner.path, shown, fit, run.recipe.finetune.schedule.seed)
+        fit_path(path, shown, fit, run.recipe.finetune.schedule.seed)
         with atomic_path(weights) as temporary:
-            save_weights(agent.planner.path, temporary)
-    load_weights(agent.planner.path, weights)
+            save_weights(agent, temporary)
+    fabric.barrier()
 
 
 def _pretrained(start: Path) -> Path:

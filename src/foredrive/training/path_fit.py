@@ -24,13 +24,13 @@ class PathFit:
 
 @dataclass(frozen=True)
 class PathDemonstrations(Record):
-    """What was read along N plans made without looking, and what was driven instead."""
+    """What was read along N plans made without looking, what was planned without that, what was driven."""
 
     values: Float[Tensor, "N D S F"]
     places_m: Float[Tensor, "N D S 2"]
     told: Float[Tensor, "N _told"]
-    unseen_xy: Float[Tensor, "N T 2"]
-    """The plans."""
+    planned_xy: Float[Tensor, "N T 2"]
+    """What the correction is added to."""
     driven_xy: Float[Tensor, "N T 2"]
     valid: Bool[Tensor, "N T"]
 
@@ -44,14 +44,14 @@ def fit_path(correction: PathCorrection, shown: PathDemonstrations, fit: PathFit
     optimizer = torch.optim.AdamW(correction.parameters(), lr=fit.lr, weight_decay=fit.weight_decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)
     order = torch.Generator().manual_seed(seed)
-    correction.train().requires_grad_(True)  # pre-training has left planners out
+    correction.train().requires_grad_(True)  # joint training has left it out
     with torch.random.fork_rng():
         torch.manual_seed(seed)  # of dropout
         for _ in range(fit.steps):
             chosen = torch.randint(len(shown.told), (min(fit.batch_size, len(shown.told)),), generator=order)
             batch = shown[chosen]
             change = correction(PathReads(batch.values, batch.places_m), batch.told)
-            error = (batch.unseen_xy + change.cumsum(dim=1) - batch.driven_xy).abs().sum(dim=-1)
+            error = (batch.planned_xy + change.cumsum(dim=1) - batch.driven_xy).abs().sum(dim=-1)
             loss = torch.where(batch.valid, error, 0.0).sum() / batch.valid.sum().clamp_min(1)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()

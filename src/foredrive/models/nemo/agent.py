@@ -1,5 +1,6 @@
 """NeMo as something that drives: the world model and the planner on top of it."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -31,9 +32,13 @@ class NemoAgent(nn.Module):
     def forward(self, clip: Clip, steps: int) -> NemoOutput:
         """Observe, imagine `steps` key frames and whatever the planner looks at, plan."""
         beliefs, decoded = self.world_model(clip, max(steps, self.planner.looks_ahead))
+        return NemoOutput(beliefs[: steps + 1], decoded[: steps + 1], self.plan(clip, beliefs))
+
+    def plan(self, clip: Clip, beliefs: Sequence[Belief]) -> Trajectory:
+        """Plan from what is believed of now and of the next key frames, as many as the planner looks at."""
         now = clip.now
         poses, speeds = ego_motion(clip, self.planner.history)
-        plan = self.planner(
+        plan: Trajectory = self.planner(
             beliefs[0].volume,
             beliefs[1].volume if self.planner.looks_ahead else None,
             clip.command,
@@ -42,7 +47,7 @@ class NemoAgent(nn.Module):
             clip.ego_speed_valid[:, now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
         )
-        return NemoOutput(beliefs[: steps + 1], decoded[: steps + 1], plan)
+        return plan
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:

@@ -1,0 +1,84 @@
+"""Getting imitators going again.
+
+Who learns from recordings learns that who stands goes on standing, and drives begin at rest (inertia in
+Codevilla et al. 2019, "Exploring the Limitations of Behavior Cloning"). TransFuser (Chitta et al. 2022) lets
+a vehicle that has stood for long creep forward if its lidar sees nobody ahead; so does this.
+"""
+
+from collections.abc import Callable
+
+import torch
+
+from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
+
+STANDS_MPS, STAYS_M = 0.2, 1.0
+"""Who is slower, and plans to go no further than this, stands because he wants to."""
+AT_START_S, STUCK_S = 1.0, 20.0
+"""Patience before anything has moved, and later, when a red light may be the reason."""
+CREEPS_S, CREEPS_MPS, CREEPS_MPS2 = 2.0, 4.0, 1.5
+FREE_M, FREE_HALF_WIDTH_M, FREE_HEIGHT_M = 6.0, 1.3, (0.3, 2.2)
+"""Nothing may return a beam from the box ahead of the bumper."""
+
+
+class Restarting:
+    """An `Agent` that is another, except when that has stood for long and the way ahead is free.
+
+    Args:
+        agent: sees a batch of one clip.
+        clock: time of the drive, s.
+    """
+
+    def __init__(self, agent: Agent, clock: Callable[[], float]) -> None:
+        self._agent, self._clock = agent, clock
+        self._stands_since_s: float | None = None
+        self._has_moved = False
+        self._creeps_until_s = -1.0
+
+    def act(self, observation: Clip) -> Trajectory:
+        """The agent's plan, or one to creep forward."""
+        plan, t_s = self._agent.act(observation), self._clock()
+        speed_mps = float(observation.ego_speed_mps[0, observation.now])
+        if speed_mps > STANDS_MPS or float(plan.xy[0, 0].norm(dim=-1).max()) > STAYS_M:
+            self._stands_since_s = None
+            self._has_moved |= speed_mps > STANDS_MPS
+        elif self._stands_since_s is None:
+            self._stands_since_s = t_s
+        since_s = t_s if self._stands_since_s is None else self._stands_since_s
+        patience_s = STUCK_S if self._has_moved else AT_START_S
+        if t_s - since_s >= patience_s:
+            self._creeps_until_s, self._stands_since_s = t_s + CREEPS_S, None
+        if t_s < self._creeps_until_s and is_free_ahead(observation):
+            return _creeping(speed_mps).to(plan.xy.device)
+        return plan
+
+
+def is_free_ahead(observation: Clip) -> bool:
+    """Whether lidar sees nothing in the box ahead of the bumper now; without lidar nobody knows."""
+    now = observation.now
+    if not bool(observation.sweep_valid[0, now]):
+        return False
+    sweep = observation.sweeps[0, now]
+    x, y, z = sweep.points_ego.unbind(dim=-1)
+    bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
+    inside = sweep.valid & sweep.returned & (x > bumper_m) & (x < bumper_m + FREE_M)
+    inside &= (y.abs() < FREE_HALF_WIDTH_M) & (z > FREE_HEIGHT_M[0]) & (z < FREE_HEIGHT_M[1])
+    return not bool(inside.any())
+
+
+def _creeping(speed_mps: float) -> Trajectory:
+    """Straight on, gathering a little speed."""
+    t_s = FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
+    gains_s = max(CREEPS_MPS - speed_mps, 0.0) / CREEPS_MPS2
+    gained_s = t_s.clamp_max(gains_s)
+    x = speed_mps * t_s + 0.5 * CREEPS_MPS2 * gained_s**2 + CREEPS_MPS2 * gained_s * (t_s - gained_s)
+    xy = torch.stack([x, torch.zeros_like(x)], dim=-1)[None, None]
+    flat = xy[..., 0]
+    return Trajectory(
+        xy=xy,
+        yaw=torch.zeros_like(flat),
+        valid=torch.ones_like(flat, dtype=torch.bool),
+        log_prob=torch.zeros(1, 1),
+        dt_s=FRAME_DT_S,
+    )
