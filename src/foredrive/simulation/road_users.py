@@ -37,6 +37,10 @@ class RoadUsers(NamedTuple):
             velocity_mps=self.velocity_mps + moved[:, None] * (later.velocity_mps - self.velocity_mps),
         )
 
+    def without(self, track_ids: Int[np.ndarray, "k"]) -> "RoadUsers":
+        """As if some were not there."""
+        return self._replace(track_id=np.where(np.isin(self.track_id, track_ids), -1, self.track_id))
+
 
 class Box(NamedTuple):
     """An upright box on the ground."""

@@ -8,6 +8,7 @@ from recordings.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,15 +16,18 @@ from jaxtyping import Float64
 
 from foredrive.scene import Clip, Trajectory
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.road_users import Box, road_users, touched
+from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
 from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator
 from foredrive.towns.traffic.driven import Driven
+from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
-from foredrive.towns.traffic.vehicles import Vehicles
+from foredrive.towns.traffic.vehicles import Vehicles, path_starts
 
 EVERY, STEPS = 2, 15
 """Waypoints lie so many decisions apart: 3 s in all."""
+SETS_OFF_S, SETS_OFF_MPS, AT_LIGHT_M = 2.5, 1.0, 3.0
+BRAKES_MPS2, NEAR_M = (3.0, 6.0), 0.2
 REJOINS_M = 5.0
 """Who is beside where it imagines itself is back there to 1/e after this way."""
 HALT_MPS = 0.3
@@ -51,7 +55,7 @@ class TownExpert:
         here, now = simulator.driven, simulator.foresight()
         now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
         self._imagined = [now]
-        if traffic.stands_back(now.traffic):
+        if traffic.stands_back(now.traffic) or _is_too_late(traffic, now.traffic):
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
             self._imagined.append(simulator.foreseen(self._imagined[-1]))
@@ -59,7 +63,26 @@ class TownExpert:
         if halts and traffic.lacks_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
         path = np.stack([traffic.poses(then.traffic).axle_xyz[0, :2] for then in self._imagined])
-        return _in_ego_frame(_rejoined(path, here.axle_xyz[:2])[EVERY::EVERY], here)
+        path = self._not_into_anybody(traffic, _rejoined(path, here.axle_xyz[:2]), here)
+        return _in_ego_frame(path[EVERY::EVERY], here)
+
+    def _not_into_anybody(
+        self, traffic: Traffic, path: Float64[np.ndarray, "K 2"], here: Driven
+    ) -> Float64[np.ndarray, "K 2"]:
+        """The path as imagined or, if that leads into somebody, braked on."""
+        v, graph = self._imagined[0].traffic.vehicles, traffic.lanes
+        leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
+        behind = v.track_id[leader == 0]  # who follows takes care himself
+        users = [road_users(traffic, then.traffic).without(behind) for then in self._imagined]
+        arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+        t_s = DECISION_S * np.arange(len(path))
+        options = [arc_m]
+        for brakes_mps2 in BRAKES_MPS2:
+            till_s = np.minimum(t_s, here.speed_mps / brakes_mps2)
+            options.append(np.minimum(here.speed_mps * till_s - 0.5 * brakes_mps2 * till_s**2, arc_m[-1]))
+        free = (way_m for way_m in options if _is_free(path, arc_m, way_m, users, here))
+        best_m = next(free, options[-1])
+        return np.stack([np.interp(best_m, arc_m, axis) for axis in path.T], axis=1)
 
     def _edged_over(self, traffic: Traffic, here: Driven) -> Float64[np.ndarray, "T 2"]:
         """Slowly along the line of the route, as long as nobody comes near; for each imagined step."""
@@ -76,7 +99,11 @@ class TownExpert:
             middle = np.array([x, y, here.axle_xyz[2]])
             middle[:2] += EGO.axle_to_centre_m * np.array([math.cos(yaw), math.sin(yaw)])
             half = 0.5 * np.array([EGO.length_m, EGO.width_m]) + CLEAR_M
-            if touched(Box(middle, yaw, half), road_users(traffic, then.traffic)).any():
+            others = road_users(traffic, then.traffic)
+            met = touched(Box(middle, yaw, half), others)
+            if (np.hypot(*others.velocity_mps[met].T) > HALT_MPS).any():
+                points = points[:1]  # he goes first
+            if met.any():
                 break
             points.append(np.array([x, y]))
         points += [points[-1]] * (len(self._imagined) - len(points))
@@ -109,6 +136,34 @@ class TownExpert:
 
 def _rows(vehicles: Vehicles, rows: np.ndarray) -> Vehicles:
     return Vehicles(**{name: value[rows] for name, value in vars(vehicles).items()})
+
+
+def _is_free(
+    path: Float64[np.ndarray, "K 2"],
+    arc_m: Float64[np.ndarray, "K"],
+    way_m: Float64[np.ndarray, "K"],
+    users: Sequence[RoadUsers],
+    here: Driven,
+) -> bool:
+    """Whether it touches nobody on a path, so far along it at each step."""
+    half, yaw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + NEAR_M, here.yaw_rad
+    for at_m, others in zip(way_m.tolist(), users, strict=True):
+        axle, before = (
+            np.array([np.interp(m, arc_m, axis) for axis in path.T]) for m in (at_m, max(at_m - 1.0, 0.0))
+        )
+        if np.hypot(*(axle - before)) > 0.5:
+            yaw = math.atan2(*(axle - before)[::-1])
+        forward = np.array([math.cos(yaw), math.sin(yaw)])
+        middle = np.append(axle + EGO.axle_to_centre_m * forward, here.axle_xyz[2])
+        if touched(Box(middle, yaw, half), others).any():
+            return False
+    return True
+
+
+def _is_too_late(traffic: Traffic, state: TrafficState) -> bool:
+    """Whether it stands, or nearly, at a light that is not green long enough to get over the line."""
+    to_light_m = min(traffic.to_light_m(state, in_s) for in_s in (0.0, SETS_OFF_S))
+    return bool(state.vehicles.speed_mps[0] < SETS_OFF_MPS and to_light_m < AT_LIGHT_M)
 
 
 def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "K 2"]:

@@ -187,12 +187,14 @@ class Traffic:
         to_route = self._to_route(state)
         return to_route is not None and to_route[1] < LACKS_ROOM_M
 
-    def to_light_m(self, state: TrafficState) -> float:
-        """The way of vehicle 0 to the next junction of its route, infinite if no light closes that."""
+    def to_light_m(self, state: TrafficState, in_s: float = 0.0) -> float:
+        """The way of vehicle 0 to the next junction of its route; infinite in junctions, and if no light will
+        close that one."""
         v, ahead = state.vehicles, state.route[state.route_passed :]
         on_it = np.flatnonzero(self.lanes.contested[ahead])
-        shows = self.signals.shows(state.time_s)
-        if not len(on_it) or shows[ahead[on_it[0]]] in (Light.NONE, Light.GREEN):
+        shows = self.signals.shows(state.time_s + in_s)
+        closed = len(on_it) > 0 and shows[ahead[on_it[0]]] not in (Light.NONE, Light.GREEN)
+        if not closed or self.lanes.contested[v.lane[0]]:
             return np.inf
         return float(path_starts(self.lanes, v.path[:1])[0, BEHIND + 1] - v.front_m[0])
 
