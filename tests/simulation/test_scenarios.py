@@ -136,6 +136,13 @@ def test_the_expert_foresees_it(
     assert driven.score.driving_score_1_0 == 100.0
 
 
+def test_the_expert_waits_for_who_runs_a_light(simulator: TownSimulator) -> None:
+    route, scenario = town05_place(ScenarioKind.RED_LIGHT_RUNNER, "5")
+    driven = drive_route(simulator, town_scenario(route, (scenario,)), TownExpert(simulator), route="r")
+    assert not [event for event in driven.events if event.kind.startswith("collision")]
+    assert driven.score.completion == 1.0
+
+
 def test_a_drive_with_a_scenario_goes_on_bit_by_bit(
     simulator: TownSimulator, places: dict[ScenarioKind, tuple[DriveRoute, Scenario]]
 ) -> None:
