@@ -15,7 +15,7 @@ FAILURES_SHOWN = 3
 
 
 def drive(
-    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|ego-mlp:RUN")],
+    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|…")],
     out: Path,
     routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short",
     repetitions: int = 1,
@@ -36,13 +36,16 @@ def drive(
     Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
 
     Args:
-        agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or the MLP that sees
-            ego status alone, fitted to what a run was trained on.
+        agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or ego-mlp:RUN, the
+            MLP that sees ego status alone, fitted to what a run was trained on. Lessons, whose logs tell what
+            the expert would do at each key frame: disturbed, the expert steered aside and slowed, or
+            pupil:RUN, a run and the expert by turns.
         out: Folder of the suite: summary.json, report.html, drives, logs.
         routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file.
         repetitions: How often each route is driven, every time among other traffic.
         seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
-        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog; a bright day if left out.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog; any: drawn
+            for each drive; a bright day if left out.
         sensors: Log cameras and lidar of agents that need none, too; without, drives are much faster.
         image_size: Size of the six cameras' images, px.
         vehicles: How many vehicles share the road near the ego vehicle.

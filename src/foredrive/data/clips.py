@@ -1,5 +1,6 @@
 """Clips of 123D logs with their voxel labels, as a torch data set."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,10 @@ from foredrive.data.labels import LabelStore, VoxelLabels
 from foredrive.data.lidar import empty_sweep, read_sweep
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
+from foredrive.data.recorded import read_taught_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
 from foredrive.errors import InputError
-from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, VoxelGrid, VoxelSpec
+from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,9 @@ class ClipConfig:
     occupancy_source: Literal["lidar", "recorded"] = "lidar"
     """Where voxel labels come from: what the beams met and passed through, or the exact occupancy with flow
     that recordings of towns carry, seen or not."""
+    future_source: Literal["driven", "taught"] = "driven"
+    """Where the future to learn from comes from: what was driven, or what the teacher of a lesson would do
+    instead (`foredrive drive --taught`); clips of logs without a teacher have what was driven."""
 
 
 class ClipDataset(Dataset[Example]):
@@ -141,6 +146,18 @@ class ClipDataset(Dataset[Example]):
         future = log.driven_future(now, self.config.horizon_steps, self.config.horizon_dt_s)
         return command_at(log, now, future)
 
+    def _future(self, log: Log, now: int) -> Trajectory:
+        steps, dt_s = self.config.horizon_steps, self.config.horizon_dt_s
+        taught = read_taught_plan(log, now) if self.config.future_source == "taught" else None
+        if taught is None:
+            return log.driven_future(now, steps, dt_s)
+        if len(taught.xy[0]) < steps or abs(taught.dt_s - dt_s) > 1e-6:
+            horizon = f"{len(taught.xy[0])} waypoints {taught.dt_s} s apart"
+            raise InputError(f"{log.path.folder}: was taught {horizon}, not {steps} of {dt_s} s")
+        return dataclasses.replace(
+            taught, xy=taught.xy[:, :steps], yaw=taught.yaw[:, :steps], valid=taught.valid[:, :steps]
+        )
+
     def clip(self, index: int) -> Clip:
         """Read one clip without its labels.
 
@@ -170,7 +187,7 @@ class ClipDataset(Dataset[Example]):
             ego_speed_valid=speed_mps.isfinite(),
             command=torch.tensor(0 if command is None else int(command)),
             command_valid=torch.tensor(command is not None),
-            future=log.driven_future(now, config.horizon_steps, config.horizon_dt_s),
+            future=self._future(log, now),
             map=read_map_patch(log, now) if config.map else None,
         )
 

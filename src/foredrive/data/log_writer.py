@@ -63,16 +63,18 @@ from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
     LIDAR_BEAMS,
+    TAUGHT_PLAN,
     FullOccupancy,
     occupancy_metadata,
     pack_beams,
     pack_occupancy,
+    pack_plan,
     pack_visibility,
 )
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import log_so3, matrix_from_yaw
-from foredrive.scene import Boxes, Category, LidarSweep, VoxelSpec
+from foredrive.scene import Boxes, Category, LidarSweep, Trajectory, VoxelSpec
 
 DATASET = "foredrive"
 """123D's data set name of all that is written here; maps lie at maps/foredrive/foredrive_LOCATION.arrow."""
@@ -126,6 +128,8 @@ class Frame:
     visibility: Float[np.ndarray, "M"] | None = None
     """Share of each of `boxes` that the cameras see of what they would if nothing hid it, 0 to 1."""
     caption: str | None = None
+    taught: Trajectory | None = None
+    """What a teacher would do from here, unbatched, in the ego frame at `t_us`."""
     traffic_lights: dict[int, TrafficLightStatus] | None = None
     """What the lights show, by the ids that the lanes behind their stop lines have in the log's map."""
     depth_m: dict[str, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
@@ -225,6 +229,8 @@ class LogWriter:
             modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
         if frame.caption is not None:
             modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
+        if frame.taught is not None:
+            modalities.append(_custom(frame, TAUGHT_PLAN, pack_plan(frame.taught)))
         if frame.traffic_lights is not None:
             lights = [TrafficLightDetection(*shown) for shown in sorted(frame.traffic_lights.items())]
             modalities.append(TrafficLightDetections(lights, Timestamp.from_us(frame.t_us)))

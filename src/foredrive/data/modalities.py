@@ -1,4 +1,5 @@
-"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility, captions.
+"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility, captions,
+what a teacher would do.
 
 All travel as 123D custom modalities, one row a frame; arrays are zstd-compressed one by one, so that a row
 can be read without touching its neighbours.
@@ -14,13 +15,15 @@ from jaxtyping import Float, Int
 from py123d.datatypes.custom.custom_modality import CustomModalityMetadata
 
 from foredrive.errors import InputError
-from foredrive.scene import LidarSweep, VoxelSpec
+from foredrive.scene import LidarSweep, Trajectory, VoxelSpec
 
 LIDAR_BEAMS = "lidar_beams"
 FULL_OCCUPANCY = "full_occupancy"
 BOX_VISIBILITY = "box_visibility"
 CAPTION = "caption"
 """One text a frame."""
+TAUGHT_PLAN = "taught_plan"
+"""What a teacher would do from here."""
 
 _ORIGIN_STEP_M = 1e-4
 _DIRECTION_STEP = 1 / 32767
@@ -125,6 +128,24 @@ def pack_visibility(visibility: Float[np.ndarray, "M"]) -> dict[str, Any]:
 def unpack_visibility(data: dict[str, Any]) -> Float[np.ndarray, "M"]:
     """Inverse of `pack_visibility`."""
     return expand_array(data["visibility"]).astype(np.float32)
+
+
+def pack_plan(plan: Trajectory) -> dict[str, Any]:
+    """A plan of one alternative, waypoints kept to the millimetre."""
+    xy_mm = np.round(plan.xy[0].double().numpy() * 1e3).astype(np.int32)
+    return {"xy_mm": squeeze_array(xy_mm), "yaw": squeeze_array(plan.yaw[0].numpy()), "dt_s": plan.dt_s}
+
+
+def unpack_plan(data: dict[str, Any]) -> Trajectory:
+    """Inverse of `pack_plan`, unbatched."""
+    xy = torch.from_numpy(expand_array(data["xy_mm"]).astype(np.float32) * np.float32(1e-3))[None]
+    return Trajectory(
+        xy=xy,
+        yaw=torch.from_numpy(expand_array(data["yaw"]).copy())[None],
+        valid=torch.ones(xy.shape[:2], dtype=torch.bool),
+        log_prob=torch.zeros(1),
+        dt_s=float(data["dt_s"]),
+    )
 
 
 def squeeze_array(array: np.ndarray) -> dict[str, Any]:

@@ -11,10 +11,13 @@ from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
     FULL_OCCUPANCY,
+    TAUGHT_PLAN,
     FullOccupancy,
     unpack_occupancy,
+    unpack_plan,
     unpack_visibility,
 )
+from foredrive.scene import Trajectory
 
 
 def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
@@ -48,6 +51,17 @@ def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
     with reading(log.file(f"custom.{FULL_OCCUPANCY}"), f"the occupancy at frame {frame}"):
         row = _row(log, frame, FULL_OCCUPANCY)
         return None if row is None else unpack_occupancy(row.data, row.metadata)
+
+
+def read_taught_plan(log: Log, frame: int) -> Trajectory | None:
+    """What the teacher would do from a frame on, unbatched, in its ego frame; None if nobody was asked.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    with reading(log.file(f"custom.{TAUGHT_PLAN}"), f"the taught plan at frame {frame}"):
+        row = _row(log, frame, TAUGHT_PLAN)
+        return None if row is None else unpack_plan(row.data)
 
 
 def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] | None:

@@ -13,6 +13,7 @@ from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.rivals import fit_rivals
 from foredrive.recipes.train import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.lessons import Alternating, Disturbed
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.restarts import Restarting
 from foredrive.simulation.simple_agents import Straight
@@ -21,6 +22,7 @@ from foredrive.simulation.town_expert import TownExpert
 
 CRUISE_MPS = 5.0
 EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
+DISTURBED, PUPIL = "disturbed", "pupil:"
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,13 @@ def needs_of(driver: str) -> Needs:
 
     Args:
         driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN", the MLP that sees ego
-            status alone, fitted to what the run was trained on.
+            status alone, fitted to what the run was trained on; for lessons "disturbed", the expert whom
+            things happen to, or "pupil:RUN", a run and the expert by turns.
 
     Raises:
         InputError: there is no such driver.
     """
-    if driver in (EXPERT, STOP, CONSTANT_VELOCITY):
+    if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
         return Needs(cameras=False, past_frames=1)
     clips = open_run(_run_folder(driver)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
@@ -62,8 +65,11 @@ def needs_of(driver: str) -> Needs:
     return Needs(cameras=not driver.startswith(EGO_MLP), past_frames=clips.past_frames)
 
 
-def make_driver(driver: str, simulator: TownSimulator) -> Agent:
+def make_driver(driver: str, simulator: TownSimulator, seed: int = 0) -> Agent:
     """A driver for one drive in a simulator.
+
+    Args:
+        seed: of what happens in a lesson.
 
     Raises:
         InputError: there is no such driver.
@@ -72,14 +78,24 @@ def make_driver(driver: str, simulator: TownSimulator) -> Agent:
         return TownExpert(simulator)
     if driver in (STOP, CONSTANT_VELOCITY):
         return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
-    folder, learned = _run_folder(driver), _fitted if driver.startswith(EGO_MLP) else _seeing
-    return Restarting(learned(folder), lambda: simulator.state.t_s)
+
+    def clock() -> float:
+        return simulator.state.t_s
+
+    if driver == DISTURBED:
+        return Disturbed(TownExpert(simulator), clock, seed)
+    folder = _run_folder(driver)
+    if driver.startswith(PUPIL):
+        return Alternating(_seeing(folder), TownExpert(simulator), clock, seed)
+    return Restarting(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
 
 
 def _run_folder(driver: str) -> Path:
-    folder = Path(driver.removeprefix(EGO_MLP))
+    folder = Path(driver.removeprefix(EGO_MLP).removeprefix(PUPIL))
     if not folder.is_dir():
-        known = f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder or {EGO_MLP}RUN"
+        known = (
+            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {PUPIL}RUN"
+        )
         raise InputError(f"{driver}: no such driver; there are {known}")
     return folder
 

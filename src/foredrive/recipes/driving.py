@@ -10,6 +10,7 @@ import functools
 import json
 import statistics
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from foredrive.recipes.drivers import make_driver, needs_of
 from foredrive.recipes.fan_out import fan_out, reason
 from foredrive.simulation.drive import Drive, Pace, drive_route
 from foredrive.simulation.drive_log import drive_log, key_frame
+from foredrive.simulation.lessons import Alternating, Disturbed
 from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
 from foredrive.simulation.scenarios.kinds import ScenarioKind
@@ -40,7 +42,8 @@ from foredrive.simulation.scores import (
 )
 from foredrive.simulation.time_to_collision import LEAST_S
 from foredrive.simulation.town import TownScenario, TownSimulator, grow
-from foredrive.towns.conditions import find_conditions
+from foredrive.towns.campaign import ANY_CONDITIONS
+from foredrive.towns.conditions import CONDITIONS, find_conditions
 from foredrive.towns.recorder import Crowd
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
@@ -62,7 +65,7 @@ class DriveSuite:
     seed: int = 0
     """Of the place and the traffic in the first repetition; the next has the next."""
     conditions: str | None = None
-    """None draws bright daylight from the seed."""
+    """A name, or `ANY_CONDITIONS`: drawn for each drive; None draws bright daylight from the seed."""
     sensors: bool = True
     """Drives of drivers that need none are logged with cameras and lidar all the same."""
     image_hw: tuple[int, int] = (144, 256)
@@ -77,7 +80,7 @@ class DriveSuite:
         Pace(self.period_s, self.latency_s)
         if self.repetitions < 1:
             raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
-        if self.conditions is not None:
+        if self.conditions not in (None, ANY_CONDITIONS):
             find_conditions(self.conditions)
 
 
@@ -157,15 +160,21 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict
     began = time.perf_counter()
     route = snap_route(next(r for r in load_route_set(suite.routes) if r.id == job.route))
     simulator, scenario = TownSimulator(), scenario_of(suite, route, job.repetition)
+    agent = make_driver(suite.driver, simulator, _lot(scenario.seed, job.route))
     with drive_log(scenario, out, job.name) as log:
+
+        def write_frame() -> None:
+            taught = agent.teacher.plan() if isinstance(agent, Disturbed | Alternating) else None
+            log.write(key_frame(simulator, taught))
+
         drive = drive_route(
             simulator,
             scenario,
-            make_driver(suite.driver, simulator),
+            agent,
             route=job.route,
             repetition=job.repetition,
             pace=Pace(suite.period_s, suite.latency_s),
-            on_frame=lambda: log.write(key_frame(simulator)),
+            on_frame=write_frame,
         )
     kept = _kept(drive, route, time.perf_counter() - began) | {"log": str(log.folder.relative_to(out))}
     write_json(_file(out, job), kept)
@@ -177,6 +186,9 @@ def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownSc
     needs = needs_of(suite.driver)
     seen = needs.cameras or suite.sensors
     seed = suite.seed + repetition
+    name = suite.conditions
+    if name == ANY_CONDITIONS:
+        name = list(CONDITIONS)[_lot(seed, route.id) % len(CONDITIONS)]
     happens = scenarios_on(route, grow(route.town, seed), seed) if suite.scenarios else ()
     return TownScenario(
         town=route.town,
@@ -184,12 +196,17 @@ def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownSc
         seed=seed,
         lanes=route.lanes,
         crowd=Crowd(suite.vehicles, suite.people),
-        conditions=None if suite.conditions is None else find_conditions(suite.conditions),
+        conditions=None if name is None else find_conditions(name),
         sensors=SensorSuite(camera_rig(suite.image_hw), roof_lidar()) if seen else None,
         past_frames=needs.past_frames,
         limit_s=timeout_s(route.length_m),
         scenarios=happens,
     )
+
+
+def _lot(seed: int, route: str) -> int:
+    """A number drawn for a drive, always the same."""
+    return zlib.crc32(f"{seed} {route}".encode())
 
 
 def read_drive(path: Path) -> dict[str, Any]:

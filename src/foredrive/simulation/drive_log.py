@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from foredrive.data.log_writer import Frame, LogWriter
+from foredrive.scene import Trajectory
 from foredrive.simulation.dynamics import yaw_rate_radps
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
@@ -25,8 +26,12 @@ def drive_log(scenario: TownScenario, out: Path, name: str) -> LogWriter:
     return LogWriter(out, split, name, cameras, maps, scenario.town, scenario.route_xyz)
 
 
-def key_frame(simulator: TownSimulator) -> Frame:
-    """What is logged of a simulator's latest key frame, if that is now."""
+def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Frame:
+    """What is logged of a simulator's latest key frame, if that is now.
+
+    Args:
+        taught: what a teacher would do from here, a batch of one.
+    """
     frame, ego = simulator.state.frames[-1], simulator.state.ego
     names = () if simulator.scenario.sensors is None else simulator.scenario.sensors.rig.names
     images = frame.images.permute(0, 2, 3, 1).numpy()
@@ -40,5 +45,6 @@ def key_frame(simulator: TownSimulator) -> Frame:
         images=dict(zip(names, images, strict=True)),
         sweep=frame.sweep,
         boxes=frame.boxes,
+        taught=None if taught is None else taught[0],
         traffic_lights=lights_of_lanes(load_town_map(simulator.scenario.town), lights),
     )

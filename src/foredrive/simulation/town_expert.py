@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from foredrive.scene import Clip, Trajectory
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
-from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator
+from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator, TownState
 from foredrive.towns.traffic.driven import Driven
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState
@@ -48,9 +48,19 @@ class TownExpert:
     def __init__(self, simulator: TownSimulator) -> None:
         self._simulator = simulator
         self._imagined: list[Foresight] = []
+        self._planned: tuple[TownState, Trajectory] | None = None
 
     def act(self, observation: Clip) -> Trajectory:
         """The plan from the simulator's now on, whatever was observed."""
+        return self.plan()
+
+    def plan(self) -> Trajectory:
+        """The plan from the simulator's now on; who asks twice is told the same."""
+        if self._planned is None or self._planned[0] is not self._simulator.state:
+            self._planned = self._simulator.state, self._plan()
+        return self._planned[1]
+
+    def _plan(self) -> Trajectory:
         simulator, traffic = self._simulator, self._simulator.traffic
         here, now = simulator.driven, simulator.foresight()
         now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
