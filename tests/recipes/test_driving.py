@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.logs import LogPath, find_logs
@@ -61,6 +62,27 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def driven(suite: DriveSuite, out: Path) -> Driven:
     return drive_suite(suite, out, workers=1)
+
+
+def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -> None:
+    suite = DriveSuite(
+        "disturbed", str(routes), seed=5, conditions="any", sensors=False, vehicles=4, people=2
+    )
+    driven = drive_suite(suite, tmp_path, workers=1)
+    logs = find_logs(tmp_path)
+    taught, was_driven = (
+        ClipDataset(logs, ClipConfig(1, 0, (18, 32), VOXELS, future_source=source), None)
+        for source in ("taught", "driven")
+    )
+    assert driven.broken == {}
+    for index in range(len(taught)):
+        said, done = taught.clip(index).future, was_driven.clip(index).future
+        assert said.valid.all()  # three seconds, whenever the drive is over
+        assert said.dt_s == done.dt_s == 0.5
+        assert torch.diff(said.xy[0, :, 0]).ge(-0.01).all()
+        assert float(said.xy[0, -1].norm()) < 40
+        apart_m = (said.xy - done.xy)[done.valid].norm(dim=-1)  # he does what he says, more or less
+        assert apart_m.numel() == 0 or 0 < float(apart_m.max()) < 6
 
 
 def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> None:

@@ -1,6 +1,5 @@
 """Clips of 123D logs with their voxel labels, as a torch data set."""
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -151,12 +150,7 @@ class ClipDataset(Dataset[Example]):
         taught = read_taught_plan(log, now) if self.config.future_source == "taught" else None
         if taught is None:
             return log.driven_future(now, steps, dt_s)
-        if len(taught.xy[0]) < steps or abs(taught.dt_s - dt_s) > 1e-6:
-            horizon = f"{len(taught.xy[0])} waypoints {taught.dt_s} s apart"
-            raise InputError(f"{log.path.folder}: was taught {horizon}, not {steps} of {dt_s} s")
-        return dataclasses.replace(
-            taught, xy=taught.xy[:, :steps], yaw=taught.yaw[:, :steps], valid=taught.valid[:, :steps]
-        )
+        return _at_times(taught, dt_s * np.arange(1, steps + 1))
 
     def clip(self, index: int) -> Clip:
         """Read one clip without its labels.
@@ -243,6 +237,21 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
         )
     clips: list[list[int]] = frames[whole].tolist()
     return clips
+
+
+def _at_times(plan: Trajectory, times_s: Float64[np.ndarray, "T"]) -> Trajectory:
+    """A plan of one alternative at other, even times; beyond its end nothing is valid."""
+    known_s = plan.dt_s * np.arange(len(plan.xy[0]) + 1)
+    yaw = np.unwrap(np.append(0.0, plan.yaw[0].double().numpy()))
+    x, y = (np.append(0.0, axis) for axis in plan.xy[0].double().numpy().T)
+    at = torch.from_numpy(np.stack([np.interp(times_s, known_s, values) for values in (x, y, yaw)])).float()
+    return Trajectory(
+        xy=at[:2].T[None],
+        yaw=at[None, 2],
+        valid=torch.from_numpy(times_s <= known_s[-1] + 1e-6)[None],
+        log_prob=plan.log_prob,
+        dt_s=float(times_s[0]),
+    )
 
 
 def _stack_sweeps(sweeps: list[LidarSweep | None]) -> LidarSweep:

@@ -8,12 +8,12 @@ drives and the teacher says what he would do (Ross et al. 2011, "DAgger").
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.simulation.town_expert import TownExpert
 
 CALM_S = 5.0
 """Mean time between disturbances."""
@@ -26,6 +26,15 @@ STEERED_SHARE = 0.65
 """Of the disturbances; the others are of pace."""
 TURN_S = 6.0
 """Pupil and teacher drive for so long before lots are drawn again."""
+
+
+@runtime_checkable
+class Teacher(Protocol):
+    """Who knows what to do, as `TownExpert` does."""
+
+    def plan(self) -> Trajectory:
+        """What he would do now, in the ego frame; asked twice he says the same."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +53,7 @@ class Disturbed:
         seed: of what happens when.
     """
 
-    def __init__(self, teacher: TownExpert, clock: Callable[[], float], seed: int) -> None:
+    def __init__(self, teacher: Teacher, clock: Callable[[], float], seed: int) -> None:
         self.teacher, self._clock = teacher, clock
         self._rng = np.random.default_rng([seed, 0])
         self._begins_s = self._rng.exponential(CALM_S)
@@ -52,7 +61,7 @@ class Disturbed:
 
     def act(self, observation: Clip) -> Trajectory:
         """The agent's plan, as disturbed as it is now."""
-        plan, t_s, rng = self.teacher.act(observation), self._clock(), self._rng
+        plan, t_s, rng = self.teacher.plan(), self._clock(), self._rng
         if self._now is not None and t_s >= self._now.until_s:
             self._now, self._begins_s = None, t_s + rng.exponential(CALM_S)
         if self._now is None and t_s >= self._begins_s:
@@ -82,7 +91,7 @@ class Alternating:
     def __init__(
         self,
         pupil: Agent,
-        teacher: TownExpert,
+        teacher: Teacher,
         clock: Callable[[], float],
         seed: int,
         share: float = 0.7,
@@ -96,4 +105,4 @@ class Alternating:
         if self._clock() >= self._until_s:
             self._until_s = self._clock() + TURN_S
             self._is_pupils = bool(self._rng.random() < self._share)
-        return (self._pupil if self._is_pupils else self.teacher).act(observation)
+        return self._pupil.act(observation) if self._is_pupils else self.teacher.plan()

@@ -65,6 +65,10 @@ class MotionFlow(nn.Module):
     def forward(self, volumes: Float[Tensor, "b T D Z Y X"]) -> Motion:
         """Args: volumes of the past and of now (last), each in its own ego frame."""
         stacked = volumes.flatten(1, 2).contiguous(memory_format=torch.channels_last_3d)
-        flow = self.flow(stacked).float().unflatten(1, (self.steps, 3))
-        xi = self.rigid(stacked).float().unflatten(1, (self.steps, 6))
+        batch = len(stacked)
+        if batch == 1 and stacked.device.type == "cpu" and not torch.compiler.is_compiling():
+            # PyTorch leaves one volume alone to its slow convolution: two take a sixth of the time.
+            stacked = stacked.expand(2, -1, -1, -1, -1)
+        flow = self.flow(stacked)[:batch].float().unflatten(1, (self.steps, 3))
+        xi = self.rigid(stacked)[:batch].float().unflatten(1, (self.steps, 6))
         return Motion(flow=flow, T_prev_next=exp_se3(XI_SCALE * xi))

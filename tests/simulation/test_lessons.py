@@ -1,0 +1,87 @@
+"""Lessons: what happens to a teacher, whose turn it is, and what he says meanwhile."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from foredrive.data.collate import stack_records
+from foredrive.scene import Clip, Command, Trajectory
+from foredrive.simulation.lessons import STEERED_SHARE, STEERS_RAD, Alternating, Disturbed
+from foredrive.simulation.observation import KeyFrame, make_clip, no_images
+from foredrive.simulation.simple_agents import Straight
+from foredrive.towns.recorder import boxes_of
+
+STEP_S, HOURS_S = 0.5, 3600.0
+
+
+@dataclass(frozen=True)
+class Steady:
+    """A teacher who always says the same."""
+
+    said: Trajectory
+
+    def plan(self) -> Trajectory:
+        return self.said
+
+
+@pytest.fixture(scope="module")
+def teacher(clip: Clip) -> Steady:
+    return Steady(Straight(8.0).act(clip))
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    frame = KeyFrame(0.0, np.eye(4), 5.0, no_images(), None, boxes_of([], np.eye(4)))
+    return stack_records([make_clip([frame], None, Command.STRAIGHT)])
+
+
+def plans(agent_type: type, clip: Clip, seed: int, *agents: object) -> torch.Tensor:
+    """Waypoints of all plans of an hour."""
+    now = [0.0]
+    agent, out = agent_type(*agents, lambda: now[0], seed), []
+    while now[0] < HOURS_S:
+        plan: Trajectory = agent.act(clip)
+        out.append(plan.xy[0, 0])
+        now[0] += STEP_S
+    return torch.stack(out)
+
+
+def test_a_teacher_is_steered_aside_or_held_up_but_mostly_left_alone(clip: Clip, teacher: Steady) -> None:
+    xy = plans(Disturbed, clip, 3, teacher)
+    gets_m, bears_rad = xy[:, -1].norm(dim=-1), torch.atan2(xy[:, 0, 1], xy[:, 0, 0])
+    steered, paced = bears_rad != 0, ~torch.isclose(gets_m, torch.tensor(24.0))
+    assert not (steered & paced).any()  # one thing at a time
+    low, high = STEERS_RAD
+    assert ((bears_rad.abs() > low) & (bears_rad.abs() < high))[steered].all()
+    assert 0.4 < (bears_rad[steered] > 0).float().mean() < 0.6
+    # 5 s of calm, then 1.5 s aside (.65) or 2.75 s at another pace, rounded up to plans
+    begun = torch.diff((steered | paced).int(), prepend=torch.zeros(1)) > 0
+    assert 0.2 < (steered | paced).float().mean() < 0.4
+    assert (steered & begun).sum() / begun.sum() == pytest.approx(STEERED_SHARE, abs=0.06)
+    assert 0 < (gets_m == 0).float().mean() < (gets_m > 25).float().mean() + 0.1  # stands; hurries
+    straight = xy / gets_m.clamp_min(1e-6)[:, None, None]
+    torch.testing.assert_close(straight[steered, 2] * 6, straight[steered, 5] * 3, rtol=1e-5, atol=1e-5)
+
+
+def test_the_same_seed_brings_the_same_lesson(clip: Clip, teacher: Steady) -> None:
+    first, again, other = (plans(Disturbed, clip, seed, teacher) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_pupil_and_teacher_take_turns(clip: Clip, teacher: Steady) -> None:
+    speed = plans(Alternating, clip, 0, Straight(2.0), teacher)[:, -1, 0] / 3
+    is_pupils = speed == 2.0
+    assert ((speed == 8.0) | is_pupils).all()
+    assert 0.6 < is_pupils.float().mean() < 0.8
+    changes = torch.nonzero(torch.diff(is_pupils.int()))[:, 0] + 1
+    assert (changes % 12 == 0).all()  # turns of six seconds
+
+
+def test_at_the_pupils_share_of_one_the_teacher_never_drives(clip: Clip, teacher: Steady) -> None:
+    now = [0.0]
+    agent = Alternating(Straight(2.0), teacher, lambda: now[0], 0, share=1.0)
+    for now[0] in range(0, 100, 3):
+        assert float(agent.act(clip).xy[0, 0, -1, 0]) == 6.0
