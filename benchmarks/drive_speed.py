@@ -70,7 +70,7 @@ def sensors(seed: int) -> Mapping[str, float]:
         took, clip = took + step_s, seen
     assert clip is not None
     recipe = find_recipe("nemo_tiny")
-    agent, plan_s = build_agent(recipe, load_backbone=False).eval(), []
+    agent, plan_s = build_agent(recipe, fetch=False).eval(), []
     for _ in range(PLANS):
         began = time.perf_counter()
         agent.act(shrink_images(stack_records([clip]), recipe.clips.image_hw))

@@ -146,7 +146,7 @@ class Bench:
         torch.manual_seed(0)
         recipe = recipe_at(voxel_m)
         self.fabric = make_fabric(recipe.precision)
-        self.agent = build_agent(recipe, load_backbone=False)
+        self.agent = build_agent(recipe, fetch=False)
         objective = build_objective(recipe, recipe.finetune, self.agent)
         optimizer = torch.optim.AdamW(objective.parameters(), lr=recipe.finetune.schedule.lr)
         self.objective, self.optimizer = self.fabric.setup(objective, optimizer)

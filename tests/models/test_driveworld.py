@@ -20,7 +20,7 @@ from foredrive.models.driveworld import (
 )
 from foredrive.models.driveworld.planes import PlanesToVolume, PlaneToVector, StaticScene, VectorToPlane
 from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace
-from foredrive.models.driveworld.task_prompt import TaskPrompt
+from foredrive.models.driveworld.task_prompt import PROMPTS, TaskPrompt
 from foredrive.models.lift_splat import LiftSplatEncoder
 from foredrive.scene import Clip, Example, VoxelSpec
 
@@ -37,7 +37,7 @@ def states(**changes: bool) -> StateSpace:
 @pytest.fixture(scope="module")
 def model() -> DriveWorld:
     torch.manual_seed(0)
-    texts = {"occupancy": torch.randn(6), "forecast": torch.randn(6)}
+    texts = {task: torch.randn(6) for task in PROMPTS}
     size_yx = SPEC.shape_zyx[1:]
     return DriveWorld(
         backbone=ImageBackbone(
@@ -58,7 +58,6 @@ def model() -> DriveWorld:
         past_frames=PAST,
         dt_s=0.5,
         channels=8,
-        predicts_flow=True,
     ).eval()
 
 
@@ -195,7 +194,7 @@ def test_actions_are_those_that_led_from_pose_to_pose(clip: Clip) -> None:
 
 
 def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, clip: Clip) -> None:
-    seen = model.unroll(clip, 2, torch.Generator().manual_seed(0))
+    seen = model.unroll(model.see(clip), 2, torch.Generator().manual_seed(0))
     assert (len(seen.beliefs), len(seen.posteriors), len(seen.priors)) == (PAST + 3, PAST + 1, PAST + 1)
     assert seen.actions.shape == (2, PAST + 3, 2)
     assert seen.velocities_mps.shape == (2, PAST + 1, 3, 2)
@@ -212,7 +211,7 @@ def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, cli
     without = {name for name, parameter in model.named_parameters() if parameter.grad is None}
     assert without == set()
     assert not any(name.endswith("encodings") for name, _ in model.named_parameters())  # the text is frozen
-    repeated = model.unroll(clip, 2, torch.Generator().manual_seed(0))
+    repeated = model.unroll(model.see(clip), 2, torch.Generator().manual_seed(0))
     assert torch.equal(repeated.beliefs[-1].volume, seen.beliefs[-1].volume)
 
 

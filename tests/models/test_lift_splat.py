@@ -34,8 +34,9 @@ def test_depths_lie_along_the_optical_axis(make_example: Callable[..., Example])
 def test_what_falls_into_a_cell_is_summed_and_the_rest_is_gone(make_example: Callable[..., Example]) -> None:
     lift = encoder()
     cell, inside = lift.cells(rig_of(make_example), (2, 4))
-    values = torch.rand(1, cell.shape[1], 5)
-    plane = splat(values, cell, inside, (16, 16))
+    share, feature = torch.rand(1, 16, 9), torch.rand(1, 16, 5)
+    values = (share[..., None] * feature[:, :, None]).flatten(1, 2)
+    plane = splat(share, feature, cell, inside, (16, 16))
     torch.testing.assert_close(plane.sum(dim=(2, 3)), (values * inside[..., None]).sum(1))
     points = lift.points_m(rig_of(make_example), (2, 4))[0]
     one = int(inside[0].nonzero()[7])

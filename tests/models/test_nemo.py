@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.lifting import project_to_cameras
-from foredrive.models.nemo import NemoAgent, VolumeRenderer
+from foredrive.models.nemo import VolumeRenderer
 from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import BevEncoderSize, Recipe, Stage
 from foredrive.recipes.nemo import nemo_base, nemo_tiny
@@ -30,7 +31,7 @@ def small_recipe() -> Recipe:
 
 
 @pytest.fixture
-def agent() -> NemoAgent:
+def agent() -> PlanningAgent:
     torch.manual_seed(0)
     return build_agent(small_recipe()).eval()
 
@@ -40,7 +41,9 @@ def example(make_example: Callable[..., Example]) -> Example:
     return make_example(spec=SPEC, batch=2, past=1, future=2, cameras=4)
 
 
-def test_a_voxel_straight_ahead_is_seen_by_the_front_camera_alone(agent: NemoAgent, example: Example) -> None:
+def test_a_voxel_straight_ahead_is_seen_by_the_front_camera_alone(
+    agent: PlanningAgent, example: Example
+) -> None:
     seen = example.clip.observed().frames([-1])
     rig = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
     uv, visible = project_to_cameras(agent.world_model.encoder.centres_m, rig, seen.image_valid.flatten(0, 1))
@@ -52,7 +55,7 @@ def test_a_voxel_straight_ahead_is_seen_by_the_front_camera_alone(agent: NemoAge
     torch.testing.assert_close(uv[0, 0, ahead], expected, atol=1e-4, rtol=0)
 
 
-def test_a_missing_image_is_not_looked_at(agent: NemoAgent, example: Example) -> None:
+def test_a_missing_image_is_not_looked_at(agent: PlanningAgent, example: Example) -> None:
     clip = example.clip.observed()
     masked = clip.image_valid.clone()
     masked[:, :, 0] = False
@@ -66,7 +69,7 @@ def test_a_missing_image_is_not_looked_at(agent: NemoAgent, example: Example) ->
     assert not torch.allclose(a, unmasked)
 
 
-def test_nothing_after_now_reaches_the_plan(agent: NemoAgent, example: Example) -> None:
+def test_nothing_after_now_reaches_the_plan(agent: PlanningAgent, example: Example) -> None:
     clip = example.clip
     images = clip.images.clone()
     images[:, clip.now + 1 :] = 0
@@ -78,12 +81,12 @@ def test_nothing_after_now_reaches_the_plan(agent: NemoAgent, example: Example) 
         agent.world_model.observe(clip)
 
 
-def test_too_few_frames_are_refused(agent: NemoAgent, example: Example) -> None:
+def test_too_few_frames_are_refused(agent: PlanningAgent, example: Example) -> None:
     with pytest.raises(InputError, match="needs 1 frames before now"):
         agent.world_model.observe(example.clip.observed().frames([-1]))
 
 
-def test_without_motion_the_future_is_the_present(agent: NemoAgent, example: Example) -> None:
+def test_without_motion_the_future_is_the_present(agent: PlanningAgent, example: Example) -> None:
     """Motion starts at zero (its last layers do), so imagining must not change anything."""
     with torch.no_grad():
         belief = agent.world_model.observe(example.clip.observed())
@@ -97,7 +100,7 @@ def test_without_motion_the_future_is_the_present(agent: NemoAgent, example: Exa
         agent.world_model.imagine(belief, 1, torch.zeros(2, 1, 2))
 
 
-def test_driving_forward_moves_the_volume_back(agent: NemoAgent, example: Example) -> None:
+def test_driving_forward_moves_the_volume_back(agent: PlanningAgent, example: Example) -> None:
     """Two metres ahead per step: what was at x + 2 is at x, and the poses chain up."""
     motion = agent.world_model.motion
     with torch.no_grad():
@@ -136,7 +139,7 @@ def test_what_passes_through_shows_the_background() -> None:
     )
 
 
-def test_an_unknown_command_is_not_taken_for_a_known_one(agent: NemoAgent, example: Example) -> None:
+def test_an_unknown_command_is_not_taken_for_a_known_one(agent: PlanningAgent, example: Example) -> None:
     clip = example.clip.observed()
     with torch.no_grad():
         plans = {
@@ -245,7 +248,7 @@ def test_the_same_generator_gives_the_same_losses(example: Example) -> None:
 def test_nemo_base_has_the_papers_size() -> None:
     recipe = nemo_base()
     with torch.device("meta"):
-        agent = build_agent(recipe, load_backbone=False)
+        agent = build_agent(recipe, fetch=False)
     assert agent.world_model.encoder.query.shape == (200 * 200 * 16, 64)
     assert agent.planner.plan.shape == (256,)
     parameters = sum(parameter.numel() for parameter in agent.parameters())

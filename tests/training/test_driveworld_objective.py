@@ -39,7 +39,6 @@ def world() -> DriveWorld:
         past_frames=PAST,
         dt_s=0.5,
         channels=8,
-        predicts_flow=True,
     )
 
 

@@ -23,6 +23,8 @@ class Prediction(Record):
     """[b 1 T] in the ego frame at now."""
     flow_mps: Float[Tensor, "b F 3 Z Y X"] | None = None
     """Velocity over ground of what is in a voxel, in the ego axes of its frame."""
+    futures: Bool[Tensor, "b K P Z Y X"] | None = None
+    """Occupancy in K futures drawn by chance, of the P = F - 1 key frames after now."""
     images: Float[Tensor, "b R C 3 h w"] | None = None
     """Rendered views of the clip's cameras, RGB from 0 to 1."""
     image_known: Bool[Tensor, "b R C h w"] | None = None

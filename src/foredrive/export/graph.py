@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import ego_motion
-from foredrive.models.nemo import NemoAgent
+from foredrive.models.nemo import Nemo
 from foredrive.scene import CameraRig, Clip
 
 
@@ -26,7 +27,7 @@ class GraphInputs(NamedTuple):
     past_motion: Float[Tensor, "1 P 4"]
 
     @classmethod
-    def of(cls, observed: Clip, agent: NemoAgent) -> "GraphInputs":
+    def of(cls, observed: Clip, agent: PlanningAgent) -> "GraphInputs":
         """What `agent` looks at of an observed clip with a batch of one."""
         rig, frames = observed.rig, agent.world_model.past_frames + 1
         poses, speeds = ego_motion(observed, agent.planner.history)
@@ -76,7 +77,7 @@ MEANING = {
 
 
 class AgentGraph(nn.Module):
-    """A NeMo agent between plain tensors: nothing in it depends on what the data say, so it can be traced.
+    """An agent on a NeMo between plain tensors: nothing in it depends on what data say, so it can be traced.
 
     Args:
         agent: in evaluation mode.
@@ -85,7 +86,7 @@ class AgentGraph(nn.Module):
     """
 
     def __init__(
-        self, agent: NemoAgent, camera_names: tuple[str, ...], image_hw: tuple[int, int], steps: int
+        self, agent: PlanningAgent, camera_names: tuple[str, ...], image_hw: tuple[int, int], steps: int
     ) -> None:
         super().__init__()
         self.agent, self.camera_names, self.image_hw, self.steps = agent, camera_names, image_hw, steps
@@ -103,8 +104,9 @@ class AgentGraph(nn.Module):
         command_valid: Bool[Tensor, "1"],
         past_motion: Float[Tensor, "1 P 4"],
     ) -> dict[str, Tensor]:
-        """As `NemoAgent.forward`: the fields of `GraphOutputs`; `MEANING` says what all of them are."""
+        """As `PlanningAgent.forward`: the fields of `GraphOutputs`; `MEANING` says what all of them are."""
         model, planner = self.agent.world_model, self.agent.planner
+        assert isinstance(model, Nemo)
         rig = CameraRig(
             K=K,
             T_ego_cam=T_ego_cam,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
@@ -47,12 +47,14 @@ class LiftSplatEncoder(nn.Module):
         finest = features[0]
         told = self.depth_and_context(finest).float()
         depth, context = told.split([len(self.depths_m), self.width], dim=-1)
-        lifted = depth.softmax(-1)[..., None] * context[..., None, :]  # [b C h w K W]
-        lifted = lifted * image_valid[:, :, None, None, None, None]
+        depth = depth.softmax(-1) * image_valid[:, :, None, None, None]
         cell, inside = self.cells(rig, (finest.shape[2], finest.shape[3]))
-        return self.out(splat(lifted.flatten(1, 4), cell, inside, self.spec.shape_zyx[1:]))
+        plane = splat(depth.flatten(1, 3), context.flatten(1, 3), cell, inside, self.spec.shape_zyx[1:])
+        return self.out(plane)
 
-    def cells(self, rig: CameraRig, feature_hw: tuple[int, int]) -> tuple[Tensor, Bool[Tensor, "b P"]]:
+    def cells(
+        self, rig: CameraRig, feature_hw: tuple[int, int]
+    ) -> tuple[Int[Tensor, "b P"], Bool[Tensor, "b P"]]:
         """The cell of the plane (y · X + x) that each depth of each feature lies in, and whether in any."""
         points = self.points_m(rig, feature_hw)
         lower = points.new_tensor(self.spec.lower_m)
@@ -77,19 +79,21 @@ class LiftSplatEncoder(nn.Module):
 
 
 def splat(
-    values: Float[Tensor, "b P W"],
-    cell: Tensor,
+    share: Float[Tensor, "b N K"],
+    feature: Float[Tensor, "b N W"],
+    cell: Int[Tensor, "b P"],
     inside: Bool[Tensor, "b P"],
     size_yx: tuple[int, int],
 ) -> Float[Tensor, "b W Y X"]:
-    """Sums of what falls into each cell of a plane.
+    """Sums of what falls into each cell of a plane; nothing is computed of what falls beside it.
 
     Args:
-        cell: index y · X + x of each of P values, of any value where not `inside`.
+        share: of each of N features that belongs to each of K depths.
+        cell: index y · X + x of each of the P = N·K, of any value where not `inside`.
     """
-    b, _, width = values.shape
-    count = size_yx[0] * size_yx[1]
-    batch = torch.arange(b, device=cell.device)[:, None] * count
-    plane = values.new_zeros(b * count, width)
-    plane = plane.index_add(0, (batch + cell)[inside], values[inside])
+    b, count, width = len(share), size_yx[0] * size_yx[1], feature.shape[-1]
+    whose = inside.flatten().nonzero()[:, 0] // share.shape[-1]
+    values = share.flatten(1)[inside][:, None] * feature.flatten(0, 1)[whose]
+    first = torch.arange(b, device=cell.device)[:, None] * count
+    plane = values.new_zeros(b * count, width).index_add(0, (first + cell)[inside], values)
     return plane.view(b, *size_yx, width).permute(0, 3, 1, 2)

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
-from transformers import AutoModel, AutoTokenizer
 
 from foredrive.errors import InputError
 
@@ -31,6 +30,8 @@ def encode_texts(texts: Sequence[str], model: str) -> Float[Tensor, "N E"]:
     Raises:
         InputError: there is no such model here, and it cannot be had.
     """
+    from transformers import AutoModel, AutoTokenizer  # takes seconds, and most only need its name
+
     where = str(_in_package()) if model == IN_A_PACKAGE else model
     try:
         tokenizer, encoder = AutoTokenizer.from_pretrained(where), AutoModel.from_pretrained(where).eval()

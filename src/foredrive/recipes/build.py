@@ -2,24 +2,41 @@
 
 import warnings
 
+from torch import nn
+
+from foredrive.data import ClipConfig
 from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.averaging import AveragingEncoder
 from foredrive.models.backbone import ImageBackbone
 from foredrive.models.bev import BevEncoder
+from foredrive.models.driveworld import DriveWorld
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.models.lifting import LiftingEncoder
-from foredrive.models.nemo import MotionFlow, Nemo, NemoAgent, VolumeRenderer
+from foredrive.models.nemo import MotionFlow, Nemo, VolumeRenderer
 from foredrive.models.planner import VolumePlanner
 from foredrive.models.vgg import Vgg16Features
-from foredrive.recipes.config import AveragingEncoderSize, BevEncoderSize, Recipe, Stage
-from foredrive.training import NemoObjective
+from foredrive.recipes.build_driveworld import build_driveworld
+from foredrive.recipes.config import (
+    AnyStage,
+    AveragingEncoderSize,
+    BevEncoderSize,
+    DriveWorldSize,
+    DriveWorldStage,
+    NemoSize,
+    Recipe,
+    Stage,
+)
+from foredrive.scene import VoxelSpec
+from foredrive.training import DriveWorldObjective, NemoObjective
 
 
-def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
+def build_agent(recipe: Recipe, *, fetch: bool = True) -> PlanningAgent:
     """World model and planner with fresh weights.
 
-    The backbone loads the weights the recipe names, unless `load_backbone` is False because trained ones
-    will replace them.
+    Args:
+        fetch: whether to fetch what the recipe names, weights of a backbone and encodings of texts; not
+            needed where trained weights will replace them.
     """
     size, clips = recipe.model, recipe.clips
     backbone = ImageBackbone(
@@ -29,33 +46,13 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         layer_type=size.backbone.layer_type,
         stages=size.backbone.stages,
         channels=size.channels,
-        weights=size.backbone.weights if load_backbone else None,
+        weights=size.backbone.weights if fetch else None,
         checkpoint="backbone" in size.checkpoint,
     )
-    encoder = _build_encoder(recipe)
-    motion = MotionFlow(
-        channels=size.channels,
-        frames=clips.past_frames + 1,
-        hidden=size.motion_hidden,
-        steps=clips.future_frames,
-    )
-    renderer = VolumeRenderer(
-        clips.voxels,
-        channels=size.channels,
-        near_m=size.ray_near_m,
-        far_m=size.ray_far_m,
-        samples=size.ray_samples,
-        hidden=size.recon_hidden,
-    )
-    world_model = Nemo(
-        backbone=backbone,
-        encoder=encoder,
-        motion=motion,
-        renderer=renderer,
-        past_frames=clips.past_frames,
-        channels=size.channels,
-        hidden=size.occupancy_hidden,
-    )
+    if isinstance(size, DriveWorldSize):
+        world_model: Nemo | DriveWorld = build_driveworld(size, clips, backbone, fetch=fetch)
+    else:
+        world_model = _build_nemo(size, clips, backbone)
     planner = VolumePlanner(
         channels=size.channels,
         spec=clips.voxels,
@@ -70,7 +67,34 @@ def build_agent(recipe: Recipe, *, load_backbone: bool = True) -> NemoAgent:
         ego_mlp=_build_ego_mlp(recipe),
         look_m=size.planner_look_m,
     )
-    return NemoAgent(world_model, planner)
+    return PlanningAgent(world_model, planner)
+
+
+def _build_nemo(size: NemoSize, clips: ClipConfig, backbone: ImageBackbone) -> Nemo:
+    encoder = _build_encoder(size, clips.voxels)
+    motion = MotionFlow(
+        channels=size.channels,
+        frames=clips.past_frames + 1,
+        hidden=size.motion_hidden,
+        steps=clips.future_frames,
+    )
+    renderer = VolumeRenderer(
+        clips.voxels,
+        channels=size.channels,
+        near_m=size.ray_near_m,
+        far_m=size.ray_far_m,
+        samples=size.ray_samples,
+        hidden=size.recon_hidden,
+    )
+    return Nemo(
+        backbone=backbone,
+        encoder=encoder,
+        motion=motion,
+        renderer=renderer,
+        past_frames=clips.past_frames,
+        channels=size.channels,
+        hidden=size.occupancy_hidden,
+    )
 
 
 def _build_ego_mlp(recipe: Recipe) -> EgoMLP | None:
@@ -84,8 +108,7 @@ def _build_ego_mlp(recipe: Recipe) -> EgoMLP | None:
     )
 
 
-def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEncoder:
-    model, spec = recipe.model, recipe.clips.voxels
+def _build_encoder(model: NemoSize, spec: VoxelSpec) -> LiftingEncoder | BevEncoder | AveragingEncoder:
     size, levels = model.encoder, len(model.backbone.stages)
     if isinstance(size, AveragingEncoderSize):
         return AveragingEncoder(spec, channels=model.channels, hidden=size.hidden)
@@ -112,21 +135,30 @@ def _build_encoder(recipe: Recipe) -> LiftingEncoder | BevEncoder | AveragingEnc
     )
 
 
-def build_objective(recipe: Recipe, stage: Stage, agent: NemoAgent) -> NemoObjective:
+def build_objective(recipe: Recipe, stage: AnyStage, agent: PlanningAgent) -> nn.Module:
     """What is trained in a stage. Without real VGG-16 weights the perceptual loss has weight 0."""
+    if isinstance(stage, DriveWorldStage):
+        objective: nn.Module = DriveWorldObjective(
+            agent, stage.weights, steps=recipe.clips.future_frames, temporal=stage.temporal
+        )
+    else:
+        objective = _build_nemo_objective(recipe, stage, agent)
+    if recipe.path is not None and agent.planner.path is not None:
+        agent.planner.path.requires_grad_(False)  # it has its turn after the last stage
+    return objective
+
+
+def _build_nemo_objective(recipe: Recipe, stage: Stage, agent: PlanningAgent) -> NemoObjective:
     features = None
     if stage.vgg16 is not None:
         try:
             features = Vgg16Features(stage.vgg16)
         except (OSError, InputError) as error:
-            warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=2)
-    objective = NemoObjective(
+            warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
+    return NemoObjective(
         agent,
         stage.weights,
         steps=recipe.clips.future_frames if stage.imagine else 0,
         ray_stride=stage.ray_stride,
         image_features=features,
     )
-    if recipe.path is not None and agent.planner.path is not None:
-        agent.planner.path.requires_grad_(False)  # it has its turn after the last stage
-    return objective

@@ -2,15 +2,18 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Discriminator, Tag, TypeAdapter, ValidationError
 
 from foredrive.data import ClipConfig
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training import LossWeights, PathFit, Schedule
+from foredrive.training import DriveWorldWeights, LossWeights, PathFit, Schedule
+
+NEMO: Final = "nemo"
+DRIVEWORLD: Final = "driveworld"
 
 
 @dataclass(frozen=True)
@@ -56,18 +59,31 @@ class AveragingEncoderSize:
 
 
 @dataclass(frozen=True)
-class NemoSize:
-    """Sizes of NeMo's parts; see the modules' own docstrings."""
+class PooledLiftingSize:
+    """Deformable lifting into a volume, folded into a plane; see `models.pooled_lifting`."""
+
+    heads: int
+    points: int
+    layers: int
+    kind: Literal["pooled"] = "pooled"
+
+
+@dataclass(frozen=True)
+class LiftSplatSize:
+    """Lift, splat; see `models.lift_splat.LiftSplatEncoder`."""
+
+    near_m: float
+    far_m: float
+    step_m: float
+    kind: Literal["lift_splat"] = "lift_splat"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSize:
+    """Sizes of what all agents have: a backbone, a volume of D channels, the planner; see `VolumePlanner`."""
 
     backbone: BackboneSize
-    encoder: VolumeEncoderSize | BevEncoderSize | AveragingEncoderSize
     channels: int
-    occupancy_hidden: int
-    motion_hidden: int
-    ray_near_m: float
-    ray_far_m: float
-    ray_samples: int
-    recon_hidden: int
     planner_width: int
     planner_layers: int
     planner_heads: int
@@ -85,9 +101,63 @@ class NemoSize:
     """Trade time for memory: what these parts compute is not kept but computed again."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class NemoSize(AgentSize):
+    """Sizes of NeMo's parts; see the modules' own docstrings."""
+
+    encoder: VolumeEncoderSize | BevEncoderSize | AveragingEncoderSize
+    occupancy_hidden: int
+    motion_hidden: int
+    ray_near_m: float
+    ray_far_m: float
+    ray_samples: int
+    recon_hidden: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class PromptSize:
+    """Task prompts; see `models.driveworld.task_prompt`."""
+
+    widths: tuple[int, ...]
+    """Channels of the steps from a sentence to a plane."""
+    encoding: int
+    """How many numbers the text encoder makes of a sentence."""
+    text_encoder: str
+    """By name or folder; needed once, by training from scratch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveWorldSize(AgentSize):
+    """Sizes of DriveWorld's parts; see the modules' own docstrings."""
+
+    encoder: PooledLiftingSize | LiftSplatSize
+    plane: int
+    """C, channels of the plane that images are lifted to."""
+    observation: int
+    """Of x_t (512 in the paper)."""
+    observation_hidden: int
+    state: int
+    history: int
+    memory: int
+    """How many histories the Dynamic Memory Bank holds."""
+    memory_heads: int
+    objects: int
+    """K, moving objects whose velocities are estimated."""
+    states_hidden: int
+    expanded: tuple[int, ...]
+    """Channels of the steps from a state to a plane (m_θ)."""
+    volume_hidden: int
+    statics: int
+    """Channels of latent statics; 0 leaves Static Scene Propagation out."""
+    prompt: PromptSize | None
+    memory_bank: bool = True
+    motion_norm: bool = True
+    kind: Literal["driveworld"] = DRIVEWORLD
+
+
 @dataclass(frozen=True)
 class Stage:
-    """One stage of training."""
+    """One stage of NeMo's training."""
 
     schedule: Schedule
     weights: LossWeights
@@ -99,19 +169,51 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class DriveWorldStage:
+    """One stage of DriveWorld's training."""
+
+    schedule: Schedule
+    weights: DriveWorldWeights
+    temporal: bool = True
+    """Otherwise each frame's occupancy is learned from that frame alone."""
+    kind: Literal["driveworld"] = DRIVEWORLD
+
+
+def _kind_of(written: object) -> str:
+    """Whose size or stage was written: only DriveWorld's say so."""
+    return DRIVEWORLD if isinstance(written, dict) and written.get("kind") == DRIVEWORLD else NEMO
+
+
+AnyModel = Annotated[
+    Annotated[NemoSize, Tag(NEMO)] | Annotated[DriveWorldSize, Tag(DRIVEWORLD)], Discriminator(_kind_of)
+]
+AnyStage = Annotated[
+    Annotated[Stage, Tag(NEMO)] | Annotated[DriveWorldStage, Tag(DRIVEWORLD)], Discriminator(_kind_of)
+]
+
+
+@dataclass(frozen=True)
 class Recipe:
-    """Everything that decides a run, but for where the logs are."""
+    """Everything that decides a run, but for where the logs are. The stages are of the model's kind."""
 
     name: str
     clips: ClipConfig
-    model: NemoSize
-    pretrain: Stage | None
+    model: AnyModel
+    pretrain: AnyStage | None
     """None: fine-tuning starts from scratch, or from weights that are given."""
-    finetune: Stage
+    finetune: AnyStage
     path: PathFit | None = None
     """How the planner's `PathCorrection` is fitted to what the fine-tuned world model sees, which joint
     fine-tuning then leaves alone; None leaves it to joint fine-tuning."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+
+
+S = TypeVar("S", bound=Stage | DriveWorldStage)
+
+
+def rescheduled(stage: S, **changes: Any) -> S:
+    """The stage with other entries of its schedule."""
+    return replace(stage, schedule=replace(stage.schedule, **changes))
 
 
 def labelled_by(recipe: Recipe, occupancy_source: Literal["lidar", "recorded"]) -> Recipe:
@@ -140,7 +242,7 @@ def load_recipe(path: Path) -> Recipe:
         raise InputError(f"{path.parent}: not a run folder, {path.name} cannot be read") from error
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
+        where = ".".join(str(part) for part in first["loc"] if part not in (NEMO, DRIVEWORLD))
         raise InputError(f"{path}: not a recipe: {f'{where}: ' if where else ''}{first['msg']}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a recipe: {str(error).splitlines()[0]}") from error

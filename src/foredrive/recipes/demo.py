@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.recipes.config import Recipe, Stage
+from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.evaluate import evaluate_run
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.recipes.train import Run, train_run
@@ -43,24 +43,19 @@ def full_demo() -> DemoSize:
 
 def quick_demo() -> DemoSize:
     """The same steps in a minute or so: they run, but nothing is learned worth looking at."""
-    recipe = nemo_tiny()
+    recipe, few = nemo_tiny(), {"batch_size": 2, "warmup_steps": 2}
     return DemoSize(
         recipe=dataclasses.replace(
             recipe,
             name="nemo_tiny (quick)",
-            pretrain=None if recipe.pretrain is None else _shortened(recipe.pretrain, 12),
-            finetune=_shortened(recipe.finetune, 6),
+            pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, steps=12, **few),
+            finetune=rescheduled(recipe.finetune, steps=6, **few),
         ),
         train_drives=(("Town01", 1), ("Town02", 1)),
         test_drives=(("Town05", 1),),
         train_s=6.0,
         test_s=6.0,
     )
-
-
-def _shortened(stage: Stage, steps: int) -> Stage:
-    schedule = dataclasses.replace(stage.schedule, steps=steps, batch_size=2, warmup_steps=2)
-    return dataclasses.replace(stage, schedule=schedule)
 
 
 def run_demo(size: DemoSize, out: Path, say: Callable[[str], None]) -> tuple[Run, list[LogPath]]:

@@ -8,8 +8,8 @@ import torch
 
 from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
-from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.rivals import fit_rivals
 from foredrive.recipes.train import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
@@ -37,7 +37,7 @@ class Needs:
 class _Sees:
     """An agent that was trained on smaller images than the vehicle takes."""
 
-    agent: NemoAgent
+    agent: PlanningAgent
     image_hw: tuple[int, int]
     device: str
 

@@ -22,7 +22,7 @@ from foredrive.evaluation import (
 )
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.recipes.open_clips import open_clips
-from foredrive.recipes.predict import NemoPredictor
+from foredrive.recipes.predict import AgentPredictor
 from foredrive.recipes.rivals import fit_rivals
 from foredrive.recipes.train import Run, load_agent
 from foredrive.scene import Example, Trajectory
@@ -30,6 +30,8 @@ from foredrive.scene import Example, Trajectory
 SUMMARY = "summary.json"
 RENDER_STRIDE = 2
 """One pixel in this many along rows and columns is rendered and compared."""
+FUTURES = 5
+"""Drawn from world models that know chance."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,8 @@ class Inspection:
     example: Example
     occupancy_prob: Float[Tensor, "F Z Y X"]
     """Now first, then the imagined key frames."""
-    rendered: Float[Tensor, "C 3 h w"]
-    """The views at now, RGB 0 to 1."""
+    rendered: Float[Tensor, "C 3 h w"] | None
+    """The views at now, RGB 0 to 1; None from a world model that does not render."""
     volume: Float[Tensor, "D Z Y X"]
     plan: Trajectory
     """[1 T]."""
@@ -106,7 +108,7 @@ def evaluate_run(
     with Progress() as progress:
         task = progress.add_task("evaluate", total=len(dataset))
         result = evaluate(
-            NemoPredictor(agent, clips.future_frames, RENDER_STRIDE if views else 0),
+            AgentPredictor(agent, clips.future_frames, RENDER_STRIDE if views else 0, FUTURES),
             _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,
             baselines={
@@ -131,7 +133,7 @@ def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspectio
     clips = run.recipe.clips
     config = dataclasses.replace(clips, lidar=True, map=True)
     dataset = open_clips(logs, config, run.cache_dir)
-    predictor = NemoPredictor(agent, clips.future_frames, RENDER_STRIDE)
+    predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE)
     found = []
     for k in range(min(count, len(dataset))):
         try:
@@ -141,13 +143,12 @@ def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspectio
         observed = collate([item]).clip.observed()
         prediction = predictor.predict(observed)
         assert prediction.occupancy_logit is not None
-        assert prediction.images is not None
         assert prediction.plan is not None
         found.append(
             Inspection(
                 example=item,
                 occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
-                rendered=prediction.images[0, 0],
+                rendered=None if prediction.images is None else prediction.images[0, 0],
                 volume=agent.world_model.observe(observed).volume[0],
                 plan=prediction.plan[0],
             )

@@ -19,7 +19,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path
-from foredrive.models.nemo import NemoAgent
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.nemo import Nemo
 from foredrive.recipes.open_clips import open_clips
 from foredrive.recipes.train import Run, load_agent
 from foredrive.scene import Clip
@@ -61,6 +62,8 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     from foredrive.export.onnx import OPSET, write_onnx
 
     agent = load_agent(run)
+    if not isinstance(agent.world_model, Nemo):
+        raise InputError(f"{run.folder}: only agents on NeMo can be exported, this is {run.recipe.name}")
     size = run.recipe.clips
     dataset = open_clips(logs, size, run.cache_dir)
     samples = []
@@ -110,7 +113,7 @@ def _check_packages() -> None:
             raise InputError(f"no package {name}: pip install 'foredrive[export]' brings it along") from error
 
 
-def _as_it_runs_here(agent: NemoAgent, observed: Clip, steps: int) -> GraphOutputs:
+def _as_it_runs_here(agent: PlanningAgent, observed: Clip, steps: int) -> GraphOutputs:
     output = agent(observed, steps)
     now = torch.eye(4)[None]
     poses = [now if belief.T_now_ego is None else belief.T_now_ego for belief in output.beliefs]
@@ -163,7 +166,7 @@ def _difference(name: str, a: Tensor, b: Tensor) -> Float[Tensor, "..."]:
 
 
 def _latency_ms(
-    agent: NemoAgent, runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
+    agent: PlanningAgent, runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
 ) -> dict[str, dict[str, float]]:
     """Median and 90th percentile of one clip, in turns, so that a busy machine slows all of them alike."""
     times: dict[str, list[float]] = {"eager": [], **{name: [] for name in runtimes}}

@@ -2,6 +2,7 @@
 
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe
+from foredrive.recipes.driveworld import driveworld_tiny
 from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_tiny, nemo_town
 from foredrive.recipes.nemo_rows import nemo_rows
 
@@ -9,6 +10,7 @@ RECIPES: dict[str, Recipe] = {
     "nemo_tiny": nemo_tiny(),
     **nemo_rows(nemo_town(), TOWN_BEV),
     **nemo_rows(nemo_base(), BASE_BEV),
+    "driveworld_tiny": driveworld_tiny(),
 }
 
 

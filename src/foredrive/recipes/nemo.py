@@ -70,6 +70,7 @@ def nemo_town() -> Recipe:
     tiny = nemo_tiny()
     pretrain, finetune = tiny.pretrain, tiny.finetune
     assert pretrain is not None
+    assert isinstance(tiny.model, NemoSize)
     return dataclasses.replace(
         tiny,
         name="nemo_town",

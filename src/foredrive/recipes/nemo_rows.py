@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from foredrive.recipes.config import BevEncoderSize, Recipe
+from foredrive.recipes.config import BevEncoderSize, NemoSize, Recipe, Stage
 
 
 def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
@@ -48,21 +48,25 @@ def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
 
 def _planning_alone(recipe: Recipe, future: Literal["attention", "concatenation", "none"]) -> Recipe:
     """Fine-tuning by the waypoints alone."""
-    weights = replace(recipe.finetune.weights, recon=0.0, occ=0.0)
+    stage = recipe.finetune
+    assert isinstance(stage, Stage)
+    weights = replace(stage.weights, recon=0.0, occ=0.0)
     return replace(
         recipe,
         model=replace(recipe.model, planner_future=future),
-        finetune=replace(recipe.finetune, weights=weights, imagine=False),
+        finetune=replace(stage, weights=weights, imagine=False),
     )
 
 
 def _in_bev(recipe: Recipe, bev: BevEncoderSize) -> Recipe:
+    assert isinstance(recipe.model, NemoSize)
     return replace(recipe, model=replace(recipe.model, encoder=bev))
 
 
 def _pretrained_with(recipe: Recipe, *, image: bool, occupancy: bool, flow: bool) -> Recipe:
     """Pre-training with some of its three parts."""
-    assert recipe.pretrain is not None
-    weights = recipe.pretrain.weights
+    stage = recipe.pretrain
+    assert isinstance(stage, Stage)
+    weights = stage.weights
     weights = replace(weights, recon=weights.recon if image else 0.0, occ=weights.occ if occupancy else 0.0)
-    return replace(recipe, pretrain=replace(recipe.pretrain, weights=weights, imagine=flow))
+    return replace(recipe, pretrain=replace(stage, weights=weights, imagine=flow))

@@ -14,8 +14,8 @@ from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, LogPath, collate
 from foredrive.files import atomic_path
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import ego_motion
-from foredrive.models.nemo import NemoAgent
 from foredrive.recipes.open_clips import open_clips
 from foredrive.scene import Example
 from foredrive.training import PathDemonstrations
@@ -25,7 +25,7 @@ BATCH = 8
 
 @torch.no_grad()
 def read_paths(
-    agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
+    agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
 ) -> PathDemonstrations:
     """Read the present volume of clips `stride_s` apart along the plans made without looking; half precision
     is kept.
@@ -45,7 +45,9 @@ def read_paths(
     return PathDemonstrations(**kept)
 
 
-def _read(agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path) -> dict[str, Tensor]:
+def _read(
+    agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path
+) -> dict[str, Tensor]:
     dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
     loader: Iterable[Example] = DataLoader(dataset, batch_size=BATCH, collate_fn=collate)
     agent.eval()
@@ -57,17 +59,16 @@ def _read(agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_di
     return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
 
-def _row(agent: NemoAgent, example: Example) -> dict[str, Tensor]:
-    planner, world = agent.planner, agent.world_model
+def _row(agent: PlanningAgent, example: Example) -> dict[str, Tensor]:
+    planner = agent.planner
     assert planner.path is not None
     clip = example.clip.observed()
-    belief = world.observe(clip)
-    ahead = world.imagine(belief, planner.looks_ahead) if planner.looks_ahead else []
-    plan = agent.plan(clip, [belief, *ahead])
+    beliefs = agent.foresee(clip, planner.looks_ahead)
+    plan = agent.plan(clip, beliefs)
     poses, speeds = ego_motion(clip, planner.history)
     past = torch.cat([poses, speeds[:, :-1, None]], dim=-1)
     unseen_xy, told = planner.without_looking(clip.command, clip.command_valid, speeds[:, -1], past)
-    reads = planner.path.read(belief.volume, unseen_xy)
+    reads = planner.path.read(agent.planned_on(beliefs[0]), unseen_xy)
     change = planner.path(reads, told).cumsum(dim=1)
     future = example.clip.future
     row = {
@@ -81,7 +82,7 @@ def _row(agent: NemoAgent, example: Example) -> dict[str, Tensor]:
     return {name: tensor.contiguous().cpu() for name, tensor in row.items()}
 
 
-def _key(agent: NemoAgent, logs: Sequence[LogPath], clips: ClipConfig, stride_s: float) -> str:
+def _key(agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, stride_s: float) -> str:
     digest = hashlib.blake2b(digest_size=16)
     read = (str(logs), repr(dataclasses.asdict(clips)), repr(stride_s))
     digest.update("\n".join(read).encode())

@@ -1,43 +1,66 @@
-"""NeMo under evaluation: what it says about a clip, in the form an evaluation asks for."""
+"""An agent under evaluation: what it says about a clip, in the form an evaluation asks for."""
+
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.evaluation.predictor import Prediction
-from foredrive.models.nemo import NemoAgent
-from foredrive.scene import Clip, Decoded
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.driveworld import DriveWorld
+from foredrive.models.nemo import Nemo, VolumeRenderer
+from foredrive.scene import Belief, Clip, Decoded
 from foredrive.training import thinned_rays
 
 
-class NemoPredictor:
+class AgentPredictor:
     """A trained agent as a `Predictor`.
 
     Args:
         agent: in evaluation mode.
         steps: number of future key frames to predict.
-        ray_stride: one pixel in `ray_stride` along rows and columns is rendered, at now; 0 renders nothing.
+        ray_stride: one pixel in `ray_stride` along rows and columns is rendered, at now, by a world model
+            that renders; 0 renders nothing.
+        futures: how many futures to draw from a world model that knows chance; their states follow from the
+            order of clips.
     """
 
-    def __init__(self, agent: NemoAgent, steps: int, ray_stride: int) -> None:
-        self.agent, self.steps, self.ray_stride = agent, steps, ray_stride
+    def __init__(self, agent: PlanningAgent, steps: int, ray_stride: int, futures: int = 0) -> None:
+        self.agent, self.steps, self.ray_stride, self.futures = agent, steps, ray_stride, futures
+        self._generator = torch.Generator().manual_seed(0)
 
     @torch.no_grad()
     def predict(self, observed: Clip) -> Prediction:
-        """Occupancy now and at the next key frames, the plan, the views at now."""
+        """Occupancy and flow now and at the next key frames, the plan, views at now, futures by chance."""
         output = self.agent(observed, self.steps)
-        decoded = output.decoded
+        decoded, world = output.decoded, self.agent.world_model
+        flow = [frame.flow for frame in decoded if frame.flow is not None]
+        views = None
+        if self.ray_stride and isinstance(world, Nemo):
+            views = self._views(world.renderer, observed, decoded[0])[:, None]
+        futures = None
+        if self.futures and self.steps and isinstance(world, DriveWorld):
+            drawn = [
+                world.imagine(output.beliefs[0], self.steps, generator=self._generator)
+                for _ in range(self.futures)
+            ]
+            futures = torch.stack([_occupied(world, beliefs) for beliefs in drawn], dim=1)
         return Prediction(
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
             plan=output.plan,
-            images=self._views(observed, decoded[0])[:, None] if self.ray_stride else None,
+            flow_mps=torch.stack(flow, dim=1) if flow else None,
+            futures=futures,
+            images=views,
             image_stride=max(self.ray_stride, 1),
         )
 
-    def _views(self, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
+    def _views(self, renderer: VolumeRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
         rays = thinned_rays(observed, observed.now, self.ray_stride)
-        rendered = self.agent.world_model.renderer(
-            now.feature, now.occupancy_logit, rays.origin, rays.direction
-        )
+        rendered = renderer(now.feature, now.occupancy_logit, rays.origin, rays.direction)
         b, c, _, h, w = rays.rgb.shape
         return rendered.rgb.view(b, c, h, w, 3).permute(0, 1, 4, 2, 3)
+
+
+def _occupied(world: DriveWorld, beliefs: Sequence[Belief]) -> Bool[Tensor, "b F Z Y X"]:
+    return torch.stack([world.decode(belief).occupancy_logit > 0 for belief in beliefs], dim=1)

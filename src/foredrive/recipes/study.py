@@ -10,7 +10,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, read_summary
 from foredrive.metrics import PROTOCOLS
-from foredrive.recipes.config import Recipe, Stage
+from foredrive.recipes.config import Recipe, Stage, rescheduled
 from foredrive.recipes.evaluate import SUMMARY, evaluate_run
 from foredrive.recipes.recording import record_drives
 from foredrive.recipes.train import train_run
@@ -76,21 +76,19 @@ def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:
 def seeded(recipe: Recipe, seed: int) -> Recipe:
     """The recipe with another seed for weights, order of data and rays."""
 
-    def change(stage: Stage) -> Stage:
-        return dataclasses.replace(stage, schedule=dataclasses.replace(stage.schedule, seed=seed))
-
     return dataclasses.replace(
         recipe,
-        pretrain=None if recipe.pretrain is None else change(recipe.pretrain),
-        finetune=change(recipe.finetune),
+        pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, seed=seed),
+        finetune=rescheduled(recipe.finetune, seed=seed),
     )
 
 
 def occupancy_alone(recipe: Recipe) -> Recipe:
     """One stage that learns the occupancy of the present and nothing else, as long as pre-training takes."""
-    assert recipe.pretrain is not None
-    weights = dataclasses.replace(recipe.pretrain.weights, wpts=0.0, recon=0.0)
-    stage = dataclasses.replace(recipe.pretrain, weights=weights, imagine=False)
+    stage = recipe.pretrain
+    assert isinstance(stage, Stage)
+    weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
+    stage = dataclasses.replace(stage, weights=weights, imagine=False)
     return dataclasses.replace(recipe, pretrain=None, finetune=stage, path=None)
 
 

@@ -11,9 +11,9 @@ import torch
 from foredrive.data import ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.nemo import NemoAgent
+from foredrive.models.agent import PlanningAgent
 from foredrive.recipes.build import build_agent, build_objective
-from foredrive.recipes.config import Recipe, Stage, load_recipe, save_recipe
+from foredrive.recipes.config import AnyStage, Recipe, load_recipe, save_recipe
 from foredrive.recipes.open_clips import open_clips
 from foredrive.recipes.path_reads import read_paths
 from foredrive.recipes.rivals import fit_rivals
@@ -117,7 +117,7 @@ def train_run(
     return run
 
 
-def _fit_path(run: Run, fit: PathFit, agent: NemoAgent, fabric: "Fabric") -> None:
+def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent, fabric: "Fabric") -> None:
     """Fit what the planner reads along its path in the volume as it has become."""
     path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
     if path is None or weights.is_file():
@@ -139,7 +139,12 @@ def _pretrained(start: Path) -> Path:
 
 
 def _train_stage(
-    run: Run, name: str, stage: Stage, agent: NemoAgent, dataset: ClipDataset, fabric: "Fabric"
+    run: Run,
+    name: str,
+    stage: AnyStage,
+    agent: PlanningAgent,
+    dataset: ClipDataset,
+    fabric: "Fabric",
 ) -> None:
     weights = run.folder / name / WEIGHTS
     if not weights.is_file():
@@ -152,9 +157,9 @@ def _train_stage(
     load_weights(agent, weights)
 
 
-def load_agent(run: Run) -> NemoAgent:
+def load_agent(run: Run) -> PlanningAgent:
     """The trained agent, ready to act."""
-    agent = build_agent(run.recipe, load_backbone=False)
+    agent = build_agent(run.recipe, fetch=False)
     load_weights(agent, run.weights)
     return agent.eval()
 

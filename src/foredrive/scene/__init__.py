@@ -14,6 +14,7 @@ from foredrive.scene.protocols import (
     Renderer,
     Simulator,
     Step,
+    Task,
     WorldModel,
 )
 from foredrive.scene.rig import CameraRig
@@ -41,6 +42,7 @@ __all__ = [
     "Renderer",
     "Simulator",
     "Step",
+    "Task",
     "Trajectory",
     "VoxelGrid",
     "VoxelSpec",

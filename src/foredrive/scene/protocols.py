@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -11,6 +11,9 @@ from foredrive.scene.clip import Clip
 from foredrive.scene.record import Record
 from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelSpec
+
+Task = Literal["occupancy", "forecast", "plan"]
+"""What features are wanted for: the scene now, the scene later, a path."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,10 @@ class WorldModel(Protocol):
 
     def decode(self, belief: Belief) -> Decoded:
         """Occupancy, flow and renderable features of a belief."""
+        ...
+
+    def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
+        """The volume of a belief as the head of a task is given it."""
         ...
 
 

@@ -6,6 +6,7 @@ from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
     from foredrive.training.checkpoints import load_weights, save_weights
+    from foredrive.training.driveworld_objective import DriveWorldObjective, DriveWorldWeights
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from foredrive.training.rays import ImageRays, thinned_rays
 
 __all__ = [
+    "DriveWorldObjective",
+    "DriveWorldWeights",
     "ImageRays",
     "LossWeights",
     "NemoObjective",
@@ -32,6 +35,7 @@ __getattr__ = on_demand(
     __name__,
     {
         "checkpoints": ("load_weights", "save_weights"),
+        "driveworld_objective": ("DriveWorldObjective", "DriveWorldWeights"),
         "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective"),

@@ -1,22 +1,28 @@
-"""DriveWorld's pre-training objective (eq. 3)."""
+"""DriveWorld's objective: eq. 3, and waypoints where a planner is learned with it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.losses import occupancy_loss
+from foredrive.losses import occupancy_loss, waypoint_loss
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.models.driveworld.state_space import ACTION_SCALE
-from foredrive.scene import Boxes, Clip, Example
+from foredrive.scene import Belief, Boxes, Clip, Example
+from foredrive.training.objective import train_planner
 
 MOVING_MPS = 0.5
 
 
 @dataclass(frozen=True)
 class DriveWorldWeights:
-    """Weights of the terms of eq. 3, each a mean over frames; the paper gives none, MILE the first two."""
+    """Weights of the terms of eq. 3, each a mean over frames; the paper gives none, MILE the first two.
+
+    With all of them 0 but `wpts`, planning alone is learned.
+    """
 
     kl: float = 1e-3
     balance: float = 0.75
@@ -32,48 +38,74 @@ class DriveWorldWeights:
     bce: float = 10.0
     occupied: float = 3.0
     """Of the occupancy loss, as for NeMo."""
+    wpts: float = 0.0
+    """Of the waypoints; with 0 the planner is left as it is."""
 
 
 class DriveWorldObjective(nn.Module):
     """Maps a batch to its losses.
 
     Args:
-        world: what is trained.
+        agent: a DriveWorld and its planner.
         weights: of the terms.
         steps: L, imagined key frames.
+        temporal: otherwise every observed frame's occupancy is learned from its own plane alone, and nothing
+            that has to do with time: pre-training in 3-D, as OccNet's and UniScene's.
     """
 
-    def __init__(self, world: DriveWorld, weights: DriveWorldWeights, *, steps: int) -> None:
+    def __init__(
+        self, agent: PlanningAgent, weights: DriveWorldWeights, *, steps: int, temporal: bool = True
+    ) -> None:
         super().__init__()
-        self.world, self.weights, self.steps = world, weights, steps
+        self.agent, self.weights, self.steps, self.temporal = agent, weights, steps, temporal
+        train_planner(agent.planner, weights.wpts > 0)
+        world = agent.world_model
+        assert isinstance(world, DriveWorld)
+        world.states.requires_grad_(temporal)
+        world.to_vector.requires_grad_(temporal)
+        world.occupancy.requires_grad_(weights.occ > 0)
+        world.flow.requires_grad_(weights.flow > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is what to descend. The generator draws states and the frame of statics."""
-        clip, weights = example.clip, self.weights
-        seen = self.world.unroll(clip.observed(), self.steps, generator)
-        first = clip.now - self.world.past_frames
-        shown = slice(first, clip.now + self.steps + 1)
-        losses = {
-            "kl": torch.stack(
-                [
-                    balanced_kl(q, p, weights.balance).mean()
-                    for q, p in zip(seen.posteriors, seen.priors, strict=True)
-                ]
-            ).mean(),
-            "action": _action_loss(seen, clip, shown),
-            "velocity": _velocity_loss(
-                seen, clip.boxes[:, first : clip.now + 1], clip.boxes_valid[:, first:]
-            ),
-        }
-        losses |= self._volume_losses(seen, example, first)
+        clip, weights, world = example.clip, self.weights, self.agent.world_model
+        assert isinstance(world, DriveWorld)
+        observed = clip.observed()
+        seen = world.see(observed)
+        losses: dict[str, Float[Tensor, ""]] = {}
+        if not self.temporal:
+            losses |= self._volume_losses(world, world.without_time(seen), example)
+        elif weights.occ > 0:
+            unrolled = world.unroll(seen, self.steps, generator)
+            losses |= self._latent_losses(unrolled, clip)
+            losses |= self._volume_losses(world, unrolled.beliefs, example)
+        if weights.wpts > 0:
+            now = world.believe(seen)
+            ahead = world.imagine(now, 1) if self.agent.planner.looks_ahead else []
+            losses["wpts"] = waypoint_loss(self.agent.plan(observed, [now, *ahead]), clip.future)
         losses["loss"] = torch.stack([getattr(weights, name) * value for name, value in losses.items()]).sum()
         return losses
 
-    def _volume_losses(self, seen: Unrolled, example: Example, first: int) -> dict[str, Float[Tensor, ""]]:
+    def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
+        """How well states are foreseen, and what the policy and the estimated velocities are off by."""
+        first = clip.now + 1 - len(unrolled.posteriors)
+        pairs = zip(unrolled.posteriors, unrolled.priors, strict=True)
+        kl = torch.stack([balanced_kl(q, p, self.weights.balance).mean() for q, p in pairs]).mean()
+        shown = slice(first, clip.now + self.steps + 1)
+        past = slice(first, clip.now + 1)
+        return {
+            "kl": kl,
+            "action": _action_loss(unrolled, clip, shown),
+            "velocity": _velocity_loss(unrolled, clip.boxes[:, past], clip.boxes_valid[:, past]),
+        }
+
+    def _volume_losses(
+        self, world: DriveWorld, beliefs: Sequence[Belief], example: Example
+    ) -> dict[str, Float[Tensor, ""]]:
         """Occupancy and flow of every frame."""
         weights, occ, flow = self.weights, [], []
-        for k, belief in enumerate(seen.beliefs):
-            decoded, frame = self.world.decode(belief), first + k
+        for frame, belief in enumerate(beliefs, start=example.clip.now - world.past_frames):
+            decoded = world.decode(belief)
             known = example.occupancy.known[:, frame]
             occ.append(
                 occupancy_loss(
@@ -85,7 +117,7 @@ class DriveWorldObjective(nn.Module):
                     occupied_weight=weights.occupied,
                 )
             )
-            if decoded.flow is not None:
+            if decoded.flow is not None and weights.flow > 0:
                 off = (decoded.flow - example.flow.values[:, frame]).square().sum(dim=1)
                 flow.append(_masked_mean(off, example.flow.known[:, frame]))
         out = {"occ": torch.stack(occ).mean()}
@@ -100,11 +132,11 @@ def _action_loss(seen: Unrolled, clip: Clip, shown: slice) -> Float[Tensor, ""]:
     return off.mean()
 
 
-def _velocity_loss(seen: Unrolled, boxes: Boxes, known: Bool[Tensor, "b _T"]) -> Float[Tensor, ""]:
+def _velocity_loss(seen: Unrolled, boxes: Boxes, known: Bool[Tensor, "b T"]) -> Float[Tensor, ""]:
     """L1 of the velocities of the nearest moving objects, nearest first."""
     estimated = seen.velocities_mps
     truth, there = nearest_moving(boxes, estimated.shape[2])
-    there = there & known[:, : there.shape[1], None]
+    there = there & known[:, :, None]
     off = (estimated - truth).abs().sum(-1) / ACTION_SCALE[0]
     return _masked_mean(off, there)
 

@@ -8,8 +8,10 @@ from torch import Tensor, nn
 
 from foredrive.losses import l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
 from foredrive.losses.reconstruction import ImageFeatures
-from foredrive.models.nemo import NemoAgent
-from foredrive.scene import Example
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.nemo import Nemo
+from foredrive.models.planner import VolumePlanner
+from foredrive.scene import Example, Trajectory
 from foredrive.training.rays import thinned_rays
 
 
@@ -45,7 +47,7 @@ class NemoObjective(nn.Module):
 
     def __init__(
         self,
-        agent: NemoAgent,
+        agent: PlanningAgent,
         weights: LossWeights,
         *,
         steps: int,
@@ -56,24 +58,24 @@ class NemoObjective(nn.Module):
         self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
         self.image_features = image_features
         world, plans = agent.world_model, weights.wpts > 0
-        agent.planner.requires_grad_(plans)
-        if agent.planner.ego_mlp is not None:
-            agent.planner.ego_mlp.requires_grad_(False)
+        assert isinstance(world, Nemo)
+        train_planner(agent.planner, plans)
         world.motion.requires_grad_(steps > 0 or (plans and agent.planner.looks_ahead > 0))
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""
-        clip = example.clip
+        clip, world = example.clip, self.agent.world_model
+        assert isinstance(world, Nemo)
         now, weights = clip.now, self.weights
         observed = clip.observed()
+        plan: Trajectory | None = None
         if weights.wpts > 0:
             output = self.agent(observed, self.steps)
             decoded, plan = output.decoded, output.plan
         else:
-            _, decoded = self.agent.world_model(observed, self.steps)
-            plan = None
+            decoded = [world.decode(belief) for belief in self.agent.foresee(observed, self.steps)]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
@@ -90,7 +92,7 @@ class NemoObjective(nn.Module):
                 )
             if weights.recon > 0:
                 rays = thinned_rays(clip, frame, self.ray_stride, generator)
-                rendered = self.agent.world_model.renderer(
+                rendered = world.renderer(
                     belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
                 )
                 b, c, _, h, w = rays.rgb.shape
@@ -109,3 +111,10 @@ class NemoObjective(nn.Module):
             losses["wpts"] = waypoint_loss(plan, clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
         return losses
+
+
+def train_planner(planner: VolumePlanner, trained: bool) -> None:
+    """Whether a planner takes part in a stage; the ego MLP that it starts from never does."""
+    planner.requires_grad_(trained)
+    if planner.ego_mlp is not None:
+        planner.ego_mlp.requires_grad_(False)

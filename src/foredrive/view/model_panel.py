@@ -47,7 +47,11 @@ class ModelPanel:
             self.lowest_m = gui.add_slider(
                 "height, m >", low_m, high_m, spec.voxel_m, min(above_road, high_m)
             )
-            render = gui.add_button("Render from here", hint="what the model would see with your eyes")
+            render = gui.add_button(
+                "Render from here",
+                hint="what the model would see with your eyes",
+                visible=self._observer.renders,
+            )
             self._rendered = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
         for slider in (self.frame, self.above, self.lowest_m):
             slider.on_update(lambda _: self.show(self._index))

@@ -1,11 +1,13 @@
 """DriveWorld (Min et al. 2024): a world model whose state is remembered, and whose scene is handed on."""
 
+from foredrive.models.driveworld.actions import actions_of, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence
-from foredrive.models.driveworld.world_model import DriveWorld, Unrolled, actions_of, motion_of
+from foredrive.models.driveworld.world_model import DriveWorld, Seen, Unrolled
 
 __all__ = [
     "DiagonalGaussian",
     "DriveWorld",
+    "Seen",
     "Unrolled",
     "actions_of",
     "balanced_kl",

@@ -32,10 +32,9 @@ class DiagonalGaussian(Record):
 
     def sample(self, generator: torch.Generator | None = None) -> Float[Tensor, "*b S"]:
         """Reparametrised: gradients reach mean and std (Kingma & Welling 2014)."""
-        noise = torch.randn(
-            self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype
-        )
-        return self.mean + self.std * noise
+        device = self.mean.device if generator is None else generator.device
+        noise = torch.randn(self.mean.shape, generator=generator, device=device, dtype=self.mean.dtype)
+        return self.mean + self.std * noise.to(self.mean.device)
 
     def detach(self) -> "DiagonalGaussian":
         """Without a gradient."""

@@ -105,7 +105,7 @@ class PlanesToVolume(nn.Module):
 
     Args:
         channels: of all planes together.
-        hidden: channels of the volume's convolutions' input.
+        hidden: channels of the volume before the last convolution.
         out: D.
         height: Z.
     """
@@ -119,7 +119,7 @@ class PlanesToVolume(nn.Module):
             nn.ReLU(),
         )
         self.convolve = nn.Sequential(
-            nn.Conv3d(hidden, out, 3, padding=1), nn.ReLU(), nn.Conv3d(out, out, 3, padding=1)
+            nn.Conv3d(hidden, hidden, 3, padding=1), nn.ReLU(), nn.Conv3d(hidden, out, 3, padding=1)
         )
 
     def forward(self, planes: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b D Z Y X"]:

@@ -14,7 +14,7 @@ from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.nemo.motion import MotionFlow
 from foredrive.models.nemo.rendering import VolumeRenderer
 from foredrive.ops.volume import warp_volume
-from foredrive.scene import Belief, CameraRig, Clip, Decoded, VoxelSpec
+from foredrive.scene import Belief, CameraRig, Clip, Decoded, Task, VoxelSpec
 
 OCCUPIED_PRIOR = 0.02
 """Where f_occ starts: most of space is free, and a volume that starts opaque hides what lies behind."""
@@ -107,8 +107,6 @@ class Nemo(nn.Module):
         logit = self.occupancy(belief.volume.permute(0, 2, 3, 4, 1))[..., 0].float()
         return Decoded(occupancy_logit=logit, feature=belief.volume)
 
-    def forward(self, clip: Clip, steps: int) -> tuple[list[Belief], list[Decoded]]:
-        """Now and the next `steps` key frames, as beliefs and decoded."""
-        now = self.observe(clip)
-        beliefs = [now, *self.imagine(now, steps)] if steps else [now]
-        return beliefs, [self.decode(belief) for belief in beliefs]
+    def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
+        """The belief's own volume: NeMo's features are the same for all tasks."""
+        return belief.volume

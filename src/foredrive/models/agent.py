@@ -1,0 +1,67 @@
+"""Something that drives: a world model, and the planner on top of it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.models.driveworld import DriveWorld
+from foredrive.models.ego_mlp import ego_motion
+from foredrive.models.nemo import Nemo
+from foredrive.models.planner import VolumePlanner
+from foredrive.scene import Belief, Clip, Decoded, Trajectory
+
+
+class AgentOutput(NamedTuple):
+    """Everything an agent says about a clip."""
+
+    beliefs: list[Belief]
+    """Now, then the imagined key frames."""
+    decoded: list[Decoded]
+    plan: Trajectory
+
+
+class PlanningAgent(nn.Module):
+    """An `Agent` over any world model: plans from the volume at now and the one imagined next (NeMo §3.3)."""
+
+    def __init__(self, world_model: Nemo | DriveWorld, planner: VolumePlanner) -> None:
+        super().__init__()
+        self.world_model = world_model
+        self.planner = planner
+
+    def forward(self, clip: Clip, steps: int) -> AgentOutput:
+        """Observe, imagine `steps` key frames and whatever the planner looks at, plan."""
+        beliefs = self.foresee(clip, max(steps, self.planner.looks_ahead))
+        decoded = [self.world_model.decode(belief) for belief in beliefs[: steps + 1]]
+        return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs))
+
+    def foresee(self, clip: Clip, steps: int) -> list[Belief]:
+        """Now and the next `steps` key frames."""
+        now = self.world_model.observe(clip)
+        return [now, *self.world_model.imagine(now, steps)] if steps else [now]
+
+    def plan(self, clip: Clip, beliefs: Sequence[Belief]) -> Trajectory:
+        """Plan from what is believed of now and of the next key frames, as many as the planner looks at."""
+        now = clip.now
+        poses, speeds = ego_motion(clip, self.planner.history)
+        plan: Trajectory = self.planner(
+            self.planned_on(beliefs[0]),
+            self.planned_on(beliefs[1]) if self.planner.looks_ahead else None,
+            clip.command,
+            clip.command_valid,
+            clip.ego_speed_mps[:, now],
+            clip.ego_speed_valid[:, now],
+            torch.cat([poses, speeds[:, :-1, None]], dim=-1),
+        )
+        return plan
+
+    def planned_on(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
+        """The volume as the planner is given it."""
+        return self.world_model.volume_for(belief, "plan")
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan from now on."""
+        return self(observation, 0).plan
