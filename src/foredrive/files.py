@@ -7,6 +7,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from foredrive.errors import InputError
+
 WHILE_WRITING = "while writing "
 """Starts the note that `naming` adds to an error; the path follows."""
 
@@ -21,6 +23,19 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, unless it is there.
+
+    Raises:
+        InputError: there can be none, as below /proc.
+        OSError: the disk refuses it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no folder can be made there") from None
+
+
 @contextlib.contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
     """Yield a temporary path beside `final` and rename it there when the block ends well.
@@ -28,10 +43,13 @@ def atomic_path(final: Path) -> Iterator[Path]:
     The block may make the temporary path a file or a folder; an existing file under the final name is
     replaced, an existing folder too. If the block raises (a full disk, Ctrl-C), whatever was written is
     removed and the final name is left as it was.
+
+    Raises:
+        InputError: its folder cannot be made.
     """
     final = Path(final)
     with naming(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(final.parent)
         scratch = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent))
         temporary = scratch / final.name
         try:

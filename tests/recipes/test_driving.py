@@ -1,12 +1,14 @@
 """Suites of drives: kept as they end, never driven twice, never mixed up."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from foredrive.cli.main import main
 from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.logs import LogPath, find_logs
 from foredrive.errors import InputError
@@ -16,6 +18,7 @@ from foredrive.recipes.driving import (
     DriveJob,
     Driven,
     DriveSuite,
+    claim,
     drive_suite,
     read_drive,
     scenario_of,
@@ -136,11 +139,34 @@ def test_a_folder_holds_one_suite(driven: Driven, suite: DriveSuite, out: Path, 
     with pytest.raises(InputError, match="another suite"):
         drive_suite(dataclasses.replace(suite, seed=1), out, workers=1)
     (tmp_path / "drives").mkdir()
+    (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="nobody knows"):
         drive_suite(suite, tmp_path, workers=1)
     (out / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="not what is kept of a drive"):
         drive_suite(suite, out, workers=1)
+
+
+def test_a_folder_is_claimed_by_what_can_be_driven(suite: DriveSuite, tmp_path: Path) -> None:
+    for wrong in ({"routes": "nothing.xml"}, {"driver": "nobody"}):
+        with pytest.raises(InputError, match=wrong.get("routes", "no such driver")):
+            claim(dataclasses.replace(suite, **wrong), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    claim(suite, tmp_path)
+    other = dataclasses.replace(suite, seed=1, repetitions=2)
+    claim(other, tmp_path)  # nothing has been driven yet
+    (tmp_path / "drives").mkdir()
+    (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
+    with pytest.raises(InputError, match="another suite"):
+        claim(suite, tmp_path)
+    claim(dataclasses.replace(other, repetitions=1), tmp_path)
+    assert json.loads((tmp_path / "suite.json").read_text())["repetitions"] == 2
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="folders can be made everywhere here")
+def test_a_folder_that_cannot_be_made_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["drive", "--agent", "stop", "--out", "/proc/no/folder"]) == 2
+    assert capsys.readouterr().err == "foredrive: /proc/no/folder: no folder can be made there\n"
 
 
 @pytest.mark.parametrize("driver", ["nobody", "ego-mlp:nowhere"])

@@ -56,8 +56,7 @@ def drive(
         workers: How many drives run at a time; 0 is one for each core.
         ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
     """
-    from foredrive.recipes.driving import DriveSuite, claim, drive_suite
-    from foredrive.view.drive_report import write_drive_report
+    from foredrive.recipes.driving import DriveSuite
 
     suite = DriveSuite(
         driver=str(Path(agent).absolute()) if Path(agent).is_dir() else agent,
@@ -73,10 +72,16 @@ def drive(
         period_s=period,
         latency_s=latency,
     )
+    _drive(suite, out, workers or len(os.sched_getaffinity(0)), ray)
+
+
+def _drive(suite: "DriveSuite", out: Path, workers: int, on_ray: bool) -> None:
+    from foredrive.recipes.driving import claim, drive_suite
+    from foredrive.view.drive_report import write_drive_report
+
     claim(suite, out)
-    cores = len(os.sched_getaffinity(0))
     with _Progress(suite) as progress:
-        driven = drive_suite(suite, out, workers or cores, on_ray=ray, tick=progress.tick)
+        driven = drive_suite(suite, out, workers, on_ray=on_ray, tick=progress.tick)
     _tell(driven)
     print(f"look: {write_drive_report(out)}")
 

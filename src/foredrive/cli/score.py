@@ -58,7 +58,6 @@ def score(
         }
     figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
     figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
-    out.mkdir(parents=True, exist_ok=True)
     write_summary(out / "summary.json", figures)
     write_score_report(
         out / "report.html", f"{results.name} against {truth.name}", read, scores, result, worst

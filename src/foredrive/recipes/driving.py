@@ -128,9 +128,9 @@ def drive_suite(
         InputError: there is no such driver or set of routes, or the folder holds another suite.
         OSError: the disk is full.
     """
+    claim(suite, out)
     routes = load_route_set(suite.routes)
     jobs = [DriveJob(route.id, n) for n in range(suite.repetitions) for route in routes]
-    claim(suite, out)
     drives, broken = {}, {}
     for job in jobs:
         if _file(out, job).is_file():
@@ -286,30 +286,32 @@ def _kept(drive: Drive, route: DriveRoute, wall_s: float) -> dict[str, Any]:
 
 
 def claim(suite: DriveSuite, out: Path) -> None:
-    """Note in a folder whose it is.
+    """Note in a folder whose it is, once it is known that there is something to drive.
 
     Raises:
-        InputError: it is another's, or there is no such driver.
+        InputError: it is another's, or there is no such driver or set of routes.
     """
     needs_of(suite.driver)
+    load_route_set(suite.routes)
     wanted = json.loads(json.dumps(dataclasses.asdict(suite)))
     path = out / SUITE
-    if not path.is_file():
-        if (out / DRIVES).exists():
+    if any((out / DRIVES).glob("*.json")):
+        there = _read_suite(path)
+        if there is None:
             raise InputError(f"{out}: holds drives that nobody knows the suite of; choose another folder")
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1) + "\n")
-        return
+        if {**there, "repetitions": 0} != {**wanted, "repetitions": 0}:
+            raise InputError(f"{out}: holds the drives of another suite; choose another folder")
+        wanted["repetitions"] = max(there["repetitions"], suite.repetitions)
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+
+
+def _read_suite(path: Path) -> dict[str, Any] | None:
     try:
         there = json.loads(path.read_text())
     except (OSError, ValueError):
-        there = None
-    more = {**wanted, "repetitions": 0}
-    if not isinstance(there, dict) or {**there, "repetitions": 0} != more:
-        raise InputError(f"{out}: holds the drives of another suite; choose another folder")
-    if there["repetitions"] < suite.repetitions:
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+        return None
+    return there if isinstance(there, dict) and isinstance(there.get("repetitions"), int) else None
 
 
 def _file(out: Path, job: DriveJob) -> Path:

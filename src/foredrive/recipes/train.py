@@ -165,7 +165,6 @@ def load_agent(run: Run) -> PlanningAgent:
 
 
 def _write(run: Run) -> None:
-    run.folder.mkdir(parents=True, exist_ok=True)
     logs = [{"folder": str(log.folder), "maps_dir": str(log.maps_dir)} for log in run.logs]
     with atomic_path(run.folder / LOGS) as temporary:
         start = None if run.start is None else str(run.start)
