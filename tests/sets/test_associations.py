@@ -8,6 +8,8 @@ import pytest
 from foredrive.errors import InputError
 from foredrive.sets.associations import sum_associations
 from foredrive.sets.component import scale
+from foredrive.sets.frontier import sum_assignments
+from foredrive.sets.gating import bound_left_out
 from foredrive.sets.interval import bound_component
 
 
@@ -97,6 +99,26 @@ def test_gating_takes_off_no_more_than_it_says() -> None:
             assert -1e-9 <= lost[-1] <= gated.log_upper - gated.log_lower + 1e-9
             assert gated.log_upper - gated.log_lower <= 0.3 + 1e-9
     assert max(lost) > 1e-3
+
+
+def test_what_left_out_pairs_add_is_bounded() -> None:
+    """Whatever pairs are left out of scenes of any density; objects may have no background."""
+    rng = np.random.default_rng(7)
+    added, bound = [], []
+    for _ in range(500):
+        rows, columns = rng.integers(1, 7, 2)
+        pair = rng.random((rows, columns)) ** rng.choice([1, 4, 16])
+        alone, none = rng.uniform(0.01, 1, rows), rng.random(columns) * (rng.random(columns) < 0.8)
+        kept = sum_assignments(np.where(rng.random(pair.shape) < 0.6, pair, 0.0), alone, none)
+        if kept.log_total == -np.inf:
+            continue
+        row, column = np.nonzero((kept.pair == 0) & (pair > 0))
+        log_weight = np.log(pair[row, column] / alone[row] * kept.column_freed[column])
+        added.append(sum_assignments(pair, alone, none).log_total - kept.log_total)
+        bound.append(bound_left_out(log_weight, row, column))
+        assert added[-1] <= bound[-1] + 1e-12
+    assert len(added) > 300
+    assert np.median(np.array(bound) / np.maximum(added, 1e-3)) < 3  # and not by far
 
 
 def test_distant_clusters_are_summed_exactly_however_many_they_are() -> None:

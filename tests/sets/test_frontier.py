@@ -48,6 +48,12 @@ def test_equal_to_enumeration_whatever_is_possible() -> None:
         else:
             assert got.log_total == pytest.approx(math.log(expected), abs=1e-12)
             np.testing.assert_allclose(got.pair, shares / expected, atol=1e-12)
+            for r in range(rows):
+                rest, _ = enumerate_sum(np.delete(pair, r, 0), np.delete(row_alone, r), column_alone)
+                assert got.row_freed[r] == pytest.approx(rest / expected, rel=1e-9)
+            for c in range(columns):
+                rest, _ = enumerate_sum(np.delete(pair, c, 1), row_alone, np.delete(column_alone, c))
+                assert got.column_freed[c] == pytest.approx(rest / expected, rel=1e-9)
 
 
 def test_a_long_chain_has_a_narrow_frontier() -> None:

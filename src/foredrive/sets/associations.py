@@ -5,22 +5,23 @@ objects are background. Its weight is the product of what every pair, absent det
 weighs (PMB density, thesis eq. 3.10-3.12, where each summand is one association).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import no_type_check
+from functools import partial
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.sets.component import Components, find_components, scale, sum_components
-from foredrive.sets.interval import bound_component
+from foredrive.sets.gating import bound_left_out, gate, thin
+from foredrive.sets.interval import bound_choices, bound_component
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_COARSER_NATS = (1e-7, 1e-4, 0.1, 1.0, 10.0)
-"""What may be gated of components that are too large to be summed, until they are not."""
-_NEGLIGIBLE_NATS = 40.0
+_THINNER_NATS = (1e-6, 1e-4, 1e-2, 0.1, 1.0, 10.0)
+"""What leaving out pairs of a component that is too large to be summed may take off it, until it is not."""
+_WIDE_NATS = 1.0
+"""A wider interval is worth a second bound."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class AssociationSum:
     log_lower: float
     """What was summed; -inf if no association is possible."""
     log_upper: float
-    """No more than this was missed by gating and by listing only the best associations."""
+    """The sum is proven to be no more."""
     detection: Int[ndarray, "E"]
     """Detection of each pair that may belong together; all other pairs have probability 0."""
     object: Int[ndarray, "E"]
@@ -69,10 +70,10 @@ def sum_associations(
 
     Pairs are left out (gated) as long as that takes no more than `gate_nats` off the logarithm. What
     remains falls into connected components, each of which is summed exactly where that takes at most
-    `max_states` numbers. A larger one is gated again, a little less strictly each time, up to 10 nats; what
-    is too large even then is summed over its `k` best associations. The interval of the result holds what
-    either may have missed. A component without any possible association makes the sum zero; its
-    probabilities are then those of the association with fewest impossible members.
+    `max_states` numbers. Of a larger one the least likely pairs are left out, step by step, until its parts
+    can be summed; what cannot be, even then, is summed over its `k` best associations. The interval of the
+    result holds what either may have missed. A component without any possible association makes the sum
+    zero; its probabilities are then those of the association with fewest impossible members.
 
     Raises `InputError` for weights that are NaN or infinite, naming them.
     """
@@ -82,9 +83,11 @@ def sum_associations(
     _check("pair (detection, object)", log_pair)
     _check("absent detection", log_absent)
     _check("background object", log_background)
-    found = _sum_gated(log_pair, log_absent, log_background, k, max_states, gate_nats)
+    row, column, lost_nats = gate(log_pair, log_absent, log_background, gate_nats)
+    sum_large = partial(_sum_large, k=k, max_states=max_states)
+    found = _sum_kept(log_pair, log_absent, log_background, row, column, max_states, sum_large)
     return AssociationSum(
-        found.log_lower, found.log_upper, found.row, found.column, found.share,
+        found.log_lower, found.log_upper + lost_nats, found.row, found.column, found.share,
         np.clip(1.0 - np.bincount(found.row, found.share, len(log_absent)), 0.0, 1.0),
         np.clip(1.0 - np.bincount(found.column, found.share, len(log_background)), 0.0, 1.0),
         found.best, np.flatnonzero(found.bad_rows), np.flatnonzero(found.bad_columns),
@@ -97,43 +100,53 @@ class _Found:
 
     log_lower: float
     log_upper: float
+    """Of the sum over associations of pairs that were kept."""
     row: Int[ndarray, "E"]
+    """Of the pairs that were kept."""
     column: Int[ndarray, "E"]
     share: Float[ndarray, "E"]
+    log_freed: Float[ndarray, "C"]
+    """Upper bound of the logarithm of the sum without a column over the sum."""
     best: Int[ndarray, "C"]
     bad_rows: Bool[ndarray, "R"]
     bad_columns: Bool[ndarray, "C"]
 
 
-def _sum_gated(
+def _sum_kept(
     log_pair: Float[ndarray, "R C"],
     log_row: Float[ndarray, "R"],
     log_column: Float[ndarray, "C"],
-    k: int,
+    row: Int[ndarray, "E"],
+    column: Int[ndarray, "E"],
     max_states: int,
-    gate_nats: float,
+    sum_large: Callable[[ndarray, ndarray, ndarray], _Found],
 ) -> _Found:
-    """Gate, and sum every component; one that is too large is gated again, less strictly."""
-    row, column, lost_nats = _gate(log_pair, log_row, log_column, gate_nats)
+    """Sum every component of the pairs that are kept; `sum_large` has those that are too large."""
     components = find_components(row, column, len(log_row), len(log_column))
     log_edge = log_pair[row, column]
     exact = sum_components(components, row, column, log_edge, log_row, log_column, max_states)
     found = _Found(
-        exact.log_sum, exact.log_sum + lost_nats, row, column, exact.share, exact.best,
+        exact.log_sum, exact.log_sum, row, column, exact.share, exact.log_freed, exact.best,
         exact.bad_rows, exact.bad_columns,
     )  # fmt: skip
+    if len(exact.too_large) == 0:
+        return found
+    parts, summed = [], np.ones(len(row), bool)
     for n in exact.too_large:
         i, j, edge = _members(components, n)
         here = np.full((len(i), len(j)), -np.inf)
-        where = np.searchsorted(i, row[edge]), np.searchsorted(j, column[edge])
-        here[where] = log_edge[edge]
-        part = _sum_large(here, log_row[i], log_column[j], k, max_states, gate_nats)
+        here[np.searchsorted(i, row[edge]), np.searchsorted(j, column[edge])] = log_edge[edge]
+        part = sum_large(here, log_row[i], log_column[j])
         found.log_lower += part.log_lower
         found.log_upper += part.log_upper
-        share = np.zeros(here.shape)
-        share[part.row, part.column] = part.share
-        found.share[edge] = share[where]
         found.best[j] = np.where(part.best < 0, -1, i[part.best])
+        found.log_freed[j] = part.log_freed
+        summed[edge] = False
+        parts.append((i[part.row], j[part.column], part.share))
+    found.row, found.column, found.share = (
+        np.concatenate(each)
+        for each in zip((row[summed], column[summed], exact.share[summed]), *parts, strict=True)
+    )
     return found
 
 
@@ -154,17 +167,38 @@ def _sum_large(
     log_column: Float[ndarray, "C"],
     k: int,
     max_states: int,
-    gate_nats: float,
 ) -> _Found:
-    """Gate a component that is too large less strictly, or bound it."""
-    for coarser_nats in _COARSER_NATS:
-        if coarser_nats > gate_nats:
-            return _sum_gated(log_pair, log_row, log_column, k, max_states, coarser_nats)
-    interval = bound_component(scale(log_pair, log_row, log_column), k)
-    row, column = np.nonzero(interval.share)
+    """Sum fewer pairs of a component that is too large, and bound what the others add."""
+    found = _sum_thinner(log_pair, log_row, log_column, k, max_states, _THINNER_NATS)
+    left_out = log_pair > -np.inf
+    left_out[found.row, found.column] = False
+    row, column = np.nonzero(left_out)
+    log_weight = log_pair[row, column] - log_row[row] + found.log_freed[column]
+    found.log_upper += bound_left_out(log_weight, row, column)
+    if found.log_upper - found.log_lower > _WIDE_NATS:
+        found.log_upper = min(found.log_upper, bound_choices(scale(log_pair, log_row, log_column)))
+    return found
+
+
+def _sum_thinner(
+    log_pair: Float[ndarray, "R C"],
+    log_row: Float[ndarray, "R"],
+    log_column: Float[ndarray, "C"],
+    k: int,
+    max_states: int,
+    thinner_nats: tuple[float, ...],
+) -> _Found:
+    """Leave out pairs until what is kept can be summed; list the best associations if it never can."""
+    scaled = scale(log_pair, log_row, log_column)
+    if thinner_nats:
+        row, column = thin(scaled, thinner_nats[0])
+        sum_large = partial(_sum_thinner, k=k, max_states=max_states, thinner_nats=thinner_nats[1:])
+        return _sum_kept(log_pair, log_row, log_column, row, column, max_states, sum_large)
+    interval = bound_component(scaled, k)
+    row, column = np.nonzero(log_pair > -np.inf)
     return _Found(
-        interval.log_lower, interval.log_upper, row, column, interval.share[row, column], interval.best,
-        np.zeros(len(log_row), bool), np.zeros(len(log_column), bool),
+        interval.log_lower, interval.log_upper, row, column, interval.share[row, column], -log_column,
+        interval.best, np.zeros(len(log_row), bool), np.zeros(len(log_column), bool),
     )  # fmt: skip
 
 
@@ -173,93 +207,3 @@ def _check(name: str, log_weight: Float[ndarray, "..."]) -> None:
     if not valid.all():
         where = tuple(np.argwhere(~valid)[0].tolist())
         raise InputError(f"weight of {name} {where} is {log_weight[where]}: it must be finite, or zero")
-
-
-def _gate(
-    log_pair: Float[ndarray, "R C"],
-    log_row: Float[ndarray, "R"],
-    log_column: Float[ndarray, "C"],
-    budget_nats: float,
-) -> tuple[Int[ndarray, "E"], Int[ndarray, "E"], float]:
-    """Pairs that are kept, and a bound on what the others add to the logarithm of the sum.
-
-    An association without its left-out pairs is one of those that stay; each pair put back multiplies its
-    weight by the pair's odds against being absent and background. Hence sum ≤ (sum of those that stay) ·
-    Π_j (1 + Σ_i odds_ij), over the pairs left out. Prices decide where odds are infinite: at certain
-    detections and objects without background.
-    """
-    infinite = bool((log_row == -np.inf).any() or (log_column == -np.inf).any())
-    by_odds = (0.5 if infinite else 1.0) * budget_nats
-    row, column, log_odds, lost_nats = _list_odds(
-        log_pair, log_row, log_column, np.log(0.5 * by_odds / max(log_pair.size, 1))
-    )
-    kept, more_nats = _keep_likely(log_odds, 0.5 * by_odds)
-    row, column, lost_nats = row[kept], column[kept], lost_nats + more_nats
-    if infinite:
-        log_kept = np.full(log_pair.shape, -np.inf)
-        log_kept[row, column] = log_pair[row, column]
-        kept, more_nats = _gate_by_price(log_kept, log_row, log_column, row, column, 0.5 * budget_nats)
-        row, column, lost_nats = row[kept], column[kept], lost_nats + more_nats
-    return row, column, lost_nats
-
-
-def _keep_likely(log_share: Float[ndarray, "E"], budget: float) -> tuple[Bool[ndarray, "E"], float]:
-    """All but the least, as many as together are no more than the budget; what these add to the logarithm.
-
-    None of at least 1 is left out: pairs whose odds are smaller are in no best association.
-    """
-    share = np.exp(np.minimum(log_share, 0.0))
-    order = np.argsort(share)
-    total = np.cumsum(share[order])
-    out = order[(total <= budget) & (log_share[order] < 0.0)]
-    kept = np.ones(len(share), bool)
-    kept[out] = False
-    return kept, float(share[out].sum())
-
-
-@_kernel
-@no_type_check
-def _list_odds(log_pair, log_row, log_column, log_least):
-    """Pairs of larger odds than the least, these, and what all others may add to the logarithm."""
-    rows, columns = log_pair.shape
-    row, column = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.int64)
-    odds, count, lost = np.empty(rows * columns), 0, np.zeros(columns)
-    for r in range(rows):
-        for c in range(columns):
-            if log_pair[r, c] == -np.inf:
-                continue
-            log_odds = log_pair[r, c] - log_row[r] - log_column[c]
-            if log_odds > log_least:
-                row[count], column[count], odds[count], count = r, c, log_odds, count + 1
-            elif log_odds > log_least - _NEGLIGIBLE_NATS:
-                lost[c] += np.exp(log_odds)
-    lost += rows * np.exp(log_least - _NEGLIGIBLE_NATS)
-    return row[:count].copy(), column[:count].copy(), odds[:count].copy(), np.log1p(lost).sum()
-
-
-def _gate_by_price(
-    log_pair: Float[ndarray, "R C"],
-    log_row: Float[ndarray, "R"],
-    log_column: Float[ndarray, "C"],
-    row: Int[ndarray, "E"],
-    column: Int[ndarray, "E"],
-    budget_nats: float,
-) -> tuple[Bool[ndarray, "E"], float]:
-    """Which of the pairs to keep so that the others add no more than the budget; what they add.
-
-    Scaled, the best association weighs 1 and is kept. All that have a given pair weigh no more than the pair
-    times what the other rows (or columns) can choose from, each without regard to the rest. Nothing is left
-    out where no association is possible.
-    """
-    scaled = scale(log_pair, log_row, log_column)
-    if scaled.log_best == -np.inf:
-        return np.ones(len(row), bool), 0.0
-    log_scaled = scaled.log_pair[row, column]
-    pair = np.exp(log_scaled)
-    by_row = np.log(scaled.row_alone + np.bincount(row, pair, len(log_row)))
-    by_column = np.log(scaled.column_alone + np.bincount(column, pair, len(log_column)))
-    of_rows, of_columns = by_row.sum() - by_row, by_column.sum() - by_column
-    others = of_rows[row] if of_rows.max() <= of_columns.max() else of_columns[column]
-    kept, lost = _keep_likely(log_scaled + others, budget_nats)
-    has = scaled.column[row] == column
-    return kept | has, float(np.log1p(lost))

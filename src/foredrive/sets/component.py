@@ -28,6 +28,8 @@ class Scaled(NamedTuple):
     log_pair: Float[ndarray, "R C"]
     row_alone: Float[ndarray, "R"]
     column_alone: Float[ndarray, "C"]
+    log_column_scale: Float[ndarray, "C"]
+    """Logarithm of what the weights of a column were multiplied by."""
     log_best: float
     """What the best association weighs unscaled; -inf if none is possible."""
 
@@ -49,6 +51,8 @@ class ComponentSums(NamedTuple):
     log_sum: float
     share: Float[ndarray, "E"]
     """Probability of each edge."""
+    log_freed: Float[ndarray, "C"]
+    """Logarithm of the sum without a column over the sum, where that is positive."""
     best: Int[ndarray, "C"]
     """Row of each column in the most likely association; -1: none."""
     bad_rows: Bool[ndarray, "R"]
@@ -84,7 +88,7 @@ def find_components(row: Int[ndarray, "E"], column: Int[ndarray, "E"], rows: int
 @no_type_check
 def sum_components(components, row, column, log_edge, log_row, log_column, max_states):
     """Sum what takes at most `max_states` numbers, and what is in no component; see `ComponentSums`."""
-    share, best = np.zeros(len(row)), np.full(len(log_column), -1)
+    share, best, log_freed = np.zeros(len(row)), np.full(len(log_column), -1), -log_column
     alone, unpaired = np.ones(len(log_row), np.bool_), np.ones(len(log_column), np.bool_)
     alone[components.row] = False
     unpaired[components.column] = False
@@ -105,7 +109,7 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
         for e in edges:
             log_pair[place[row[e]], column_place[column[e]]] = log_edge[e]
         scaled = scale(log_pair, log_row[i], log_column[j])
-        solved, log_part, pair = sum_scaled(scaled, max_states)
+        solved, log_part, pair, freed = sum_scaled(scaled, max_states)
         if not solved:
             too_large[left], left = n, left + 1
             continue
@@ -118,13 +122,14 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
                 best[j[scaled.column[p]]] = i[p]
         for p in range(len(j)):
             bad_columns[j[p]] = scaled.bad_columns[p]
-    return ComponentSums(log_sum, share, best, bad_rows, bad_columns, too_large[:left])
+            log_freed[j[p]] = np.log(freed[p]) + scaled.log_column_scale[p]
+    return ComponentSums(log_sum, share, log_freed, best, bad_rows, bad_columns, too_large[:left])
 
 
 @_kernel
 @no_type_check
 def sum_scaled(scaled, max_states):
-    """Whether a component could be summed exactly, the logarithm of its sum, and the share of each pair.
+    """Whether a component could be summed exactly, the logarithm of its sum, shares, and `column_freed`.
 
     The frontier runs over whichever side keeps it narrower. Where no association is possible the pairs are
     those of the association with fewest impossible members.
@@ -135,19 +140,19 @@ def sum_scaled(scaled, max_states):
         for r in range(rows):
             if scaled.column[r] < columns:
                 pair[r, scaled.column[r]] = 1.0
-        return True, -np.inf, pair
+        return True, -np.inf, pair, np.zeros(columns)
     pair = np.exp(scaled.log_pair)
     sweep = plan_sweep(pair > 0.0, max_states)
     turned = np.ascontiguousarray(pair.T)
     other = plan_sweep(turned > 0.0, max_states)
     if min(sweep.states, other.states) > max_states:
-        return False, 0.0, pair
+        return False, 0.0, pair, np.zeros(columns)
     if sweep.states <= other.states:
-        log_total, share = sum_sweep(pair, scaled.row_alone, scaled.column_alone, sweep)
+        log_total, share, _, freed = sum_sweep(pair, scaled.row_alone, scaled.column_alone, sweep)
     else:
-        log_total, turned = sum_sweep(turned, scaled.column_alone, scaled.row_alone, other)
+        log_total, turned, freed, _ = sum_sweep(turned, scaled.column_alone, scaled.row_alone, other)
         share = np.ascontiguousarray(turned.T)
-    return True, scaled.log_best + log_total, share
+    return True, scaled.log_best + log_total, share, freed
 
 
 @_kernel
@@ -187,7 +192,17 @@ def scale(
     column_alone = np.where(no_column, 0.0, np.exp(column_price))
     bad_rows, bad_columns = no_row & (column == columns), no_column & ~taken[:-1]
     return Scaled(
-        cost, free, column_free, column, bad_rows, bad_columns, log_scaled, row_alone, column_alone, log_best
+        cost,
+        free,
+        column_free,
+        column,
+        bad_rows,
+        bad_columns,
+        log_scaled,
+        row_alone,
+        column_alone,
+        column_price + column_free,
+        log_best,
     )
 
 

@@ -17,11 +17,14 @@ _WIDEST, _CHEAP = 40, 1 << 10
 
 
 class AssignmentTotals(NamedTuple):
-    """The weight of all assignments together, and which share of it each pair has."""
+    """The weight of all assignments together, and what it is made of; zeros if the total is 0."""
 
     log_total: float
     pair: Float[ndarray, "R C"]
-    """Share of the total in which the row has the column; zeros if the total is 0."""
+    """Share of the total in which the row has the column."""
+    row_freed: Float[ndarray, "R"]
+    """The total without the row over the total: times the row's weight alone, its probability to be alone."""
+    column_freed: Float[ndarray, "C"]
 
 
 class Sweep(NamedTuple):
@@ -56,8 +59,7 @@ def sum_assignments(
     pair, row_alone, column_alone = (
         np.ascontiguousarray(w, dtype=np.float64) for w in (pair, row_alone, column_alone)
     )
-    log_total, shares = sum_sweep(pair, row_alone, column_alone, plan_sweep(pair > 0, np.iinfo(np.int64).max))
-    return AssignmentTotals(float(log_total), shares)
+    return sum_sweep(pair, row_alone, column_alone, plan_sweep(pair > 0, np.iinfo(np.int64).max))
 
 
 @_kernel
@@ -150,10 +152,12 @@ def sum_sweep(pair, row_alone, column_alone, sweep):
     start[1:] = np.cumsum(sweep.size)
     ahead = np.zeros(start[-1])
     log_total = _sweep_forward(pair, row_alone, column_alone, sweep, start, ahead)
-    shares = np.zeros(pair.shape)
+    rows, columns = pair.shape
+    totals = AssignmentTotals(log_total, np.zeros((rows, columns)), np.zeros(rows), np.zeros(columns))
     if log_total > -np.inf:
-        _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, shares)
-    return log_total, shares
+        totals.column_freed[:] = 1.0 / column_alone
+        _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, totals)
+    return totals
 
 
 @_kernel
@@ -192,8 +196,8 @@ def _sweep_forward(pair, row_alone, column_alone, sweep, start, ahead):
 
 @_kernel
 @no_type_check
-def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, shares):
-    """Fill `shares`, with the weight of what follows, by subset that was taken before."""
+def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, totals):
+    """Fill the `totals`, with the weight of what follows, by subset that was taken before."""
     column, weight, bit_of = _no_choices(pair)
     after, state = np.zeros(sweep.size.max()), np.zeros(sweep.size.max())
     after[0] = 1.0
@@ -208,10 +212,11 @@ def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, shares):
                     if not s & bit:
                         after[s | bit] = after[s]
                         after[s] *= none
-        whole = 0.0
+        left = 0.0
         for s in range(size):
             state[s] = after[s] * row_alone[row]
-            whole += before[s] * state[s]
+            left += before[s] * after[s]
+        whole = left * row_alone[row]
         for n in range(count):
             share, bit = 0.0, bit_of[n]
             for s in range(size):
@@ -219,9 +224,14 @@ def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, shares):
                     with_pair = after[s | bit] * weight[n]
                     state[s] += with_pair
                     share += before[s] * with_pair
-            shares[row, column[n]] = share
+            totals.pair[row, column[n]] = share
             whole += share
-        shares[row] /= whole
+        totals.pair[row] /= whole
+        totals.row_freed[row] = left / whole
+        for n in range(count):
+            if sweep.last[column[n]] == place:
+                freed = _without(n, row_alone[row], weight[:count], bit_of, before, after)
+                totals.column_freed[column[n]] = freed / whole
         for n in range(count):
             if sweep.first[column[n]] == place:  # no row before could take it
                 for s in range(size):
@@ -230,6 +240,25 @@ def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, shares):
         state[:size] /= state[:size].max()
         state[size:] = 0.0
         after, state = state, after
+
+
+@_kernel
+@no_type_check
+def _without(n, alone, weight, bit_of, before, after):
+    """What a row's choices weigh together if column n, of which it is the last row, were not there.
+
+    Where the column is taken already, what follows does not have its weight alone.
+    """
+    total, bit = 0.0, bit_of[n]
+    for s in range(len(before)):
+        if s & bit:
+            continue
+        reached = before[s] * alone
+        for m in range(len(weight)):
+            if s & bit_of[m]:
+                reached += before[s ^ bit_of[m]] * weight[m]
+        total += reached * after[s | bit]
+    return total
 
 
 @_kernel

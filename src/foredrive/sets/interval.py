@@ -45,11 +45,15 @@ def bound_component(scaled: Scaled, k: int) -> Interval:
     log_lower = scaled.log_best + float(np.log(weight.sum()))
     if len(weight) < k:
         return Interval(log_lower, log_lower, share, best[:columns])
+    return Interval(log_lower, max(log_lower, bound_choices(scaled)), share, best[:columns])
+
+
+def bound_choices(scaled: Scaled) -> float:
+    """Upper bound of the logarithm of the sum over associations, by `choice_bound` of either side."""
     pair = np.exp(scaled.log_pair)
     by_row = choice_bound(pair, scaled.row_alone, scaled.column_alone)
     by_column = choice_bound(np.ascontiguousarray(pair.T), scaled.column_alone, scaled.row_alone)
-    log_upper = max(log_lower, scaled.log_best + min(by_row, by_column))
-    return Interval(log_lower, log_upper, share, best[:columns])
+    return scaled.log_best + min(by_row, by_column)
 
 
 def _k_best(scaled: Scaled, k: int) -> RankedAssignments:
