@@ -64,4 +64,4 @@ class PlanningAgent(nn.Module):
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """The plan from now on."""
-        return self(observation, 0).plan
+        return self.plan(observation, self.foresee(observation, self.planner.looks_ahead))
