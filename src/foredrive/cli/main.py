@@ -17,6 +17,7 @@ from foredrive.cli.demo import demo
 from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
+from foredrive.cli.imagine import imagine
 from foredrive.cli.record import record
 from foredrive.cli.score import score
 from foredrive.cli.train import train
@@ -32,6 +33,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "drive": drive,
     "score": score,
+    "imagine": imagine,
     "export": export,
     "view": view,
     "bench": bench,

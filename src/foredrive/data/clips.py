@@ -55,6 +55,9 @@ class ClipConfig:
     future_source: Literal["driven", "taught"] = "driven"
     """Where the future to learn from comes from: what was driven, or what the teacher of a lesson would do
     instead (`foredrive drive --taught`); clips of logs without a teacher have what was driven."""
+    part_s: tuple[float, float] | None = None
+    """Of a log only clips whose now and frames after it lie in this part: seconds since the log's start, the
+    end left out. None takes all of it."""
 
 
 class ClipDataset(Dataset[Example]):
@@ -230,10 +233,14 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
     now = np.unique(now[found])
     frames, found = log.nearest_frames(log.t_us[now][:, None] + offset_us)
     whole = found.all(-1) & (np.diff(frames, axis=-1) > 0).all(-1)
+    if config.part_s is not None:
+        t_s = (log.t_us[frames[:, config.past_frames :]] - log.t_us[0]) * 1e-6
+        whole &= (t_s[:, 0] >= config.part_s[0]) & (t_s[:, -1] < config.part_s[1])
     if not whole.any():
         raise InputError(
             f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
+            + ("" if config.part_s is None else f", or not into the part {config.part_s}")
         )
     clips: list[list[int]] = frames[whole].tolist()
     return clips

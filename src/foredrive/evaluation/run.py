@@ -13,7 +13,14 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.evaluation.predictor import Prediction, Predictor
 from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.evaluation.totals import Figures, FlowTotals, ImageTotals, OccupancyTotals, PlanningTotals
+from foredrive.evaluation.totals import (
+    Figures,
+    FlowTotals,
+    FuturesTotals,
+    ImageTotals,
+    OccupancyTotals,
+    PlanningTotals,
+)
 from foredrive.metrics import Obstacles, VoxelPrior, future_obstacles
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.scene import Agent, Clip, Example, Trajectory, VoxelGrid
@@ -120,6 +127,7 @@ class _Totals:
         self._frame_dt_s, self._prior = frame_dt_s, prior
         self._planning: PlanningTotals | None = None
         self._occupancy: OccupancyTotals | None = None
+        self._futures: FuturesTotals | None = None
         self._flow: FlowTotals | None = None
         self._images: ImageTotals | None = None
 
@@ -133,7 +141,13 @@ class _Totals:
             frames = prediction.occupancy_logit.shape[1]
             labels = labels_from_now(example.occupancy, clip, frames)
             self._occupancy = self._occupancy or OccupancyTotals(labels.spec, frames, dt_s, self._prior)
-            self._occupancy.add(prediction.occupancy_logit > 0, labels)
+            T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
+            self._occupancy.add(prediction.occupancy_logit > 0, labels, T_world_ego)
+        if prediction.futures is not None:
+            count, frames = prediction.futures.shape[1:3]
+            labels = labels_from_now(example.occupancy, clip, frames + 1)[:, 1:]
+            self._futures = self._futures or FuturesTotals(labels.spec, count, frames, dt_s)
+            self._futures.add(prediction.futures, labels)
         if prediction.flow_mps is not None:
             frames = prediction.flow_mps.shape[1]
             self._flow = self._flow or FlowTotals(frames, dt_s)
@@ -143,14 +157,15 @@ class _Totals:
             self._images.add(prediction.images, prediction.image_known, prediction.image_stride, clip)
 
     def figures(self) -> Figures:
-        parts = {
-            "occupancy": self._occupancy,
-            "flow": self._flow,
-            "image": self._images,
-            "planning": self._planning,
-        }
+        parts = (
+            ("occupancy", self._occupancy),
+            ("occupancy", self._futures),
+            ("flow", self._flow),
+            ("image", self._images),
+            ("planning", self._planning),
+        )
         out: Figures = {}
-        for prefix, part in parts.items():
+        for prefix, part in parts:
             if part is not None:
                 out |= part.figures(prefix)
         return out

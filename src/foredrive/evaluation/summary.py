@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 
 Value = float | int | str | None
 TABLE_COLUMNS = 120
+_RIVAL = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 
 
 def write_json(path: Path, content: object) -> None:
@@ -96,9 +98,10 @@ def _table(title: str, words: Sequence[str]) -> Table:
 
 
 def occupancy_table(summary: Mapping[str, Value]) -> Table:
-    """Occupancy now and in the future, beside the best constant where there is one."""
+    """Occupancy now and in the future, beside whatever else was judged by its IoU."""
     table = _table("Occupancy on known voxels", ("voxels", "when"))
-    for title in ("IoU", "best constant", "precision", "recall"):
+    rivals = rivals_of_occupancy(summary)
+    for title in ("IoU", *rivals.values(), "precision", "recall"):
         table.add_column(title, justify="right")
     for scope, title in (("", "all"), ("above_ground.", "above ground")):
         prefix = f"occupancy.{scope}"
@@ -108,12 +111,19 @@ def occupancy_table(summary: Mapping[str, Value]) -> Table:
                 title if i == 0 else "",
                 name.replace("future_", "in "),
                 _show(summary.get(f"{prefix}iou_{name}"), 3),
-                _show(summary.get(f"{prefix}iou_{name}.best_constant"), 3),
+                *(_show(summary.get(f"{prefix}iou_{name}.{rival}"), 3) for rival in rivals),
                 _show(summary.get(f"{prefix}precision_{name}"), 3),
                 _show(summary.get(f"{prefix}recall_{name}"), 3),
                 end_section=i == len(names) - 1,
             )
     return table
+
+
+def rivals_of_occupancy(summary: Mapping[str, Value]) -> dict[str, str]:
+    """What stands beside the IoU of a model's occupancy, with titles: the best constant, copies of its own
+    present, futures by chance."""
+    found = [match[1] for key in summary if (match := _RIVAL.fullmatch(key))]
+    return {name: name.replace("_", " ") for name in dict.fromkeys(found) if "threshold" not in name}
 
 
 def print_summary(summary: Mapping[str, Value], console: Console, model: str = "model") -> None:

@@ -4,14 +4,18 @@ import torch
 from torch import Tensor
 
 from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3
 from foredrive.metrics import (
     PROTOCOLS,
     FlowErrors,
+    FuturesCounts,
     Obstacles,
     OccupancyCounts,
     PlanScores,
     VoxelPrior,
     above_ground,
+    carried_along,
+    count_futures,
     count_occupancy,
     flow_errors,
     psnr_db,
@@ -22,6 +26,8 @@ from foredrive.metrics.protocols import HORIZON_NAMES
 from foredrive.scene import Clip, Trajectory, VoxelGrid, VoxelSpec
 
 Figures = dict[str, float | int | str]
+COPIES = (".copy", ".carried_copy")
+"""Of a predicted present: as it is, and carried along the driven path."""
 
 
 def frame_names(frames: int, frame_dt_s: float) -> list[str]:
@@ -77,7 +83,8 @@ def _by_horizon(key: str, unit: str, values: Tensor) -> Figures:
 
 
 class OccupancyTotals:
-    """Occupancy of a model, and of the best constant, over all voxels and over those above the ground."""
+    """Occupancy of a model, of the best constant and of copies of the model's own present, over all voxels
+    and over those above the ground."""
 
     def __init__(self, spec: VoxelSpec, frames: int, frame_dt_s: float, prior: VoxelPrior | None) -> None:
         if prior is not None and len(prior.occupied) != frames:
@@ -91,10 +98,16 @@ class OccupancyTotals:
         }
         self._counts: dict[tuple[str, str], OccupancyCounts] = {}
 
-    def add(self, predicted: Tensor, labels: VoxelGrid) -> None:
-        """Compare a batch of predicted occupancy (bool [b F Z Y X]) with labels [b F 1 Z Y X]."""
+    def add(self, predicted: Tensor, labels: VoxelGrid, T_world_ego: Tensor) -> None:
+        """Compare a batch of predicted occupancy (bool [b F Z Y X]) with labels [b F 1 Z Y X].
+
+        Args:
+            T_world_ego: of the frames, driven: by them the predicted present is carried into the future.
+        """
+        said = {"": predicted} | _copies(predicted, T_world_ego, labels.spec)
         for scope, region in self._regions.items():
-            self._add(scope, "", count_occupancy(predicted, labels, region))
+            for suffix, occupied in said.items():
+                self._add(scope, suffix, count_occupancy(occupied, labels, region))
             if scope in self._constants:
                 constant = self._constants[scope][0].to(predicted.device).expand_as(predicted)
                 self._add(scope, ".best_constant", count_occupancy(constant, labels, region))
@@ -104,15 +117,57 @@ class OccupancyTotals:
         self._counts[scope, suffix] = counts if so_far is None else so_far + counts
 
     def figures(self, prefix: str) -> Figures:
-        """`PREFIX.iou_now`, `PREFIX.above_ground.iou_now.best_constant` and so on."""
+        """`PREFIX.iou_now`, `PREFIX.above_ground.iou_now.best_constant`, `PREFIX.iou_future_1s.copy` …"""
         out: Figures = {}
         for (scope, suffix), counts in self._counts.items():
-            for kind in ("iou", "precision", "recall"):
+            copied = suffix in COPIES
+            for kind in ("iou",) if copied else ("iou", "precision", "recall"):
                 for name, value in zip(self._names, getattr(counts, kind).tolist(), strict=True):
-                    out[f"{prefix}.{scope}{kind}_{name}{suffix}"] = value
+                    if not (copied and name == "now"):
+                        out[f"{prefix}.{scope}{kind}_{name}{suffix}"] = value
         for scope, (_, thresholds) in self._constants.items():
             for name, value in zip(self._names, thresholds.tolist(), strict=True):
                 out[f"{prefix}.{scope}iou_{name}.best_constant_threshold"] = value
+        return out
+
+
+def _copies(predicted: Tensor, T_world_ego: Tensor, spec: VoxelSpec) -> dict[str, Tensor]:
+    """The predicted present in place of the predicted future: as it is, and as if nothing but the ego
+    vehicle moved, whose driven path is given away."""
+    frames = predicted.shape[1]
+    if frames == 1:
+        return {}
+    now = predicted[:, 0]
+    T_now_frame = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
+    carried = [carried_along(now, T_now_frame[:, k], spec) for k in range(frames)]
+    return dict(zip(COPIES, (now[:, None].expand_as(predicted), torch.stack(carried, dim=1)), strict=True))
+
+
+class FuturesTotals:
+    """Futures drawn by chance: the best of K, all of them, and how far they are apart."""
+
+    def __init__(self, spec: VoxelSpec, count: int, frames: int, frame_dt_s: float) -> None:
+        self._count, self._names = count, frame_names(frames + 1, frame_dt_s)[1:]
+        self._regions = {"": None, "above_ground.": above_ground(spec)}
+        self._counts: dict[str, FuturesCounts] = {}
+
+    def add(self, futures: Tensor, labels: VoxelGrid) -> None:
+        """Compare futures [b K P Z Y X] with labels [b P 1 Z Y X] of the same frames."""
+        for scope, region in self._regions.items():
+            counts = count_futures(futures, labels, region)
+            so_far = self._counts.get(scope)
+            self._counts[scope] = counts if so_far is None else so_far + counts
+
+    def figures(self, prefix: str) -> Figures:
+        """`PREFIX.iou_future_1s.best_of_5`, `….mean_of_5` and `PREFIX.spread_future_1s`."""
+        out: Figures = {}
+        for scope, counts in self._counts.items():
+            spread = counts.spread / counts.items
+            columns = (counts.best.iou.tolist(), counts.mean.iou.tolist(), spread.tolist())
+            for name, best, mean, apart in zip(self._names, *columns, strict=True):
+                key = f"{prefix}.{scope}iou_{name}"
+                out |= {f"{key}.best_of_{self._count}": best, f"{key}.mean_of_{self._count}": mean}
+                out[f"{prefix}.{scope}spread_{name}"] = apart
         return out
 
 

@@ -1,5 +1,6 @@
 """Open-loop planning protocols, occupancy, image quality: pure functions."""
 
+from foredrive.metrics.forecasts import FuturesCounts, carried_along, count_futures
 from foredrive.metrics.images import psnr_db, ssim
 from foredrive.metrics.obstacles import Obstacles, boxes_at_now, future_obstacles
 from foredrive.metrics.occupancy import (
@@ -16,6 +17,7 @@ from foredrive.metrics.protocols import PROTOCOLS, ObstacleGrid, PlanningProtoco
 __all__ = [
     "PROTOCOLS",
     "FlowErrors",
+    "FuturesCounts",
     "ObstacleGrid",
     "Obstacles",
     "OccupancyCounts",
@@ -24,6 +26,8 @@ __all__ = [
     "VoxelPrior",
     "above_ground",
     "boxes_at_now",
+    "carried_along",
+    "count_futures",
     "count_occupancy",
     "flow_errors",
     "future_obstacles",

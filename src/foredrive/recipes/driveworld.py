@@ -1,5 +1,7 @@
 """DriveWorld's recipes."""
 
+from dataclasses import replace
+
 from foredrive.data import ClipConfig
 from foredrive.models.text_encoder import IN_A_PACKAGE
 from foredrive.recipes.config import (
@@ -7,11 +9,13 @@ from foredrive.recipes.config import (
     DriveWorldSize,
     DriveWorldStage,
     LiftSplatSize,
+    PooledLiftingSize,
     PromptSize,
     Recipe,
+    rescheduled,
 )
 from foredrive.scene import VoxelSpec
-from foredrive.training import DriveWorldWeights, Schedule
+from foredrive.training import DriveWorldWeights, PathFit, Schedule
 
 OBSERVED, IMAGINED = 4, 4
 """T and L of the paper."""
@@ -67,4 +71,93 @@ def driveworld_tiny() -> Recipe:
             schedule=Schedule(batch_size=4, lr=1e-3, steps=160, warmup_steps=10, workers=1),
             weights=DriveWorldWeights(occ=0.5, wpts=1.0),
         ),
+    )
+
+
+def driveworld_town() -> Recipe:
+    """DriveWorld for claims tested on two CPU cores: grid, planner and steps are those of `nemo_town`."""
+    tiny = driveworld_tiny()
+    pretrain, finetune = tiny.pretrain, tiny.finetune
+    assert pretrain is not None
+    assert isinstance(tiny.model, DriveWorldSize)
+    return replace(
+        tiny,
+        name="driveworld_town",
+        clips=replace(
+            tiny.clips,
+            now_stride_s=0.5,
+            voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
+        ),
+        model=replace(
+            tiny.model,
+            encoder=LiftSplatSize(near_m=1.0, far_m=48.0, step_m=1.0),
+            planner_history=1,
+            planner_base="ego_mlp",
+            planner_look_m=(2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0),
+        ),
+        path=PathFit(),
+        pretrain=rescheduled(pretrain, steps=500, warmup_steps=50),
+        finetune=rescheduled(finetune, steps=150, warmup_steps=20),
+    )
+
+
+def driveworld_base() -> Recipe:
+    """The paper's size: ResNet-101, 200×200×16 voxels, 24 epochs at 2e-4, then 20 (UniAD's second stage).
+
+    Constants of §4.1 and of MILE (state and history); what they leave open: D = 64, a plane of 256 channels,
+    a memory of 16, K = 32, images of 448×800, voxels of 0.5 m.
+    """
+    schedule = Schedule(
+        batch_size=1,
+        lr=2e-4,
+        epochs=24,
+        weight_decay=1e-2,
+        warmup_steps=500,
+        checkpoint_every=1000,
+        workers=4,
+    )
+    return Recipe(
+        name="driveworld_base",
+        clips=ClipConfig(
+            past_frames=OBSERVED - 1,
+            future_frames=IMAGINED,
+            future_images=False,
+            image_hw=(448, 800),
+            voxels=VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200)),
+        ),
+        model=DriveWorldSize(
+            backbone=BackboneSize(
+                embedding_size=64,
+                hidden_sizes=(256, 512, 1024, 2048),
+                depths=(3, 4, 23, 3),
+                layer_type="bottleneck",
+                stages=("stage1", "stage2", "stage3", "stage4"),
+                weights="microsoft/resnet-101",
+            ),
+            encoder=PooledLiftingSize(heads=8, points=8, layers=3),
+            channels=64,
+            plane=256,
+            observation=512,
+            observation_hidden=128,
+            state=512,
+            history=1024,
+            memory=16,
+            memory_heads=8,
+            objects=32,
+            states_hidden=1024,
+            expanded=(512, 256, 128, 64),
+            volume_hidden=16,
+            statics=256,
+            prompt=PromptSize(widths=(256, 128, 64, 64), encoding=384, text_encoder=IN_A_PACKAGE),
+            planner_width=256,
+            planner_layers=3,
+            planner_heads=8,
+            attention_pool=(4, 8, 8),
+            checkpoint=("backbone", "encoder"),
+        ),
+        pretrain=DriveWorldStage(schedule=schedule, weights=DriveWorldWeights()),
+        finetune=DriveWorldStage(
+            schedule=replace(schedule, epochs=20), weights=DriveWorldWeights(occ=0.5, wpts=1.0)
+        ),
+        precision="bf16-mixed",
     )

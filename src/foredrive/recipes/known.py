@@ -2,7 +2,8 @@
 
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe
-from foredrive.recipes.driveworld import driveworld_tiny
+from foredrive.recipes.driveworld import driveworld_base, driveworld_tiny, driveworld_town
+from foredrive.recipes.driveworld_rows import driveworld_rows
 from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_tiny, nemo_town
 from foredrive.recipes.nemo_rows import nemo_rows
 
@@ -11,6 +12,8 @@ RECIPES: dict[str, Recipe] = {
     **nemo_rows(nemo_town(), TOWN_BEV),
     **nemo_rows(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),
+    **driveworld_rows(driveworld_town()),
+    **driveworld_rows(driveworld_base()),
 }
 
 

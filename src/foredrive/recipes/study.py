@@ -125,10 +125,15 @@ def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
         "collision_avg_pct": f"{headline}.collision_avg_pct",
     }
     for scope in ("", "above_ground."):
-        prefix = f"occupancy.{scope}iou_"
-        kept |= {key.removeprefix("occupancy."): key for key in summary if key.startswith(prefix)}
+        prefixes = (f"occupancy.{scope}iou_", f"occupancy.{scope}spread_")
+        kept |= {key.removeprefix("occupancy."): key for key in summary if key.startswith(prefixes)}
+    kept |= {key: key for key in summary if key.startswith("flow.")}
     for planner in ("", *(f"{name}." for name in PLANNERS)):
         for protocol in PROTOCOLS:
             for kind in ("l2_avg_m", "collision_avg_pct"):
                 kept[f"{planner}{protocol}.{kind}"] = f"planning.{planner}{protocol}.{kind}"
-    return {name: float(summary[key]) for name, key in kept.items() if "threshold" not in key}
+    return {
+        name: float(summary[key])
+        for name, key in kept.items()
+        if "threshold" not in key and summary[key] is not None
+    }

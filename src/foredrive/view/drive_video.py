@@ -12,12 +12,12 @@ from PIL import Image, ImageDraw, ImageFont
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.logs import Log, LogPath
-from foredrive.files import atomic_path
 from foredrive.geometry.boxes import box_corners
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
+from foredrive.view.video import write_video
 
 FASTER = 2.0
 """Than life."""
@@ -26,7 +26,6 @@ CAMERA_WH = (256, 144)
 ABOVE_WH = (768, 288)
 PX_PER_M, EGO_AT_X = 5.0, 0.3
 """From above, driving to the right; the vehicle stands at this part of the width."""
-QUALITY = 55
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
 
 
@@ -39,16 +38,7 @@ def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> Non
     """
     opened = Log(log)
     frames = [_frame(opened, index, drive) for index in range(len(opened))]
-    with atomic_path(path) as temporary:
-        frames[0].save(
-            temporary,
-            format="WEBP",
-            save_all=True,
-            append_images=frames[1:],
-            duration=round(1000 * FRAME_DT_S / FASTER),
-            loop=0,
-            quality=QUALITY,
-        )
+    write_video(path, frames, FRAME_DT_S / FASTER)
 
 
 def _frame(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:

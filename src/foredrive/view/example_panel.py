@@ -121,13 +121,13 @@ def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W
         panel.spec,
         ABOVE_GROUND_M,
     )
-    return _with_ego(columns, panel.spec)
+    return with_ego(columns, panel.spec)
 
 
 def volume_picture(panel: ExamplePanel) -> UInt8[np.ndarray, "H W 3"]:
     """The volume's principal components from above."""
     assert panel.volume is not None
-    return _with_ego(draw_volume_pca(panel.volume), panel.spec)
+    return with_ego(draw_volume_pca(panel.volume), panel.spec)
 
 
 def predicted_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -233,8 +233,8 @@ def _later(panel: ExamplePanel) -> str:
     return f'<p class="note">Imagined futures</p><div class="later">{"".join(columns)}</div>'
 
 
-def _with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.ndarray, "H W 3"]:
-    """Enlarge a picture of columns by a whole factor and draw the vehicle's outline."""
+def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture of columns, enlarged by a whole factor, with the vehicle's outline."""
     factor = max(1, round(MAP_PX / columns.shape[0]))
     canvas = Image.fromarray(columns).resize(
         (columns.shape[1] * factor, columns.shape[0] * factor), Image.Resampling.NEAREST

@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from foredrive.evaluation.summary import rivals_of_occupancy
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 
@@ -12,6 +13,10 @@ Figure = float | int | str | None
 Summary = Mapping[str, Figure]
 
 MISSING = "&ndash;"
+RIVALS_NOTE = (
+    '<p class="note">Copy: the predicted present in place of the future. Carried copy: moved by the path '
+    "that was driven, which no model knows. Best and mean of k: futures drawn by chance.</p>"
+)
 MODEL = ""
 AGENT_TITLES = {MODEL: "this model", "ego_mlp": "MLP of ego status alone"}
 PROTOCOL_TITLES = {
@@ -88,10 +93,12 @@ def occupancy_table(summary: Summary) -> str:
     if not whens:
         return ""
     names = "".join(f"<th>{title}</th>" for title in OCCUPANCY_TITLES.values())
+    rivals = {name: title for name, title in rivals_of_occupancy(summary).items() if name != "best_constant"}
+    others = "".join(f'<th rowspan="2">IoU, {title}</th>' for title in rivals.values())
     head = (
         '<tr><th rowspan="2"></th><th class="group" colspan="3">this model</th>'
-        '<th class="group" colspan="3">best constant</th><th rowspan="2">IoU ratio</th></tr>'
-        f"<tr>{names * 2}</tr>"
+        '<th class="group" colspan="3">best constant</th><th rowspan="2">IoU ratio</th>'
+        f"{others}</tr><tr>{names * 2}</tr>"
     )
     bodies = []
     for scope, title in SCOPE_TITLES.items():
@@ -102,9 +109,10 @@ def occupancy_table(summary: Summary) -> str:
             cells += [_cell(summary.get(f"{key}.best_constant")) for key in keys]
             ratio = ratio_to_constant(summary, f"occupancy.{scope}iou_{when}")
             cells.append(f"<td>{MISSING if ratio is None else f'{ratio:.2f} &times;'}</td>")
+            cells += [_cell(summary.get(f"occupancy.{scope}iou_{when}.{rival}")) for rival in rivals]
             rows.append(_row(when_title(when), cells))
-        bodies.append(_tbody(rows, title, 8))
-    return _table(head, "".join(bodies))
+        bodies.append(_tbody(rows, title, 8 + len(rivals)))
+    return _table(head, "".join(bodies)) + (RIVALS_NOTE if rivals else "")
 
 
 def image_table(summary: Summary) -> str:

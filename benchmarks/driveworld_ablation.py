@@ -1,0 +1,87 @@
+"""The rows of DriveWorld's Tables 1 and 2 at the size of towns, beside NeMo: hours of
+`foredrive bench driveworld_ablation`.
+
+Drives, cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretraining: the two world
+models see the same drives, for as many steps.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import RECIPES
+from foredrive.recipes.study import (
+    StudyLogs,
+    StudyTowns,
+    record_study,
+    run_arm,
+    seeded,
+    share_of,
+    work_folder,
+)
+
+WORK = work_folder(Path("runs/nemo_study"))
+TOWNS = StudyTowns()
+FULL, NEMO = "driveworld_town", "nemo_town"
+ROWS = [name for name in RECIPES if name.startswith(FULL)]
+
+
+def row(name: str) -> Callable[[int], dict[str, float]]:
+    """One recipe, both stages on all drives."""
+
+    def measure(seed: int) -> dict[str, float]:
+        return _arm(name, seed, _logs())
+
+    return measure
+
+
+def pretrained_on(share: float) -> Callable[[int], dict[str, float]]:
+    """The full recipe, pre-trained on a share of the drives and fine-tuned on all."""
+
+    def measure(seed: int) -> dict[str, float]:
+        logs, first = _logs(), f"{FULL}_first_{100 * share:.0f}pct"
+        _arm(FULL, seed, _part(logs, share), folder=first)
+        return _arm(FULL, seed, logs, folder=f"{first}_then_all", start=first)
+
+    return measure
+
+
+def finetuned_on(share: float) -> Callable[[int], dict[str, float]]:
+    """The full recipe, pre-trained on all drives and fine-tuned on a share of them."""
+
+    def measure(seed: int) -> dict[str, float]:
+        logs = _logs()
+        _arm(FULL, seed, logs)
+        return _arm(FULL, seed, _part(logs, share), folder=f"{FULL}_then_{100 * share:.0f}pct", start=FULL)
+
+    return measure
+
+
+def _logs() -> StudyLogs:
+    return record_study(TOWNS, WORK / "towns", workers=2)
+
+
+def _part(logs: StudyLogs, share: float) -> StudyLogs:
+    return dataclasses.replace(logs, train=share_of(logs.train, share))
+
+
+def _arm(
+    name: str, seed: int, logs: StudyLogs, folder: str | None = None, start: str | None = None
+) -> dict[str, float]:
+    def place(run: str) -> Path:
+        return WORK / "runs" / f"{run}_seed{seed}"
+
+    begun = None if start is None else place(start)
+    return run_arm(seeded(RECIPES[name], seed), logs, place(folder or name), WORK / "cache", begun)
+
+
+BENCHMARK = Benchmark(
+    question="What does each part of DriveWorld add, in the rows of its Tables 1 and 2?",
+    arms={name: row(name) for name in (*ROWS, NEMO)}
+    | {"pretrained_50pct": pretrained_on(0.5), "finetuned_75pct": finetuned_on(0.75)},
+    config={
+        "recipes": {name: dataclasses.asdict(RECIPES[name]) for name in (*ROWS, NEMO)},
+        "towns": dataclasses.asdict(TOWNS),
+    },
+)

@@ -1,0 +1,85 @@
+"""Occupancy forecast against copies of the present, in towns and on a real log.
+
+`foredrive bench driveworld_forecast`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Drives,
+cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretraining and driveworld_ablation.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from foredrive.data import LogPath, find_logs
+from foredrive.data.convert import convert
+from foredrive.errors import InputError
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import RECIPES
+from foredrive.recipes.forecast import forecasting, judge_forecast
+from foredrive.recipes.study import StudyTowns, record_study, run_arm, seeded, work_folder
+from foredrive.recipes.train import train_run
+
+WORK = work_folder(Path("runs/nemo_study"))
+TOWNS = StudyTowns()
+DRIVEWORLD, NEMO = "driveworld_town", "nemo_town"
+LEARNED_S, STRIDE_S = 3.95, 0.1
+"""The first 40 frames of a log of 10 Hz, and every frame as a now."""
+WHOLE_S = 1e6
+
+
+def in_towns(name: str) -> Callable[[int], dict[str, float]]:
+    """A recipe as it is, on the drives of Town05."""
+
+    def measure(seed: int) -> dict[str, float]:
+        logs = record_study(TOWNS, WORK / "towns", workers=2)
+        figures = run_arm(seeded(RECIPES[name], seed), logs, _folder(name, seed), WORK / "cache")
+        return {key: value for key, value in figures.items() if "l2" not in key and "collision" not in key}
+
+    return measure
+
+
+def on_pandaset(name: str, *, pretrained: bool) -> Callable[[int], dict[str, float]]:
+    """A recipe's world model, learned from the first frames of the real log and judged on the others."""
+
+    def measure(seed: int) -> dict[str, float]:
+        log, recipe = _pandaset(), seeded(RECIPES[name], seed)
+        start = None
+        if pretrained:
+            logs = record_study(TOWNS, WORK / "towns", workers=2)
+            start = train_run(recipe, logs.train, _folder(name, seed), WORK / "cache").folder
+        arm = f"pandaset_{name}_{'pretrained' if pretrained else 'scratch'}"
+        learned = forecasting(recipe, (0.0, LEARNED_S), STRIDE_S)
+        run = train_run(learned, [log], _folder(arm, seed), WORK / "cache", start)
+        return judge_forecast(run, [log], (LEARNED_S, WHOLE_S))
+
+    return measure
+
+
+def _folder(arm: str, seed: int) -> Path:
+    return WORK / "runs" / f"{arm}_seed{seed}"
+
+
+def _pandaset() -> LogPath:
+    root = WORK / "pandaset"
+    if root.is_dir():
+        return find_logs(root)[0]
+    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
+    if not source.is_dir():
+        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
+    return convert(source, "pandaset", root)[0]
+
+
+BENCHMARK = Benchmark(
+    question="Does DriveWorld foresee occupancy better than copies of the present do?",
+    arms={f"towns_{name}": in_towns(name) for name in (DRIVEWORLD, NEMO)}
+    | {
+        f"pandaset_{name}_{begun}": on_pandaset(name, pretrained=begun == "pretrained")
+        for name in (DRIVEWORLD, NEMO)
+        for begun in ("pretrained", "scratch")
+    },
+    config={
+        "recipes": {name: dataclasses.asdict(RECIPES[name]) for name in (DRIVEWORLD, NEMO)},
+        "towns": dataclasses.asdict(TOWNS),
+        "learned_s": LEARNED_S,
+        "stride_s": STRIDE_S,
+    },
+)

@@ -1,0 +1,109 @@
+"""One training step of DriveWorld beside one of NeMo, on the same clips: `foredrive bench driveworld_speed`.
+
+Twenty seconds of Town01 are recorded first. Steps are taken in turns, so that a busy machine slows both
+alike; their ratio is that of the time that computing took. Where there is a GPU, the base size is measured
+too.
+"""
+
+import dataclasses
+import statistics
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from foredrive.data import collate
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.measuring import Took, forget_peak, measure, peak_mib
+from foredrive.recipes import RECIPES, Recipe
+from foredrive.recipes.build import build_agent, build_objective
+from foredrive.recipes.open_clips import open_clips
+from foredrive.recipes.recording import record_drives
+from foredrive.towns.campaign import Campaign, plan_drives
+from foredrive.training import make_fabric
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+PLANS = plan_drives(Campaign(("Town01",), (1,), seconds=20.0, rate_hz=2.0))
+IMAGE_HW = (144, 256)
+TURNS = 7
+STAGES = ("pretrain", "finetune")
+
+
+class Stepper:
+    """A recipe's stage with its optimizer and one batch, ready to be stepped."""
+
+    def __init__(self, recipe: Recipe, stage_name: str, folder: Path, seed: int) -> None:
+        stage = recipe.pretrain if stage_name == "pretrain" else recipe.finetune
+        assert stage is not None
+        logs = list(record_drives(PLANS, folder / "towns", IMAGE_HW, workers=1).logs.values())
+        dataset = open_clips(logs, dataclasses.replace(recipe.clips, future_images=True), folder / "cache")
+        size = stage.schedule.batch_size
+        torch.manual_seed(seed)
+        self.fabric = make_fabric(recipe.precision)
+        items = [dataset[int(k * len(dataset) / size)] for k in range(size)]
+        self.example = self.fabric.to_device(collate(items)) if DEVICE == "cuda" else collate(items)
+        objective = build_objective(recipe, stage, build_agent(recipe, fetch=False))
+        trained = [p for p in objective.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(trained, lr=stage.schedule.lr)
+        self.objective, self.optimizer = self.fabric.setup(objective, optimizer)
+
+    def step(self) -> None:
+        """As `training.train` does it."""
+        loss = self.objective(self.example, torch.Generator().manual_seed(0))["loss"]
+        self.optimizer.zero_grad(set_to_none=True)
+        self.fabric.backward(loss)
+        self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=35.0)
+        self.optimizer.step()
+
+
+def beside(name: str, nemo: str) -> Callable[[int], dict[str, float]]:
+    """A DriveWorld's steps and a NeMo's, in turns."""
+
+    def run(seed: int) -> dict[str, float]:
+        figures: dict[str, float] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for stage in STAGES:
+                mine, theirs = (Stepper(RECIPES[each], stage, Path(folder), seed) for each in (name, nemo))
+                took: dict[str, list[Took]] = {"": [], "nemo_": []}
+                for _ in range(TURNS + 1):  # the first ones warm up
+                    took[""].append(measure(mine.step, 1, DEVICE))
+                    took["nemo_"].append(measure(theirs.step, 1, DEVICE))
+                figures |= _figures(stage, took)
+                forget_peak(DEVICE)
+                mine.step()
+                figures[f"{stage}.peak_mib"] = peak_mib(DEVICE)
+        headline = {name: figures[f"pretrain.{name}"] for name in ("step_s", "ratio_to_nemo")}
+        return headline | figures
+
+    return run
+
+
+def _figures(stage: str, took: dict[str, list[Took]]) -> dict[str, float]:
+    """Medians without the first turn; ratios by computing on a CPU, by the clock on a GPU."""
+    figures = {}
+    for model, turns in took.items():
+        for kind in ("wall_s", "cpu_s"):
+            figures[f"{model}{kind}"] = statistics.median(getattr(turn, kind) for turn in turns[1:])
+    kind = "wall_s" if DEVICE == "cuda" else "cpu_s"
+    return {
+        f"{stage}.step_s": figures["wall_s"],
+        f"{stage}.step_cpu_s": figures["cpu_s"],
+        f"{stage}.nemo_step_s": figures["nemo_wall_s"],
+        f"{stage}.nemo_step_cpu_s": figures["nemo_cpu_s"],
+        f"{stage}.ratio_to_nemo": figures[kind] / figures[f"nemo_{kind}"],
+    }
+
+
+BENCHMARK = Benchmark(
+    question="How long does a training step of DriveWorld take beside one of NeMo at equal resolution?",
+    arms={"tiny": beside("driveworld_tiny", "nemo_tiny")}
+    | ({"base": beside("driveworld_base", "nemo_base")} if DEVICE == "cuda" else {}),
+    config={
+        "recipes": {
+            name: dataclasses.asdict(RECIPES[name])
+            for name in ("driveworld_tiny", "nemo_tiny", "driveworld_base", "nemo_base")
+        },
+        "turns": TURNS,
+    },
+)

@@ -1,0 +1,91 @@
+"""Forecasts of occupancy: what anybody could say who knows the present, and several futures by chance."""
+
+import functools
+import itertools
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from foredrive.geometry.se3 import transform_points
+from foredrive.metrics.occupancy import OccupancyCounts, count_occupancy
+from foredrive.scene import VoxelGrid, VoxelSpec
+from foredrive.scene.record import Record
+
+
+def carried_along(
+    occupied: Bool[Tensor, "b Z Y X"], T_src_dst: Float64[Tensor, "b 4 4"], spec: VoxelSpec
+) -> Bool[Tensor, "b Z Y X"]:
+    """Occupancy as it looks from another pose if nothing moves: that of the voxel where each centre lies.
+
+    Args:
+        occupied: on the grid in the frame src; what lies outside of it is taken to be free.
+        T_src_dst: points of the frame dst, in which the result is, -> src.
+    """
+    centres = spec.centres_m(occupied.device).flatten(0, 2).double()
+    place = transform_points(T_src_dst, centres.expand(len(occupied), -1, -1))
+    index = ((place - place.new_tensor(spec.lower_m)) / spec.voxel_m).floor().long()
+    nz, ny, nx = spec.shape_zyx
+    inside = ((index >= 0) & (index < index.new_tensor([nx, ny, nz]))).all(-1)
+    flat = ((index[..., 2] * ny + index[..., 1]) * nx + index[..., 0]).where(inside, 0)
+    return (occupied.flatten(1).gather(1, flat) & inside).view(occupied.shape)
+
+
+@dataclass(frozen=True)
+class FuturesCounts(Record):
+    """How K futures drawn by chance agree with what happened, and with each other; per frame."""
+
+    best: OccupancyCounts
+    """Of the future of each item that is the best over all its frames together."""
+    mean: OccupancyCounts
+    """Of all futures."""
+    spread: Float[Tensor, "F"]
+    """Sum over items of 1 - IoU between two of its futures, averaged over pairs: 0 if they are alike."""
+    items: int
+
+    def __add__(self, other: "FuturesCounts") -> "FuturesCounts":
+        return FuturesCounts(
+            self.best + other.best,
+            self.mean + other.mean,
+            self.spread + other.spread,
+            self.items + other.items,
+        )
+
+
+def count_futures(
+    futures: Bool[Tensor, "b K F Z Y X"], labels: VoxelGrid, region: Bool[Tensor, "Z Y X"] | None = None
+) -> FuturesCounts:
+    """Compare K futures of each item with labels [b F 1 Z Y X] as `count_occupancy` does."""
+    best, mean, spread = [], [], torch.zeros(futures.shape[2], dtype=torch.float64)
+    for item, drawn in enumerate(futures):
+        label = labels[item : item + 1]
+        counts = [count_occupancy(future[None], label, region) for future in drawn]
+        agreement = [float(_pooled_iou(count)) for count in counts]
+        best.append(counts[max(range(len(counts)), key=agreement.__getitem__)])
+        mean += counts
+        inside = drawn if region is None else drawn & region.to(drawn.device)
+        spread += _disagreement(inside)
+    return FuturesCounts(_total(best), _total(mean), spread, len(futures))
+
+
+def _pooled_iou(counts: OccupancyCounts) -> Float[Tensor, ""]:
+    """Over all frames; 0 where nothing was occupied."""
+    hits = counts.true_positive.sum()
+    return hits / (hits + counts.false_positive.sum() + counts.false_negative.sum()).clamp_min(1)
+
+
+def _total(counts: Sequence[OccupancyCounts]) -> OccupancyCounts:
+    return functools.reduce(operator.add, counts)
+
+
+def _disagreement(drawn: Bool[Tensor, "K F Z Y X"]) -> Float64[Tensor, "F"]:
+    """1 - IoU per frame, averaged over pairs of futures; nothing occupied in either is agreement."""
+    pairs = list(itertools.combinations(drawn.flatten(2).unbind(), 2))
+    apart = torch.zeros(drawn.shape[1], dtype=torch.float64)
+    for one, other in pairs:
+        either = (one | other).sum(-1)
+        apart += ((one ^ other).sum(-1) / either.clamp_min(1)).double().cpu()
+    return apart / max(len(pairs), 1)

@@ -1,0 +1,119 @@
+"""Futures that a model imagines, beside what happened, as a video: from above and through the cameras."""
+
+import datetime
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from foredrive.metrics.occupancy import ABOVE_GROUND_M
+from foredrive.recipes.imagination import Moment
+from foredrive.view import palette
+from foredrive.view.example_panel import COMPARISON_KEY, with_ego
+from foredrive.view.image_drawing import resize
+from foredrive.view.log_sheet import camera_rows
+from foredrive.view.video import write_video
+from foredrive.view.voxel_drawing import draw_comparison
+
+PANEL_PX, GAP_PX, TITLE_PX, HEAD_PX, KEY_PX = 320, 10, 26, 40, 34
+COLUMNS = 3
+HOLD = 2
+"""How many times as long now is shown as what follows."""
+
+
+def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: float) -> int:
+    """Write one moment after another, each from now on in real time; returns how many frames there are."""
+    frames = []
+    for moment in moments:
+        shown = [draw_imagined(moment, step, frame_dt_s) for step in range(moment.futures.shape[1])]
+        frames += [shown[0]] * HOLD + shown[1:]
+    write_video(path, frames, frame_dt_s)
+    return len(frames)
+
+
+def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
+    """What happened and every future at one key frame: the front cameras above, occupancy from above below.
+
+    Args:
+        step: 0 is now.
+    """
+    rows = _camera_strips(moment, step)
+    label = moment.example.occupancy
+    frame = moment.example.clip.now + step
+    truth, known = label.values[frame, 0] > 0.5, label.known[frame]
+    panels = [("what happened", truth)]
+    count = len(moment.futures)
+    panels += [
+        (f"future {k + 1} of {count}" if count > 1 else "imagined", future[step])
+        for k, future in enumerate(moment.futures)
+    ]
+    lines = -(-len(panels) // COLUMNS)
+    cell_h = TITLE_PX + PANEL_PX * truth.shape[2] // truth.shape[1] + GAP_PX
+    strips_h = sum(TITLE_PX + strip.shape[0] + GAP_PX for _, strip in rows)
+    width = COLUMNS * (PANEL_PX + GAP_PX) + GAP_PX
+    canvas = Image.new("RGB", (width, HEAD_PX + strips_h + lines * cell_h + KEY_PX), palette.GROUND)
+    pen, y = ImageDraw.Draw(canvas), HEAD_PX
+    _write(pen, (GAP_PX, 9), _title(moment, step, frame_dt_s), 18, palette.INK)
+    for title, strip in rows:
+        _write(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
+        canvas.paste(Image.fromarray(strip), (GAP_PX, y + TITLE_PX))
+        y += TITLE_PX + strip.shape[0] + GAP_PX
+    for number, (title, occupied) in enumerate(panels):
+        line, column = divmod(number, COLUMNS)
+        at = (GAP_PX + column * (PANEL_PX + GAP_PX), y + line * cell_h)
+        columns = draw_comparison(occupied, truth, known, label.spec, ABOVE_GROUND_M)
+        picture = with_ego(columns, label.spec)
+        size_hw = (PANEL_PX * picture.shape[0] // picture.shape[1], PANEL_PX)
+        _write(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
+        canvas.paste(Image.fromarray(resize(picture, size_hw)), (at[0], at[1] + TITLE_PX))
+    _draw_key(pen, canvas.height - KEY_PX + 6)
+    return canvas
+
+
+def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
+    """The three cameras that look ahead most: what they saw and, where it can be rendered, would see."""
+    clip = moment.example.clip
+    frame = clip.now + step
+    order = camera_rows(clip.rig[frame])
+    ahead = order[0][:COLUMNS] if order else []
+    shown = [camera for camera in ahead if bool(clip.image_valid[frame, camera])]
+    if not shown:
+        return []
+    strips = [("what the cameras saw", _strip(clip.images[frame, shown]))]
+    if moment.rendered is not None:
+        rendered = (moment.rendered[step, shown].clamp(0, 1) * 255).byte()
+        strips.append(("what they see in the imagined volume", _strip(rendered)))
+    return strips
+
+
+def _strip(images: Tensor) -> UInt8[np.ndarray, "h w 3"]:
+    """Images [C 3 h w] side by side, each as wide as a panel."""
+    height = PANEL_PX * images.shape[2] // images.shape[3]
+    gap = np.full((height, GAP_PX, 3), palette.rgb255(palette.GROUND), dtype=np.uint8)
+    parts = []
+    for image in images:
+        parts += [resize(image.permute(1, 2, 0).numpy(), (height, PANEL_PX)), gap]
+    return np.concatenate(parts[:-1], axis=1)
+
+
+def _title(moment: Moment, step: int, frame_dt_s: float) -> str:
+    log, _, t_us = moment.example.key[0].rpartition("@")
+    taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
+    when = f"+{step * frame_dt_s:.1f} s" if step else "now"
+    return f"{log}  {taken:%H:%M:%S}   {when}"
+
+
+def _draw_key(pen: ImageDraw.ImageDraw, y: int) -> None:
+    x = GAP_PX
+    font = ImageFont.load_default(size=13)
+    for colour, name in COMPARISON_KEY:
+        pen.rectangle((x, y + 2, x + 14, y + 16), fill=colour, outline=palette.GRID)
+        pen.text((x + 20, y), name, fill=palette.FAINT, font=font)
+        x += 20 + round(pen.textlength(name, font=font)) + 24
+
+
+def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
+    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

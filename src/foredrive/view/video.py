@@ -1,0 +1,61 @@
+"""Moving pictures on disk."""
+
+from collections.abc import Sequence
+from importlib import util
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+WEBP_QUALITY = 55
+MP4, WEBP = ".mp4", ".webp"
+
+
+def check_video(path: Path) -> None:
+    """Whether a video can be written under this name.
+
+    Raises:
+        InputError: it ends on anything but .mp4 and .webp, or for MP4 there is no PyAV.
+    """
+    if path.suffix not in (MP4, WEBP):
+        raise InputError(f"{path}: videos end on {MP4}, or on {WEBP}, which browsers play as a picture")
+    if path.suffix == MP4 and util.find_spec("av") is None:
+        raise InputError(f"{path}: MP4 needs PyAV: pip install 'foredrive[video]', or write {WEBP}")
+
+
+def write_video(path: Path, frames: Sequence[Image.Image], frame_s: float) -> None:
+    """Write frames of one size, each shown for `frame_s`: MP4 (H.264) or animated WebP, by the path's suffix.
+
+    Raises:
+        InputError: as `check_video`.
+    """
+    check_video(path)
+    with atomic_path(path) as temporary:
+        if path.suffix == MP4:
+            _write_mp4(temporary, frames, frame_s)
+            return
+        frames[0].save(
+            temporary,
+            format="WEBP",
+            save_all=True,
+            append_images=frames[1:],
+            duration=round(1000 * frame_s),
+            loop=0,
+            quality=WEBP_QUALITY,
+        )
+
+
+def _write_mp4(path: Path, frames: Sequence[Image.Image], frame_s: float) -> None:
+    import av  # an extra
+
+    width, height = (n - n % 2 for n in frames[0].size)  # as H.264 has it
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=round(1 / frame_s))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for frame in frames:
+            picture = av.VideoFrame.from_ndarray(np.asarray(frame)[:height, :width].copy(), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
