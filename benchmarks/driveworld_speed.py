@@ -42,7 +42,7 @@ class Stepper:
         torch.manual_seed(seed)
         self.fabric = make_fabric(recipe.precision)
         items = [dataset[int(k * len(dataset) / size)] for k in range(size)]
-        self.example = self.fabric.to_device(collate(items)) if DEVICE == "cuda" else collate(items)
+        self.example = collate(items).to(self.fabric.device)
         objective = build_objective(recipe, stage, build_agent(recipe, fetch=False))
         trained = [p for p in objective.parameters() if p.requires_grad]
         optimizer = torch.optim.AdamW(trained, lr=stage.schedule.lr)

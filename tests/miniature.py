@@ -1,4 +1,4 @@
-"""A run of seconds: NeMo with every part but hardly any width, and a log of five seconds to train it on."""
+"""A run of seconds: world models with every part but hardly any width, and a log of five seconds for them."""
 
 import dataclasses
 from pathlib import Path
@@ -7,9 +7,17 @@ import synthetic_log
 
 from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.recipes import Recipe
-from foredrive.recipes.config import BackboneSize, NemoSize, Stage, VolumeEncoderSize
+from foredrive.recipes.config import (
+    BackboneSize,
+    DriveWorldSize,
+    DriveWorldStage,
+    LiftSplatSize,
+    NemoSize,
+    Stage,
+    VolumeEncoderSize,
+)
 from foredrive.scene import VoxelSpec
-from foredrive.training import LossWeights, Schedule
+from foredrive.training import DriveWorldWeights, LossWeights, Schedule
 
 STEPS = 3
 """Of either stage."""
@@ -55,6 +63,44 @@ def miniature() -> Recipe:
             schedule=Schedule(batch_size=2, lr=1e-3, steps=STEPS, warmup_steps=1),
             weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
+        ),
+    )
+
+
+def miniature_driveworld() -> Recipe:
+    """The same with a DriveWorld, but without task prompts, which need a text encoder."""
+    nemo = miniature()
+    return Recipe(
+        name="miniature_driveworld",
+        clips=nemo.clips,
+        model=DriveWorldSize(
+            backbone=nemo.model.backbone,
+            encoder=LiftSplatSize(near_m=1.0, far_m=17.0, step_m=2.0),
+            channels=8,
+            plane=8,
+            observation=8,
+            observation_hidden=4,
+            state=6,
+            history=8,
+            memory=4,
+            memory_heads=2,
+            objects=3,
+            states_hidden=16,
+            expanded=(8, 4),
+            volume_hidden=4,
+            statics=4,
+            prompt=None,
+            planner_width=16,
+            planner_layers=1,
+            planner_heads=2,
+            attention_pool=(1, 4, 4),
+        ),
+        pretrain=DriveWorldStage(
+            schedule=Schedule(batch_size=2, lr=2e-3, steps=STEPS, warmup_steps=1), weights=DriveWorldWeights()
+        ),
+        finetune=DriveWorldStage(
+            schedule=Schedule(batch_size=2, lr=1e-3, steps=STEPS, warmup_steps=1),
+            weights=DriveWorldWeights(occ=0.5, wpts=1.0),
         ),
     )
 

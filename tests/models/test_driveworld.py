@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import weakref
 from collections.abc import Callable
 
 import pytest
@@ -157,6 +158,26 @@ def test_imagination_repeats_under_a_seed_and_goes_on_where_it_stopped(model: Dr
     assert not torch.allclose(drawn[0][1].volume, drawn[2][1].volume)
     assert {belief.state.shape for belief in means} == {now.state.shape}
     assert model.decode(means[0]).flow.shape == (2, 3, *SPEC.shape_zyx)
+
+
+@torch.no_grad()
+def test_imagining_on_and_on_keeps_nothing_of_what_was(model: DriveWorld, clip: Clip) -> None:
+    belief, kept = model.observe(clip), []
+    size = belief.state.shape
+    for _ in range(3 * MEMORY):
+        belief = model.imagine(belief, 1, generator=torch.Generator().manual_seed(0))[-1]
+        kept += [weakref.ref(belief.volume), weakref.ref(belief.state)]
+    assert belief.state.shape == size
+    assert sum(reference() is not None for reference in kept) == 2
+
+
+@torch.no_grad()
+def test_a_task_has_features_of_its_own(model: DriveWorld, clip: Clip) -> None:
+    now = model.observe(clip)
+    torch.testing.assert_close(model.volume_for(now, "occupancy"), now.volume)
+    assert not torch.allclose(model.volume_for(now, "plan"), now.volume)
+    (later,) = model.imagine(now, 1)
+    torch.testing.assert_close(model.volume_for(later, "forecast"), later.volume)
 
 
 @torch.no_grad()

@@ -5,41 +5,30 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from miniature import miniature_driveworld
 
-from foredrive.models.backbone import ImageBackbone
-from foredrive.models.driveworld import DriveWorld, motion_of
-from foredrive.models.driveworld.planes import PlanesToVolume, PlaneToVector, StaticScene, VectorToPlane
-from foredrive.models.driveworld.state_space import StateSpace
-from foredrive.models.lift_splat import LiftSplatEncoder
-from foredrive.scene import Example, VoxelSpec
-from foredrive.training.driveworld_objective import DriveWorldObjective, DriveWorldWeights, nearest_moving
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.driveworld import motion_of
+from foredrive.recipes.build import build_agent
+from foredrive.scene import Example
+from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_moving
 
-SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
-PAST, STEPS = 1, 2
+RECIPE = miniature_driveworld()
+SPEC = RECIPE.clips.voxels
+PAST, STEPS = RECIPE.clips.past_frames, RECIPE.clips.future_frames
+PRETRAINING, PLANNING = RECIPE.pretrain.weights, RECIPE.finetune.weights
 
 
-def world() -> DriveWorld:
+def agent() -> PlanningAgent:
     torch.manual_seed(0)
-    return DriveWorld(
-        backbone=ImageBackbone(
-            embedding_size=8,
-            hidden_sizes=(8,),
-            depths=(1,),
-            layer_type="basic",
-            stages=("stage1",),
-            channels=8,
-        ),
-        encoder=LiftSplatEncoder(SPEC, channels=8, width=8, near_m=1.0, far_m=5.0, step_m=1.0),
-        states=StateSpace(observation=8, state=6, history=8, objects=4, heads=2, memory=4, hidden=16),
-        to_vector=PlaneToVector(8, 4, 8),
-        from_vector=VectorToPlane(14, (8, 8), (8, 8)),
-        to_volume=PlanesToVolume(12, 4, 8, 2),
-        statics=StaticScene(8, 4),
-        prompt=None,
-        past_frames=PAST,
-        dt_s=0.5,
-        channels=8,
-    )
+    return build_agent(RECIPE)
+
+
+def gradients(objective: DriveWorldObjective, example: Example) -> dict[str, bool]:
+    """Of every parameter of the agent, whether a gradient reaches it."""
+    objective(example, torch.Generator().manual_seed(0))["loss"].backward()
+    found = objective.agent.named_parameters()
+    return {name: p.grad is not None and bool(p.grad.abs().sum() > 0) for name, p in found}
 
 
 @pytest.fixture
@@ -59,7 +48,7 @@ def example(make_example: Callable[..., Example]) -> Example:
 
 
 def test_descending_it_lowers_every_term_but_the_divergence(example: Example) -> None:
-    objective = DriveWorldObjective(world(), DriveWorldWeights(), steps=STEPS)
+    objective = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS)
     optimizer = torch.optim.Adam(objective.parameters(), 5e-3)
     seen = []
     for step in range(30):
@@ -72,7 +61,7 @@ def test_descending_it_lowers_every_term_but_the_divergence(example: Example) ->
     assert last["loss"] < 0.9 * first["loss"]
     for name in ("occ", "action", "velocity"):
         assert last[name] < first[name]
-    weights = DriveWorldWeights()
+    weights = PRETRAINING
     assert first["loss"] == pytest.approx(
         sum(getattr(weights, name) * value for name, value in first.items() if name != "loss"), rel=1e-5
     )
@@ -84,9 +73,7 @@ def test_what_is_not_known_counts_for_nothing(example: Example) -> None:
         occupancy=dataclasses.replace(example.occupancy, known=torch.zeros_like(example.occupancy.known)),
         clip=dataclasses.replace(example.clip, boxes_valid=torch.zeros_like(example.clip.boxes_valid)),
     )
-    losses = DriveWorldObjective(world(), DriveWorldWeights(), steps=STEPS)(
-        nothing, torch.Generator().manual_seed(0)
-    )
+    losses = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS)(nothing, torch.Generator().manual_seed(0))
     assert [losses[name].item() for name in ("occ", "velocity", "flow")] == [0.0, 0.0, 0.0]
     assert losses["loss"].isfinite()
 
@@ -101,3 +88,34 @@ def test_the_nearest_that_move_come_first(example: Example) -> None:
     nothing, none = nearest_moving(dataclasses.replace(boxes, valid=torch.zeros_like(boxes.valid)), 2)
     assert not none.any()
     assert nothing.isfinite().all()
+
+
+def test_pretraining_reaches_all_but_the_planner_and_finetuning_that_too(example: Example) -> None:
+    before = gradients(DriveWorldObjective(agent(), PRETRAINING, steps=STEPS), example)
+    assert not any(reached for name, reached in before.items() if name.startswith("planner."))
+    left_out = {name for name, reached in before.items() if not reached and name.startswith("world_model.")}
+    assert {name for name in left_out if "states.velocity" not in name} == set()
+    joint = gradients(DriveWorldObjective(agent(), PLANNING, steps=STEPS), example)
+    alone = dataclasses.replace(PLANNING, kl=0.0, occ=0.0, action=0.0, flow=0.0, velocity=0.0)
+    planning = gradients(DriveWorldObjective(agent(), alone, steps=STEPS), example)
+    for reached in (joint, planning):
+        assert reached["planner.plan"]
+        assert reached["world_model.encoder.depth_and_context.weight"]
+    assert joint["world_model.occupancy.weight"]
+    assert not planning["world_model.occupancy.weight"]
+
+
+def test_without_time_only_what_a_single_frame_shows_is_learned(example: Example) -> None:
+    objective = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS, temporal=False)
+    assert set(objective(example, torch.Generator())) == {"occ", "flow", "loss"}
+    reached = gradients(objective, example)
+    assert reached["world_model.backbone.lateral.0.weight"]
+    assert reached["world_model.statics.net.0.weight"]
+    assert not any(hit for name, hit in reached.items() if ".states." in name or ".to_vector." in name)
+
+
+def test_a_seed_decides_what_is_drawn(example: Example) -> None:
+    objective = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS)
+    first, again, other = (objective(example, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first["loss"], again["loss"])
+    assert not torch.equal(first["occ"], other["occ"])
