@@ -113,6 +113,17 @@ def test_what_a_log_lacks_is_masked(tmp_path: Path) -> None:
     assert alone.images.shape == (5, 0, 3, 24, 48)
 
 
+def test_a_part_of_a_log_holds_now_and_all_that_comes_after(flat_root: Path) -> None:
+    def nows(part_s: tuple[float, float]) -> list[int]:
+        clips = ClipDataset(find_logs(flat_root), config(part_s=part_s), None)
+        return [int(clips[i].key[0].split("@")[1]) - world.START_US for i in range(len(clips))]
+
+    assert nows((0.0, 3.0)) == [1_000_000, 1_500_000]  # a second is seen before now and one foreseen
+    assert nows((3.0, 9.0)) == [3_000_000, 3_500_000, 4_000_000]
+    with pytest.raises(InputError, match=r"not into the part \(4\.5, 9\.0\)"):
+        nows((4.5, 9.0))
+
+
 def test_future_images_can_be_left_out(flat_root: Path) -> None:
     clip = ClipDataset(find_logs(flat_root), config(future_images=False), None)[0].clip
     assert clip.image_valid.all(-1).tolist() == [True, True, True, False, False]

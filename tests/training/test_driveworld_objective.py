@@ -28,7 +28,7 @@ def gradients(objective: DriveWorldObjective, example: Example) -> dict[str, boo
     """Of every parameter of the agent, whether a gradient reaches it."""
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     found = objective.agent.named_parameters()
-    return {name: p.grad is not None and bool(p.grad.abs().sum() > 0) for name, p in found}
+    return {name: p.grad is not None for name, p in found}
 
 
 @pytest.fixture
@@ -93,8 +93,9 @@ def test_the_nearest_that_move_come_first(example: Example) -> None:
 def test_pretraining_reaches_all_but_the_planner_and_finetuning_that_too(example: Example) -> None:
     before = gradients(DriveWorldObjective(agent(), PRETRAINING, steps=STEPS), example)
     assert not any(reached for name, reached in before.items() if name.startswith("planner."))
+    # Lift, splat looks at the finest level alone.
     left_out = {name for name, reached in before.items() if not reached and name.startswith("world_model.")}
-    assert {name for name in left_out if "states.velocity" not in name} == set()
+    assert left_out == {f"world_model.backbone.smooth.1.{kind}" for kind in ("weight", "bias")}
     joint = gradients(DriveWorldObjective(agent(), PLANNING, steps=STEPS), example)
     alone = dataclasses.replace(PLANNING, kl=0.0, occ=0.0, action=0.0, flow=0.0, velocity=0.0)
     planning = gradients(DriveWorldObjective(agent(), alone, steps=STEPS), example)
