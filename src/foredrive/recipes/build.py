@@ -139,7 +139,11 @@ def build_objective(recipe: Recipe, stage: AnyStage, agent: PlanningAgent) -> nn
     """What is trained in a stage. Without real VGG-16 weights the perceptual loss has weight 0."""
     if isinstance(stage, DriveWorldStage):
         objective: nn.Module = DriveWorldObjective(
-            agent, stage.weights, steps=recipe.clips.future_frames, temporal=stage.temporal
+            agent,
+            stage.weights,
+            steps=recipe.clips.future_frames,
+            temporal=stage.temporal,
+            statics_of=stage.statics_of,
         )
     else:
         objective = _build_nemo_objective(recipe, stage, agent)

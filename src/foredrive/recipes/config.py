@@ -176,6 +176,9 @@ class DriveWorldStage:
     weights: DriveWorldWeights
     temporal: bool = True
     """Otherwise each frame's occupancy is learned from that frame alone."""
+    statics_of: Literal["random", "now"] = "random"
+    """The frame that all frames take what stands from: a random one, as the paper pre-trains, or the present,
+    as it is when the model is used."""
     kind: Literal["driveworld"] = DRIVEWORLD
 
 

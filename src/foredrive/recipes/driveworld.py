@@ -70,6 +70,7 @@ def driveworld_tiny() -> Recipe:
         finetune=DriveWorldStage(
             schedule=Schedule(batch_size=4, lr=1e-3, steps=160, warmup_steps=10, workers=1),
             weights=DriveWorldWeights(occ=0.5, wpts=1.0),
+            statics_of="now",
         ),
     )
 
@@ -157,7 +158,9 @@ def driveworld_base() -> Recipe:
         ),
         pretrain=DriveWorldStage(schedule=schedule, weights=DriveWorldWeights()),
         finetune=DriveWorldStage(
-            schedule=replace(schedule, epochs=20), weights=DriveWorldWeights(occ=0.5, wpts=1.0)
+            schedule=replace(schedule, epochs=20),
+            weights=DriveWorldWeights(occ=0.5, wpts=1.0),
+            statics_of="now",
         ),
         precision="bf16-mixed",
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -51,13 +52,21 @@ class DriveWorldObjective(nn.Module):
         steps: L, imagined key frames.
         temporal: otherwise every observed frame's occupancy is learned from its own plane alone, and nothing
             that has to do with time: pre-training in 3-D, as OccNet's and UniScene's.
+        statics_of: the frame that all frames take what stands from.
     """
 
     def __init__(
-        self, agent: PlanningAgent, weights: DriveWorldWeights, *, steps: int, temporal: bool = True
+        self,
+        agent: PlanningAgent,
+        weights: DriveWorldWeights,
+        *,
+        steps: int,
+        temporal: bool = True,
+        statics_of: Literal["random", "now"] = "random",
     ) -> None:
         super().__init__()
-        self.agent, self.weights, self.steps, self.temporal = agent, weights, steps, temporal
+        self.agent, self.weights, self.steps = agent, weights, steps
+        self.temporal, self.statics_of = temporal, statics_of
         train_planner(agent.planner, weights.wpts > 0)
         world = agent.world_model
         assert isinstance(world, DriveWorld)
@@ -76,7 +85,7 @@ class DriveWorldObjective(nn.Module):
         if not self.temporal:
             losses |= self._volume_losses(world, world.without_time(seen), example)
         elif weights.occ > 0:
-            unrolled = world.unroll(seen, self.steps, generator)
+            unrolled = world.unroll(seen, self.steps, generator, self.statics_of)
             losses |= self._latent_losses(unrolled, clip)
             losses |= self._volume_losses(world, unrolled.beliefs, example)
         if weights.wpts > 0:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -177,15 +178,23 @@ class DriveWorld(nn.Module):
             raise InputError("DriveWorld prompts beliefs of its own")
         return self._volume(self._unpacked(belief.state), belief.statics, task)
 
-    def unroll(self, seen: Seen, steps: int, generator: torch.Generator | None) -> Unrolled:
+    def unroll(
+        self,
+        seen: Seen,
+        steps: int,
+        generator: torch.Generator | None,
+        statics_of: Literal["random", "now"] = "random",
+    ) -> Unrolled:
         """All that training looks at: T observed frames by the posterior, `steps` imagined by the prior.
 
-        States are sampled with a generator; statics are those of a random frame then (§3.1).
+        Args:
+            generator: samples the states; without one they are means, and statics now's.
+            statics_of: the frame whose statics all frames are decoded from (§3.1: a random one).
         """
         latents, posteriors, priors = self._filter(seen, generator)
         frames = len(latents)
         shown = frames - 1
-        if generator is not None:
+        if generator is not None and statics_of == "random":
             shown = int(torch.randint(frames, (1,), generator=generator))
         statics = self._statics(seen.planes[:, shown])
         beliefs = [self._decoded(each, statics, "occupancy", None) for each in latents]
