@@ -170,6 +170,7 @@ def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str])
         (["train", "nemo_tiny", "--logs", "{tmp}/none", "--out", "{tmp}/run"], "{tmp}/none: no such folder"),
         (["record", "--town", "Town9", "--out", "{tmp}/out"], "one of Town01, Town02, Town03"),
         (["evaluate", "{tmp}"], "{tmp}: not a run folder"),
+        (["imagine", "{tmp}", "{tmp}", "--out", "{tmp}/x.avi"], "{tmp}/x.avi: videos end on .mp4"),
         (["convert", "pandaset", "{tmp}/none", "--out", "{tmp}/out"], "{tmp}/none: no such folder"),
         (["convert", "kitti", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
     ],
