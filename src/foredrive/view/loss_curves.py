@@ -1,5 +1,6 @@
 """Loss curves as an inline SVG that takes on the page's text colour."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -9,9 +10,10 @@ from matplotlib.figure import Figure
 
 from foredrive.view.inline_svg import INK_MARK, inline_svg
 
-COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227")
+COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227", "#e5484d")
 NOT_LOSSES = ("step", "step_s", "lr")
 SMOOTH_STEPS = 15
+LEGEND_COLUMNS = 5
 
 
 def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float | int]]]) -> str:
@@ -48,13 +50,14 @@ def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]])
     ax.tick_params(which="both", colors=INK_MARK, length=0, labelsize=9)
     ax.spines[:].set_visible(False)
     if ax.lines:
+        legend_rows = math.ceil(len(names) / LEGEND_COLUMNS)
         ax.legend(
             frameon=False,
             labelcolor=INK_MARK,
             fontsize=9,
             loc="lower right",
             bbox_to_anchor=(1.0, 0.98),
-            ncols=len(ax.lines),
+            ncols=math.ceil(len(names) / legend_rows),
             handlelength=1.2,
             columnspacing=1.2,
         )

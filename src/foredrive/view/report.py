@@ -12,6 +12,7 @@ from foredrive.view.report_style import CSS
 from foredrive.view.summary_tables import (
     Figure,
     Summary,
+    flow_table,
     full_table,
     image_table,
     number,
@@ -64,6 +65,7 @@ def report_html(report: ReportData) -> str:
         _section("In short", _tiles(summary)),
         _section("Planning, open loop", planning_tables(summary)),
         _section("Occupancy on voxels the lidar knows", occupancy_table(summary)),
+        _section("Flow on voxels that move", flow_table(summary)),
         _section("Rendered images", image_table(summary)),
         _section("Losses", draw_loss_curves(report.losses)),
         _section("Examples", "\n".join(panel_html(panel) for panel in report.panels)),

@@ -83,7 +83,8 @@ def _notes(
             f"{len(seen)} of the {len(logs)} evaluated logs were trained on: these figures show that "
             "the model fits, not that it generalises."
         )
-    if any(lines and not any(line.get("perc") for line in lines) for lines in losses.values()):
+    rendered = [lines for lines in losses.values() if lines and "perc" in lines[0]]
+    if any(not any(line["perc"] for line in lines) for lines in rendered):
         notes.append("The perceptual loss was off in training (no VGG-16 weights, or weight 0).")
     notes += [f"Failed: {failure.key}: {failure.reason}" for failure in failures[:FAILURES_NAMED]]
     return notes

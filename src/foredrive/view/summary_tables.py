@@ -31,6 +31,7 @@ SCOPE_TITLES = {"": "all voxels", "above_ground.": f"more than {ABOVE_GROUND_M:g
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
+_FLOW = re.compile(r"flow\.epe_moving_(\w+)_mps")
 _IMAGES = re.compile(r"(\w+(?:\.\w+)*)\.psnr_db")
 
 
@@ -113,6 +114,18 @@ def occupancy_table(summary: Summary) -> str:
             rows.append(_row(when_title(when), cells))
         bodies.append(_tbody(rows, title, 8 + len(rivals)))
     return _table(head, "".join(bodies)) + (RIVALS_NOTE if rivals else "")
+
+
+def flow_table(summary: Summary) -> str:
+    """Errors of predicted flow on voxels that move, now and later, beside those of predicting none."""
+    rows = []
+    for key, value in summary.items():
+        if found := _FLOW.fullmatch(key):
+            rows.append(
+                _row(when_title(found[1]), [_cell(value, 2), _cell(summary.get(f"{key}.no_motion"), 2)])
+            )
+    head = "<tr><th></th><th>error, m/s</th><th>predicting none, m/s</th></tr>"
+    return _table(head, _tbody(rows)) if rows else ""
 
 
 def image_table(summary: Summary) -> str:
