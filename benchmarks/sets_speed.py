@@ -4,16 +4,20 @@ Times are of the processor, on one thread, so that others on the machine count f
 several runs: `foredrive bench sets-speed`.
 """
 
+import functools
 import itertools
+import json
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.evaluation import Benchmark
-from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
+from foredrive.evaluation import Benchmark, peak_rss_gib
+from foredrive.evaluation.detections import read_detections, score_frames, summarise_scores
 from foredrive.sets import (
     BoxDensity,
     LabelledBoxes,
@@ -24,7 +28,12 @@ from foredrive.sets import (
 )
 from foredrive.sets.assignment import k_best_assignments
 
-SIZES = {"100x50": (100, 50, 100.0), "900x200": (900, 200, 100.0), "900x200_dense": (900, 200, 25.0)}
+SIZES = {
+    "100x50": (100, 50, 100.0),
+    "900x200": (900, 200, 100.0),
+    "900x200_dense": (900, 200, 25.0),
+    "900x200_densest": (900, 200, 10.0),
+}
 """Detections, objects, side of the square they are in, m."""
 K, CLASSES = 25, 10
 STD = np.array([0.4, 0.4, 0.2, 0.15, 0.15, 0.15])
@@ -100,12 +109,14 @@ def least_ms(run: Callable[[], object], runs: int = 9) -> float:
     return min(taken)
 
 
-def likelihood(seed: int) -> dict[str, float]:
-    """The whole PMB-NLL with its parts; how wide an interval it leaves."""
+def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
+    """The whole PMB-NLL with its parts, or MB-NLL without a background; how wide an interval it leaves."""
     torch.set_num_threads(1)
     figures = {}
     for size in SIZES:
         pmb, objects = predicted(size, seed)
+        if not background:
+            pmb = PoissonMultiBernoulli(pmb.detected)
         figures[f"ms_{size}_k{K}"] = least_ms(lambda pmb=pmb, objects=objects: set_nll(pmb, objects, k=K))
         result = set_nll(pmb, objects, k=K)
         figures[f"gap_nats_{size}"] = float(result.nll) - result.lower
@@ -169,25 +180,60 @@ def murty_on_scipy(cost: np.ndarray, free: np.ndarray, k: int) -> np.ndarray:
     return np.array(found)
 
 
-def validation(seed: int) -> dict[str, float]:
-    """Every figure of `foredrive score` on as many frames as nuScenes' validation set has, on one thread."""
-    torch.set_num_threads(1)
-    rng = np.random.default_rng(seed)
-    lower, upper = region(60.0)
-    frames = [
-        Frame(f"{n}", f"{n // 40}", *scene(DETECTIONS, int(rng.integers(5, 60)), 100.0, rng), lower, upper)
-        for n in range(FRAMES)
+def as_boxes(state: np.ndarray, yaw: np.ndarray, label: np.ndarray) -> list[dict]:
+    """In nuScenes' format."""
+    size = np.exp(state[:, [4, 3, 5]])
+    rotation = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
+    return [
+        {"translation": t, "size": s, "rotation": q, "detection_name": f"class_{c}"}
+        for t, s, q, c in zip(
+            state[:, :3].tolist(), size.tolist(), rotation.tolist(), label.tolist(), strict=True
+        )
     ]
-    read = DetectionSet(frames, [str(n) for n in range(CLASSES)], True, {})
-    score_frames(DetectionSet(frames[:2], read.classes, True, {}))
-    started, wall_started = time.process_time(), time.perf_counter()
+
+
+def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
+    """Results with variances, and truth, as files."""
+    rng = np.random.default_rng(seed)
+    origin = {"ego_translation": [0.0, 0.0, 0.0]}
+    results, truth = folder / "results.json", folder / "truth.json"
+    with results.open("w") as said, truth.open("w") as true:
+        said.write('{"meta": {}, "results": {')
+        true.write('{"meta": {}, "results": {')
+        for n in range(FRAMES):
+            detected, objects = scene(DETECTIONS, int(rng.integers(5, 60)), 100.0, rng)
+            label = detected.log_class.argmax(-1).numpy()
+            boxes = as_boxes(detected.boxes.mean.numpy(), np.asarray(detected.boxes.yaw), label)
+            for box, r in zip(boxes, detected.log_existence.exp().tolist(), strict=True):
+                box |= {"detection_score": r, "covariance": (STD**2).tolist(), "yaw_std": 0.158}
+            there = as_boxes(objects.state.numpy(), np.asarray(objects.yaw), objects.label.numpy())
+            there = [{**box, **origin, "scene_token": f"{n // 40}"} for box in there]
+            comma = ", " if n else ""
+            said.write(f'{comma}"{n}": {json.dumps(boxes)}')
+            true.write(f'{comma}"{n}": {json.dumps(there)}')
+        said.write("}}")
+        true.write("}}")
+    return results, truth
+
+
+def validation(seed: int) -> dict[str, float]:
+    """`foredrive score` on as many frames as nuScenes' validation set has, on one thread, from its files."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        results, truth = write_validation(Path(folder), seed)
+        started, wall_started = time.process_time(), time.perf_counter()
+        read = read_detections(results, truth)
+    reading_s, after_reading_gib = time.process_time() - started, peak_rss_gib()
     scores = score_frames(read, k=K)
-    likelihood_s = time.process_time() - started
+    frames_s = time.process_time() - started - reading_s
     summarise_scores(read, scores)
     return {
         "validation_size_s": time.process_time() - started,
         "validation_size_wall_s": time.perf_counter() - wall_started,
-        "of_which_frames_s": likelihood_s,
+        "of_which_reading_s": reading_s,
+        "of_which_frames_s": frames_s,
+        "peak_rss_gib_reading": after_reading_gib,
+        "peak_rss_gib": peak_rss_gib(),
         "largest_gap_nats": max(score.gap for score in scores),
     }
 
@@ -196,6 +242,7 @@ BENCHMARK = Benchmark(
     question="How long do set likelihoods take, beside SciPy's assignments?",
     arms={
         "pmb_nll": likelihood,
+        "mb_nll": functools.partial(likelihood, background=False),
         "k_best": k_best,
         "hungarian_by_scipy": best_only,
         "validation": validation,

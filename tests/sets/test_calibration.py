@@ -8,15 +8,16 @@ import torch
 from scipy import integrate, stats
 
 from foredrive.errors import InputError
-from foredrive.sets import BoxDensity, LabelledBoxes
+from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli, UniformPoisson
 from foredrive.sets.calibration import (
     conformal_factor,
     conformal_scores,
     fit_existence,
     fit_scale,
+    fit_set_calibration,
     reliability,
 )
-from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score, object_brier
 from foredrive.sets.resampling import bootstrap_mean
 
 
@@ -128,3 +129,33 @@ def test_bootstrap_p_values_are_small_where_the_mean_is_far_from_0() -> None:
     assert math.isnan(one.low)
     with pytest.raises(InputError, match="finite"):
         bootstrap_mean(np.array([np.inf]), ["a"], rng)
+
+
+def test_object_level_error_by_hand() -> None:
+    """Two detections of the first object say (0.6, 0.1) on average; nobody speaks of the second."""
+    probability = np.array([[0.9, 0.0], [0.3, 0.2], [0.5, 0.5]])
+    near = np.array([[True, False], [True, False], [False, False]])
+    error = object_brier(probability, near, np.array([0, 1]))
+    np.testing.assert_allclose(error, [0.4**2 + 0.1**2, 1.0])
+
+
+def test_a_detector_is_mended_by_frames_apart() -> None:
+    """It says .9 and σ = 1 m where half of its objects exist and boxes err by 2 m."""
+    rng = np.random.default_rng(6)
+    said, true = [], []
+    for _ in range(300):
+        r = torch.full((4,), 0.9, dtype=torch.float64)
+        place = 40.0 * torch.arange(4.0, dtype=torch.float64)[:, None].expand(4, 2)
+        boxes = BoxDensity(
+            place + 2.0 * torch.as_tensor(rng.normal(size=(4, 2))), torch.eye(2).expand(4, 2, 2)
+        )
+        said.append(MultiBernoulli(r.log(), torch.log1p(-r), torch.zeros(4, 1), boxes))
+        exists = torch.as_tensor(rng.random(4) < 0.5)
+        true.append(LabelledBoxes(torch.zeros(4, dtype=torch.long), place)[exists])
+    region = torch.full((2,), 500.0)
+    mend = fit_set_calibration(said, true, UniformPoisson(torch.tensor([1.0]), -region, region))
+    mended = mend(said[0])
+    assert mend.std_factor == pytest.approx(2.0, abs=0.15)
+    np.testing.assert_allclose(mended.log_existence.exp(), 0.5, atol=0.06)
+    np.testing.assert_allclose(mended.log_absence.exp(), 1 - mended.log_existence.exp())
+    torch.testing.assert_close(mended.boxes.chol, mend.std_factor * said[0].boxes.chol)

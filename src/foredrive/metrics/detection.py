@@ -1,7 +1,9 @@
 """Average precision of boxes: hits by centre distance (nuScenes) or by overlap (COCO)."""
 
 from collections.abc import Sequence
+from typing import no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
@@ -25,16 +27,24 @@ def match_greedily(
 ) -> Int[ndarray, "M"]:
     """Object of each detection, or -1: the best scored first, each takes the closest that is left.
 
-    Of one frame and class. `closeness` is larger for better pairs; those below `least` are none.
+    Of one frame. `closeness` is larger for better pairs, -inf between classes; those below `least` are none.
     """
-    found = np.full(len(score), -1)
-    near = np.flatnonzero((closeness >= least).any(1))  # few are
-    left = closeness[near]
-    for place in np.argsort(-score[near], kind="stable"):
-        j = int(left[place].argmax())
-        if left[place, j] >= least:
-            found[near[place]] = j
-            left[:, j] = -np.inf
+    return _match_greedily(np.argsort(-score, kind="stable"), closeness, least)
+
+
+@numba.njit(cache=True, nogil=True)
+@no_type_check
+def _match_greedily(order, closeness, least):
+    found = np.full(len(order), -1)
+    taken = np.zeros(closeness.shape[1], np.bool_)
+    for i in order:
+        closest, best = -1, least
+        for j in range(len(taken)):
+            close = closeness[i, j]
+            if not taken[j] and (close > best or (closest < 0 and close == best)):
+                closest, best = j, close
+        if closest >= 0:
+            found[i], taken[closest] = closest, True
     return found
 
 

@@ -5,10 +5,12 @@ from foredrive.sets.boxes import BoxDensity, LabelledBoxes
 from foredrive.sets.calibration import (
     ExistenceMap,
     Reliability,
+    SetCalibration,
     conformal_factor,
     conformal_scores,
     fit_existence,
     fit_scale,
+    fit_set_calibration,
     reliability,
 )
 from foredrive.sets.detections import objects_from_boxes, pmb_from_detections
@@ -23,7 +25,7 @@ from foredrive.sets.processes import (
     UniformPoisson,
     poisson_log_prob,
 )
-from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score, object_brier
 from foredrive.sets.resampling import BootstrapMean, bootstrap_mean
 
 __all__ = [
@@ -38,6 +40,7 @@ __all__ = [
     "PoissonMultiBernoulli",
     "PoissonProcess",
     "Reliability",
+    "SetCalibration",
     "SetNll",
     "SumPoisson",
     "UniformPoisson",
@@ -50,7 +53,9 @@ __all__ = [
     "energy_score",
     "fit_existence",
     "fit_scale",
+    "fit_set_calibration",
     "gospa",
+    "object_brier",
     "objects_from_boxes",
     "pmb_from_detections",
     "poisson_log_prob",

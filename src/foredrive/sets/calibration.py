@@ -1,6 +1,8 @@
 """Whether probabilities and covariances mean what they say, and what mends them after training."""
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,8 @@ from scipy.optimize import isotonic_regression
 
 from foredrive.errors import InputError
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes
+from foredrive.sets.likelihood import set_nll
+from foredrive.sets.processes import MultiBernoulli, PoissonMultiBernoulli, PoissonProcess
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,49 @@ def fit_scale(boxes: BoxDensity, objects: LabelledBoxes, weight: Float[ndarray, 
     if boxes.family == "gaussian":
         return math.sqrt(float(weight @ (white**2).mean(1) / weight.sum()))
     return math.sqrt(2) * float(weight @ np.abs(white).mean(1) / weight.sum())
+
+
+@dataclass(frozen=True)
+class SetCalibration:
+    """What to make of a detector's probabilities of existence and of its standard deviations."""
+
+    existence: ExistenceMap
+    std_factor: float
+
+    def __call__(self, detected: MultiBernoulli) -> MultiBernoulli:
+        """What was said, as it was meant."""
+        r = torch.as_tensor(self.existence(detected.log_existence.exp().cpu().numpy()))
+        r = r.to(detected.log_existence)
+        boxes = dataclasses.replace(detected.boxes, chol=detected.boxes.chol * self.std_factor)
+        return dataclasses.replace(detected, log_existence=r.log(), log_absence=torch.log1p(-r), boxes=boxes)
+
+
+def fit_set_calibration(
+    detected: Sequence[MultiBernoulli], objects: Sequence[LabelledBoxes], background: PoissonProcess
+) -> SetCalibration:
+    """Isotonic existence and one factor on standard deviations, from frames that were not trained on.
+
+    By the associations of each frame, objects that no detection explains being of the `background`.
+    """
+    existence, has_object, boxes, paired = [], [], [], []
+    for found, truth in zip(detected, objects, strict=True):
+        pairs = set_nll(PoissonMultiBernoulli(found, background), truth).associations
+        existence.append(found.log_existence.exp().cpu().numpy())
+        has_object.append(1.0 - pairs.absent)
+        has = np.flatnonzero(pairs.best >= 0)
+        boxes.append(found.boxes[pairs.best[has]])
+        paired.append(truth[has])
+    if not existence:
+        raise InputError("calibration needs frames")
+    factor = fit_scale(
+        BoxDensity(
+            torch.cat([each.mean for each in boxes]),
+            torch.cat([each.chol for each in boxes]),
+            family=boxes[0].family,
+        ),
+        LabelledBoxes(torch.cat([o.label for o in paired]), torch.cat([o.state for o in paired])),
+    )
+    return SetCalibration(fit_existence(np.concatenate(existence), np.concatenate(has_object)), factor)
 
 
 def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float) -> float:

@@ -39,6 +39,12 @@ class SetNll:
     """Minus the entropy of the associations, never positive but for rounding; NaN if `nll` is infinite."""
     associations: AssociationSum
     """Who belongs to whom, and which detections or objects make the value infinite."""
+    pair_log_box: Float[Tensor, "E"]
+    """Log-density of the object's box, of each pair in `associations`."""
+    pair_log_label: Float[Tensor, "E"]
+    """Log-probability that the detection exists with the object's label."""
+    log_background: Float[Tensor, "N"]
+    """Log λ at each object."""
 
 
 def set_nll(
@@ -68,8 +74,9 @@ def set_nll(
         k=k, max_states=max_states, gate_nats=gate_nats,
     )  # fmt: skip
     i, j = (torch.as_tensor(index, device=log_absent.device) for index in (found.detection, found.object))
-    localisation = _expected(found.probability, detected.boxes.log_prob_of_pairs(i, objects, j))
-    classification = _expected(found.probability, detected.log_label_of_pairs(i, objects, j))
+    log_box = detected.boxes.log_prob_of_pairs(i, objects, j)
+    log_label = detected.log_label_of_pairs(i, objects, j)
+    localisation, classification = (_expected(found.probability, log) for log in (log_box, log_label))
     false, missed = _expected(found.absent, log_absent), _expected(found.background, log_background)
     energy = localisation + classification + false + missed + expected
     value = energy.new_tensor(-found.log_lower) + expected.detach()
@@ -79,7 +86,10 @@ def set_nll(
     missed = missed + (math.inf if len(found.impossible_objects) else 0.0)
     ambiguity = nll - (localisation + classification + false + missed + expected)
     lower = float(expected.detach()) - found.log_upper
-    return SetNll(nll, lower, localisation, classification, false, missed, expected, ambiguity, found)
+    return SetNll(
+        nll, lower, localisation, classification, false, missed, expected, ambiguity, found,
+        log_box, log_label, log_background,
+    )  # fmt: skip
 
 
 def _expected(probability: Float[np.ndarray, "..."], log: Float[Tensor, "..."]) -> Float[Tensor, ""]:

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.special import ndtr
 
@@ -13,6 +13,20 @@ from foredrive.sets.boxes import BoxDensity, LabelledBoxes
 def brier(probability: Float[ndarray, "n"], happened: Bool[ndarray, "n"]) -> Float[ndarray, "n"]:
     """Squared error of probabilities (Brier 1950)."""
     return (probability - happened) ** 2
+
+
+def object_brier(
+    probability: Float[ndarray, "M K"], near: Bool[ndarray, "M N"], label: Int[ndarray, "N"]
+) -> Float[ndarray, "N"]:
+    """Squared error of what detections near each object say on average of its class; 1 if there are none.
+
+    `probability` is that of existence with each class. The mean over objects is the object-level calibration
+    error of Park, Sobolewski and Azizan (arXiv 2412.01782), at one threshold of nearness.
+    """
+    count = near.sum(0)
+    mean = near.T.astype(float) @ probability / np.maximum(count, 1)[:, None]
+    mean[np.arange(len(label)), label] -= 1.0
+    return np.where(count > 0, (mean**2).sum(1), 1.0)
 
 
 def crps_gaussian(

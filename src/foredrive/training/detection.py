@@ -1,12 +1,16 @@
 """Two ways to train a detection head: by matching (DETR), or by the likelihood of the set (Paper A)."""
 
+import copy
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.models.detection import BoxSet
+from foredrive.errors import InputError
+from foredrive.models.detection import BoxSet, DetectionHead
 from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli, PoissonMultiBernoulli, set_nll
 from foredrive.sets.assignment import best_assignment
 
@@ -14,6 +18,50 @@ NO_OBJECT_WEIGHT = 0.1
 BOX_WEIGHT, HEADING_WEIGHT = 0.5, 0.5
 STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 """Errors of this size, in m and log m, count alike."""
+
+Sample = tuple[Float[Tensor, "D Z Y X"], LabelledBoxes]
+"""A volume, and the objects in it."""
+Loss = Callable[[BoxSet, LabelledBoxes], Float[Tensor, ""]]
+"""Of one frame: `matching_loss` or `set_loss`."""
+
+
+def fit_head(
+    head: DetectionHead,
+    samples: Sequence[Sample],
+    loss: Loss,
+    *,
+    steps: int,
+    batch: int = 8,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+) -> DetectionHead:
+    """A copy of the head, trained for some more steps; the learning rate rises and falls to nothing.
+
+    Raises `InputError` if there are fewer samples than a batch holds.
+    """
+    if len(samples) < batch:
+        raise InputError(f"{len(samples)} samples are fewer than a batch of {batch}")
+    head = copy.deepcopy(head).train()
+    rng = np.random.default_rng(seed)
+    optimizer = torch.optim.AdamW(head.parameters(), learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, total_steps=steps)
+    for _ in range(steps):
+        chosen = [samples[n] for n in rng.choice(len(samples), batch, replace=False)]
+        optimizer.zero_grad()
+        found = head(torch.stack([volume for volume, _ in chosen]))
+        torch.stack([loss(found[n], truth) for n, (_, truth) in enumerate(chosen)]).mean().backward()
+        torch.nn.utils.clip_grad_norm_(head.parameters(), 10.0)
+        optimizer.step()
+        schedule.step()
+    return head.eval()
+
+
+def said_of(head: DetectionHead, volumes: Sequence[Float[Tensor, "D Z Y X"]]) -> list[MultiBernoulli]:
+    """What the head says of each volume, float64, without gradients."""
+    with torch.no_grad():
+        return [
+            as_multi_bernoulli(head(volume[None])[0].map_tensors(torch.Tensor.double)) for volume in volumes
+        ]
 
 
 def as_multi_bernoulli(found: BoxSet) -> MultiBernoulli:

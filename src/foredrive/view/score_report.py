@@ -1,7 +1,7 @@
 """The report on a file of detections: figures, reliability, and the frames where most likelihood was lost."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 
 from rich.console import Console
@@ -30,6 +30,7 @@ SHOWN = {
     "pgospa.distance": "P-GOSPA",
     "calibration.d_ece": "D-ECE",
     "calibration.existence": "Calibration of existence, by associations",
+    "calibration.object_level": "Object-level calibration error",
     "std.best_factor": "Factor on standard deviations that fits best",
     "conformal.coverage_90": "Coverage of conformal 90 % boxes",
     "against.difference": "PMB-NLL less that of the other file",
@@ -44,7 +45,7 @@ def print_scores(figures: Figures, console: Console) -> None:
     table.add_column(justify="right")
     for key, title in SHOWN.items():
         if figures.get(key) is not None:
-            table.add_row(title, number(figures[key]))
+            table.add_row(title, unescape(number(figures[key])))
     console.print(table)
 
 

@@ -92,12 +92,15 @@ def test_kitti_boxes_forward_left_up(tmp_path: Path) -> None:
         ({"size": [0.0, 4.0, 1.5]}, r"frame a, box 1 has the size"),
         ({"size": [2.0, 4.0]}, r"box 1 has no size of 3"),
         ({"translation": [float("nan"), 0.0, 0.0]}, r"frame a, box 1 has a translation that is not finite"),
+        ({"rotation": [0.0, 0.0, 0.0, 0.0]}, r"frame a, box 1 has the rotation"),
         ({"detection_score": 1.2}, r"detection 1 has a score outside"),
         ({"detection_score": float("nan")}, r"box 1 has a detection_score that is not finite"),
         ({"covariance": [1, 1, 1, 1, 1, -1]}, r"detection 1 has a covariance that is not positive"),
         ({"covariance": [1, 2]}, r"box 1: its covariance is neither"),
         ({"yaw_std": 0.0}, r"detection 1 has a standard deviation of its heading"),
         ({"class_probabilities": {"moon": 1.0}}, r"box 1: class_probabilities"),
+        ({"class_probabilities": {"car": "x"}}, r"box 1: class_probabilities must be numbers"),
+        ({"covariance": ["x"] * 6}, r"box 1: its covariance is not made of numbers"),
         ({"class_probabilities": {"car": 0.4}}, r"detection 1 has class probabilities"),
     ],
 )
@@ -117,6 +120,10 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "empty.json").write_text("")
     with pytest.raises(InputError, match=r"empty\.json: not JSON"):
         read_detections(tmp_path / "empty.json", truth)
+    with pytest.raises(InputError, match=r"nowhere\.json: No such file"):
+        read_detections(tmp_path / "nowhere.json", truth)
+    with pytest.raises(InputError, match=r"list\.json: neither an object"):
+        read_detections(truth, write_list(tmp_path / "list.json", []))
     with pytest.raises(InputError, match="holds no frames"):
         read_detections(write_nuscenes(tmp_path / "none.json", {}), tmp_path / "none.json")
     coco = write_coco_truth(tmp_path / "coco.json", [])

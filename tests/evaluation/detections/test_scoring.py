@@ -103,6 +103,7 @@ def test_images_with_overlaps_by_hand(tmp_path: Path) -> None:
     assert figures["map_at.0.85"] == 0.0
     assert figures["calibration.d_ece"] == pytest.approx((0.4 + 0.3) / 2)
     assert figures["calibration.la_ece"] == pytest.approx((0.2 + 0.3) / 2)
+    assert figures["calibration.object_level"] == pytest.approx((0.4**2 + 1 + 0.3**2) / 2, abs=1e-5)
     assert figures["gospa.missed"] == pytest.approx(50.0**2 / 2 / 2)  # one of two images
     assert figures["frames"] == 2
     assert figures["pmb_nll.frames_infinite"] == 0
@@ -124,6 +125,19 @@ def test_relevance_stands_beside_what_is_not_weighted(tmp_path: Path) -> None:
     assert figures["object_cost"] == pytest.approx(cost.mean())
     assert figures["object_cost.by_relevance"] == pytest.approx((3 * cost[0] + cost[1]) / 4)
     assert cost[1] > 10 > cost[0]
+
+
+def test_no_objects_at_all(tmp_path: Path) -> None:
+    """What is said of an empty street is false, and no slice is of anything."""
+    found = {"a": [box(0.0, 0.0, detection_score=0.9)]}
+    read = read_detections(
+        write_nuscenes(tmp_path / "found.json", found), write_nuscenes(tmp_path / "gt.json", {"a": []})
+    )
+    figures = summarise_scores(read, score_frames(read)).figures
+    assert figures["pmb_nll.false"] == pytest.approx(-math.log(0.1))
+    assert figures["pmb_nll.mean"] == pytest.approx(-math.log(0.1) + 1.0)  # and one object more was expected
+    assert figures["by_class.car.objects"] == 0
+    assert figures["calibration.object_level"] is None
 
 
 def test_no_detections_at_all(tmp_path: Path) -> None:

@@ -21,9 +21,10 @@ from foredrive.evaluation.detections.frames import (
     DetectionSet,
     Family,
     Frame,
+    all_numbers_of,
     around,
-    class_distribution,
-    covariance_matrix,
+    class_distributions,
+    covariances_of,
     detections_of_file,
     numbers_of,
     objects_of_file,
@@ -62,7 +63,7 @@ def read_coco(
                     )
     counts = {
         "frames_without_detections": len(known - set(found)),
-        "boxes_without_covariance": sum("covariance" not in record for record in results),
+        "boxes_without_covariance": sum(record.get("covariance") is None for record in results),
         "crowds_left_out": crowds,
     }
     frames = [
@@ -84,15 +85,13 @@ def _frame(
 ) -> Frame:
     where, true_where = f"{path}: image {image['id']}", f"{truth_path}: image {image['id']}"
     corners, true_corners = _corners(said, path), _corners(true, truth_path)
-    share, covariance = np.zeros((len(said), len(classes))), np.zeros((len(said), 4, 4))
-    score = np.zeros(len(said))
-    for place, (n, record) in enumerate(said):
-        here = f"{path}: record {n}"
-        score[place] = numbers_of(record, "score", 1, here)[0]
-        label = label_of[record["category_id"]]
-        share[place] = class_distribution(here, record.get("class_probabilities"), label, classes)
-        stated = record.get("covariance")
-        covariance[place] = _default(corners[place]) if stated is None else covariance_matrix(here, stated, 4)
+    records = [record for _, record in said]
+    names = [f"{path}: record {n}" for n, _ in said]
+    share = class_distributions(
+        records, [label_of[record["category_id"]] for record in records], classes, names
+    )
+    covariance = covariances_of(records, _defaults(corners), names)
+    score = all_numbers_of(records, "score", 1, names)[:, 0]
     labels = [label_of[record["category_id"]] for _, record in true]
     height, width = (numbers_of(image, key, 1, true_where)[0] for key in ("height", "width"))
     return Frame(
@@ -106,18 +105,21 @@ def _frame(
 
 
 def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray, "n 4"]:
-    corners = np.zeros((len(records), 4))
-    for place, (n, record) in enumerate(records):
-        x, y, width, height = numbers_of(record, "bbox", 4, f"{path}: record {n}")
-        if not (width > 0 and height > 0):
-            raise InputError(f"{path}: record {n} has a bbox of the size {width} x {height}")
-        corners[place] = x, y, x + width, y + height
-    return corners
+    bbox = all_numbers_of(
+        [record for _, record in records], "bbox", 4, [f"{path}: record {n}" for n, _ in records]
+    )
+    wrong = np.flatnonzero(~(bbox[:, 2:] > 0).all(1))
+    if len(wrong):
+        width, height = bbox[wrong[0], 2:]
+        raise InputError(
+            f"{path}: record {records[wrong[0]][0]} has a bbox of the size {width:g} x {height:g}"
+        )
+    return np.concatenate([bbox[:, :2], bbox[:, :2] + bbox[:, 2:]], axis=1)
 
 
-def _default(corners: Float[ndarray, "4"]) -> Float[ndarray, "4 4"]:
-    side = np.tile(corners[2:] - corners[:2], 2)
-    return np.diag((STD_OF_SIDE * side) ** 2 + STD_PX**2)
+def _defaults(corners: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4 4"]:
+    side = np.tile(corners[:, 2:] - corners[:, :2], 2)
+    return np.eye(4) * ((STD_OF_SIDE * side) ** 2 + STD_PX**2)[:, None, :]
 
 
 def _listed(content: Mapping[str, Any], key: str, path: Path, needs: str | None = None) -> list[Any]:

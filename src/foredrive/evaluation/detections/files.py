@@ -20,9 +20,11 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
         read = read_kitti(results, truth, family)
     else:
         said, true = _read_json(results), _read_json(truth)
-        if isinstance(said, dict) and isinstance(true, dict):
+        if not isinstance(true, dict):
+            raise InputError(f"{truth}: neither an object with `results` (nuScenes) nor with `images` (COCO)")
+        if isinstance(said, dict):
             read = read_nuscenes(said, true, results, truth, family)
-        elif isinstance(said, list) and isinstance(true, dict):
+        elif isinstance(said, list):
             read = read_coco(said, true, results, truth, family)
         else:
             raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
@@ -34,5 +36,7 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
 def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:
         raise InputError(f"{path}: not JSON that can be read") from error

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
@@ -69,13 +69,13 @@ def detections_of_file(
     family: Family = "gaussian",
 ) -> MultiBernoulli:
     """Check and convert the detections of one frame; raises `InputError` with the first that is wrong."""
-    spread = np.linalg.eigvalsh(covariance).min(-1) if np.isfinite(covariance).all() else np.zeros(len(mean))
+    chol, definite = _cholesky(covariance)
     checks = {
         "a score outside [0, 1]": (score >= 0) & (score <= 1),
         "class probabilities that do not add up to 1": (class_probability >= 0).all(1)
         & (np.abs(class_probability.sum(1) - 1) < 1e-3),
         "a box that is not finite": np.isfinite(mean).all(1),
-        "a covariance that is not positive definite": spread > 0,
+        "a covariance that is not positive definite": definite,
     }
     if yaw is not None and yaw_std is not None:
         checks["a heading that is not finite"] = np.isfinite(yaw)
@@ -87,7 +87,7 @@ def detections_of_file(
     share = np.clip(class_probability, LEAST_PROBABILITY, None)
     boxes = BoxDensity(
         mean=torch.as_tensor(mean),
-        chol=torch.as_tensor(np.linalg.cholesky(covariance)),
+        chol=torch.as_tensor(chol),
         yaw=None if yaw is None else torch.as_tensor(yaw),
         concentration=None if yaw_std is None else torch.as_tensor(1.0 / yaw_std**2),
         family=family,
@@ -111,33 +111,82 @@ def objects_of_file(
     return LabelledBoxes(torch.as_tensor(np.asarray(label, dtype=np.int64)), torch.as_tensor(state), headings)
 
 
-def covariance_matrix(where: str, value: object, dims: int) -> Float[ndarray, "D D"]:
-    """A covariance as files have it: a matrix, or the variances."""
+def _cholesky(
+    covariance: Float[ndarray, "M D D"],
+) -> tuple[Float[ndarray, "M D D"], Bool[ndarray, "M"]]:
+    """Lower factors, and which of the covariances have one; zeros unless all do."""
+    finite = np.isfinite(covariance).all((1, 2))
     try:
-        array = np.asarray(value, dtype=np.float64)
+        if finite.all():
+            return np.linalg.cholesky(covariance), finite
+    except np.linalg.LinAlgError:
+        pass
+    least = np.zeros(len(covariance))
+    least[finite] = np.linalg.eigvalsh(covariance[finite]).min(-1)
+    definite = least > 0
+    if definite.all():  # but for rounding, which the factor does not forgive
+        definite[least.argmin()] = False
+    return np.zeros_like(covariance), definite
+
+
+def covariances_of(
+    records: Sequence[Mapping[str, Any]], default: Float[ndarray, "n D D"], names: Sequence[str]
+) -> Float[ndarray, "n D D"]:
+    """Covariances as files have them, matrices or variances; the default where there is none."""
+    stated = [n for n, record in enumerate(records) if record.get("covariance") is not None]
+    covariance = np.array(default)
+    if stated:
+        values = [records[n]["covariance"] for n in stated]
+        dims = covariance.shape[-1]
+        covariance[stated] = _covariance_matrices(values, dims, [names[n] for n in stated])
+    return covariance
+
+
+def _covariance_matrices(
+    values: Sequence[object], dims: int, names: Sequence[str]
+) -> Float[ndarray, "n D D"]:
+    """All at once if they have the same form, which is much faster, else one after the other."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: its covariance is not made of numbers") from error
-    if array.shape == (dims,):
-        return np.diag(array)
-    if array.shape != (dims, dims) or not np.allclose(array, array.T, rtol=1e-6):
+        if len(values) == 1:
+            raise InputError(f"{names[0]}: its covariance is not made of numbers") from error
+        array = np.zeros(0)
+    if array.shape == (len(values), dims):
+        return array[:, :, None] * np.eye(dims)
+    if array.shape == (len(values), dims, dims):
+        slack = 1e-6 * np.abs(array).max((1, 2), keepdims=True)
+        if not (np.abs(array - array.swapaxes(1, 2)) > slack).any():  # what is not finite is found later
+            return array
+    if len(values) == 1:
         raise InputError(
-            f"{where}: its covariance is neither {dims} variances nor a symmetric matrix of them"
+            f"{names[0]}: its covariance is neither {dims} variances nor a symmetric matrix of them"
         )
-    return array
+    each = [_covariance_matrices([value], dims, names[n : n + 1]) for n, value in enumerate(values)]
+    return np.concatenate(each)
 
 
-def class_distribution(
-    where: str, probabilities: object, label: int, classes: Sequence[str]
-) -> Float[ndarray, "K"]:
+def class_distributions(
+    records: Sequence[Mapping[str, Any]],
+    labels: Sequence[int],
+    classes: Sequence[str],
+    names: Sequence[str],
+) -> Float[ndarray, "n K"]:
     """Class probabilities by name as files have them; all on the label where there are none."""
-    share = np.zeros(len(classes))
-    if probabilities is None:
-        share[label] = 1.0
-        return share
-    if not isinstance(probabilities, dict) or not set(probabilities) <= set(classes):
-        raise InputError(f"{where}: class_probabilities must be an object with known classes as its keys")
-    for name, value in probabilities.items():
-        share[classes.index(name)] = value
+    share, place = np.zeros((len(records), len(classes))), {name: n for n, name in enumerate(classes)}
+    for n, (record, label) in enumerate(zip(records, labels, strict=True)):
+        stated = record.get("class_probabilities")
+        if stated is None:
+            share[n, label] = 1.0
+            continue
+        if not isinstance(stated, dict) or not stated.keys() <= place.keys():
+            raise InputError(
+                f"{names[n]}: class_probabilities must be an object with known classes as its keys"
+            )
+        try:
+            share[n, [place[name] for name in stated]] = np.array([*stated.values()], dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{names[n]}: class_probabilities must be numbers") from error
     return share
 
 
@@ -161,6 +210,21 @@ def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> F
     if not np.isfinite(value).all():
         raise InputError(f"{where} has a {key} that is not finite")
     return value
+
+
+def all_numbers_of(
+    records: Sequence[Mapping[str, Any]], key: str, count: int, names: Sequence[str]
+) -> Float[ndarray, "n count"]:
+    """`numbers_of` every record."""
+    try:
+        values = np.array([record[key] for record in records], dtype=np.float64)
+        shape = (len(records), count) if count > 1 else (len(records),)
+        if values.shape == shape and np.isfinite(values).all():
+            return values.reshape(-1, count)
+    except (KeyError, TypeError, ValueError):
+        pass
+    found = [numbers_of(record, key, count, names[n]) for n, record in enumerate(records)]
+    return np.array(found).reshape(-1, count)
 
 
 def relevance_of(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:

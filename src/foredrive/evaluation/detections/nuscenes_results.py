@@ -22,11 +22,11 @@ from foredrive.evaluation.detections.frames import (
     DetectionSet,
     Family,
     Frame,
+    all_numbers_of,
     around,
-    class_distribution,
-    covariance_matrix,
+    class_distributions,
+    covariances_of,
     detections_of_file,
-    numbers_of,
     objects_of_file,
     relevance_of,
 )
@@ -54,7 +54,7 @@ def read_nuscenes(
     frames = []
     for token, boxes in true.items():
         said = found.get(token, ())
-        counts["boxes_without_covariance"] += sum("covariance" not in box for box in said)
+        counts["boxes_without_covariance"] += sum(box.get("covariance") is None for box in said)
         frames.append(_frame(token, said, boxes, classes, path, truth_path, family))
     return DetectionSet(frames, classes, True, counts)
 
@@ -75,26 +75,16 @@ def _frame(
     state[:, :3] -= origin
     true_state[:, :3] -= origin
     label = [classes.index(str(box["detection_name"])) for box in said]
+    names = [f"{where}, box {n}" for n in range(len(said))]
+    yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in said]
     detected = detections_of_file(
         where,
-        np.array(
-            [numbers_of(box, "detection_score", 1, f"{where}, box {n}")[0] for n, box in enumerate(said)]
-        ),
-        np.array(
-            [
-                class_distribution(f"{where}, box {n}", box.get("class_probabilities"), of, classes)
-                for n, (box, of) in enumerate(zip(said, label, strict=True))
-            ]
-        ).reshape(-1, len(classes)),
+        all_numbers_of(said, "detection_score", 1, names)[:, 0],
+        class_distributions(said, label, classes, names),
         state,
-        np.array(
-            [
-                covariance_matrix(f"{where}, box {n}", box.get("covariance", DEFAULT_COVARIANCE), 6)
-                for n, box in enumerate(said)
-            ]
-        ).reshape(-1, 6, 6),
+        covariances_of(said, np.tile(DEFAULT_COVARIANCE, (len(said), 1, 1)), names),
         yaw,
-        np.array([float(box.get("yaw_std", STD_YAW_RAD)) for box in said]),
+        all_numbers_of(yaw_std, "yaw_std", 1, names)[:, 0],
         family=family,
     )
     objects = objects_of_file(
@@ -126,16 +116,18 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
 
 def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
     """Centre and log length, width, height; heading."""
+    names = [f"{where}, box {n}" for n in range(len(boxes))]
     centre, size, rotation = (
-        np.array([numbers_of(box, key, count, f"{where}, box {n}") for n, box in enumerate(boxes)]).reshape(
-            -1, count
-        )
+        all_numbers_of(boxes, key, count, names)
         for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
     )
     wrong = np.flatnonzero(~(size > 0).all(1))
     if len(wrong):
-        raise InputError(f"{where}, box {wrong[0]} has the size {size[wrong[0]].tolist()}")
-    w, x, y, z = rotation.T
+        raise InputError(f"{names[wrong[0]]} has the size {size[wrong[0]].tolist()}")
+    wrong = np.flatnonzero(~(np.linalg.norm(rotation, axis=1) > 0))
+    if len(wrong):
+        raise InputError(f"{names[wrong[0]]} has the rotation {rotation[wrong[0]].tolist()}")
+    w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     return np.concatenate([centre, np.log(size[:, [1, 0, 2]])], axis=1), yaw
 

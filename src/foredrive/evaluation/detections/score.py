@@ -1,6 +1,6 @@
 """Every frame's set likelihood, its parts, and what detections and objects had to do with each other."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +13,11 @@ from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, mat
 from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
 from foredrive.sets import (
     Gospa,
-    MultiBernoulli,
     PoissonMultiBernoulli,
     SetNll,
     UniformPoisson,
     gospa,
+    object_brier,
     set_nll,
     wasserstein_distance,
 )
@@ -27,6 +27,8 @@ LOW_CONFIDENCE = 0.1
 """Detections no surer than this become the Poisson background (Paper A)."""
 UNEXPLAINED_PER_FRAME = 1.0
 """Objects expected beyond that, evenly over classes and the frame's region: no object is impossible."""
+NEAR_M, NEAR_OVERLAP = (1.0, 2.0), (0.5, 0.75)
+"""Detections that speak of an object, for object-level calibration."""
 GOSPA_CUTOFF_M, GOSPA_CUTOFF_PX = 2.0, 50.0
 GOSPA_CONFIDENCE = 0.5
 """Detections below it are left out of GOSPA, which knows no probabilities."""
@@ -43,6 +45,8 @@ class ObjectScores:
     missed_probability: Float[ndarray, "N"]
     best: Int[ndarray, "N"]
     """Index among the frame's `detected`; -1: background."""
+    brier: Float[ndarray, "N"]
+    """`object_brier` of the detections that are not background, mean over thresholds of nearness."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,9 @@ def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
     pmb = predicted_set(frame, len(read.classes))
     result = set_nll(pmb, frame.objects, k=k)
     sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(LOW_CONFIDENCE))
-    detections = _detections(frame, result, sure, read.upright)
+    closeness = _closeness(frame, read.upright)
+    detections = _detections(frame, result, sure, closeness, read.upright)
+    brier = _object_brier(frame, sure, closeness, read.upright)
     return FrameScore(
         frame.name,
         frame.sequence,
@@ -118,7 +124,7 @@ def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
         {part: float(getattr(result, part)) for part in PARTS},
         *_gospas(frame, detections, read.upright),
         detections,
-        _objects(frame, pmb, result, sure),
+        _objects(frame, result, sure, brier),
         None if read.upright else _pdq(frame, detections),
     )
 
@@ -133,15 +139,15 @@ def _pdq(frame: Frame, detections: DetectionScores) -> PdqCounts:
 
 
 def _objects(
-    frame: Frame, pmb: PoissonMultiBernoulli, result: SetNll, sure: Int[ndarray, "_"]
+    frame: Frame,
+    result: SetNll,
+    sure: Int[ndarray, "_"],
+    brier: Float[ndarray, "N"],
 ) -> ObjectScores:
-    found = result.associations
-    i, j = torch.as_tensor(found.detection), torch.as_tensor(found.object)
-    count = len(found.background)
-    box = -found.probability * pmb.detected.boxes.log_prob_of_pairs(i, frame.objects, j).numpy()
-    label = -found.probability * pmb.detected.log_label_of_pairs(i, frame.objects, j).numpy()
-    assert pmb.background is not None
-    log_background = pmb.background.log_intensity(frame.objects).numpy()
+    found, count = result.associations, len(result.associations.background)
+    box = -found.probability * result.pair_log_box.numpy()
+    label = -found.probability * result.pair_log_label.numpy()
+    log_background = result.log_background.numpy()
     with np.errstate(invalid="ignore"):
         missed = np.where(found.background > 0, -found.background * log_background, 0.0)
     return ObjectScores(
@@ -151,40 +157,53 @@ def _objects(
         missed,
         found.background,
         np.where(found.best < 0, -1, np.append(sure, -1)[found.best]),
+        brier,
     )
 
 
-def _detections(frame: Frame, result: SetNll, sure: Int[ndarray, "_"], upright: bool) -> DetectionScores:
+def _object_brier(
+    frame: Frame, sure: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], upright: bool
+) -> Float[ndarray, "N"]:
+    detected, label = frame.detected, frame.objects.label.numpy()
+    probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[sure]
+    thresholds = [-distance for distance in NEAR_M] if upright else NEAR_OVERLAP
+    each = [object_brier(probability, closeness[sure] >= least, label) for least in thresholds]
+    return np.mean(each, axis=0)
+
+
+def _detections(
+    frame: Frame,
+    result: SetNll,
+    sure: Int[ndarray, "_"],
+    closeness: Float[ndarray, "M N"],
+    upright: bool,
+) -> DetectionScores:
     detected, objects = frame.detected, frame.objects
     label = detected.log_class.argmax(-1).numpy()
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
     has_object[sure] = 1.0 - result.associations.absent
-    closeness, least = _closeness(detected, frame, upright)
+    least = [-threshold for threshold in NUSCENES_DISTANCES_M] if upright else COCO_OVERLAPS
     hit, overlap = np.zeros((len(least), len(label)), bool), np.full(len(label), np.nan)
     if not upright:
         overlap[:] = 0.0
     true = objects.label.numpy()
-    for name in np.intersect1d(label, true):
-        i, j = np.flatnonzero(label == name), np.flatnonzero(true == name)
-        near = closeness[np.ix_(i, j)]
-        for t, threshold in enumerate(least):
-            hit[t, i] = match_greedily(score[i], near, threshold) >= 0
-        if not upright:
-            taken = match_greedily(score[i], near, np.nextafter(0.0, 1.0))
-            overlap[i[taken >= 0]] = near[np.flatnonzero(taken >= 0), taken[taken >= 0]]
+    near = np.where(label[:, None] == true, closeness, -np.inf)
+    for t, threshold in enumerate(least):
+        hit[t] = match_greedily(score, near, threshold) >= 0
+    if not upright:
+        taken = match_greedily(score, near, np.nextafter(0.0, 1.0))
+        which = np.flatnonzero(taken >= 0)
+        overlap[which] = near[which, taken[which]]
     return DetectionScores(label, score, detected.log_existence.exp().numpy(), has_object, hit, overlap)
 
 
-def _closeness(
-    detected: MultiBernoulli, frame: Frame, upright: bool
-) -> tuple[Float[ndarray, "M N"], Sequence[float]]:
-    """Minus the distance of centres over ground in m, or the overlap; and what a hit needs."""
-    mean, state = detected.boxes.mean.numpy(), frame.objects.state.numpy()
+def _closeness(frame: Frame, upright: bool) -> Float[ndarray, "M N"]:
+    """Minus the distance of centres over ground in m, or the overlap."""
+    mean, state = frame.detected.boxes.mean.numpy(), frame.objects.state.numpy()
     if not upright:
-        return overlaps(mean, state), COCO_OVERLAPS
-    apart = np.linalg.norm(mean[:, None, :2] - state[:, :2], axis=-1)
-    return -apart, [-threshold for threshold in NUSCENES_DISTANCES_M]
+        return overlaps(mean, state)
+    return -np.linalg.norm(mean[:, None, :2] - state[:, :2], axis=-1)
 
 
 def _gospas(frame: Frame, detections: DetectionScores, upright: bool) -> tuple[Gospa, Gospa]:

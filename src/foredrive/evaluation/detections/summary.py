@@ -142,14 +142,24 @@ def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Rel
 
 
 def _calibration(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """By class: D-ECE, and for image boxes LaECE (overlap of hits at 0.5) and LaECE₀ (any overlap)."""
+    """D-ECE by class and range, object-level error; LaECE (overlap of hits at 0.5) and LaECE₀ of images."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
     at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
-    figures: Summary = {"brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None}
+    of_objects = _joined(scores, "objects", "brier")
+    figures: Summary = {
+        "brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None,
+        "calibration.object_level": float(of_objects.mean()) if len(of_objects) else None,
+    }
     outcomes = {} if read.upright else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
     for c, name in enumerate(read.classes):
         figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[at][label == c]).error
+    if all(frame.range_m is not None for frame in read.frames):
+        where = torch.cat([frame.detected.boxes.mean[:, :2] for frame in read.frames]).norm(dim=-1).numpy()
+        for low, high in pairwise(RANGES_M):
+            inside = (where >= low) & (where < high)
+            error = reliability(score[inside], hit[at][inside]).error
+            figures[f"calibration.d_ece.from_{low:g}_m"] = error
     for key, outcome in outcomes.items():
         errors = [reliability(score[label == c], outcome[label == c]).error for c in range(len(read.classes))]
         figures[f"calibration.{key}"] = mean_of_valid(errors)
@@ -203,8 +213,8 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
     seen = [frame.visibility for frame in read.frames if frame.visibility is not None]
     if len(seen) == len(scores) and not np.isnan(np.concatenate(seen)).any():
         visibility = np.concatenate(seen)
-        edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else np.zeros(0)
-        for low, high in zip(edges, [*edges[1:], np.inf], strict=True):
+        edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else []
+        for low, high in pairwise([*edges, np.inf]):
             inside = np.flatnonzero((visibility >= low) & (visibility < high))
             figures |= _slice(f"by_visibility.from_{low:g}", scores, inside)
     return figures

@@ -1,0 +1,112 @@
+"""The detection task on lidar: samples from any log, a head's figures on them, side by side with others'.
+
+A head (`models.detection`) learns from samples by `training.detection.fit_head`; docs/sets.md shows how.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.data import ClipConfig, ClipDataset, LogPath
+from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
+from foredrive.geometry.boxes import points_in_boxes
+from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec
+from foredrive.sets import LabelledBoxes, MultiBernoulli, UniformPoisson
+
+CLASSES = ("vehicle", "cycle", "pedestrian")
+_CLASS_OF = {
+    **dict.fromkeys((Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER), 0),
+    **dict.fromkeys((Category.BICYCLE, Category.MOTORCYCLE), 1),
+    Category.PEDESTRIAN: 2,
+}
+LEAST_HITS = 3
+"""Objects that fewer beams met are left out."""
+_IMAGE_HW = (16, 28)
+"""Nothing looks at the images."""
+HALF_HEIGHT_M, LARGEST_LOG_SIZE = 5.0, 4.0
+"""Of the region in which objects may be that no detection explains."""
+
+
+class DetectionSample(NamedTuple):
+    """One moment of a log."""
+
+    volume: Float[Tensor, "1 Z Y X"]
+    objects: LabelledBoxes
+    log: str
+
+
+def detection_samples(log: LogPath, spec: VoxelSpec, *, stride_s: float = 0.5) -> list[DetectionSample]:
+    """Hits and objects every `stride_s` of a log that has lidar and boxes."""
+    config = ClipConfig(
+        past_frames=0, future_frames=0, image_hw=_IMAGE_HW, voxels=spec, horizon_steps=1, lidar=True,
+        now_stride_s=stride_s,
+    )  # fmt: skip
+    dataset = ClipDataset([log], config, cache_dir=None)
+    found = []
+    for clip in map(dataset.clip, range(len(dataset))):
+        volume = hits_volume(clip.sweeps[clip.now], spec)
+        found.append(DetectionSample(volume, objects_of(clip, spec), log.name))
+    return found
+
+
+def hits_volume(sweep: LidarSweep, spec: VoxelSpec) -> Float[Tensor, "1 Z Y X"]:
+    """Logarithm of 1 + the hits in each voxel."""
+    points = sweep.points_ego[sweep.returned & sweep.valid]
+    index = ((points - torch.tensor(spec.lower_m)) / spec.voxel_m).floor().long()
+    depth, height, breadth = spec.shape_zyx
+    index = index[((index >= 0) & (index < torch.tensor([breadth, height, depth]))).all(-1)]
+    flat = (index[:, 2] * height + index[:, 1]) * breadth + index[:, 0]
+    count = torch.bincount(flat, minlength=depth * height * breadth)
+    return torch.log1p(count.float()).view(1, depth, height, breadth)
+
+
+def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
+    """Objects of one clip at now, of the classes that are told apart, over the volume's ground and seen."""
+    sweep, boxes = clip.sweeps[clip.now], clip.boxes[clip.now]
+    points = sweep.points_ego[sweep.returned & sweep.valid]
+    hits = points_in_boxes(points, boxes.centre, boxes.size_lwh, boxes.yaw).sum(0)
+    lower, upper = _ground(spec)
+    inside = ((boxes.centre[:, :2] > lower) & (boxes.centre[:, :2] < upper)).all(-1)
+    label = torch.tensor([_CLASS_OF.get(Category(int(c)), -1) for c in boxes.category])
+    keep = boxes.valid & inside & (hits >= LEAST_HITS) & (label >= 0)
+    kept = boxes[keep]
+    return LabelledBoxes(label[keep], torch.cat([kept.centre, kept.size_lwh.log()], dim=-1), kept.yaw)
+
+
+def unexplained(spec: VoxelSpec) -> UniformPoisson:
+    """One object a frame that no detection explains, evenly over classes and the volume's ground."""
+    lower, upper = _ground(spec)
+    rest = torch.tensor([HALF_HEIGHT_M, *[LARGEST_LOG_SIZE] * 3])
+    rate = torch.full((len(CLASSES),), 1 / len(CLASSES))
+    region = torch.cat([lower, -rest]).double(), torch.cat([upper, rest]).double()
+    return UniformPoisson(rate, *region, has_yaw=True)
+
+
+def judge(
+    detected: Sequence[MultiBernoulli], samples: Sequence[DetectionSample], spec: VoxelSpec
+) -> dict[str, float]:
+    """What `foredrive score` says of detections: likelihood, its parts, mAP, calibration."""
+    region = unexplained(spec)
+    frames = [
+        Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
+        for n, (found, sample) in enumerate(zip(detected, samples, strict=True))
+    ]
+    read = DetectionSet(frames, CLASSES, True, {})
+    summary = summarise_scores(read, score_frames(read)).figures
+    names = {
+        "pmb_nll.mean": "pmb_nll", "map": "map", "calibration.d_ece": "d_ece", "brier.hit": "brier",
+        "calibration.existence": "existence_error", "calibration.object_level": "object_level_error",
+        "std.best_factor": "std_best_factor", "pgospa.distance": "pgospa_m", "objects": "objects",
+        "pmb_nll.frames_infinite": "frames_infinite",
+    }  # fmt: skip
+    parts = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
+    names |= {f"pmb_nll.{part}": f"pmb_nll_{part}" for part in parts}
+    return {short: float(summary.get(key) or 0.0) for key, short in names.items()}
+
+
+def _ground(spec: VoxelSpec) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+    lower = torch.tensor(spec.lower_m[:2])
+    return lower, lower + spec.voxel_m * torch.tensor([spec.shape_zyx[2], spec.shape_zyx[1]])
