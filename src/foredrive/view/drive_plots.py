@@ -20,7 +20,8 @@ from foredrive.view.inline_svg import INK_MARK
 
 AROUND_M, SMALLEST_M = 25.0, 45.0
 FASTEST_MPS = 14.0
-SPEED_MAP = "viridis"
+SPEED_MAP, DARKEST = "plasma", -0.35
+"""Who stands is so far, in parts of the fastest, from the colours that cannot be told from the road."""
 ROAD = "#333d4b"
 LETTERS = {
     InfractionKind.COLLISION_PEDESTRIAN: "P",
@@ -36,7 +37,8 @@ LETTERS = {
 
 
 def draw_way(drive: Mapping[str, Any]) -> Figure:
-    """The route over the town's lanes, the way driven coloured by speed, infractions marked; north is up."""
+    """The route over the town's lanes, the way driven coloured by speed; north is up. Infractions and
+    scenarios are marked."""
     figure = Figure(figsize=(4.6, 4.6))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     route, track = np.array(drive["route_xy"]), np.array(drive["track"]["xy"])
@@ -49,22 +51,22 @@ def draw_way(drive: Mapping[str, Any]) -> Figure:
     ax.set_xticks([])
     ax.set_yticks([])
     _draw_lanes(ax, drive["town"], centre, half)
-    ax.plot(*route.T, color=palette.EXPERT, linewidth=5.0, alpha=0.35, solid_capstyle="round", zorder=2)
+    ax.plot(*route.T, color=palette.FAINT, linewidth=6.0, alpha=0.5, solid_capstyle="round", zorder=2)
     ax.plot(*route[-1], "o", color=palette.EXPERT, markersize=9, markerfacecolor="none", zorder=4)
     if len(track) > 1:
         pieces = LineCollection(
             list(np.stack([track[:-1], track[1:]], axis=1)),
             array=np.array(drive["track"]["speed_mps"][1:]),
             cmap=SPEED_MAP,
-            norm=Normalize(0.0, FASTEST_MPS),
+            norm=Normalize(DARKEST * FASTEST_MPS, FASTEST_MPS),
             linewidth=2.4,
             capstyle="round",
             zorder=3,
         )
         ax.add_collection(pieces)
     ax.plot(*track[0], "o", color=palette.EGO, markersize=5, zorder=4)
-    for infraction in drive["score"]["infractions"]:
-        _mark(ax, infraction["xy_world"], LETTERS[InfractionKind(infraction["kind"])])
+    for _, xy, text, style in _marks(drive):
+        ax.text(xy[0], xy[1], text, zorder=6, va="center_baseline", **style)
     scale_m = 20.0 if half < 120 else 100.0
     x, y = centre[0] - 0.92 * half, centre[1] - 0.92 * half
     ax.plot([x, x + scale_m], [y, y], color=palette.INK, linewidth=1.5)
@@ -73,7 +75,7 @@ def draw_way(drive: Mapping[str, Any]) -> Figure:
 
 
 def draw_timeline(drive: Mapping[str, Any]) -> Figure:
-    """Speed over time, with what went wrong, and where others came near."""
+    """Speed over time, with what happened and what went wrong, and where others came near."""
     figure = Figure(figsize=(7.6, 2.3))
     ax = figure.add_axes((0.07, 0.22, 0.92, 0.70))
     t_s, speed = drive["track"]["t_s"], drive["track"]["speed_mps"]
@@ -83,20 +85,9 @@ def draw_timeline(drive: Mapping[str, Any]) -> Figure:
     ax.set(xlim=(0.0, max(float(drive["score"]["duration_s"]), 1.0)), ylim=(0.0, top))
     for t0, t1 in _near(drive["nearest_s"]):
         ax.axvspan(t0, t1, color="#e0a458", alpha=0.3, linewidth=0)
-    for infraction in drive["score"]["infractions"]:
-        ax.axvline(infraction["t_s"], color=palette.PLAN, linewidth=1.4)
-        letter = LETTERS[InfractionKind(infraction["kind"])]
-        ax.text(
-            infraction["t_s"],
-            0.97 * top,
-            letter,
-            color="white",
-            fontsize=8,
-            weight="bold",
-            ha="center",
-            va="top",
-            bbox={"boxstyle": "circle,pad=0.25", "facecolor": palette.PLAN, "edgecolor": "none"},
-        )
+    for at_s, _, text, style in _marks(drive):
+        ax.axvline(at_s, color=style["bbox"]["facecolor"], linewidth=1.4)
+        ax.text(at_s, 0.96 * top, text, va="top", **style)
     ax.set_xlabel("time, s", color=INK_MARK, fontsize=9)
     ax.set_ylabel("speed, m/s", color=INK_MARK, fontsize=9)
     ax.tick_params(colors=INK_MARK, labelsize=8)
@@ -119,19 +110,26 @@ def _draw_lanes(ax: Axes, town: str, centre: Float[np.ndarray, "2"], half: float
     ax.add_collection(LineCollection(lines, color="#465266", linewidth=0.5, zorder=1.1))
 
 
-def _mark(ax: Axes, xy: Sequence[float], letter: str) -> None:
-    ax.plot(xy[0], xy[1], "o", color=palette.PLAN, markersize=13, markeredgecolor="white", zorder=5)
-    ax.text(
-        xy[0],
-        xy[1],
-        letter,
-        color="white",
-        fontsize=8,
-        weight="bold",
-        ha="center",
-        va="center_baseline",
-        zorder=6,
-    )
+def scenario_events(drive: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Where scenarios began, in the order in which they did: they are numbered by it."""
+    return [event for event in drive["events"] if event["kind"] == "scenario"]
+
+
+def _marks(drive: Mapping[str, Any]) -> list[tuple[float, Sequence[float], str, dict[str, Any]]]:
+    """When, where, what to write and how for all that is marked; infractions come last, on top."""
+    marks = [
+        (event["t_s"], event["xy_world"], str(number), _style("square", palette.SCENARIO))
+        for number, event in enumerate(scenario_events(drive), start=1)
+    ]
+    return marks + [
+        (each["t_s"], each["xy_world"], LETTERS[InfractionKind(each["kind"])], _style("circle", palette.PLAN))
+        for each in drive["score"]["infractions"]
+    ]
+
+
+def _style(shape: str, colour: str) -> dict[str, Any]:
+    box = {"boxstyle": f"{shape},pad=0.25", "facecolor": colour, "edgecolor": "white", "linewidth": 0.6}
+    return {"color": "white", "fontsize": 8, "weight": "bold", "ha": "center", "bbox": box}
 
 
 def _near(nearest_s: Sequence[float | None]) -> list[tuple[float, float]]:

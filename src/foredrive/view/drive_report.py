@@ -13,8 +13,9 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.driving import DRIVES, SUITE, SUMMARY, read_drive, score_of
+from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, InfractionKind
-from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way
+from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.inline_svg import inline_svg
 from foredrive.view.report_style import CSS
@@ -86,7 +87,7 @@ def _page(suite: Mapping[str, Any], summary: Summary, drives: Mapping[str, Mappi
         f"<h1>{escape(title)}</h1>",
         _run(summary),
         f"<section><h2>In short</h2>{_tiles(summary)}{_infraction_table(summary)}</section>",
-        f"<section><h2>Drives</h2>{_legend()}{_drive_table(drives)}</section>",
+        f"<section><h2>Drives</h2>{_legend(summary)}{_drive_table(drives)}</section>",
         "<section><h2>One by one, the worst first</h2>",
         *(_drive(name, drives[name]) for name in worst_first),
         "</section>",
@@ -111,10 +112,11 @@ def _run(summary: Summary) -> str:
 
 
 def _tiles(summary: Summary) -> str:
-    tiles = [
-        (name, number(summary[key], 1), f"&plusmn; {number(summary[f'{key}.spread'], 1)} over repetitions")
-        for key, name in SCORES.items()
-    ]
+    again = (summary["repetitions"] or 0) > 1  # type: ignore[operator]
+    tiles = []
+    for key, name in SCORES.items():
+        spread = f"&plusmn; {number(summary[f'{key}.spread'], 1)} over repetitions"
+        tiles.append((name, number(summary[key], 1), spread if again else "one repetition"))
     tiles.append(("Drives the agent failed at", number(summary["failed"]), f"of {number(summary['drives'])}"))
     tiles.append(("Comfortable time, %", _percent(summary["comfortable_share"]), "within nuPlan's bounds"))
     tiles.append(
@@ -145,15 +147,23 @@ def _infraction_table(summary: Summary) -> str:
         for ending in Ending
         if summary[f"endings.{ending}"]
     )
+    begun = ", ".join(
+        f"{number(summary[f'scenarios.{kind}'])} {_words(kind)}"
+        for kind in ScenarioKind
+        if summary[f"scenarios.{kind}"]
+    )
     head = '<tr><th scope="row">infraction</th><th>number</th><th>per km</th></tr>'
-    return f"<p>Endings: {endings}.</p>" + (f"<table>{head}{rows}</table>" if rows else "")
+    told = f"<p>Endings: {endings}.</p><p>Scenarios begun: {begun or 'none'}.</p>"
+    return told + (f"<table>{head}{rows}</table>" if rows else "")
 
 
-def _legend() -> str:
-    letters = ", ".join(f"<b>{letter}</b> {_words(kind)}" for kind, letter in LETTERS.items())
+def _legend(summary: Summary) -> str:
+    found = [kind for kind in LETTERS if summary[f"infractions.{kind}"]]
+    letters = ", ".join(f"<b>{LETTERS[kind]}</b> {_words(kind)}" for kind in found)
     return (
-        '<p class="note">In the maps the route is green and the way driven coloured by speed, from dark (0) '
-        f"to yellow (14 m/s). Red marks: {letters}. Orange: somebody less than 0.95 s from being touched.</p>"
+        '<p class="note">In the maps the route is grey and the way driven coloured by speed, from violet (0) '
+        f"to yellow (14 m/s). Violet numbers: scenarios that begin. {f'Red: {letters}. ' if letters else ''}"
+        "Orange: somebody less than 0.95 s from being touched.</p>"
     )
 
 
@@ -191,8 +201,10 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
         )
         for infraction in score.infractions
     ]
-    scenarios = (event for event in drive["events"] if event["kind"] == "scenario")
-    lines += [(event["t_s"], f"scenario: {_words(event['what'])}") for event in scenarios]
+    lines += [
+        (event["t_s"], f"scenario {place}: {_words(event['what'])}")
+        for place, event in enumerate(scenario_events(drive), start=1)
+    ]
     told = "".join(f"<li>{t_s:.1f} s: {text}</li>" for t_s, text in sorted(lines))
     return (
         f'<h3 id="{name}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'

@@ -13,10 +13,12 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.logs import Log, LogPath
 from foredrive.geometry.boxes import box_corners
+from foredrive.scene import Boxes
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
+from foredrive.view.drive_plots import scenario_events
 from foredrive.view.video import write_video
 
 FASTER = 2.0
@@ -26,6 +28,10 @@ CAMERA_WH = (256, 144)
 ABOVE_WH = (768, 288)
 PX_PER_M, EGO_AT_X = 5.0, 0.3
 """From above, driving to the right; the vehicle stands at this part of the width."""
+LEAST_PX = 3.5
+"""Nobody is smaller than this radius: people would hardly be seen."""
+TOLD_S = 6.0
+"""For how long a caption says that a scenario has begun."""
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
 
 
@@ -42,7 +48,10 @@ def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> Non
 
 
 def _frame(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
-    above = _from_above(log, index, drive)
+    above = from_above(
+        drive["town"], np.array(drive["route_xy"]), log.T_world_ego[index], read_boxes(log, index)
+    )
+    _caption(ImageDraw.Draw(above), log, index, drive)
     cameras = pinhole_cameras(log)
     shown = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None]
     if not shown:
@@ -56,12 +65,21 @@ def _frame(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
     return frame
 
 
-def _from_above(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
-    """The scene around the vehicle, which drives to the right."""
+def from_above(
+    town: str,
+    route_xy: Float[np.ndarray, "N 2"],
+    T_world_ego: Float[np.ndarray, "4 4"],
+    boxes: Boxes | None,
+) -> Image.Image:
+    """The scene around the vehicle, which drives to the right.
+
+    Args:
+        boxes: of the others, in the ego frame.
+    """
     twice = 2  # drawn larger and shrunk: PIL's polygons have no smooth edges
     image = Image.new("RGB", (twice * ABOVE_WH[0], twice * ABOVE_WH[1]), palette.GROUND)
     pen = ImageDraw.Draw(image)
-    T_ego_world = np.linalg.inv(log.T_world_ego[index])
+    T_ego_world = np.linalg.inv(T_world_ego)
 
     def pixels(xy_ego: Float[np.ndarray, "N 2"]) -> list[tuple[float, float]]:
         x = twice * (EGO_AT_X * ABOVE_WH[0] + PX_PER_M * xy_ego[:, 0])
@@ -71,28 +89,29 @@ def _from_above(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
     def from_world(xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         return xy @ T_ego_world[:2, :2].T + T_ego_world[:2, 3]
 
-    here = log.T_world_ego[index, :2, 3]
-    for outline in _lane_outlines(drive["town"]):
-        if np.abs(outline - here).max(axis=1).min() < ABOVE_WH[0] / PX_PER_M:
+    for outline in _lane_outlines(town):
+        if np.abs(outline - T_world_ego[:2, 3]).max(axis=1).min() < ABOVE_WH[0] / PX_PER_M:
             pen.polygon(pixels(from_world(outline)), fill=ROAD, outline=EDGE, width=twice)
-    route = from_world(np.array(drive["route_xy"]))
-    pen.line(pixels(route), fill=ROUTE, width=twice * 4, joint="curve")
-    boxes = read_boxes(log, index)
+    pen.line(pixels(from_world(route_xy)), fill=ROUTE, width=twice * 4, joint="curve")
     if boxes is not None:
         boxes = boxes[boxes.valid]
         corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)[:, :4, :2]
         for outline, category in zip(corners.double().numpy(), boxes.category.tolist(), strict=True):
             pen.polygon(pixels(outline), fill=palette.box_colour(category))
+            middle = np.mean(pixels(outline), axis=0)
+            pen.circle((middle[0], middle[1]), twice * LEAST_PX, fill=palette.box_colour(category))
     pen.polygon(pixels(EGO_OUTLINE_XY), fill=palette.EGO)
-    image = image.resize(ABOVE_WH, Image.Resampling.BOX)
-    _caption(ImageDraw.Draw(image), log, index, drive)
-    return image
+    return image.resize(ABOVE_WH, Image.Resampling.BOX)
 
 
 def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: Mapping[str, Any]) -> None:
     t_s = float(log.t_us[index] - log.t_us[0]) * 1e-6
     font = ImageFont.load_default(size=16)
-    pen.text((10, 8), f"{t_s:5.1f} s   {log.speed_mps[index]:4.1f} m/s", fill=palette.INK, font=font)
+    pen.text((10, 8), f"{t_s:.1f} s   {log.speed_mps[index]:.1f} m/s", fill=palette.INK, font=font)
+    begun = [each for each in scenario_events(drive) if 0.0 <= t_s - each["t_s"] < TOLD_S]
+    for each in begun[-1:]:
+        text = each["what"].replace("_", " ")
+        pen.text((ABOVE_WH[0] - 10, 8), text, fill=palette.SCENARIO, font=font, anchor="ra")
     wrong = [each for each in drive["score"]["infractions"] if each["t_s"] <= t_s + 1e-6]
     for line, each in enumerate(wrong[-4:]):
         text = f"{each['t_s']:.1f} s  {each['kind'].replace('_', ' ')} {each['what']}"

@@ -20,6 +20,7 @@ EXPERT = "#3ddc84"
 PLAN = "#ff4d4f"
 """What the model plans."""
 EGO = "#f5f7fa"
+SCENARIO = "#8a78e8"
 
 BOX_COLOURS: dict[Category, str] = {
     Category.CAR: "#4cc9f0",
