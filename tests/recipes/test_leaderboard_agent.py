@@ -77,8 +77,9 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
         "GPS": (1, np.zeros(3)),
         "IMU": (1, np.array([0, 0, 9.8, 0, 0, 0, 1.57])),
         "SPEED": (1, {"speed": 0.0}),
+        "LIDAR": (1, np.array([[30.0, 0.0, 1.0, 0.5]], dtype=np.float32)),
     }
-    assert len(data) == 9
+    assert data.keys() == {sensor["id"] for sensor in agent.sensors()}
     controls = [agent.run_step(data, 0.05 * k) for k in range(12)]
     assert all(isinstance(control, carla.VehicleControl) for control in controls)
     assert controls[0].brake > 0  # before there is a past

@@ -1,5 +1,6 @@
 """Who may drive a town: agents by the names that the command line knows."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -30,6 +31,8 @@ class Needs:
     """What an agent has to be shown."""
 
     cameras: bool
+    lidar: bool
+    """Learned agents go on from a halt only where lidar sees nobody (`Restarting`)."""
     past_frames: int
 
 
@@ -58,36 +61,43 @@ def needs_of(driver: str) -> Needs:
         InputError: there is no such driver.
     """
     if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
-        return Needs(cameras=False, past_frames=1)
+        return Needs(cameras=False, lidar=False, past_frames=1)
     clips = open_run(_run_folder(driver)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    return Needs(cameras=not driver.startswith(EGO_MLP), past_frames=clips.past_frames)
+    return Needs(not driver.startswith(EGO_MLP), lidar=True, past_frames=clips.past_frames)
 
 
-def make_driver(driver: str, simulator: TownSimulator, seed: int = 0) -> Agent:
-    """A driver for one drive in a simulator.
+def make_driver(
+    driver: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
+) -> Agent:
+    """A driver for one drive.
 
     Args:
+        driver: as for `needs_of`.
+        clock: time of the drive, s.
+        town: where the expert is to drive; the others drive anywhere.
         seed: of what happens in a lesson.
 
     Raises:
-        InputError: there is no such driver.
+        InputError: there is no such driver, or it is the expert and there is no town.
     """
     if driver == EXPERT:
-        return TownExpert(simulator)
+        return _expert(town)
+    if driver == DISTURBED:
+        return Disturbed(_expert(town), clock, seed)
     if driver in (STOP, CONSTANT_VELOCITY):
         return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
-
-    def clock() -> float:
-        return simulator.state.t_s
-
-    if driver == DISTURBED:
-        return Disturbed(TownExpert(simulator), clock, seed)
     folder = _run_folder(driver)
     if driver.startswith(PUPIL):
-        return Alternating(_seeing(folder), TownExpert(simulator), clock, seed)
+        return Alternating(_seeing(folder), _expert(town), clock, seed)
     return Restarting(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
+
+
+def _expert(town: TownSimulator | None) -> TownExpert:
+    if town is None:
+        raise InputError("the expert knows a town's traffic from inside: it cannot drive in CARLA")
+    return TownExpert(town)
 
 
 def _run_folder(driver: str) -> Path:

@@ -160,7 +160,8 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict
     began = time.perf_counter()
     route = snap_route(next(r for r in load_route_set(suite.routes) if r.id == job.route))
     simulator, scenario = TownSimulator(), scenario_of(suite, route, job.repetition)
-    agent = make_driver(suite.driver, simulator, _lot(scenario.seed, job.route))
+    lot = _lot(scenario.seed, job.route)
+    agent = make_driver(suite.driver, lambda: simulator.state.t_s, simulator, lot)
     with drive_log(scenario, out, job.name) as log:
 
         def write_frame() -> None:
@@ -184,7 +185,7 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict
 def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownScenario:
     """The circumstances of one drive."""
     needs = needs_of(suite.driver)
-    seen = needs.cameras or suite.sensors
+    seen = needs.lidar or suite.sensors
     seed = suite.seed + repetition
     name = suite.conditions
     if name == ANY_CONDITIONS:

@@ -10,14 +10,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.recipes.drivers import EXPERT, make_driver, needs_of
+from foredrive.recipes.drivers import make_driver, needs_of
 from foredrive.recipes.driving import DriveSuite
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.leaderboard import LeaderboardDriver
-from foredrive.simulation.town import TownSimulator
-from foredrive.towns.sensing.rig import camera_rig
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 SEPARATOR = "+"
 """Bench2Drive appends this and the name of the route to the configuration, once more with each route."""
@@ -54,17 +52,16 @@ class ForedriveAgent(_AutonomousAgent):
             InputError: there is no such driver, or it drives in towns alone.
         """
         driver, self._route_name = driver_of(path_to_conf_file)
-        if driver == EXPERT:
-            raise InputError("the expert knows a town's traffic from inside: it cannot drive in CARLA")
-        needs = needs_of(driver)
+        needs, self._t_s = needs_of(driver), 0.0
+        agent = make_driver(driver, lambda: self._t_s)
         rig = camera_rig(DriveSuite.image_hw) if needs.cameras else None
-        self._driver = LeaderboardDriver(make_driver(driver, TownSimulator()), rig, needs.past_frames)
+        self._driver = LeaderboardDriver(agent, rig, roof_lidar() if needs.lidar else None, needs.past_frames)
         self._make_control = import_carla().VehicleControl
         self._has_route = False
         self._metrics: dict[str, Any] = {}
 
     def sensors(self) -> list[dict[str, Any]]:
-        """The cameras, if it needs them; satellites, IMU and speedometer."""
+        """The cameras and the lidar, if it needs them; satellites, IMU and speedometer."""
         return self._driver.sensors()
 
     def run_step(self, input_data: dict[str, tuple[int, Any]], timestamp: float) -> Any:
@@ -72,6 +69,7 @@ class ForedriveAgent(_AutonomousAgent):
         if not self._has_route:
             self._driver.set_route(self._global_plan, self._global_plan_world_coord)
             self._has_route = True
+        self._t_s = timestamp
         pedals = self._driver.step(input_data, timestamp)
         if hasattr(self, "get_metric_info"):  # Bench2Drive's base class
             self._metrics[str(len(self._metrics))] = self.get_metric_info()
@@ -83,7 +81,6 @@ class ForedriveAgent(_AutonomousAgent):
         place = os.environ.get("SAVE_PATH")
         if place and metrics and self._route_name:
             path = Path(place) / self._route_name / METRICS
-            path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as temporary:
                 temporary.write_text(json.dumps(metrics))
 

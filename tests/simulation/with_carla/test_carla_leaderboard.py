@@ -13,10 +13,10 @@ from carla_stand_in import lat_lon
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.simulation.carla.global_plan import GlobalPlan
-from foredrive.simulation.carla.leaderboard import GPS, IMU, SPEED, LeaderboardDriver
+from foredrive.simulation.carla.leaderboard import GPS, IMU, LIDAR, SPEED, LeaderboardDriver
 from foredrive.simulation.dynamics import STEP_S, BicycleState
 from foredrive.simulation.route_progress import Progress
-from foredrive.towns.sensing.rig import camera_rig
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 SIZE = (9, 16)
 
@@ -105,7 +105,7 @@ def sensed(driver: LeaderboardDriver, ego: BicycleState, frame: int) -> dict[str
 
 def test_the_agent_sees_key_frames_and_its_plan_is_driven() -> None:
     agent = Straight(5.0)
-    driver = LeaderboardDriver(agent, camera_rig(SIZE), past_frames=2)
+    driver = LeaderboardDriver(agent, camera_rig(SIZE), None, past_frames=2)
     driver.set_route(BY_SATELLITE, PLAN)
     x_m = speed = 0.0
     throttles = []
@@ -134,6 +134,25 @@ def test_the_agent_sees_key_frames_and_its_plan_is_driven() -> None:
     assert [int(c.command[0]) for c in (agent.seen[0], clip)] == [Command.STRAIGHT, Command.LEFT]
 
 
+def test_two_half_turns_of_the_lidar_are_a_sweep() -> None:
+    """One step sees what is ahead, the next what is behind; the lidar's axes are left-handed."""
+    agent, lidar = Straight(0.0), roof_lidar()
+    driver = LeaderboardDriver(agent, None, lidar, past_frames=0)
+    driver.set_route(BY_SATELLITE, PLAN)
+    halves = np.array([[[8.0, 3.0, -1.0, 0.5]], [[-9.0, 0.0, 0.5, 0.2]]], dtype=np.float32)
+    for k in range(11):
+        data = sensed(driver, BicycleState(0.0, 0.0, 0.0, 0.0), k)
+        driver.step(data | {LIDAR: (k, halves[k % 2])}, k * STEP_S)
+    clip = agent.seen[-1]
+    assert clip.sweep_valid.all()
+    assert not clip.misses_known.any()
+    sweep = clip.sweeps[0, 0]
+    xyz = sweep.points_ego[sweep.valid] - lidar.T_ego_lidar[:3, 3]
+    assert sorted(xyz.tolist()) == [pytest.approx([-9.0, 0.0, 0.5]), pytest.approx([8.0, -3.0, -1.0])]
+    with pytest.raises(InputError, match="sent nothing: LIDAR"):
+        driver.step(data, 0.6)
+
+
 def test_who_is_beside_its_plan_steers_back_the_way_carla_does() -> None:
     """Headed north, with a plan that bends to the left: CARLA's steering is negative."""
 
@@ -143,7 +162,7 @@ def test_who_is_beside_its_plan_steers_back_the_way_carla_does() -> None:
             plan.xy[..., 1] = 0.05 * plan.xy[..., 0] ** 2
             return plan
 
-    driver = LeaderboardDriver(Left(5.0), camera_rig(SIZE), past_frames=0)
+    driver = LeaderboardDriver(Left(5.0), camera_rig(SIZE), None, past_frames=0)
     driver.set_route(BY_SATELLITE, PLAN)
     ego = BicycleState(60.0, 20.0, 0.5 * math.pi, 5.0)
     pedals = [driver.step(sensed(driver, ego, k), k * STEP_S) for k in range(3)]
@@ -151,11 +170,13 @@ def test_who_is_beside_its_plan_steers_back_the_way_carla_does() -> None:
 
 
 def test_the_sensors_are_what_the_leaderboards_allow() -> None:
-    sensors = LeaderboardDriver(Straight(1.0), camera_rig(SIZE), 1).sensors()
+    sensors = LeaderboardDriver(Straight(1.0), camera_rig(SIZE), roof_lidar(), 1).sensors()
     kinds = [sensor["type"] for sensor in sensors]
     assert kinds.count("sensor.camera.rgb") == 6
+    assert kinds.count("sensor.lidar.ray_cast") == 1
     assert sorted(set(kinds)) == [
-        *("sensor.camera.rgb", "sensor.other.gnss", "sensor.other.imu", "sensor.speedometer")
+        *("sensor.camera.rgb", "sensor.lidar.ray_cast"),
+        *("sensor.other.gnss", "sensor.other.imu", "sensor.speedometer"),
     ]
     assert len({sensor["id"] for sensor in sensors}) == len(sensors)
     gps = next(sensor for sensor in sensors if sensor["id"] == GPS)
@@ -164,7 +185,7 @@ def test_the_sensors_are_what_the_leaderboards_allow() -> None:
 
 
 def test_what_is_missing_is_named() -> None:
-    driver = LeaderboardDriver(Straight(1.0), camera_rig(SIZE), 1)
+    driver = LeaderboardDriver(Straight(1.0), camera_rig(SIZE), None, 1)
     data = sensed(driver, BicycleState(0.0, 0.0, 0.0, 0.0), 0)
     with pytest.raises(InputError, match="no route"):
         driver.step(data, 0.0)

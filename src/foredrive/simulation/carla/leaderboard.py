@@ -1,7 +1,7 @@
 """A Foredrive agent by the interface of CARLA's leaderboards 1.0, 2.0 and 2.1, and of Bench2Drive's fork.
 
 What they hand over in `run_step` becomes a `Clip`, twice a second; the agent's plan is followed by our
-controller at 20 Hz. Nothing is used that the track SENSORS does not have: cameras, satellites, IMU,
+controller at 20 Hz. Nothing is used that the track SENSORS does not have: cameras, lidar, satellites, IMU,
 speedometer, the route.
 """
 
@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from foredrive.data.collate import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, CameraRig, Clip
+from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
 from foredrive.simulation.carla.frames import ego_in_actor, pose_of, yaw_of_compass
 from foredrive.simulation.carla.global_plan import GlobalPlan
@@ -27,7 +28,7 @@ from foredrive.simulation.carla.localization import (
     lat_lon_of,
     locate,
 )
-from foredrive.simulation.carla.sensors import camera_specs, image_of, mounting
+from foredrive.simulation.carla.sensors import camera_specs, image_of, lidar_spec, mounting, sweep_of
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S, BicycleState
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
@@ -35,9 +36,13 @@ from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_progress import Progress
 from foredrive.towns.recorder import boxes_of
 
-GPS, IMU, SPEED = "GPS", "IMU", "SPEED"
+GPS, IMU, SPEED, LIDAR = "GPS", "IMU", "SPEED", "LIDAR"
 COMPASS_AT = 6
 """In what the IMU sends, after three accelerations and three turn rates."""
+
+
+LIDAR_STEPS = 2
+"""The leaderboards' lidar turns at 10 Hz: so many steps make a revolution."""
 
 
 class LeaderboardDriver:
@@ -47,24 +52,29 @@ class LeaderboardDriver:
         agent: sees batches of one clip.
         rig: its cameras, without leading dimensions; None for an agent that needs none. Leaderboard 1.0
             allows four, 2.x and Bench2Drive eight.
+        lidar: where one is mounted; what it is like, the leaderboards decide. None: there is none.
         past_frames: key frames before now that it looks at; until it has them the vehicle stands.
 
     Raises:
         InputError: CARLA has no such cameras.
     """
 
-    def __init__(self, agent: Agent, rig: CameraRig | None, past_frames: int) -> None:
+    def __init__(
+        self, agent: Agent, rig: CameraRig | None, lidar: SpinningLidar | None, past_frames: int
+    ) -> None:
         T_actor_ego = ego_in_actor()
-        self._agent, self._rig, self._past_frames = agent, rig, past_frames
+        self._agent, self._rig, self._lidar, self._past_frames = agent, rig, lidar, past_frames
         axle = mounting(pose_of(T_actor_ego))
         self._sensors = [
             *([] if rig is None else camera_specs(rig, T_actor_ego)),
+            *([] if lidar is None else [lidar_spec(lidar, LIDAR, T_actor_ego)]),
             {"type": "sensor.other.gnss", "id": GPS} | axle,
             {"type": "sensor.other.imu", "id": IMU} | axle,
             {"type": "sensor.speedometer", "id": SPEED},
         ]
         self._plan: GlobalPlan | None = None
         self._frames: tuple[KeyFrame, ...] = ()
+        self._points: tuple[Float32[np.ndarray, "_ 4"], ...] = ()
         self._where: Whereabouts | None = None
         self._following, self._asked, self._progress = Following(), Asked(), Progress()
         self._steer = 0.0
@@ -110,6 +120,8 @@ class LeaderboardDriver:
         self._progress = self._plan.advance(self._progress, here, speed_mps, t_s)
         where, steering_rad = self._where, steering_rad_of(self._steer)
         ego = BicycleState(where.x_m, where.y_m, where.yaw_rad, speed_mps, steering_rad)
+        if self._lidar is not None:
+            self._points = (*self._points, input_data[LIDAR][1])[-LIDAR_STEPS:]
         if t_s > self._next_frame_s - 0.5 * STEP_S:
             self._next_frame_s = t_s + FRAME_DT_S
             self._see(input_data, self._where, speed_mps)
@@ -125,14 +137,19 @@ class LeaderboardDriver:
         images = no_images()
         if self._rig is not None:
             images = torch.stack([_image(self._rig, name, input_data[name][1]) for name in self._rig.names])
+        sweep = None
+        if self._lidar is not None:
+            points = np.concatenate(self._points)
+            sweep = sweep_of(points, np.array([len(points)]), self._lidar)
         T = at.T_world_ego
-        frame = KeyFrame(at.t_s, T, speed_mps, images, None, boxes_of([], T))
+        frame = KeyFrame(at.t_s, T, speed_mps, images, sweep, boxes_of([], T))
         self._frames = (*self._frames, frame)[-1 - self._past_frames :]
 
     def _clip(self) -> Clip:
         assert self._plan is not None
         clip = make_clip(self._frames, self._rig, self._plan.command(self._progress))
-        return dataclasses.replace(clip, boxes_valid=torch.zeros_like(clip.boxes_valid))
+        unknown = torch.zeros_like(clip.boxes_valid)
+        return dataclasses.replace(clip, boxes_valid=unknown, misses_known=unknown)
 
 
 def _image(rig: CameraRig, name: str, sent: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:

@@ -89,6 +89,11 @@ def lidar_pose(lidar: SpinningLidar, T_actor_ego: Float64[np.ndarray, "4 4"]) ->
     return pose_of(T_actor_ego @ lidar.T_ego_lidar.double().numpy())
 
 
+def lidar_spec(lidar: SpinningLidar, name: str, T_actor_ego: Float64[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """A lidar in the form of the leaderboard's `sensors()`, which has one kind alone."""
+    return {"type": LIDAR, "id": name} | mounting(lidar_pose(lidar, T_actor_ego))
+
+
 def mounting(pose: CarlaPose) -> dict[str, float]:
     """A pose under the leaderboard's names."""
     x, y, z, roll, pitch, yaw = pose
