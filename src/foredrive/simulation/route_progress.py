@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.commands import command_of, route_offset_m
+from foredrive.errors import InputError
 from foredrive.scene import Command
+from foredrive.simulation.dynamics import EGO
 
 SPACING_M = 1.0
 AHEAD_M, BACK_M = 20.0, 5.0
@@ -28,6 +30,19 @@ class Progress:
     """Distance from the route."""
     moved_s: float = 0.0
     """When the vehicle moved last."""
+
+
+def first_step(xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "3"]:
+    """From where a route begins to its first point that is a wheelbase away: so a vehicle stands there, m.
+
+    Raises:
+        InputError: no point is so far.
+    """
+    away_m = np.hypot(*(xyz[:, :2] - xyz[0, :2]).T)
+    ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
+    if not len(ahead):
+        raise InputError("a route is longer than a vehicle")
+    return np.asarray(xyz[ahead[0]] - xyz[0])
 
 
 class RouteLine:

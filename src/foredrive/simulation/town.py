@@ -16,7 +16,7 @@ from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, step, yaw_r
 from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users
-from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.route_progress import Progress, RouteLine, first_step
 from foredrive.simulation.scenarios.kinds import Scenario
 from foredrive.simulation.scenarios.play import Director
 from foredrive.simulation.scenarios.scene import Ego, Play
@@ -343,9 +343,5 @@ def _rules_of(town: str, seed: int, crowd: Crowd) -> Traffic:
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:
     """At rest where a route begins, along it."""
-    away_m = np.hypot(*(route_xyz[:, :2] - route_xyz[0, :2]).T)
-    ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
-    if not len(ahead):
-        raise InputError("a route is longer than a vehicle")
-    x, y, _ = route_xyz[ahead[0]] - route_xyz[0]
+    x, y, _ = first_step(route_xyz)
     return BicycleState(float(route_xyz[0, 0]), float(route_xyz[0, 1]), float(np.arctan2(y, x)), 0.0)

@@ -13,6 +13,7 @@ from foredrive.scene import Category, Command, Control
 from foredrive.simulation.carla.simulator import CarlaSimulator
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
 from foredrive.simulation.scores import Ending
 from foredrive.simulation.simple_agents import Straight
 from foredrive.simulation.town import TownScenario
@@ -74,6 +75,14 @@ def test_a_drive_begins_at_rest_at_the_start_of_the_route(world: World, scenario
         assert not clip.misses_known.any()
         assert clip.command == Command.STRAIGHT
         assert not clip.boxes.valid.any()
+    assert is_left_as_found(world, client)
+
+
+def test_scenarios_are_the_towns_alone(world: World, scenario: TownScenario) -> None:
+    client = Client(world)
+    happens = dataclasses.replace(scenario, scenarios=(Scenario(ScenarioKind.CUT_IN, 30.0, 10.0),))
+    with CarlaSimulator(client) as simulator, pytest.raises(InputError, match="no scenarios"):
+        simulator.reset(happens)
     assert is_left_as_found(world, client)
 
 

@@ -27,7 +27,7 @@ from foredrive.simulation.drive import Standing
 from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
 from foredrive.simulation.lane_rules import RuleState, left_lanes
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.route_progress import Progress, RouteLine, first_step
 from foredrive.simulation.town import FRAME_STEPS, SETTLE_S, TownScenario
 from foredrive.towns.conditions import draw_daylight
 from foredrive.towns.recorder import BOXES_WITHIN_M, boxes_of
@@ -101,9 +101,11 @@ class CarlaSimulator:
 
         Raises:
             InputError: the server lacks the town, a blueprint or an answer; there is no room for the vehicle;
-                the rig has cameras that CARLA has not.
+                the rig has cameras that CARLA has not; there are scenarios to play, which towns alone do.
         """
         self.close()
+        if scenario.scenarios:
+            raise InputError("CARLA plays no scenarios of ours: leave them out, or drive on its leaderboard")
         self._scenario, self._route = scenario, RouteLine(scenario.route_xyz)
         start = _start(scenario.route_xyz)
         self._session = Session(self._client, scenario.town, scenario.seed, self._traffic_port)
@@ -276,11 +278,7 @@ def _sweep(measurement: Any, lidar: SpinningLidar) -> LidarSweep:
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> CarlaPose:
     """Where CARLA's actor is put so that the rear axle stands where the route begins, along it."""
-    away_m = np.hypot(*(route_xyz[:, :2] - route_xyz[0, :2]).T)
-    ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
-    if not len(ahead):
-        raise InputError("a route is longer than a vehicle")
-    forward = route_xyz[ahead[0]] - route_xyz[0]
+    forward = first_step(route_xyz)
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(*forward[:2])
     T = np.eye(4)
