@@ -8,7 +8,8 @@ import numpy as np
 from foredrive.scene import Control, Event
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.routes import DriveRoute
-from foredrive.simulation.scenarios.kinds import BRAKING_MPS2, REACTION_S, Scenario
+from foredrive.simulation.scenarios.kinds import Scenario
+from foredrive.simulation.scenarios.kinematics import BRAKING_MPS2, REACTION_S
 from foredrive.simulation.town import TownScenario, TownSimulator, TownState
 from foredrive.towns.recorder import Crowd
 

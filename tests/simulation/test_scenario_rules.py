@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
-from foredrive.simulation.scenarios.kinds import arrival_s, cruise_mps, stopping_m
+from foredrive.simulation.scenarios.acts import act
+from foredrive.simulation.scenarios.kinds import MEETINGS, Scenario, ScenarioKind, Way
+from foredrive.simulation.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
+from foredrive.simulation.scenarios.scene import Ego, Play, Scene
+from foredrive.simulation.scenarios.strays import pace_among
+from foredrive.simulation.time_to_collision import MovingBoxes
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.driven import Driven
 from foredrive.towns.traffic.fleet import ego_vehicle
@@ -52,6 +57,100 @@ def test_who_takes_up_the_cruise_speed_is_there_in_time(way_m: float, time_s: fl
 def test_cruise_speed_at_the_ends_of_what_can_be() -> None:
     assert cruise_mps(100.0, 3.0, 5.0, 3.0) == 5.0 + 9.0  # too far: as fast as it gets
     assert cruise_mps(10.0, 4.0, 8.0, 3.0) == 2.5  # too near: slower at once
+
+
+def vehicles_at(*rows: tuple[float, float, float, float]) -> MovingBoxes:
+    """Cars of 4.5 m by 1.8 m along x: where their middles are, and how fast."""
+    table = np.array(rows).reshape(-1, 4)
+    size = np.tile([4.5, 1.8], (len(table), 1))
+    return MovingBoxes(table[:, :2], size, np.zeros(len(table)), table[:, 2:])
+
+
+@pytest.mark.parametrize(
+    ("others", "pace"),
+    [
+        (vehicles_at(), 1.4),
+        (vehicles_at((-8.0, 3.5, 8.0, 0.0)), 0.0),  # comes, and would be there in a second
+        (vehicles_at((8.0, 3.5, 8.0, 0.0)), 1.4),  # has passed
+        (vehicles_at((-60.0, 3.5, 8.0, 0.0)), 1.4),  # comes later
+        (vehicles_at((0.0, 3.5, 0.0, 0.0)), -0.8),  # stands in the way: he makes room
+        (vehicles_at((0.0, 3.5, 0.0, 0.0), (0.0, -1.3, 0.0, 0.0)), 0.0),  # and cannot go back either
+    ],
+)
+def test_a_stray_waits_for_who_comes_and_steps_back_before_who_stands(
+    others: MovingBoxes, pace: float
+) -> None:
+    """He is 1 m along his way, and with what he keeps free 0.65 m to each side along it."""
+    walker = stray([[0, 0, 0], [0, 8, 0]], s_m=1.0)
+    assert pace_among(walker, 1.4, others) == pace
+
+
+def scene_on(
+    traffic: Traffic,
+    kind: ScenarioKind,
+    guests_m: tuple[float, ...],
+    mps: float = 0.0,
+    done_m: float = 0.0,
+    ego_mps: float = 0.0,
+) -> Scene:
+    """Guests on the long lane, the first of which plays; they meet at 120 m of it, and 100 m of the route."""
+    lane = long_lane(traffic)
+    state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([12.0])))
+    for slot, along_m in zip(traffic.guest_slots, guests_m, strict=False):
+        state = invited(traffic, state, slot, (lane,), along_m, mps)
+    scenario = Scenario(kind, 100.0, 13.9, ways=(Way((lane,), 120.0, 110.0),), ego_lane=lane)
+    count = len(guests_m) if kind in MEETINGS else 1
+    play = Play(cast=tuple(traffic.guest_slots[:count]))
+    ego = Ego(5.0, done_m, ego_mps, 0.0, traffic.poses(state).centre_m[0], 0.0)
+    return Scene(traffic, scenario, play, state, ego, Orders.none(len(state.vehicles.active)))
+
+
+@pytest.mark.parametrize("kind", [ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN])
+@pytest.mark.parametrize("follower_m", [None, 62.0])
+def test_who_waits_for_the_ego_vehicle_does_not_hold_up_others_for_long(
+    traffic: Traffic, kind: ScenarioKind, follower_m: float | None
+) -> None:
+    guests_m = (70.0,) if follower_m is None else (70.0, follower_m)
+    scene = scene_on(traffic, kind, guests_m)
+    slot, goes = traffic.guest_slots[0], []
+    for _ in range(60):
+        scene.orders.most_mps2[:] = np.inf
+        scene = act(scene, DT_S)
+        goes.append(bool(scene.orders.most_mps2[slot] > 0.0))
+    if follower_m is None:
+        assert not any(goes)
+    else:
+        assert goes.index(True) == pytest.approx(30, abs=1)
+        assert all(goes[31:])
+
+
+def test_who_has_passed_is_not_waited_for(traffic: Traffic) -> None:
+    kind, (first, second) = ScenarioKind.ONCOMING_TRAFFIC, traffic.guest_slots
+    scene = act(scene_on(traffic, kind, (135.0, 100.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
+    assert scene.play.cast == (second,)
+    assert np.isinf(scene.orders.most_mps2[first])
+    scene = act(scene_on(traffic, kind, (136.0, 129.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
+    assert (scene.play.number, scene.play.begun) == (1, ())
+
+
+@pytest.mark.parametrize(("along_m", "begins"), [(85.0, True), (100.0, False)])
+def test_who_cuts_in_has_room_for_it_before_the_junction(
+    traffic: Traffic, along_m: float, begins: bool
+) -> None:
+    """At 7 m/s a change takes 3.5 s and 24.5 m, and at 11 m/s somebody is so near as it takes."""
+    on_route_m = along_m - 20.0
+    done_m = on_route_m - 18.5
+    scene = scene_on(traffic, ScenarioKind.CUT_IN, (along_m,), 7.0, done_m, ego_mps=11.0)
+    scene = act(scene, DT_S)
+    assert bool(scene.play.begun) == begins
+    assert (scene.orders.change is not None) == begins
+
+
+def test_who_is_over_the_line_does_not_brake_for_a_scenario(traffic: Traffic) -> None:
+    scene = scene_on(traffic, ScenarioKind.LEAD_BRAKES, (123.0,), 7.0, done_m=90.0, ego_mps=8.0)
+    scene = act(scene, DT_S)
+    assert (scene.play.number, scene.play.begun) == (1, ())
+    assert np.isinf(scene.orders.most_mps2).all()
 
 
 def stray(way: list[list[float]], **changes: float) -> Stray:

@@ -10,7 +10,8 @@ from driver import SEED, Driver, drive, town_scenario
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.route_sets import RouteWaypoints, load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
-from foredrive.simulation.scenarios.kinds import REACTION_S, Scenario, ScenarioKind
+from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.simulation.scenarios.kinematics import REACTION_S
 from foredrive.simulation.scenarios.places import possible_scenarios, scenarios_on
 from foredrive.simulation.town import TownSimulator, grow
 from foredrive.simulation.town_expert import TownExpert
@@ -68,6 +69,7 @@ def happens(simulator: TownSimulator, route: DriveRoute, scenario: Scenario, wha
         assert [number for number, _ in play.begun] == [0]
         actors = {str(stray.track_id) for stray in states[-1].decided.strays} or {"1", "2", "3"}
         hits = [event for event in events if event.kind == f"collision_{what}"]
+        assert len({hit.detail.split()[1] for hit in hits}) == len(hits)  # each is counted once
         if attentive:
             assert not hits
             assert states[-1].ego.speed_mps < 0.1

@@ -5,14 +5,17 @@ import dataclasses
 import numpy as np
 
 from foredrive.simulation.scenarios.cast import RUN_UP_M, is_let_go
-from foredrive.simulation.scenarios.kinds import SPARE_M, ScenarioKind, arrival_s, cruise_mps, stopping_m
-from foredrive.simulation.scenarios.scene import STANDS_MPS, Scene
+from foredrive.simulation.scenarios.kinds import ENDS_BEFORE, MEETINGS, ScenarioKind
+from foredrive.simulation.scenarios.kinematics import SPARE_M, arrival_s, cruise_mps, stopping_m
+from foredrive.simulation.scenarios.scene import STANDS_MPS, Play, Scene
 from foredrive.towns.traffic.guests import granted_through
+from foredrive.towns.traffic.lane_changes import change_length_m
 
 MOVES_MPS = 1.0
 """Who comes to meet the ego vehicle looks at it only while it is slower."""
 PASSED_M = 6.0
-SETS_OFF_M, SLOW = 48.0, 0.55
+SETS_OFF_M = 48.0
+SLOW = {ScenarioKind.LEAD_BRAKES: 0.55, ScenarioKind.CUT_IN: 0.35}
 """Who drives ahead stands until the ego vehicle is so near, and then drives at this part of the limit."""
 BRAKES_MPS2, BRAKES_S = 6.0, 4.5
 FOLLOWED_M, FOLLOWED_S = 40.0, 4.0
@@ -43,12 +46,18 @@ def act(scene: Scene, dt_s: float) -> Scene:
     play, ego = scene.play, scene.ego
     if scene.scenario.kind is ScenarioKind.CUT_IN and play.since_s is not None:
         return _come_over(scene, play.since_s)
-    places_m = [scene.along_m(slot) for slot in play.cast]
-    lead_m = places_m[0] if places_m else None
-    if ego.front_gap_m(scene.scenario.at_m) < -PASSED_M or (play.cast and places_m[-1] is None):
-        return scene._replace(play=play.after())
+    if ego.front_gap_m(scene.scenario.at_m) < -PASSED_M:
+        return _over(scene)
+    if not play.cast:
+        return scene
+    if scene.scenario.kind in MEETINGS:
+        play = _without_passed(scene)
+        scene = scene._replace(play=play)
+    lead_m = scene.along_m(play.cast[0]) if play.cast else None
     if lead_m is None:
-        return scene if not play.cast else scene._replace(play=play.after())
+        return _over(scene)
+    if play.since_s is None and scene.scenario.kind in ENDS_BEFORE and lead_m > scene.way.meet_m:
+        return _over(scene)  # nobody brakes or changes lanes in a junction for it
     if play.since_s is None and scene.scenario.kind in STANDING:
         held_s = play.holds_up_s + dt_s if scene.holds_up() else 0.0
         scene = scene._replace(play=dataclasses.replace(play, holds_up_s=held_s))
@@ -62,6 +71,14 @@ def act(scene: Scene, dt_s: float) -> Scene:
             return _cut_in(scene, lead_m)
         case _:
             return _meet(_waiting(scene, dt_s, True), lead_m)
+
+
+def _without_passed(scene: Scene) -> Play:
+    """Those alone who can still be met: they have neither passed the place nor turned off."""
+    places = ((slot, scene.along_m(slot)) for slot in scene.play.cast)
+    until_m = scene.way.meet_m + ROOM_M
+    left = [slot for slot, m in places if m is not None and m < until_m + scene.half_m(slot)]
+    return dataclasses.replace(scene.play, cast=tuple(left))
 
 
 def _waiting(scene: Scene, dt_s: float, goes_on: bool) -> Scene:
@@ -89,7 +106,7 @@ def _cruise_ahead(scene: Scene, gap_m: float) -> None:
     slot = scene.play.cast[0]
     goes = scene.ego.has_set_out and (gap_m < SETS_OFF_M or scene.speed_mps(slot) > MOVES_MPS)
     goes |= scene.play.holds_up_s > STANDS_S
-    scene.towards_mps(slot, SLOW * scene.scenario.limit_mps if goes else 0.0)
+    scene.towards_mps(slot, SLOW[scene.scenario.kind] * scene.scenario.limit_mps if goes else 0.0)
 
 
 def _lead(scene: Scene, lead_m: float, dt_s: float) -> Scene:
@@ -101,6 +118,8 @@ def _lead(scene: Scene, lead_m: float, dt_s: float) -> Scene:
         return scene
     gap_m, lead_mps = _gap_m(scene, lead_m), scene.speed_mps(slot)
     _cruise_ahead(scene, gap_m)
+    if lead_m + lead_mps**2 / (2 * BRAKES_MPS2) > scene.way.meet_m:
+        return scene
     least_m = ego.stopping_m() - lead_mps**2 / (2 * BRAKES_MPS2)
     soon_m = least_m + SPARE_M + ego.speed_mps * dt_s
     if _follows(scene, gap_m) and gap_m >= least_m and (gap_m < soon_m or play.waited_s > FOLLOWED_S):
@@ -137,7 +156,11 @@ def _stands_behind(scene: Scene) -> bool:
 def _cut_in(scene: Scene, lead_m: float) -> Scene:
     ego, slot, gap_m = scene.ego, scene.play.cast[0], _gap_m(scene, lead_m)
     _cruise_ahead(scene, gap_m)
-    closing_mps = ego.speed_mps - scene.speed_mps(slot)
+    lead_mps = scene.speed_mps(slot)
+    has_room = lead_m + change_length_m(scene.state.vehicles)[slot] < scene.way.meet_m
+    if lead_mps < MOVES_MPS or not has_room:
+        return scene
+    closing_mps = ego.speed_mps - lead_mps
     # It goes on as it does: what counts is by how much the ego vehicle is faster.
     least_m = max(stopping_m(closing_mps, ego.acceleration_mps2), LEAST_CUT_M)
     spare_m = gap_m - least_m
@@ -175,9 +198,6 @@ def _meet(scene: Scene, lead_m: float) -> Scene:
     line_m, room_m = scene.way.line_m - lead_m - scene.half_m(slot), ego.front_gap_m(scenario.at_m - ROOM_M)
     comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
     if play.since_s is not None:
-        last_m = scene.along_m(play.cast[-1])
-        if last_m is None or last_m > scene.way.meet_m + scene.half_m(slot) + ROOM_M:
-            return _over(scene)
         if runs:
             scene.towards_mps(slot, play.cruise_mps)
             return _run(scene, slot, line_m)
@@ -206,6 +226,8 @@ def _has_time(scene: Scene, lead_m: float) -> bool:
 def _synchronised(scene: Scene, lead_m: float, fastest: float) -> Scene:
     """With orders to meet the ego vehicle, no faster than a part of the limit."""
     slot, scenario = scene.play.cast[0], scene.scenario
+    if lead_m > scene.way.meet_m:
+        return scene
     arrives_s = max(scene.ego.arrival_s(scenario), 0.1)
     wanted = cruise_mps(scene.way.meet_m - lead_m, arrives_s, scene.speed_mps(slot), GATHERS_MPS2)
     wanted = min(wanted, fastest * scenario.limit_mps)
@@ -217,8 +239,10 @@ def _wait(scene: Scene, slot: int, to_go_m: float) -> None:
     """Before the line of a light that will be run; of all others the lights take care."""
     if scene.scenario.kind is ScenarioKind.RED_LIGHT_RUNNER:
         scene.towards_mps(slot, min(max((to_go_m - RUN_UP_M) / 3.0, 0.0), CREEP_MPS))
+    elif not scene.ego.has_set_out:
+        scene.towards_mps(slot, 0.0)
     elif to_go_m > NEAR_M:
-        scene.towards_mps(slot, CREEP_MPS if scene.ego.has_set_out else 0.0)
+        scene.towards_mps(slot, CREEP_MPS)
 
 
 def _run(scene: Scene, slot: int, line_m: float) -> Scene:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.simulation.scenarios.ground import Ground
-from foredrive.simulation.scenarios.kinds import ScenarioKind, Way
+from foredrive.simulation.scenarios.kinds import MEETINGS, ScenarioKind, Way
 from foredrive.simulation.scenarios.scene import Scene
 from foredrive.towns.traffic.guests import cleared, invited, points_on
 from foredrive.towns.traffic.lights import Light
@@ -27,7 +27,6 @@ STREAM, STREAM_APART_M = 3, 17.0
 BEGIN_M = 6.0
 SAMPLES_M = 4.0
 APPROACHING_MPS = 3.0
-MEETINGS = (ScenarioKind.ONCOMING_TRAFFIC, ScenarioKind.RED_LIGHT_RUNNER)
 
 
 def can_stand(ground: Ground, at_m: float) -> bool:

@@ -13,7 +13,8 @@ from foredrive.simulation.scenarios.cast import can_drive_ahead, can_stand
 from foredrive.simulation.scenarios.ground import Ground, Stretch, onward, stretches_of
 from foredrive.simulation.scenarios.junctions import at_junctions
 from foredrive.simulation.scenarios.kerbs import beside_parked, crossing
-from foredrive.simulation.scenarios.kinds import SPARE_M, Scenario, ScenarioKind, Way, stopping_m
+from foredrive.simulation.scenarios.kinds import ENDS_BEFORE, Scenario, ScenarioKind, Way
+from foredrive.simulation.scenarios.kinematics import SPARE_M, stopping_m
 from foredrive.towns.traffic.lane_graph import TURN_RAD, build_lane_graph
 from foredrive.towns.traffic.leaders import abreast
 from foredrive.towns.traffic.near_lanes import near_lanes_of
@@ -22,8 +23,6 @@ from foredrive.towns.world import World
 
 FIRST_M, CLEAR_OF_END_M = 28.0, 8.0
 """The route's begin and end are left alone."""
-ENDS_BEFORE = (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN)
-"""Where these are met is where they have to be over."""
 APART_M, STAGED_APART_M = 80.0, 120.0
 """Between scenarios: vehicles have to come up out of sight."""
 CHOICE_M = 70.0

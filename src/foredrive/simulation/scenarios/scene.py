@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinds import FRONT_M, Scenario, Way, arrival_s, stopping_m
+from foredrive.simulation.scenarios.kinds import Scenario, Way
+from foredrive.simulation.scenarios.kinematics import arrival_s, stopping_m
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.state import TrafficState
@@ -18,6 +19,8 @@ from foredrive.towns.traffic.vehicles import BEHIND, path_starts
 SET_OUT_M = 1.0
 STANDS_MPS = 0.3
 ROUNDED_M = 0.5
+FRONT_M = EGO.axle_to_centre_m + 0.5 * EGO.length_m
+"""From the rear axle to the front bumper."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from jaxtyping import Float64
 
 from foredrive.scene import Category
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinds import SPARE_M, Scenario, ScenarioKind, cruise_mps
+from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.simulation.scenarios.kinematics import SPARE_M, cruise_mps
 from foredrive.simulation.scenarios.scene import Ego
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 from foredrive.towns.traffic.state import TrafficState
