@@ -83,6 +83,8 @@ def synthetic_example(
         ego_speed_valid=yes,
         command=torch.full((batch,), 2),
         command_valid=torch.ones(batch, dtype=torch.bool),
+        target_xy=torch.tensor([20.0, 0.5]).expand(batch, 2),
+        target_valid=torch.ones(batch, dtype=torch.bool),
         future=Trajectory(
             xy=torch.stack([torch.arange(1, steps + 1) * 2.0, torch.zeros(steps)], -1).expand(
                 batch, 1, -1, -1

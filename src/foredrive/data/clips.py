@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.collate import stack_records
-from foredrive.data.commands import command_at
+from foredrive.data.commands import command_at, target_at
 from foredrive.data.image_store import ImageStore
 from foredrive.data.labels import LabelStore, VoxelLabels
 from foredrive.data.lidar import empty_sweep, read_sweep
@@ -168,7 +168,7 @@ class ClipDataset(Dataset[Example]):
         sweeps = [read_sweep(log, frame) if config.lidar else None for frame in frames]
         boxes = [read_boxes(log, frame) for frame in frames]
         speed_mps = torch.from_numpy(log.speed_mps[frames]).float()
-        command = self._command(log, now)[0]
+        command, target = self._command(log, now)[0], target_at(log, now)
         return Clip(
             t_s=torch.from_numpy((log.t_us[frames] - log.t_us[now]) * 1e-6).float(),
             T_world_ego=torch.from_numpy(log.T_world_ego[frames]),
@@ -184,6 +184,8 @@ class ClipDataset(Dataset[Example]):
             ego_speed_valid=speed_mps.isfinite(),
             command=torch.tensor(0 if command is None else int(command)),
             command_valid=torch.tensor(command is not None),
+            target_xy=torch.zeros(2) if target is None else torch.from_numpy(target).float(),
+            target_valid=torch.tensor(target is not None),
             future=self._future(log, now),
             map=read_map_patch(log, now) if config.map else None,
         )

@@ -41,8 +41,44 @@ def command_of(lateral_m: float) -> Command:
     return Command.RIGHT if lateral_m <= -LATERAL_M else Command.STRAIGHT
 
 
+def target_at(log: Log, frame: int) -> Float64[np.ndarray, "2"] | None:
+    """Where the route leads, as `route_target`; None without a provided route.
+
+    Raises:
+        InputError: on a route that cannot be read.
+    """
+    route = _route_at(log, frame)
+    return None if route is None else route_target(*route, log.T_world_ego[frame])
+
+
+def route_target(
+    arc_m: Float64[np.ndarray, "K"],
+    xy: Float64[np.ndarray, "K 2"],
+    progress_m: float,
+    T_world_ego: Float64[np.ndarray, "4 4"],
+) -> Float64[np.ndarray, "2"]:
+    """The route's point LOOKAHEAD_M ahead, or its end, seen from the vehicle: x forward, y left, m.
+
+    Args:
+        arc_m: arc length of each point of the route.
+        progress_m: arc length of the ego's projection on it.
+    """
+    ahead = np.array([np.interp(progress_m + LOOKAHEAD_M, arc_m, axis) for axis in xy.T])
+    forward = T_world_ego[:2, 0] / np.hypot(*T_world_ego[:2, 0])
+    dx, dy = ahead - T_world_ego[:2, 3]
+    return np.array([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]])
+
+
 def _route_offset_m(log: Log, frame: int) -> float | None:
     """How far left the route bears from where the ego is beside it; None without a provided route."""
+    route = _route_at(log, frame)
+    return None if route is None else route_offset_m(*route)
+
+
+def _route_at(
+    log: Log, frame: int
+) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K 2"], float] | None:
+    """Arc length and points of the route, and how far along it the ego is."""
     metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
     if not isinstance(metadata, RouteMetadata) or metadata.source != "provided":
         return None
@@ -50,7 +86,7 @@ def _route_offset_m(log: Log, frame: int) -> float | None:
         progress_m = log.scene.get_route_progress_at_iteration(log.iteration(frame))
         if progress_m is None:
             return None
-        return route_offset_m(metadata.polyline_arc_m, metadata.polyline_xyz[:, :2], progress_m)
+        return metadata.polyline_arc_m, metadata.polyline_xyz[:, :2], float(progress_m)
 
 
 def route_offset_m(

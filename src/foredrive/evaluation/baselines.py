@@ -73,13 +73,13 @@ class DrivenStatus(Record):
     valid: Bool[Tensor, "N T"]
 
 
-def read_status(clips: Iterable[Clip], past_frames: int) -> DrivenStatus:
+def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False) -> DrivenStatus:
     """Ego status and what was driven, of batches of clips.
 
     Raises:
         InputError: if there is none.
     """
-    rows = [_driven_status(clip, past_frames) for clip in clips]
+    rows = [_driven_status(clip, past_frames, target) for clip in clips]
     if not rows:
         raise InputError("the training set is empty")
     return DrivenStatus(
@@ -89,20 +89,21 @@ def read_status(clips: Iterable[Clip], past_frames: int) -> DrivenStatus:
     )
 
 
-def _driven_status(clip: Clip, past_frames: int) -> DrivenStatus:
+def _driven_status(clip: Clip, past_frames: int, target: bool) -> DrivenStatus:
     future = clip.future
     driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
-    return DrivenStatus(ego_status(clip, past_frames), driven, future.valid[:, 0])
+    return DrivenStatus(ego_status(clip, past_frames, target=target), driven, future.valid[:, 0])
 
 
 def read_training_set(
-    loader: Iterable[Example], frames: int, past_frames: int
+    loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False
 ) -> tuple[VoxelPrior, DrivenStatus]:
     """Everything the baselines need to know of a training set, in one pass (images are not looked at).
 
     Args:
         frames: now and future key frames of the voxel prior.
         past_frames: of the ego status.
+        target: whether the ego status knows where the route leads.
     """
     prior: VoxelPrior | None = None
 
@@ -114,19 +115,26 @@ def read_training_set(
             prior.add(labels)
             yield example.clip
 
-    status = read_status(clips(), past_frames)
+    status = read_status(clips(), past_frames, target=target)
     assert prior is not None
     return prior, status
 
 
 def fit_ego_mlp(
-    data: DrivenStatus, *, past_frames: int, dt_s: float, seed: int, steps: int = 1000, batch_size: int = 256
+    data: DrivenStatus,
+    *,
+    past_frames: int,
+    dt_s: float,
+    seed: int,
+    steps: int = 1000,
+    batch_size: int = 256,
+    target: bool = False,
 ) -> EgoMLP:
     """Train the ego MLP by L1 on the driven steps, AdamW with a cosine; takes seconds, repeats for a seed."""
     horizon_steps = data.driven.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = EgoMLP(past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s)
+        model = EgoMLP(past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target)
     _standardise(model, data)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)

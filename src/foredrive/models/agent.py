@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.models.driveworld import DriveWorld
-from foredrive.models.ego_mlp import ego_motion
+from foredrive.models.ego_mlp import ego_motion, route_lead
 from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Belief, Clip, Decoded, Trajectory
@@ -54,6 +54,7 @@ class PlanningAgent(nn.Module):
             clip.ego_speed_mps[:, now],
             clip.ego_speed_valid[:, now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
+            route_lead(clip) if self.planner.target else None,
         )
         return plan
 

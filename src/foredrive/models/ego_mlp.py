@@ -28,13 +28,23 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
     return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, seen]
 
 
-def ego_status(clip: Clip, past_frames: int) -> Float[Tensor, "b S"]:
+def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[Tensor, "b S"]:
     """What a vehicle knows of itself at now: `ego_motion` and the command as one-hot (zeros where unknown).
 
     Accelerations follow from the speeds.
+
+    Args:
+        target: it also knows where the route leads.
     """
     poses, speeds = ego_motion(clip, past_frames)
-    return status_row(poses, speeds, clip.command, clip.command_valid)
+    leads = route_lead(clip) if target else None
+    return status_row(poses, speeds, clip.command, clip.command_valid, leads)
+
+
+def route_lead(clip: Clip) -> Float[Tensor, "b 3"]:
+    """Where the route leads: x, y (m) and 1; zeros where that is not known."""
+    known = clip.target_valid[:, None]
+    return torch.cat([torch.where(known, clip.target_xy, 0.0), known.to(clip.target_xy)], dim=-1)
 
 
 def status_row(
@@ -42,10 +52,12 @@ def status_row(
     speeds: Float[Tensor, "b P+1"],
     command: Int[Tensor, "b"],
     command_valid: Bool[Tensor, "b"],
+    lead: Float[Tensor, "b 3"] | None = None,
 ) -> Float[Tensor, "b S"]:
-    """The numbers of `ego_status` in their order."""
+    """The numbers of `ego_status` in their order; `route_lead` comes last, if it is given."""
     one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
-    return torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
+    row = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
+    return row if lead is None else torch.cat([row, lead.to(row)], dim=-1)
 
 
 class EgoMLP(nn.Module):
@@ -58,6 +70,7 @@ class EgoMLP(nn.Module):
         past_frames: key frames before now that it looks back on (4 in the paper).
         horizon_steps, dt_s: of the plan.
         hidden: width of both hidden layers (512 in the paper).
+        target: it also knows where the route leads, which in the paper it does not.
     """
 
     status_mean: Tensor
@@ -65,10 +78,13 @@ class EgoMLP(nn.Module):
     plan_mean: Tensor
     plan_std: Tensor
 
-    def __init__(self, *, past_frames: int, horizon_steps: int, dt_s: float, hidden: int = 512) -> None:
+    def __init__(
+        self, *, past_frames: int, horizon_steps: int, dt_s: float, hidden: int = 512, target: bool = False
+    ) -> None:
         super().__init__()
         self.past_frames, self.horizon_steps, self.dt_s = past_frames, horizon_steps, dt_s
-        inputs, outputs = 4 * past_frames + 1 + len(Command), 3 * horizon_steps
+        self.target = target
+        inputs, outputs = 4 * past_frames + 1 + len(Command) + 3 * target, 3 * horizon_steps
         self.layers = nn.Sequential(
             nn.Linear(inputs, hidden),
             nn.ReLU(),
@@ -93,7 +109,7 @@ class EgoMLP(nn.Module):
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """The plan from now on."""
-        plan = self(ego_status(observation, self.past_frames))[:, None]  # [b, 1, T, 3]
+        plan = self(ego_status(observation, self.past_frames, target=self.target))[:, None]  # [b, 1, T, 3]
         return Trajectory(
             xy=plan[..., :2],
             yaw=plan[..., 2],

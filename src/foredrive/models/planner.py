@@ -18,6 +18,7 @@ from foredrive.scene import Command, Trajectory, VoxelSpec
 SPEED_SCALE_MPS = 10.0
 MOVES_M = 0.1
 PAST_SCALE = (5.0, 5.0, 1.0, SPEED_SCALE_MPS)
+LEAD_SCALE = (20.0, 20.0, 1.0)
 STEP_SCALE_M = 1.0
 """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
 PLACE_SCALE_M = 20.0
@@ -180,8 +181,11 @@ class VolumePlanner(nn.Module):
         pool: blocks of the future attention.
         history: how many key frames before now the query knows pose and speed of; in the paper it knows the
             speed at now alone, from which nobody can tell who brakes.
+        target: the query also knows where the route leads (`Clip.target_xy`), as agents on CARLA's
+            leaderboards do; in the paper it knows the command alone.
         horizon_steps, dt_s: of the plan.
-        ego_mlp: fitted beforehand, knows `history` frames and has the same horizon; it is not trained on.
+        ego_mlp: fitted beforehand, knows `history` frames, the target if the query does, and has the same
+            horizon; it is not trained on.
         look_m: distances along the plan made without looking at which the volume of now is read as well
             (`PathCorrection`); none in the paper.
     """
@@ -197,6 +201,7 @@ class VolumePlanner(nn.Module):
         future: Literal["attention", "concatenation", "none"],
         pool: tuple[int, int, int],
         history: int,
+        target: bool = False,
         horizon_steps: int,
         dt_s: float,
         ego_mlp: EgoMLP | None = None,
@@ -205,7 +210,7 @@ class VolumePlanner(nn.Module):
         super().__init__()
         height, ny, nx = spec.shape_zyx
         self.horizon_steps, self.dt_s = horizon_steps, dt_s
-        self.future, self.history = future, history
+        self.future, self.history, self.target = future, history, target
         self.fuse_future = FutureAttention(channels, pool) if future == "attention" else None
         volumes = 2 if future == "concatenation" else 1
         self.fold = nn.Sequential(
@@ -217,7 +222,8 @@ class VolumePlanner(nn.Module):
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last one: not known
-        self.speed = nn.Sequential(nn.Linear(2 + 4 * history, width), nn.ReLU(), nn.Linear(width, width))
+        told = 2 + 4 * history + 3 * target
+        self.speed = nn.Sequential(nn.Linear(told, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
         # Normalising first keeps an open path for speed and command, which most of a plan follows from.
@@ -250,6 +256,7 @@ class VolumePlanner(nn.Module):
         speed_mps: Float[Tensor, "b"],
         speed_valid: Bool[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
+        lead: Float[Tensor, "b 3"] | None = None,
     ) -> Trajectory:
         """Plan in the ego frame at now.
 
@@ -257,15 +264,18 @@ class VolumePlanner(nn.Module):
             now, future: volumes at now and at the next key frame, if it is looked at.
             command, command_valid, speed_mps, speed_valid: of now.
             past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
+            lead: see `route_lead`; asked for by a planner that knows it.
         """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
-        unseen, told = self.without_looking(command, command_valid, speed_mps, past)
+        unseen, told = self.without_looking(command, command_valid, speed_mps, past, lead)
         command = torch.where(command_valid, command, len(Command))
         status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
         status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
+        if self.target and lead is not None:
+            status = torch.cat([status, lead / lead.new_tensor(LEAD_SCALE)], dim=-1)
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
@@ -291,14 +301,18 @@ class VolumePlanner(nn.Module):
         command_valid: Bool[Tensor, "b"],
         speed_mps: Float[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
+        lead: Float[Tensor, "b 3"] | None = None,
     ) -> tuple[Float[Tensor, "b T 2"], Float[Tensor, "b _S"]]:
         """The plan that looking changes, and ego status in numbers of order 1 (none without an ego MLP)."""
+        if self.target and lead is None:
+            raise ValueError("this planner knows where the route leads")
         if self.ego_mlp is None:
             step = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
             return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1), step[:, :0]
         told = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
         with full_precision(past, told) as (poses, speeds):
-            status = status_row(poses[..., :3], speeds, command, command_valid)
+            known = lead if self.target else None
+            status = status_row(poses[..., :3], speeds, command, command_valid, known)
             return self.ego_mlp(status)[..., :2], self.ego_mlp.standardised(status)
 
     def _fuse(

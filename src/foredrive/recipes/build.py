@@ -62,6 +62,7 @@ def build_agent(recipe: Recipe, *, fetch: bool = True) -> PlanningAgent:
         future=size.planner_future,
         pool=size.attention_pool,
         history=size.planner_history,
+        target=size.planner_target,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
         ego_mlp=_build_ego_mlp(recipe),
@@ -103,6 +104,7 @@ def _build_ego_mlp(recipe: Recipe) -> EgoMLP | None:
         return None
     return EgoMLP(
         past_frames=recipe.model.planner_history,
+        target=recipe.model.planner_target,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
     )

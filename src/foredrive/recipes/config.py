@@ -92,6 +92,8 @@ class AgentSize:
     """How the planner looks at the predicted next volume."""
     planner_history: int = 0
     """Key frames before now whose pose and speed the planner is told; in the paper, now's speed alone."""
+    planner_target: bool = False
+    """Whether it knows where the route leads, beyond the command; agents on CARLA's leaderboards do."""
     planner_base: Literal["straight_on", "ego_mlp"] = "straight_on"
     """What the planner regresses changes from: the speed now, as it is; or what an MLP says that knows ego
     status alone (`planner_history` frames of it), fitted to the demonstrations before fine-tuning."""

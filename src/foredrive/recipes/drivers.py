@@ -119,5 +119,6 @@ def _seeing(folder: Path) -> _Sees:
 @lru_cache(maxsize=1)
 def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
-    clips = run.recipe.clips
-    return fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames)[1]
+    model, clips = run.recipe.model, run.recipe.clips
+    past_frames = model.planner_history if model.planner_base == "ego_mlp" else clips.past_frames
+    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, model.planner_target)[1]

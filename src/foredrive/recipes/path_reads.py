@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 from foredrive.data import ClipConfig, LogPath, collate
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
-from foredrive.models.ego_mlp import ego_motion
+from foredrive.models.ego_mlp import ego_motion, route_lead
 from foredrive.recipes.open_clips import open_clips
 from foredrive.scene import Example
 from foredrive.training import PathDemonstrations
@@ -67,7 +67,9 @@ def _row(agent: PlanningAgent, example: Example) -> dict[str, Tensor]:
     plan = agent.plan(clip, beliefs)
     poses, speeds = ego_motion(clip, planner.history)
     past = torch.cat([poses, speeds[:, :-1, None]], dim=-1)
-    unseen_xy, told = planner.without_looking(clip.command, clip.command_valid, speeds[:, -1], past)
+    unseen_xy, told = planner.without_looking(
+        clip.command, clip.command_valid, speeds[:, -1], past, route_lead(clip) if planner.target else None
+    )
     reads = planner.path.read(agent.planned_on(beliefs[0]), unseen_xy)
     change = planner.path(reads, told).cumsum(dim=1)
     future = example.clip.future

@@ -14,7 +14,7 @@ from foredrive.models.ego_mlp import EgoMLP
 
 @lru_cache(maxsize=1)  # training starts from it, evaluation wants it again, and so does a study's next arm
 def fit_rivals(
-    logs: tuple[LogPath, ...], clips: ClipConfig, cache_dir: Path, past_frames: int
+    logs: tuple[LogPath, ...], clips: ClipConfig, cache_dir: Path, past_frames: int, target: bool = False
 ) -> tuple[VoxelPrior, EgoMLP]:
     """The voxel prior of the labels and the MLP that sees ego status alone; reads all clips, without images.
 
@@ -22,11 +22,13 @@ def fit_rivals(
 
     Args:
         past_frames: of the ego status.
+        target: whether the ego status knows where the route leads.
 
     Raises:
         InputError: on logs that cannot be read.
     """
     blind = dataclasses.replace(clips, cameras=(), future_images=False)
     loader = DataLoader(ClipDataset(logs, blind, cache_dir), batch_size=16, collate_fn=collate)
-    prior, status = read_training_set(loader, clips.future_frames + 1, past_frames)
-    return prior, fit_ego_mlp(status, past_frames=past_frames, dt_s=clips.horizon_dt_s, seed=0)
+    prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
+    mlp = fit_ego_mlp(status, past_frames=past_frames, dt_s=clips.horizon_dt_s, seed=0, target=target)
+    return prior, mlp

@@ -109,7 +109,7 @@ def train_run(
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The very rival it will be judged beside.
         base = agent.planner.ego_mlp
-        _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames)
+        _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
         base.load_state_dict(fitted.state_dict())
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:

@@ -60,6 +60,10 @@ class Clip(Record):
     command: Int[Tensor, "*b"]
     """A `Command`, at now."""
     command_valid: Bool[Tensor, "*b"]
+    target_xy: Float[Tensor, "*b 2"]
+    """Where the route is 20 m on from where the vehicle is beside it (`data.commands.LOOKAHEAD_M`), in the ego
+    frame at now, m: what CARLA's global plan tells an agent beyond the command."""
+    target_valid: Bool[Tensor, "*b"]
     future: Trajectory
     """The driven future (M = 1): what an agent is trained and judged on, and must not see."""
     map: MapPatch | None = None

@@ -29,11 +29,17 @@ class KeyFrame:
     boxes: Boxes
 
 
-def make_clip(frames: Sequence[KeyFrame], rig: CameraRig | None, command: Command) -> Clip:
+def make_clip(
+    frames: Sequence[KeyFrame],
+    rig: CameraRig | None,
+    command: Command,
+    target_xy: Float64[np.ndarray, "2"] | None = None,
+) -> Clip:
     """The clip of some key frames, the last of which is now; its future is not known.
 
     Args:
         rig: of the images, without leading dimensions; None where there are none.
+        target_xy: where the route leads, as `Clip` has it; None if that is not known.
     """
     count, rig = len(frames), rig or _no_cameras()
     yes = torch.ones(count, dtype=torch.bool)
@@ -53,6 +59,8 @@ def make_clip(frames: Sequence[KeyFrame], rig: CameraRig | None, command: Comman
         ego_speed_valid=yes,
         command=torch.tensor(int(command)),
         command_valid=torch.tensor(True),
+        target_xy=torch.zeros(2) if target_xy is None else torch.from_numpy(target_xy).float(),
+        target_valid=torch.tensor(target_xy is not None),
         future=Trajectory(
             xy=torch.zeros(1, HORIZON_STEPS, 2),
             yaw=torch.zeros(1, HORIZON_STEPS),

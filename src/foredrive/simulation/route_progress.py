@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from foredrive.data.commands import command_of, route_offset_m
+from foredrive.data.commands import command_of, route_offset_m, route_target
 from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.simulation.dynamics import EGO
@@ -88,3 +88,9 @@ class RouteLine:
     def command(self, progress: Progress) -> Command:
         """Where the route leads next, as recorded logs tell it."""
         return command_of(route_offset_m(self._arc_m, self._xy, progress.done_m))
+
+    def target_xy(
+        self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
+    ) -> Float64[np.ndarray, "2"]:
+        """Where the route leads, seen from the vehicle, as recorded logs tell it."""
+        return route_target(self._arc_m, self._xy, progress.done_m, T_world_ego)

@@ -327,7 +327,9 @@ class TownSimulator:
     def _make_clip(self, state: TownState) -> Clip:
         sensors = self._scenario.sensors
         rig = None if sensors is None else sensors.rig
-        return make_clip(state.frames, rig, self._route.command(state.progress))
+        route, progress = self._route, state.progress
+        target_xy = route.target_xy(progress, state.frames[-1].T_world_ego)
+        return make_clip(state.frames, rig, route.command(progress), target_xy)
 
 
 @lru_cache(maxsize=1)  # drives in a row are often in one town

@@ -213,8 +213,8 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
     seen = [frame.visibility for frame in read.frames if frame.visibility is not None]
     if len(seen) == len(scores) and not np.isnan(np.concatenate(seen)).any():
         visibility = np.concatenate(seen)
-        edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else []
-        for low, high in pairwise([*edges, np.inf]):
+        edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else visibility
+        for low, high in pairwise([*edges.tolist(), np.inf]):
             inside = np.flatnonzero((visibility >= low) & (visibility < high))
             figures |= _slice(f"by_visibility.from_{low:g}", scores, inside)
     return figures

@@ -59,3 +59,9 @@ class GlobalPlan:
         last = int(np.searchsorted(self._arc_m, progress.done_m + LOOKAHEAD_M))
         soon = self._commands[max(first, 0) : max(last, 1)]
         return next((command for command in soon if command is not Command.STRAIGHT), Command.STRAIGHT)
+
+    def target_xy(
+        self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
+    ) -> Float64[np.ndarray, "2"]:
+        """Where the route leads, seen from the vehicle; between its few points it is taken to be straight."""
+        return self._line.target_xy(progress, T_world_ego)

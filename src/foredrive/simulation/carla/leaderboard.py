@@ -147,7 +147,9 @@ class LeaderboardDriver:
 
     def _clip(self) -> Clip:
         assert self._plan is not None
-        clip = make_clip(self._frames, self._rig, self._plan.command(self._progress))
+        plan, progress = self._plan, self._progress
+        target_xy = plan.target_xy(progress, self._frames[-1].T_world_ego)
+        clip = make_clip(self._frames, self._rig, plan.command(progress), target_xy)
         unknown = torch.zeros_like(clip.boxes_valid)
         return dataclasses.replace(clip, boxes_valid=unknown, misses_known=unknown)
 

@@ -266,7 +266,12 @@ class CarlaSimulator:
     def _make_clip(self, state: CarlaState) -> Clip:
         suite = self._scenario.sensors
         rig = None if suite is None else suite.rig
-        clip = make_clip(state.frames, rig, self._route.command(state.progress))
+        clip = make_clip(
+            state.frames,
+            rig,
+            self._route.command(state.progress),
+            self._route.target_xy(state.progress, state.frames[-1].T_world_ego),
+        )
         return dataclasses.replace(clip, misses_known=torch.zeros_like(clip.misses_known))
 
 
