@@ -99,9 +99,9 @@ def nemo_town() -> Recipe:
 def nemo_drive() -> Recipe:
     """`nemo_town` to drive in closed loop, trained on lessons (`foredrive drive --agent disturbed`).
 
-    Two things differ in what the planner is told. It does not know where it was half a second ago: who learns
-    from that learns to go on as before, and stands for ever once he stands. And it knows where the route leads,
-    as agents on CARLA's leaderboards do: the command alone leaves open when a turn begins.
+    Two things differ in what the planner is told. It does not know where it was half a second ago: who
+    learns from that learns to go on as before, and stands for ever once he stands. And it knows where the
+    route leads, as agents on CARLA's leaderboards do: the command alone leaves open when a turn begins.
     """
     town = nemo_town()
     return dataclasses.replace(

@@ -61,8 +61,8 @@ class Clip(Record):
     """A `Command`, at now."""
     command_valid: Bool[Tensor, "*b"]
     target_xy: Float[Tensor, "*b 2"]
-    """Where the route is 20 m on from where the vehicle is beside it (`data.commands.LOOKAHEAD_M`), in the ego
-    frame at now, m: what CARLA's global plan tells an agent beyond the command."""
+    """Where the route is 20 m on from beside the vehicle (`data.commands.LOOKAHEAD_M`), in the ego frame at
+    now, m: what CARLA's global plan tells an agent beyond the command."""
     target_valid: Bool[Tensor, "*b"]
     future: Trajectory
     """The driven future (M = 1): what an agent is trained and judged on, and must not see."""
