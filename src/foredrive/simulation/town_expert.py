@@ -27,13 +27,21 @@ from foredrive.towns.traffic.vehicles import Vehicles, path_starts
 EVERY, STEPS = 2, 15
 """Waypoints lie so many decisions apart: 3 s in all."""
 SETS_OFF_S, SETS_OFF_MPS, AT_LIGHT_M = 2.5, 1.0, 3.0
-BRAKES_MPS2, NEAR_M = (3.0, 6.0), 0.2
+"""Who is slower than this so near before a line needs so long to get over it: he waits for the next green."""
+BRAKES_MPS2 = (3.0, 6.0)
+"""How hard it brakes on its path if that leads into somebody: gently if that will do."""
+NEAR_M = 0.2
+"""Nobody comes nearer to its outline on the path that it takes."""
 REJOINS_M = 5.0
 """Who is beside where it imagines itself is back there to 1/e after this way."""
 HALT_MPS = 0.3
+"""Who is slower than this stands."""
 EDGES_MPS, EDGES_MPS2 = 2.5, 1.0
 """Where there is no room for a lane change that the route needs, it edges over along the route's line."""
-CLEAR_M, LOOK_M = 0.5, 2.0
+CLEAR_M = 0.5
+"""It stops before anybody nearer to its outline then."""
+LOOK_M = 2.0
+"""It points to where the line is so far ahead."""
 LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
 """Who is further from where it meant to be starts anew from the lane that it is on."""
 

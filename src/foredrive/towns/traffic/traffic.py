@@ -48,9 +48,11 @@ from foredrive.towns.traffic.vehicles import (
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
+"""Who is slower than this waits at a line, not comes to it."""
 STOPPED_MPS = 0.1
 """As leaderboards want it at stop signs."""
 LACKS_ROOM_M = 1.0
+"""With less way left to begin a lane change in, vehicle 0 has no room for it any more."""
 
 
 class Traffic:
