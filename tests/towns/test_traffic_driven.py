@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.driven import Driven, see_driven
+from foredrive.towns.traffic.driven import Driven, find_lane, see_driven
 from foredrive.towns.traffic.fleet import ego_vehicle, place
 from foredrive.towns.traffic.lane_graph import Control
 from foredrive.towns.traffic.leaders import find_leaders
@@ -171,6 +171,32 @@ def test_the_way_through_a_junction_is_taken_by_who_cannot_stop_before_it(
     assert (seen.everyone.granted[0] > 0) == way_taken
     assert seen.may_ask[0] == asks
     assert seen.may_ask[1:].all()
+
+
+def test_who_turns_in_wide_has_not_changed_his_mind(alone: Traffic) -> None:
+    """In a junction he is taken to be on the lane that he meant to take, though another is nearer."""
+    graph, near, nowhere = alone.lanes, alone.near_lanes, np.zeros(0, dtype=np.int64)
+    tried = 0
+    for meant in np.flatnonzero(graph.junction >= 0).tolist():
+        lanes = graph.siblings.other[graph.siblings.first[meant] : graph.siblings.first[meant + 1]]
+        for other in np.unique(lanes).tolist():
+            line, mine = graph.samples(other), graph.samples(meant)
+            away_m = np.hypot(*(line[:-1, None, :2] - mine[None, :-1, :2]).transpose(2, 0, 1))
+            nearest = away_m.argmin(axis=1)
+            ours, theirs = (np.arctan2(*np.diff(xyz[:, :2], axis=0).T[::-1]) for xyz in (mine, line))
+            turned = np.abs((theirs - ours[nearest] + np.pi) % (2 * np.pi) - np.pi)
+            at = np.flatnonzero((away_m.min(axis=1) > 1.0) & (away_m.min(axis=1) + 2.0 * turned < 2.8))
+            if not len(at):
+                continue
+            here, yaw = line[at[0]], float(theirs[at[0]])
+            found = find_lane(near, here, yaw, nowhere, nowhere)
+            if found is None or found[0] != other:
+                continue
+            tried += 1
+            known = np.array([meant])
+            assert find_lane(near, here, yaw, known, known)[0] == meant
+            assert find_lane(near, here, yaw, known, nowhere)[0] == other  # outside of junctions he may
+    assert tried > 10
 
 
 def test_who_drives_through_a_junction_has_the_rest_of_it(alone: Traffic) -> None:
