@@ -1,6 +1,7 @@
 """Routes: read from CARLA's files, snapped to lanes that follow each other, with what to do on the way."""
 
 import itertools
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ from foredrive.simulation.route_sets import (
     write_shipped,
 )
 from foredrive.simulation.routes import DriveRoute, RouteOption, route_line, snap_route
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.simulation.training_routes import KINDS
+from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, load_town_map
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 
 XML = """<?xml version='1.0'?>
@@ -79,7 +81,8 @@ def test_a_file_that_is_not_there_and_a_set_that_is_unknown_are_named(tmp_path: 
 
 
 def test_the_sets_that_come_along_have_the_published_sizes() -> None:
-    assert set(route_set_names()) == {"town05-short", "town05-short-10", "town05-long", "longest6"}
+    carlas = {"town05-short", "town05-short-10", "town05-long", "longest6"}
+    assert set(route_set_names()) == carlas | KINDS.keys()
     short, long, longest = (load_route_set(name) for name in ("town05-short", "town05-long", "longest6"))
     assert (len(short), len(long), len(longest)) == (32, 10, 36)
     assert {route.town for route in [*short, *long]} == {"Town05"}
@@ -89,6 +92,19 @@ def test_the_sets_that_come_along_have_the_published_sizes() -> None:
         assert np.linalg.norm(route.xyz_m[1] - route.xyz_m[0]) == pytest.approx(70.7, abs=0.1)
     chords = [np.linalg.norm(np.diff(route.xyz_m, axis=0), axis=1).sum() for route in long]
     assert (min(chords), max(chords)) == (pytest.approx(531, abs=1), pytest.approx(2101, abs=1))
+
+
+@pytest.mark.parametrize("name", list(KINDS))
+def test_the_training_towns_have_routes_of_their_own(name: str) -> None:
+    kind, routes = KINDS[name], load_route_set(name)
+    towns = [town for town in TOWNS if town not in TEST_TOWNS]
+    assert Counter(route.town for route in routes) == dict.fromkeys(towns, kind.per_town)
+    assert len({route.id for route in routes}) == len(routes)
+    here = [snap_route(route) for route in routes if route.town == "Town02"]
+    assert all(kind.shortest_m <= route.length_m <= kind.longest_m for route in here)
+    assert max(route.aside_m for route in here) < 0.5
+    met = set(np.concatenate([route.option for route in here]).tolist())
+    assert {RouteOption.LEFT, RouteOption.RIGHT, RouteOption.STRAIGHT, RouteOption.FOLLOW} <= met
 
 
 def test_what_is_shipped_is_written_as_it_is_read(tmp_path: Path) -> None:

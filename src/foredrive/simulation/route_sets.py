@@ -1,4 +1,4 @@
-"""Sets of routes: CARLA's route files, and those of Town05 that come with the package."""
+"""Sets of routes: CARLA's route files, and those that come with the package."""
 
 import json
 import math
@@ -30,7 +30,7 @@ class RouteWaypoints:
 
 def route_set_names() -> tuple[str, ...]:
     """The sets that come with the package."""
-    return (*_shipped(), SHORT_10)
+    return (*shipped_sets(), SHORT_10)
 
 
 def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
@@ -41,13 +41,22 @@ def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
     """
     if name_or_path.endswith(".xml"):
         return read_carla_routes(Path(name_or_path))
-    sets = _shipped()
+    sets = shipped_sets()
     if name_or_path == SHORT_10:
-        return _routes(sets[OF])[:10]
+        return sets[OF][:10]
     if name_or_path not in sets:
         known = ", ".join(route_set_names())
         raise InputError(f"unknown route set {name_or_path!r}: one of {known}, or a CARLA route file (.xml)")
-    return _routes(sets[name_or_path])
+    return sets[name_or_path]
+
+
+def shipped_sets() -> dict[str, list[RouteWaypoints]]:
+    """All sets of the package's data file."""
+    text = resources.files("foredrive.simulation").joinpath(SHIPPED).read_text()
+    return {
+        name: [RouteWaypoints(row["id"], row["town"], np.array(row["xyz_m"], dtype=float)) for row in rows]
+        for name, rows in json.loads(text).items()
+    }
 
 
 def read_carla_routes(path: Path) -> list[RouteWaypoints]:
@@ -97,13 +106,3 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
     if not all(map(math.isfinite, np.ravel(xyz).tolist())):
         raise InputError(f"{where} has a waypoint that is not finite")
     return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0])
-
-
-def _shipped() -> dict[str, list[dict[str, object]]]:
-    text = resources.files("foredrive.simulation").joinpath(SHIPPED).read_text()
-    content: dict[str, list[dict[str, object]]] = json.loads(text)
-    return content
-
-
-def _routes(rows: list[dict[str, object]]) -> list[RouteWaypoints]:
-    return [RouteWaypoints(str(r["id"]), str(r["town"]), np.array(r["xyz_m"], dtype=float)) for r in rows]

@@ -1,0 +1,106 @@
+"""Our own routes of the towns that are trained in: drawn from a seed, and kept in the package's data file.
+
+`python -m foredrive.simulation.training_routes` draws them all again and writes them there.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from foredrive.errors import InputError
+from foredrive.simulation.route_sets import SHIPPED, RouteWaypoints, shipped_sets, write_shipped
+from foredrive.simulation.routes import DriveRoute, RouteOption, snap_route
+from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, load_town_map
+from foredrive.towns.traffic.fleet import find_starts
+from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
+from foredrive.towns.traffic.routes import Route, draw_route
+
+CANDIDATES = 6
+"""Of so many routes that one is taken which has most of what the others lack."""
+WAYPOINT_AT = 0.75
+"""How far along each lane its waypoint lies: behind a lane change, if there is one."""
+CLEAR_OF_END_M = 3.0
+APART_M = 300.0
+"""To begin so far from all others is worth as much as a manoeuvre that none of them has."""
+
+
+class Kind(NamedTuple):
+    """What the routes of a set are like."""
+
+    per_town: int
+    shortest_m: float
+    longest_m: float
+
+
+KINDS = {"training-short": Kind(8, 80.0, 150.0), "training-long": Kind(3, 500.0, 1500.0)}
+
+
+def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
+    """Routes of a town, spread over it, with turns, ways straight on and lane changes as evenly as can be."""
+    graph = build_lane_graph(load_town_map(town))
+    starts, rng = find_starts(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
+    chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
+    met: Counter[int] = Counter()
+    while len(chosen) < kind.per_town:
+        best, most = None, -math.inf
+        while best is None:
+            for _ in range(CANDIDATES):
+                length_m = float(rng.uniform(kind.shortest_m, kind.longest_m))
+                drawn = draw_route(graph, starts, rng, length_m, from_s=0.0, until_s=math.inf)
+                found = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, kind)
+                worth = -math.inf if found is None else _worth(found[1], [route for _, route in chosen], met)
+                if worth > most:
+                    best, most = found, worth
+        chosen.append(best)
+        met.update(_manoeuvres(best[1]))
+    return [waypoints for waypoints, _ in chosen]
+
+
+def _checked(
+    name: str, town: str, graph: LaneGraph, drawn: Route, length_m: float, kind: Kind
+) -> tuple[RouteWaypoints, DriveRoute] | None:
+    """A route as waypoints, and as it is read from them; None if that is another way, or too short."""
+    ends_m = np.append(0.0, np.cumsum(graph.length_m[drawn.lanes])) - drawn.start_m
+    last = int(np.flatnonzero((ends_m[:-1] < length_m) & (graph.junction[drawn.lanes] < 0))[-1])
+    lanes = drawn.lanes[: last + 1]
+    at_m = WAYPOINT_AT * graph.length_m[lanes]
+    at_m[-1] = min(length_m - ends_m[last], graph.length_m[lanes[-1]] - CLEAR_OF_END_M)
+    first = graph.position(drawn.entered[:1], np.array([drawn.start_m]))
+    later = at_m > (drawn.start_m if last == 0 else 0.0)
+    later[0] &= at_m[0] > drawn.start_m
+    points = np.concatenate([first, graph.position(lanes, at_m)[later]])
+    waypoints = RouteWaypoints(name, town, np.round(points, 2))
+    try:
+        route = snap_route(waypoints)
+    except InputError:
+        return None
+    fits = kind.shortest_m <= route.length_m <= kind.longest_m
+    return (waypoints, route) if fits and set(lanes.tolist()) <= {leg.lane for leg in route.legs} else None
+
+
+def _worth(route: DriveRoute, others: Sequence[DriveRoute], met: Counter[int]) -> float:
+    """How much a route adds to others: manoeuvres that they lack, and a place where they are not."""
+    away_m = min((float(np.hypot(*(route.xyz[0] - o.xyz[0])[:2])) for o in others), default=0.0)
+    return sum(1 / (1 + met[option]) for option in _manoeuvres(route)) + min(away_m / APART_M, 1.0)
+
+
+def _manoeuvres(route: DriveRoute) -> set[int]:
+    return set(route.option.tolist()) - {int(RouteOption.FOLLOW)}
+
+
+def main() -> None:
+    """Write the data file with these sets drawn anew and all others as they are."""
+    sets: dict[str, Sequence[RouteWaypoints]] = dict(shipped_sets())
+    for name, kind in KINDS.items():
+        towns = [town for town in TOWNS if town not in TEST_TOWNS]
+        sets[name] = [route for town in towns for route in draw_routes(town, kind)]
+    write_shipped(Path(str(resources.files("foredrive.simulation").joinpath(SHIPPED))), sets)
+
+
+if __name__ == "__main__":
+    main()
