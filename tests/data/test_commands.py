@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from foredrive.data.commands import LATERAL_M, route_offset_m
+from foredrive.data.commands import LATERAL_M, route_offset_m, route_target
 
 
 def arc_m(xy: np.ndarray) -> np.ndarray:
@@ -36,3 +36,20 @@ def test_jitter_of_the_points_is_no_turn() -> None:
     route = along(0.5, 200.0, 0.0) + np.random.default_rng(0).normal(scale=0.03, size=(101, 2))
     arc = arc_m(route)
     assert max(abs(route_offset_m(arc, route, p)) for p in np.arange(0, 80, 0.7)) < LATERAL_M
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 2.0, -3.0])
+def test_the_target_is_seen_from_the_vehicle_wherever_it_stands(heading_rad: float) -> None:
+    """The route goes 50 m straight on, then left; the vehicle is 30 m along it, 2 m to its right."""
+    route = along(heading_rad, 50.0, np.pi / 2)
+    forward = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    T = np.eye(4)
+    T[:2, 0], T[:2, 1] = forward, [-forward[1], forward[0]]
+    T[:2, 3] = 30.0 * forward - 2.0 * T[:2, 1]
+    at = route_target(arc_m(route), route, 30.0, T)
+    np.testing.assert_allclose(at, [20.0, 2.0], atol=1e-9)
+    np.testing.assert_allclose(route_target(arc_m(route), route, 36.0, T), [20.0, 8.0], atol=1e-9)
+    np.testing.assert_allclose(route_target(arc_m(route), route, 99.0, T), [20.0, 52.0], atol=1e-9)  # its end
+    turned = T.copy()
+    turned[:2, 0], turned[:2, 1] = T[:2, 1], -T[:2, 0]  # it faces left
+    np.testing.assert_allclose(route_target(arc_m(route), route, 30.0, turned), [2.0, -20.0], atol=1e-9)

@@ -52,6 +52,10 @@ def test_the_ego_status_by_hand(make_example: MakeExample) -> None:
     clip.command_valid[:] = False
     assert ego_status(clip, past_frames=2)[0, 9:].tolist() == [0.0, 0.0, 0.0]
     torch.testing.assert_close(ego_status(clip, 2), ego_status(clip.observed(), 2))
+    clip.target_xy[:], clip.target_valid[:] = torch.tensor([19.0, -4.0]), True
+    assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 19.0, -4.0, 1.0]
+    clip.target_valid[:] = False
+    assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     with pytest.raises(InputError, match="needs 5 frames before now"):
         ego_status(clip, past_frames=5)
 

@@ -20,6 +20,7 @@ def small_planner(
     steps: int,
     ego_mlp: EgoMLP | None = None,
     look_m: tuple[float, ...] = (),
+    target: bool = False,
 ) -> VolumePlanner:
     return VolumePlanner(
         channels=4,
@@ -34,6 +35,7 @@ def small_planner(
         dt_s=0.5,
         ego_mlp=ego_mlp,
         look_m=look_m,
+        target=target,
     ).eval()
 
 
@@ -94,6 +96,23 @@ def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
     plan = planner(torch.randn(2, 4, 2, 8, 8), None, command, known, speed, torch.tensor([True, True]), past)
     status = torch.tensor([[x, y, yaw, before, now, 0, 1, 0], [x, y, yaw, before, now, 0, 0, 0]])
     torch.testing.assert_close(plan.xy[:, 0], ego_mlp(status)[..., :2])
+
+
+def test_a_planner_that_knows_where_the_route_leads_asks_and_goes_by_it() -> None:
+    torch.manual_seed(0)
+    ego_mlp = EgoMLP(past_frames=0, horizon_steps=3, dt_s=0.5, target=True)
+    planner = small_planner("none", history=0, steps=3, ego_mlp=ego_mlp, target=True)
+    told = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
+    volume, left = torch.randn(1, 4, 2, 8, 8), torch.tensor([[15.0, 9.0, 1.0]])
+    plan = planner(volume, None, *told, left)
+    status = torch.tensor([[5.0, 1.0, 0.0, 0.0, 15.0, 9.0, 1.0]])
+    torch.testing.assert_close(plan.xy[:, 0], ego_mlp(status)[..., :2])
+    torch.nn.init.normal_(planner.waypoints[-1].weight)  # what is learned beyond the MLP knows it too
+    learned = [planner(volume, None, *told, lead).xy[:, 0] for lead in (left, -left)]
+    unseen = [planner.without_looking(*told[:3], told[4], lead)[0] for lead in (left, -left)]
+    assert not torch.allclose(learned[0] - unseen[0], learned[1] - unseen[1])
+    with pytest.raises(ValueError, match="where the route leads"):
+        planner(volume, None, *told)
 
 
 def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:

@@ -1,0 +1,108 @@
+"""Does NeMo drive, and does pre-training help it to? `foredrive bench drive-nemo`, many hours on two cores.
+
+Lessons are driven in the training towns, `nemo_drive` is trained on them, and every run drives the routes of
+Town05, as do the MLP that it starts from and constant velocity. Everything is kept in runs/drive_nemo/COMMIT,
+so that an interrupted benchmark goes on drive by drive and run by run.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.evaluation import Benchmark, read_summary
+from foredrive.recipes import find_recipe
+from foredrive.recipes.driving import Driven, DriveSuite, drive_suite, summarise
+from foredrive.recipes.evaluate import SUMMARY, evaluate_run
+from foredrive.recipes.recording import record_drives
+from foredrive.recipes.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
+from foredrive.recipes.train import find_all_logs, train_run
+from foredrive.towns.campaign import Campaign, plan_drives
+
+WORK = work_folder(Path("runs/drive_nemo"))
+RECIPE = "nemo_drive"
+LESSONS = ("training-short", "training-long")
+JUDGED = {"short": "town05-short", "long": "town05-long"}
+OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
+IMAGE_HW = (144, 256)
+CORES = len(os.sched_getaffinity(0))
+
+
+def _driven(suite: DriveSuite, out: Path) -> Driven:
+    driven = drive_suite(suite, out, CORES)
+    if driven.broken:
+        job, why = next(iter(driven.broken.items()))
+        raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
+    return driven
+
+
+def _lessons() -> tuple[LogPath, ...]:
+    folders = [WORK / "lessons" / name for name in LESSONS]
+    for name, folder in zip(LESSONS, folders, strict=True):
+        _driven(DriveSuite("disturbed", name), folder)
+    return find_all_logs(folders)
+
+
+def _scores(driver: str, name: str, seed: int) -> dict[str, float]:
+    """Of the repetition of each set that the seed stands for."""
+    figures = {}
+    for short, routes in JUDGED.items():
+        suite = DriveSuite(driver, routes, seed=seed, sensors=False)
+        summary = summarise(
+            list(_driven(suite, WORK / "drives" / f"{name}_{short}_seed{seed}").drives.values())
+        )
+        kept = {
+            "driving_score_1_0": "ds",
+            "driving_score_2_1": "ds_2_1",
+            "completion": "rc",
+            "failed": "failed",
+        }
+        kept |= {key: key for key in summary if key.startswith(("infractions.", "endings."))}
+        figures |= {f"{kept[key]}_{short}": float(summary[key] or 0.0) for key in kept}
+    return figures
+
+
+def learned(pretrained: bool) -> Callable[[int], Mapping[str, float]]:
+    """`nemo_drive`, pre-trained on the lessons or from scratch."""
+
+    def measure(seed: int) -> Mapping[str, float]:
+        recipe, name = seeded(find_recipe(RECIPE), seed), "pretrained" if pretrained else "scratch"
+        if not pretrained:
+            recipe = dataclasses.replace(recipe, pretrain=None)
+        folder = WORK / "runs" / f"{name}_seed{seed}"
+        run = train_run(recipe, _lessons(), folder, WORK / "cache")
+        if not (folder / SUMMARY).is_file():
+            recorded = record_drives(plan_drives(OPEN_LOOP), WORK / "towns", IMAGE_HW, CORES)
+            logs = tuple(recorded.logs.values())
+            evaluate_run(run, logs, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
+        l2_m = read_summary(folder / SUMMARY)[f"planning.{HEADLINE}.l2_avg_m"]
+        return {"l2_avg_m": float(l2_m or 0.0), **_scores(str(folder.absolute()), name, seed)}
+
+    return measure
+
+
+def ego_mlp(seed: int) -> Mapping[str, float]:
+    """The MLP that the runs start from, which sees nothing."""
+    folder = (WORK / "runs" / f"pretrained_seed{seed}").absolute()
+    if not folder.is_dir():
+        learned(pretrained=True)(seed)
+    return _scores(f"ego-mlp:{folder}", "ego_mlp", seed)
+
+
+def constant_velocity(seed: int) -> Mapping[str, float]:
+    """Straight on at 5 m/s."""
+    return _scores("constant-velocity", "constant_velocity", seed)
+
+
+BENCHMARK = Benchmark(
+    question="How well does NeMo drive Town05's routes, and does pre-training help it to?",
+    arms={
+        "constant_velocity": constant_velocity,
+        "pretrained": learned(pretrained=True),
+        "scratch": learned(pretrained=False),
+        "ego_mlp": ego_mlp,
+    },
+    config={"recipe": dataclasses.asdict(find_recipe(RECIPE)), "lessons": LESSONS, "routes": JUDGED},
+)
