@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from foredrive.models.agent import PlanningAgent
-from foredrive.models.ego_mlp import ego_motion
+from foredrive.models.ego_mlp import ego_motion, route_lead
 from foredrive.models.nemo import Nemo
 from foredrive.scene import CameraRig, Clip
 
@@ -25,6 +25,7 @@ class GraphInputs(NamedTuple):
     command: Int[Tensor, "1"]
     command_valid: Bool[Tensor, "1"]
     past_motion: Float[Tensor, "1 P 4"]
+    route_lead: Float[Tensor, "1 3"]
 
     @classmethod
     def of(cls, observed: Clip, agent: PlanningAgent) -> "GraphInputs":
@@ -42,6 +43,7 @@ class GraphInputs(NamedTuple):
             command=observed.command.long(),
             command_valid=observed.command_valid,
             past_motion=torch.cat([poses, speeds[:, :-1, None]], dim=-1),
+            route_lead=route_lead(observed),
         )
 
 
@@ -67,6 +69,8 @@ MEANING = {
     "command_valid": "whether the command is known",
     "past_motion": "x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the P key "
     "frames before now; P is 0 where the planner does not look at them",
+    "route_lead": "x, y of where the route is 20 m on, in the ego frame at now, m, and 1; zeros where that "
+    "is not known; planners that go by the command alone do not look at it",
     "waypoints_xy": "rear axle in the ego frame now, m; the first one step ahead",
     "waypoints_yaw": "heading relative to now's, rad",
     "occupancy_logit": "before the sigmoid; now first, then the imagined key frames, each in its own ego "
@@ -103,6 +107,7 @@ class AgentGraph(nn.Module):
         command: Int[Tensor, "1"],
         command_valid: Bool[Tensor, "1"],
         past_motion: Float[Tensor, "1 P 4"],
+        route_lead: Float[Tensor, "1 3"],
     ) -> dict[str, Tensor]:
         """As `PlanningAgent.forward`: the fields of `GraphOutputs`; `MEANING` says what all of them are."""
         model, planner = self.agent.world_model, self.agent.planner
@@ -118,7 +123,9 @@ class AgentGraph(nn.Module):
         now = model.encode(images, image_valid, rig)
         beliefs = [now, *model.imagine(now, max(self.steps, planner.looks_ahead))]
         ahead = beliefs[1].volume if planner.looks_ahead else None
-        plan = planner(now.volume, ahead, command, command_valid, speed_mps, speed_valid, past_motion)
+        plan = planner(
+            now.volume, ahead, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
+        )
         shown = beliefs[: self.steps + 1]
         poses = [torch.eye(4)[None] if belief.T_now_ego is None else belief.T_now_ego for belief in shown]
         outputs = GraphOutputs(
