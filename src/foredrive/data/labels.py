@@ -158,10 +158,12 @@ class LabelStore:
             if kept is not None:
                 return kept
         labels = make_labels(log, frame, self._spec)
-        if file is not None:
-            with atomic_path(file) as temporary:
-                temporary.write_bytes(_encode(labels))
-        return labels
+        if file is None:
+            return labels
+        entry = _encode(labels)
+        with atomic_path(file) as temporary:
+            temporary.write_bytes(entry)
+        return _decode(entry, self._spec)  # velocities are rounded, the first time as every other
 
     def _file(self, log: Log, frame: int) -> Path | None:
         if self._folder is None:
