@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from foredrive.cli.arguments import OptionalPath
+from foredrive.errors import InputError
 
 if TYPE_CHECKING:
     from foredrive.evaluation.detections import DetectionSet, FrameScore
@@ -40,6 +41,8 @@ def score(
     from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
     from foredrive.view.score_report import print_scores, write_score_report
 
+    if worst < 0:
+        raise InputError(f"--worst is {worst}: a number of frames is not below 0")
     started = time.perf_counter()
     read = read_detections(results, truth, family)
     scores = _scored(read, k, results)

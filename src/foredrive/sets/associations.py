@@ -75,8 +75,10 @@ def sum_associations(
     result holds what either may have missed. A component without any possible association makes the sum
     zero; its probabilities are then those of the association with fewest impossible members.
 
-    Raises `InputError` for weights that are NaN or infinite, naming them.
+    Raises `InputError` for weights that are NaN or infinite, naming them, and for a `k` below 1.
     """
+    if k < 1:
+        raise InputError(f"k is {k}: at least the best association must be listed")
     log_pair, log_absent, log_background = (
         np.ascontiguousarray(log, dtype=np.float64) for log in (log_pair, log_absent, log_background)
     )
@@ -173,7 +175,9 @@ def _sum_large(
     left_out = log_pair > -np.inf
     left_out[found.row, found.column] = False
     row, column = np.nonzero(left_out)
-    log_weight = log_pair[row, column] - log_row[row] + found.log_freed[column]
+    alone = log_row[row] > -np.inf  # thinning spares rows that cannot be
+    log_weight = np.full(len(row), np.inf)
+    log_weight[alone] = (log_pair[row, column] + found.log_freed[column])[alone] - log_row[row][alone]
     found.log_upper += bound_left_out(log_weight, row, column)
     if found.log_upper - found.log_lower > _WIDE_NATS:
         found.log_upper = min(found.log_upper, bound_choices(scale(log_pair, log_row, log_column)))

@@ -124,6 +124,12 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
         read_detections(tmp_path / "nowhere.json", truth)
     with pytest.raises(InputError, match=r"list\.json: neither an object"):
         read_detections(truth, write_list(tmp_path / "list.json", []))
+    with pytest.raises(InputError, match="holds any box"):
+        read_detections(truth, truth)
+    (tmp_path / "kitti").mkdir()
+    (tmp_path / "kitti" / "0.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"0\.txt: not text"):
+        read_detections(tmp_path / "kitti", tmp_path / "kitti")
     with pytest.raises(InputError, match="holds no frames"):
         read_detections(write_nuscenes(tmp_path / "none.json", {}), tmp_path / "none.json")
     coco = write_coco_truth(tmp_path / "coco.json", [])
@@ -135,6 +141,8 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
             "record 0 has a bbox of the size",
         ),
         ({"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]}, "record 0 has no score"),
+        ({"image_id": [1], "category_id": 3}, "record 0 is of the unknown image None"),
+        ({"image_id": 1, "category_id": [3]}, r"record 0 has the unknown category \[3\]"),
         (17, "record 0 is of the unknown image None"),
     ):
         with pytest.raises(InputError, match=message):

@@ -48,16 +48,16 @@ def read_coco(
         if record.get("iscrowd"):
             crowds += 1
         else:
-            true[record.get("image_id")].append((n, record))
+            true[_key(record, "image_id")].append((n, record))
     for n, record in enumerate(results):
-        found[record.get("image_id") if isinstance(record, dict) else None].append((n, record))
+        found[_key(record, "image_id")].append((n, record))
     known = {image["id"] for image in images}
     for records, where in ((found, path), (true, truth_path)):
         for image_id, members in records.items():
             if image_id not in known:
                 raise InputError(f"{where}: record {members[0][0]} is of the unknown image {image_id}")
             for n, record in members:
-                if record.get("category_id") not in label_of:
+                if _key(record, "category_id") not in label_of:
                     raise InputError(
                         f"{where}: record {n} has the unknown category {record.get('category_id')}"
                     )
@@ -102,6 +102,12 @@ def _frame(
         *around(np.zeros(4), np.array([width, height, width, height]), true_corners),
         relevance=relevance_of([record for _, record in true], true_where),
     )
+
+
+def _key(record: Any, name: str) -> int | str | None:
+    """What a record names its image or category by; None if it does not."""
+    key = record.get(name) if isinstance(record, dict) else None
+    return key if isinstance(key, int | str) else None
 
 
 def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray, "n 4"]:

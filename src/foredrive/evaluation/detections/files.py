@@ -30,6 +30,8 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
             raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
     if not read.frames:
         raise InputError(f"{truth}: holds no frames")
+    if not read.classes:
+        raise InputError(f"neither {results} nor {truth} holds any box")
     return read
 
 

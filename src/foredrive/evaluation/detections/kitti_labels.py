@@ -72,8 +72,12 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
 
 def _lines(path: Path, fields: int) -> list[Line]:
     """Type and the numbers after it of each line that is not `DontCare`."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not text that can be read") from error
     lines = []
-    for n, line in enumerate(path.read_text().splitlines(), 1):
+    for n, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words or words[0] == "DontCare":
             continue
