@@ -45,4 +45,4 @@ def test_figures_and_a_report_that_loads_nothing(files: dict[str, Path], tmp_pat
 def test_wrong_files_are_one_line(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     missing = files["truth"].with_name("none.json")
     assert main(["score", str(missing), "--truth", str(files["truth"])]) == 2
-    assert capsys.readouterr().err == f"foredrive: {missing}: not JSON that can be read\n"
+    assert capsys.readouterr().err == f"foredrive: {missing}: No such file or directory\n"
