@@ -195,7 +195,6 @@ def as_boxes(state: np.ndarray, yaw: np.ndarray, label: np.ndarray) -> list[dict
 def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
     """Results with variances, and truth, as files."""
     rng = np.random.default_rng(seed)
-    origin = {"ego_translation": [0.0, 0.0, 0.0]}
     results, truth = folder / "results.json", folder / "truth.json"
     with results.open("w") as said, truth.open("w") as true:
         said.write('{"meta": {}, "results": {')
@@ -207,7 +206,9 @@ def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
             for box, r in zip(boxes, detected.log_existence.exp().tolist(), strict=True):
                 box |= {"detection_score": r, "covariance": (STD**2).tolist(), "yaw_std": 0.158}
             there = as_boxes(objects.state.numpy(), np.asarray(objects.yaw), objects.label.numpy())
-            there = [{**box, **origin, "scene_token": f"{n // 40}"} for box in there]
+            there = [
+                {**box, "ego_translation": box["translation"], "scene_token": f"{n // 40}"} for box in there
+            ]
             comma = ", " if n else ""
             said.write(f'{comma}"{n}": {json.dumps(boxes)}')
             true.write(f'{comma}"{n}": {json.dumps(there)}')

@@ -41,6 +41,9 @@ def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
     axes.set_aspect("equal")
     if not upright:
         axes.invert_yaxis()
+    unit = "m" if upright else "px"
+    axes.set_xlabel(f"x, {unit}", color=INK_MARK, fontsize=8)
+    axes.set_ylabel(f"y, {unit}", color=INK_MARK, fontsize=8)
     axes.tick_params(colors=INK_MARK, labelsize=8)
     axes.grid(color="#88888833", linewidth=0.5)
     axes.spines[:].set_visible(False)

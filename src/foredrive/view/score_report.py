@@ -23,7 +23,7 @@ SHOWN = {
     "detections": "Detections",
     "pmb_nll.mean": "PMB-NLL, nats a frame",
     **{f"pmb_nll.{part}": f"  {part.replace('_', ' ')}" for part in PARTS},
-    "pmb_nll.gap": "  no more than this too large",
+    "pmb_nll.gap": "  too large by no more than",
     "pmb_nll.frames_infinite": "Frames of infinite NLL",
     "map": "mAP",
     "gospa.distance": "GOSPA",
@@ -34,6 +34,8 @@ SHOWN = {
     "std.best_factor": "Factor on standard deviations that fits best",
     "conformal.coverage_90": "Coverage of conformal 90 % boxes",
     "against.difference": "PMB-NLL less that of the other file",
+    "against.difference_low_95": "  95 % interval, from",
+    "against.difference_high_95": "  to",
     "against.p_value": "  p-value",
 }
 
@@ -64,7 +66,7 @@ def write_score_report(
         for n in ranked
     ]
     rows = "".join(
-        f"<tr><th scope='row'>{escape(name.strip())}</th><td>{number(result.figures[key])}</td></tr>"
+        f"<tr><th scope='row'>{_indented(name)}</th><td>{number(result.figures[key])}</td></tr>"
         for key, name in SHOWN.items()
         if result.figures.get(key) is not None
     )
@@ -88,6 +90,10 @@ def write_score_report(
     )
     with atomic_path(path) as scratch:
         scratch.write_text(page, encoding="utf-8")
+
+
+def _indented(name: str) -> str:
+    return ("&emsp;" if name.startswith(" ") else "") + escape(name.strip())
 
 
 def _caption(score: FrameScore) -> str:
