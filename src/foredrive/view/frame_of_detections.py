@@ -13,6 +13,8 @@ from foredrive.view.inline_svg import INK_MARK
 OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
 FAINTEST = 0.02
 """Detections that exist less are not drawn."""
+MOST_DRAWN = 1000
+"""Of more, only the surest are drawn."""
 SIGMAS = 2.0
 
 
@@ -26,7 +28,11 @@ def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
     yaw = boxes.yaw.numpy() if boxes.yaw is not None else np.zeros(len(mean))
     true_yaw = frame.objects.yaw.numpy() if frame.objects.yaw is not None else np.zeros(len(state))
     covariance = (boxes.chol @ boxes.chol.mT).numpy()
-    for i in np.flatnonzero(existence >= FAINTEST):
+    seen = np.flatnonzero(existence >= FAINTEST)
+    if len(seen) > MOST_DRAWN:
+        axes.set_title(f"{MOST_DRAWN:,} surest of {len(seen):,} detections", color=INK_MARK, fontsize=8)
+        seen = seen[np.argsort(-existence[seen], kind="stable")[:MOST_DRAWN]]
+    for i in seen:
         corners = _corners(mean[i], float(yaw[i]), upright)
         alpha = float(np.sqrt(existence[i]))
         axes.add_patch(Polygon(corners, fill=False, edgecolor=DETECTION, alpha=alpha, linewidth=1.2))
