@@ -12,7 +12,7 @@ from foredrive.towns.traffic.guests import granted_through
 from foredrive.towns.traffic.lane_changes import change_length_m
 
 MOVES_MPS = 1.0
-"""Who comes to meet the ego vehicle looks at it only while it is slower."""
+"""Who comes to meet the ego vehicle looks at it only while it is slower, and in the way."""
 PASSED_M = 6.0
 SETS_OFF_M = 48.0
 SLOW = {ScenarioKind.LEAD_BRAKES: 0.55, ScenarioKind.CUT_IN: 0.35}
@@ -194,8 +194,8 @@ def _meet(scene: Scene, lead_m: float) -> Scene:
     oncoming traffic is never faster than allowed, and drives on as it likes where it is waited for."""
     scenario, play, ego, slot = scene.scenario, scene.play, scene.ego, scene.play.cast[0]
     runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
-    scene.orders.blind[list(play.cast)] = ego.speed_mps > MOVES_MPS
     line_m, room_m = scene.way.line_m - lead_m - scene.half_m(slot), ego.front_gap_m(scenario.at_m - ROOM_M)
+    scene.orders.blind[list(play.cast)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
     comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
     if play.since_s is not None:
         if runs:
