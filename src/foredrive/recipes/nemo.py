@@ -61,11 +61,11 @@ def nemo_tiny() -> Recipe:
 
 
 def nemo_town() -> Recipe:
-    """NeMo for claims tested on two CPU cores: 9 minutes of pre-training, 8 of fine-tuning on towns.
+    """NeMo for claims tested on two CPU cores: 500 steps of pre-training, 150 of fine-tuning on towns.
 
     As `nemo_tiny`, but it sees further ahead and is trained for longer. Its planner knows the last key frame
     too and starts from what ego status alone says, so that what it scores beyond the ego-only MLP is what
-    looking brings; it reads the volume along that plan, which is fitted before the rest is fine-tuned.
+    looking brings; it reads the volume along that plan by a head that is fitted last.
     """
     tiny = nemo_tiny()
     pretrain, finetune = tiny.pretrain, tiny.finetune

@@ -73,7 +73,9 @@ def train_run(
     cache_dir: Path | None = None,
     start: Path | None = None,
 ) -> Run:
-    """Pre-train, then fine-tune; goes on where an earlier call with the same arguments stopped.
+    """Pre-train, fine-tune, then fit what the planner reads along its path, if the recipe says so.
+
+    Goes on where an earlier call with the same arguments stopped.
 
     Args:
         recipe: one without pre-training starts from scratch.
