@@ -8,7 +8,7 @@ import torch
 from foredrive.models.detection import BoxSet, DetectionHead
 from foredrive.scene import VoxelSpec
 from foredrive.sets import LabelledBoxes, PoissonMultiBernoulli, pmb_from_detections, set_nll
-from foredrive.training.detection import as_multi_bernoulli, matching_loss, set_loss
+from foredrive.training.detection import as_multi_bernoulli, fit_head, matching_loss, set_loss
 
 
 @pytest.fixture(autouse=True)
@@ -80,13 +80,9 @@ def test_matching_takes_each_object_to_the_query_that_fits() -> None:
 
 @pytest.mark.parametrize("loss", [matching_loss, set_loss])
 def test_both_losses_teach_where_objects_are(loss: Callable[[BoxSet, LabelledBoxes], torch.Tensor]) -> None:
-    model, (volume, truth) = head(), scenes(4)
-    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    for _ in range(150):
-        optimizer.zero_grad()
-        found = model(volume)
-        torch.stack([loss(found[n], truth[n]) for n in range(4)]).mean().backward()
-        optimizer.step()
+    volume, truth = scenes(4)
+    samples = list(zip(volume, truth, strict=True))
+    model = fit_head(head(), samples, loss, steps=150, batch=4, learning_rate=5e-3)
     with torch.no_grad():
         found = model(volume)
     for n, objects in enumerate(truth):

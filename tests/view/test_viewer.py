@@ -109,7 +109,7 @@ def test_the_model_is_shown_where_it_has_seen_enough(viewer: Viewer) -> None:
 
 def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run) -> None:
     from foredrive.data import ClipDataset, collate
-    from foredrive.recipes.predict import NemoPredictor
+    from foredrive.recipes.predict import AgentPredictor
 
     times = LogTimes(log, 96, run)
     vision, observer = times.vision(10), times.observer
@@ -118,7 +118,7 @@ def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run
     dataset = ClipDataset([log], run.recipe.clips, None)
     at = next(k for k in range(len(dataset)) if dataset.now_us(k) == times.now_us[10])
     observed = collate([dataset[at]]).clip.observed()
-    expected = NemoPredictor(observer.agent, 2, ray_stride=4).predict(observed).images
+    expected = AgentPredictor(observer.agent, 2, ray_stride=4).predict(observed).images
     assert expected is not None
     whole = observer.render(vision, 0, observed.rig[0, -1])
     assert whole[:, 2::4, 2::4].permute(0, 3, 1, 2).numpy() == pytest.approx(expected[0, 0].numpy(), abs=1e-5)
