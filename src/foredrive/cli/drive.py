@@ -41,7 +41,8 @@ def drive(
             the expert would do at each key frame: disturbed, the expert steered aside and slowed, or
             pupil:RUN, a run and the expert by turns.
         out: Folder of the suite: summary.json, report.html, drives, logs.
-        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file.
+        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for lessons in
+            the other towns training-short and training-long.
         repetitions: How often each route is driven, every time among other traffic.
         seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
         conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog; any: drawn

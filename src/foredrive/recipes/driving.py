@@ -80,8 +80,9 @@ class DriveSuite:
         Pace(self.period_s, self.latency_s)
         if self.repetitions < 1:
             raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
-        if self.conditions not in (None, ANY_CONDITIONS):
-            find_conditions(self.conditions)
+        if self.conditions not in (None, ANY_CONDITIONS, *CONDITIONS):
+            there_are = ", ".join((ANY_CONDITIONS, *CONDITIONS))
+            raise InputError(f"no conditions are named {self.conditions}; there are {there_are}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.data import LogPath, collate
+from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
@@ -65,13 +65,9 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     if not isinstance(agent.world_model, Nemo):
         raise InputError(f"{run.folder}: only agents on NeMo can be exported, this is {run.recipe.name}")
     size = run.recipe.clips
-    dataset = open_clips(logs, size, run.cache_dir)
-    samples = []
-    for k in range(min(clips, len(dataset))):
-        item = dataset[int((k + 0.5) * len(dataset) / min(clips, len(dataset)))]
-        observed = collate([item]).clip.observed()
-        samples.append(_Sample(observed, GraphInputs.of(observed, agent)))
     steps = size.future_frames
+    dataset = open_clips(logs, size, run.cache_dir)
+    samples = _samples(dataset, agent, min(clips, len(dataset)))
     graph = AgentGraph(agent, dataset.camera_names, size.image_hw, steps).eval()
     program = torch.export.export(graph, tuple(samples[0].inputs))
     with atomic_path(out / PROGRAM) as temporary:
@@ -103,6 +99,13 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     with atomic_path(out / FACTS) as temporary:
         temporary.write_text(json.dumps(facts, indent=1))
     return facts
+
+
+def _samples(dataset: ClipDataset, agent: PlanningAgent, count: int) -> list[_Sample]:
+    """Clips spread evenly over the logs."""
+    every = len(dataset) / count if count else 0.0
+    clips = [collate([dataset[int((k + 0.5) * every)]]).clip.observed() for k in range(count)]
+    return [_Sample(observed, GraphInputs.of(observed, agent)) for observed in clips]
 
 
 def _check_packages() -> None:
