@@ -36,10 +36,10 @@ SHOWN_AFTER_S = {
 
 
 def places(kind: ScenarioKind) -> Iterator[tuple[DriveRoute, Scenario]]:
-    """Where on short routes of Town05 it can happen."""
-    world = grow("Town05", SEED)
-    for given in load_route_set("town05-short"):
+    """Where on short routes it can happen."""
+    for given in (*load_route_set("town05-short"), *load_route_set("training-short")):
         route = snap_route(given)
+        world = grow(route.town, SEED)
         for scenario in possible_scenarios(route, world, np.random.default_rng(0)):
             if scenario.kind is kind:
                 yield route, scenario

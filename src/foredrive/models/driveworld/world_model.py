@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import conv3d
 
 from foredrive.errors import InputError
 from foredrive.models.backbone import ImageBackbone
@@ -164,9 +165,11 @@ class DriveWorld(nn.Module):
 
     def decode(self, belief: Belief) -> Decoded:
         """Occupancy, flow, and the policy's action."""
-        volume = belief.volume.permute(0, 2, 3, 4, 1)
-        logit = self.occupancy(volume)[..., 0].float()
-        flow = self.flow(volume).permute(0, 4, 1, 2, 3).float()
+        # both heads at once, where the volume lies: two layers over voxels make a step a tenth longer
+        heads = (self.occupancy, self.flow)
+        weight = torch.cat([head.weight for head in heads])[:, :, None, None, None]
+        read = conv3d(belief.volume, weight, torch.cat([head.bias for head in heads])).float()
+        logit, flow = read[:, 0], read[:, 1:]
         action = None if belief.state is None else self.states.action(self._unpacked(belief.state))
         return Decoded(occupancy_logit=logit, feature=belief.volume, flow=flow, action=action)
 
