@@ -19,7 +19,13 @@ from foredrive.models.driveworld import (
     kl_divergence,
     motion_of,
 )
-from foredrive.models.driveworld.planes import PlanesToVolume, PlaneToVector, StaticScene, VectorToPlane
+from foredrive.models.driveworld.planes import (
+    PlanesToVolume,
+    PlaneToVector,
+    StaticScene,
+    VectorToPlane,
+    carried_plane,
+)
 from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace
 from foredrive.models.driveworld.task_prompt import PROMPTS, TaskPrompt
 from foredrive.models.lift_splat import LiftSplatEncoder
@@ -55,6 +61,7 @@ def model() -> DriveWorld:
         from_vector=VectorToPlane(HISTORY + STATE, (8, 8), size_yx),
         to_volume=PlanesToVolume(8 + 4 + 4, 4, 8, SPEC.shape_zyx[0]),
         statics=StaticScene(WIDTH, 4),
+        carry_statics=False,
         prompt=TaskPrompt(texts, (4, 4), size_yx),
         past_frames=PAST,
         dt_s=0.5,
@@ -251,3 +258,36 @@ def test_a_clip_that_shows_the_future_or_too_little_is_refused(
         model.observe(make_example(past=PAST, future=1, spec=SPEC).clip)
     with pytest.raises(InputError, match="2 frames before now"):
         model.observe(clip.frames(slice(1, None)))
+
+
+def test_a_carried_plane_shows_what_lies_there() -> None:
+    plane = torch.zeros(1, 1, *SPEC.shape_zyx[1:])  # 12 rows of y from -6 m, 10 columns of x from -4 m
+    plane[0, 0, 6, 7] = 1.0  # the cell around x 3.5 m, y 0.5 m
+    ahead = motion_of(torch.tensor([[4.0, 0.0]]), 0.5)  # 2 m straight on
+    (where,) = carried_plane(plane, ahead, SPEC)[0, 0].nonzero().tolist()
+    assert where == [6, 5]
+    left = torch.eye(4)[None].clone()
+    left[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])  # facing left: what was ahead lies to the right
+    carried = carried_plane(plane, left, SPEC)
+    assert carried[0, 0, 2, 4] == pytest.approx(1.0)  # x 0.5 m, y -3.5 m
+    assert carried.sum() == pytest.approx(1.0)
+
+
+def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: Clip) -> None:
+    now = model.observe(clip)
+    stand, go = torch.zeros(2, 2, 2), torch.tensor([4.0, 0.0]).expand(2, 2, 2)
+    as_it_is = [model.imagine(now, 2, actions)[-1].volume for actions in (stand, go)]
+    model.carry_statics = True
+    try:
+        torch.testing.assert_close(model.observe(clip).volume, now.volume)
+        standing, going = (model.imagine(now, 2, actions)[-1] for actions in (stand, go))
+        torch.testing.assert_close(model.volume_for(going, "forecast"), going.volume)
+        seen = model.see(clip)
+        first, *_, last = model.unroll(seen, 0, None).beliefs  # statics of now
+        torch.testing.assert_close(last.volume, now.volume)
+    finally:
+        model.carry_statics = False
+    torch.testing.assert_close(standing.volume, as_it_is[0])
+    assert not torch.allclose(going.volume, as_it_is[1])
+    assert going.statics is now.statics  # carried when looked at, not twice
+    assert not torch.allclose(first.volume, model.unroll(seen, 0, None).beliefs[0].volume)

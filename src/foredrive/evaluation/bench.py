@@ -1,6 +1,6 @@
 """Benchmarks' common ground: arms side by side, over seeds, stored as they come in.
 
-A benchmark is run arm by arm and seed by seed, and its file is written after each. A run that was interrupted
+A benchmark is run seed by seed and arm by arm, and its file is written after each. A run that was interrupted
 goes on where it stopped; figures are kept only while the code (commit and changes since), the benchmark's
 configuration and the machine are the same.
 """
@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -58,20 +59,18 @@ def run_benchmark(
     origin = collect_provenance()
     same = _identity(benchmark, origin)
     runs = _kept_runs(path, same, benchmark, say)
-    for arm, measure in benchmark.arms.items():
-        if arms is not None and arm not in arms:
+    chosen = [arm for arm in benchmark.arms if arms is None or arm in arms]
+    for seed, arm in product(benchmark.seeds, chosen):  # what is interrupted has all arms beside each other
+        if any(run["arm"] == arm and run["seed"] == seed for run in runs):
+            say(f"{name}: {arm}, seed {seed}: measured before")
             continue
-        for seed in benchmark.seeds:
-            if any(run["arm"] == arm and run["seed"] == seed for run in runs):
-                say(f"{name}: {arm}, seed {seed}: measured before")
-                continue
-            say(f"{name}: {arm}, seed {seed} …")
-            started = time.perf_counter()
-            figures = {key: float(value) for key, value in measure(seed).items()}
-            wall_s = time.perf_counter() - started
-            runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s})
-            write_json(path, _report(name, benchmark, origin, same, runs))
-            say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+        say(f"{name}: {arm}, seed {seed} …")
+        started = time.perf_counter()
+        figures = {key: float(value) for key, value in benchmark.arms[arm](seed).items()}
+        wall_s = time.perf_counter() - started
+        runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s})
+        write_json(path, _report(name, benchmark, origin, same, runs))
+        say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
     if not path.is_file():
         raise InputError(f"{name} has no arms or no seeds")
     return path

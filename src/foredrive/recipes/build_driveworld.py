@@ -51,6 +51,7 @@ def build_driveworld(
             size.expanded[-1] + size.statics + prompted, size.volume_hidden, size.channels, height
         ),
         statics=StaticScene(size.plane, size.statics) if size.statics else None,
+        carry_statics=size.carry_statics,
         prompt=None if size.prompt is None else _build_prompt(size.prompt, size_yx, fetch=fetch),
         past_frames=clips.past_frames,
         dt_s=clips.frame_dt_s,

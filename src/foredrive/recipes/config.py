@@ -154,6 +154,8 @@ class DriveWorldSize(AgentSize):
     prompt: PromptSize | None
     memory_bank: bool = True
     motion_norm: bool = True
+    carry_statics: bool = False
+    """Latent statics move along with the ego vehicle; in the paper they do not."""
     kind: Literal["driveworld"] = DRIVEWORLD
 
 

@@ -11,7 +11,8 @@ def driveworld_rows(full: Recipe) -> dict[str, Recipe]:
     Table 1: `scratch` (no pre-training); `rssm`, plain latent dynamics in one vector; `ssp`, with Static
     Scene Propagation; `dmb`, with the Dynamic Memory Bank too; `mln`, with motion-aware layer normalisation
     too; the full one has task prompts besides. `occupancy` is pre-trained by the occupancy of single frames,
-    as OccNet and UniScene are. All are fine-tuned alike.
+    as OccNet and UniScene are. All are fine-tuned alike. `carried` is no row of the paper: the full one whose
+    statics move along with the ego vehicle.
 
     Args:
         full: a recipe with pre-training.
@@ -29,6 +30,7 @@ def driveworld_rows(full: Recipe) -> dict[str, Recipe]:
         "ssp": replace(full, model=ssp),
         "dmb": replace(full, model=dmb),
         "mln": replace(full, model=mln),
+        "carried": replace(full, model=replace(size, carry_statics=True)),
     }
     found = {full.name: full}
     for name, recipe in rows.items():

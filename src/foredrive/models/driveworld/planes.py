@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.scene import VoxelSpec
+
 
 class AdaptiveNorm(nn.Module):
     """Instance normalisation whose scale and shift come from a vector (Huang & Belongie 2017, AdaIN)."""
@@ -98,6 +100,25 @@ class StaticScene(nn.Module):
     def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b _O Y X"]:
         """Latent statics."""
         return self.net(plane)
+
+
+def carried_plane(
+    plane: Float[Tensor, "b C Y X"], T_src_dst: Float[Tensor, "b 4 4"], spec: VoxelSpec
+) -> Float[Tensor, "b C Y X"]:
+    """A plane in the frame dst, read bilinearly where dst's cells lie in src; 0 beyond its edge.
+
+    Args:
+        plane: over the ground of `spec`, in the frame src.
+        T_src_dst: points of dst -> src; only their way over the ground counts.
+    """
+    size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
+    lower = plane.new_tensor(spec.lower_m[:2])
+    y, x = (torch.arange(n).to(plane) + 0.5 for n in spec.shape_zyx[1:])
+    cells_m = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * spec.voxel_m + lower
+    T = T_src_dst.to(plane)
+    read_m = torch.einsum("bij,yxj->byxi", T[:, :2, :2], cells_m) + T[:, None, None, :2, 3]
+    grid = 2 * (read_m - lower) / (spec.voxel_m * size_xy) - 1
+    return F.grid_sample(plane, grid, align_corners=False)
 
 
 class PlanesToVolume(nn.Module):

@@ -10,10 +10,17 @@ from torch import Tensor, nn
 from torch.nn.functional import conv3d
 
 from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3
 from foredrive.models.backbone import ImageBackbone
 from foredrive.models.driveworld.actions import actions_of, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian
-from foredrive.models.driveworld.planes import PlanesToVolume, PlaneToVector, StaticScene, VectorToPlane
+from foredrive.models.driveworld.planes import (
+    PlanesToVolume,
+    PlaneToVector,
+    StaticScene,
+    VectorToPlane,
+    carried_plane,
+)
 from foredrive.models.driveworld.state_space import Latent, StateSpace
 from foredrive.models.driveworld.task_prompt import TaskPrompt
 from foredrive.models.lift_splat import LiftSplatEncoder
@@ -33,6 +40,8 @@ class Seen(Record):
     """Each in its own ego frame."""
     actions: Float[Tensor, "b T 2"]
     """What was done at each but the last; zeros there."""
+    T_now_ego: Float[Tensor, "b T 4 4"]
+    """Each frame's ego frame -> that of the last."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +49,7 @@ class Unrolled:
     """One pass over the frames of a clip, for training."""
 
     beliefs: tuple[Belief, ...]
-    """Of the T observed frames, then of the L imagined ones."""
+    """Of the T observed frames, then of the L imagined ones; `T_now_ego` leads to the statics' frame."""
     posteriors: tuple[DiagonalGaussian, ...]
     """Of the observed frames."""
     priors: tuple[DiagonalGaussian, ...]
@@ -61,6 +70,8 @@ class DriveWorld(nn.Module):
         from_vector: (h̃, s) as a plane, m_θ.
         to_volume: all planes as a volume, l_θ.
         statics: Static Scene Propagation; None leaves it out (the rows of plain dynamics).
+        carry_statics: move latent statics along with the ego vehicle, by the driven path and, where that is
+            imagined, by the actions. The paper hands them on as they are.
         prompt: task prompts; None leaves them out.
         past_frames: T - 1.
         dt_s: between key frames.
@@ -77,6 +88,7 @@ class DriveWorld(nn.Module):
         from_vector: VectorToPlane,
         to_volume: PlanesToVolume,
         statics: StaticScene | None,
+        carry_statics: bool,
         prompt: TaskPrompt | None,
         past_frames: int,
         dt_s: float,
@@ -85,7 +97,7 @@ class DriveWorld(nn.Module):
         super().__init__()
         self.backbone, self.encoder, self.states = backbone, encoder, states
         self.to_vector, self.from_vector, self.to_volume = to_vector, from_vector, to_volume
-        self.statics, self.prompt = statics, prompt
+        self.statics, self.carry_statics, self.prompt = statics, carry_statics, prompt
         self.past_frames, self.dt_s = past_frames, dt_s
         self.occupancy = nn.Linear(channels, 1)
         nn.init.constant_(self.occupancy.bias, math.log(OCCUPIED_PRIOR / (1 - OCCUPIED_PRIOR)))
@@ -121,7 +133,8 @@ class DriveWorld(nn.Module):
         features = [level.unflatten(0, (b * t, c)) for level in levels]
         per_image = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
         planes = self.encoder(features, per_image, seen.image_valid.flatten(0, 1)).unflatten(0, (b, t))
-        return Seen(planes, actions_of(seen))
+        T_now_ego = inverse_se3(seen.T_world_ego[:, -1:]) @ seen.T_world_ego
+        return Seen(planes, actions_of(seen), T_now_ego.float())
 
     def believe(self, seen: Seen) -> Belief:
         """`observe` of frames that have been seen."""
@@ -179,7 +192,8 @@ class DriveWorld(nn.Module):
             return belief.volume
         if belief.state is None or belief.statics is None:
             raise InputError("DriveWorld prompts beliefs of its own")
-        return self._volume(self._unpacked(belief.state), belief.statics, task)
+        statics = self._carried(belief.statics, belief.T_now_ego)
+        return self._volume(self._unpacked(belief.state), statics, task)
 
     def unroll(
         self,
@@ -200,13 +214,18 @@ class DriveWorld(nn.Module):
         if generator is not None and statics_of == "random":
             shown = int(torch.randint(frames, (1,), generator=generator))
         statics = self._statics(seen.planes[:, shown])
-        beliefs = [self._decoded(each, statics, "occupancy", None) for each in latents]
+        T_shown_now = inverse_se3(seen.T_now_ego[:, shown])
+        T_shown_ego = T_shown_now[:, None] @ seen.T_now_ego
+        beliefs = [
+            self._decoded(latent, statics, "occupancy", T_shown_ego[:, k]) for k, latent in enumerate(latents)
+        ]
         policy = [self.states.action(each) for each in latents]
-        latent = latents[-1]
+        latent, T = latents[-1], T_shown_now
         for _ in range(steps):
+            T = T @ motion_of(policy[-1], self.dt_s)
             latent, prior = self._ahead(latent, policy[-1])
             latent = _with_state(latent, prior.mean if generator is None else prior.sample(generator))
-            beliefs.append(self._decoded(latent, statics, "forecast", None))
+            beliefs.append(self._decoded(latent, statics, "forecast", T))
             policy.append(self.states.action(latent))
         return Unrolled(
             beliefs=tuple(beliefs),
@@ -258,6 +277,14 @@ class DriveWorld(nn.Module):
         """b̂; no channels without Static Scene Propagation."""
         return plane[:, :0] if self.statics is None else self.statics(plane)
 
+    def _carried(
+        self, statics: Float[Tensor, "b _S Y X"], T_shown_ego: Float[Tensor, "b 4 4"] | None
+    ) -> Float[Tensor, "b _S Y X"]:
+        """Statics of one frame for another, if they are carried along."""
+        if not self.carry_statics or T_shown_ego is None:
+            return statics
+        return carried_plane(statics, T_shown_ego, self.spec)
+
     def _decoded(
         self,
         latent: Latent,
@@ -265,7 +292,7 @@ class DriveWorld(nn.Module):
         task: Task,
         T_now_ego: Float[Tensor, "b 4 4"] | None,
     ) -> Belief:
-        volume = self._volume(latent, statics, task)
+        volume = self._volume(latent, self._carried(statics, T_now_ego), task)
         return Belief(volume=volume, state=_packed(latent), statics=statics, T_now_ego=T_now_ego)
 
     def _volume(
