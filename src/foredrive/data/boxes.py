@@ -130,8 +130,10 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     box = lists.flatten().flatten().to_numpy(zero_copy_only=False).reshape(-1, 10)
     tokens = np.array(column["track_token"].flatten().to_pylist(), dtype=object)
     labels = column["label"].flatten().to_numpy(zero_copy_only=False)
-    label_class = metadata.box_detection_label_class
-    of_label = {int(value): label_class(int(value)) for value in np.unique(labels)}
+    kinds, kind = np.unique(labels, return_inverse=True)
+    of_kind = [metadata.box_detection_label_class(int(value)) for value in kinds]
+    category = np.array([category_of(label) for label in of_kind], dtype=np.int64)
+    is_ego = np.array([label.to_default() == DefaultBoxDetectionLabel.EGO for label in of_kind], dtype=bool)
     bad = ~np.isfinite(box).all(-1) | (np.linalg.norm(box[:, 3:7], axis=-1) < 0.5)
     if bad.any():
         row = np.searchsorted(first_row, bad.argmax(), side="right") - 1
@@ -152,14 +154,8 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
         size_lwh=box[:, 7:],
         velocity=np.where(np.isfinite(logged), logged, difference),
         track_id=track_id,
-        category=np.array([category_of(of_label[label]) for label in labels], dtype=np.int64),
-        is_ego=np.array(
-            [
-                token == EGO_TRACK_TOKEN or of_label[label].to_default() == DefaultBoxDetectionLabel.EGO
-                for token, label in zip(tokens, labels, strict=True)
-            ],
-            dtype=bool,
-        ),
+        category=category[kind],
+        is_ego=is_ego[kind] | (tokens == EGO_TRACK_TOKEN),
     )
 
 
