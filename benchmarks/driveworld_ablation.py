@@ -27,7 +27,7 @@ from foredrive.training import PathFit
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()
 FULL, NEMO = "driveworld_town", "nemo_town"
-PRETRAIN_STEPS, WARMUP_STEPS = 300, 30
+PRETRAIN_STEPS, FINETUNE_STEPS, WARMUP_STEPS = 300, 100, 20
 READ_EVERY_S = 3.0
 """Time between the clips that the head along the path is fitted to."""
 
@@ -38,7 +38,11 @@ def shortened(recipe: Recipe) -> Recipe:
     if pretrain is not None:
         pretrain = rescheduled(pretrain, steps=PRETRAIN_STEPS, warmup_steps=WARMUP_STEPS)
     return dataclasses.replace(
-        recipe, pretrain=pretrain, path=PathFit(stride_s=READ_EVERY_S), precision="bf16-mixed"
+        recipe,
+        pretrain=pretrain,
+        finetune=rescheduled(recipe.finetune, steps=FINETUNE_STEPS, warmup_steps=WARMUP_STEPS),
+        path=PathFit(stride_s=READ_EVERY_S),
+        precision="bf16-mixed",
     )
 
 

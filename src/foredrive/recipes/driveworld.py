@@ -66,7 +66,11 @@ def driveworld_tiny() -> Recipe:
 
 
 def driveworld_town() -> Recipe:
-    """DriveWorld for claims tested on two CPU cores: grid, planner and steps are those of `nemo_town`."""
+    """DriveWorld for claims tested on two CPU cores: grid, planner and steps are those of `nemo_town`.
+
+    One round of deformable lifting: after 300 steps, statics carried along, above-ground IoU on 32 clips of
+    Town05 was 0.127; by lift, splat, shoot, whose steps take two thirds of the time, 0.108.
+    """
     tiny, nemo = driveworld_tiny(), nemo_town()
     pretrain, finetune = tiny.pretrain, tiny.finetune
     assert pretrain is not None
@@ -78,7 +82,7 @@ def driveworld_town() -> Recipe:
         clips=_in_time(nemo.clips),
         model=replace(
             tiny.model,
-            encoder=LiftSplatSize(near_m=1.0, far_m=48.0, step_m=1.0),
+            encoder=PooledLiftingSize(heads=4, points=4, layers=1),
             planner_history=nemo.model.planner_history,
             planner_base=nemo.model.planner_base,
             planner_look_m=nemo.model.planner_look_m,
