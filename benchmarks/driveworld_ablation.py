@@ -12,7 +12,6 @@ from pathlib import Path
 
 from foredrive.evaluation import Benchmark
 from foredrive.recipes import RECIPES
-from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.study import (
     StudyLogs,
     StudyTowns,
@@ -20,32 +19,13 @@ from foredrive.recipes.study import (
     run_arm,
     seeded,
     share_of,
+    shortened,
     work_folder,
 )
-from foredrive.training import PathFit
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()
 FULL, NEMO = "driveworld_town", "nemo_town"
-PRETRAIN_STEPS, FINETUNE_STEPS, WARMUP_STEPS = 300, 100, 20
-READ_EVERY_S = 3.0
-"""Time between the clips that the head along the path is fitted to."""
-
-
-def shortened(recipe: Recipe) -> Recipe:
-    """What is trained of a recipe here."""
-    pretrain = recipe.pretrain
-    if pretrain is not None:
-        pretrain = rescheduled(pretrain, steps=PRETRAIN_STEPS, warmup_steps=WARMUP_STEPS)
-    return dataclasses.replace(
-        recipe,
-        pretrain=pretrain,
-        finetune=rescheduled(recipe.finetune, steps=FINETUNE_STEPS, warmup_steps=WARMUP_STEPS),
-        path=PathFit(stride_s=READ_EVERY_S),
-        precision="bf16-mixed",
-    )
-
-
 ARMS = {name: shortened(RECIPES[name]) for name in RECIPES if name.startswith(FULL) or name == NEMO}
 
 
