@@ -1,9 +1,11 @@
-"""The detection task on lidar: samples from any log, a head's figures on them, side by side with others'.
+"""The detection task on lidar: samples from any log, a head's figures on them, losses compared.
 
 A head (`models.detection`) learns from samples by `training.detection.fit_head`; docs/sets.md shows how.
 """
 
-from collections.abc import Sequence
+import functools
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,8 +15,10 @@ from torch import Tensor
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
+from foredrive.models.detection import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec
-from foredrive.sets import LabelledBoxes, MultiBernoulli, UniformPoisson
+from foredrive.sets import LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
+from foredrive.training.detection import Loss, fit_head, matching_loss, said_of, set_loss
 
 CLASSES = ("vehicle", "cycle", "pedestrian")
 _CLASS_OF = {
@@ -36,6 +40,14 @@ class DetectionSample(NamedTuple):
     volume: Float[Tensor, "1 Z Y X"]
     objects: LabelledBoxes
     log: str
+
+
+class DetectionSplit(NamedTuple):
+    """Samples for what they are used for."""
+
+    train: Sequence[DetectionSample]
+    calibrate: Sequence[DetectionSample]
+    test: Sequence[DetectionSample]
 
 
 def detection_samples(log: LogPath, spec: VoxelSpec, *, stride_s: float = 0.5) -> list[DetectionSample]:
@@ -88,7 +100,7 @@ def unexplained(spec: VoxelSpec) -> UniformPoisson:
 def judge(
     detected: Sequence[MultiBernoulli], samples: Sequence[DetectionSample], spec: VoxelSpec
 ) -> dict[str, float]:
-    """What `foredrive score` says of detections: likelihood, its parts, mAP, calibration."""
+    """What `foredrive score` says of detections: likelihood, its parts, mAP, calibration; NaN for none."""
     region = unexplained(spec)
     frames = [
         Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
@@ -104,7 +116,43 @@ def judge(
     }  # fmt: skip
     parts = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
     names |= {f"pmb_nll.{part}": f"pmb_nll_{part}" for part in parts}
-    return {short: float(summary.get(key) or 0.0) for key, short in names.items()}
+    found = {short: summary.get(key) for key, short in names.items()}
+    return {short: math.nan if value is None else float(value) for short, value in found.items()}
+
+
+def compare_losses(
+    split: Callable[[], DetectionSplit], spec: VoxelSpec, *, first_steps: int, more_steps: int
+) -> dict[str, Callable[[int], dict[str, float]]]:
+    """Arms of a benchmark, seed → figures: trained by matching or by set likelihood, each also calibrated.
+
+    All heads of a seed go on from the same one, for equally many steps; `split` is asked whenever samples
+    are needed.
+    """
+
+    @functools.cache
+    def trained(loss: Loss | None, seed: int) -> DetectionHead:
+        data = [sample[:2] for sample in split().train]
+        if loss is not None:
+            return fit_head(trained(None, seed), data, loss, steps=more_steps, seed=seed + 100)
+        torch.manual_seed(seed)
+        head = DetectionHead(spec, channels=1, classes=len(CLASSES))
+        return fit_head(head, data, matching_loss, steps=first_steps, seed=seed)
+
+    def measure(loss: Loss, calibrated: bool, seed: int) -> dict[str, float]:
+        torch.set_num_threads(1)
+        head, (_, apart, test) = trained(loss, seed), split()
+        said = said_of(head, [sample.volume for sample in test])
+        if calibrated:
+            before = said_of(head, [sample.volume for sample in apart])
+            mend = fit_set_calibration(before, [sample.objects for sample in apart], unexplained(spec))
+            said = [mend(found) for found in said]
+        return {**judge(said, test, spec), "frames": float(len(test))}
+
+    return {
+        name + ("_calibrated" if calibrated else ""): functools.partial(measure, loss, calibrated)
+        for calibrated in (False, True)
+        for name, loss in {"matching": matching_loss, "mb_nll": set_loss}.items()
+    }
 
 
 def _ground(spec: VoxelSpec) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
