@@ -106,7 +106,7 @@ def judge(
         Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
         for n, (found, sample) in enumerate(zip(detected, samples, strict=True))
     ]
-    read = DetectionSet(frames, CLASSES, True, {})
+    read = DetectionSet(frames, CLASSES, True, {}, len(CLASSES))
     summary = summarise_scores(read, score_frames(read)).figures
     names = {
         "pmb_nll.mean": "pmb_nll", "map": "map", "calibration.d_ece": "d_ece", "brier.hit": "brier",

@@ -102,6 +102,10 @@ def test_kitti_boxes_forward_left_up(tmp_path: Path) -> None:
         ({"class_probabilities": {"car": "x"}}, r"box 1: class_probabilities must be numbers"),
         ({"covariance": ["x"] * 6}, r"box 1: its covariance is not made of numbers"),
         ({"class_probabilities": {"car": 0.4}}, r"detection 1 has class probabilities"),
+        ({"detection_name": None}, r"box 1 has no detection_name"),
+        ({"translation": [1e200, 0.0, 0.0]}, r"box 1 has a translation beyond 1e\+12"),
+        ({"size": [10**400, 4.0, 1.5]}, r"box 1 has no size of 3"),
+        ({"yaw_std": 1e-200}, r"detection 1 has a standard deviation of its heading below"),
     ],
 )
 def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> None:
@@ -112,6 +116,58 @@ def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> No
         read_detections(results, truth)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": [0.0, 4.0, 1.5]}, r"gt\.json: frame a, box 0 has the size"),
+        ({"ego_translation": "x"}, r"gt\.json: frame a, box 0 has no ego_translation of 3"),
+        ({"ego_translation": [1.0, math.nan, 0.0]}, r"gt\.json: frame a, box 0 has a ego_translation"),
+        ({"num_pts": None}, r"gt\.json: frame a, box 0 has a num_pts that is not finite"),
+        ({"relevance": -1.0}, r"gt\.json: frame a, object 0 has a relevance below 0"),
+    ],
+)
+def test_wrong_truth_is_named(tmp_path: Path, change: dict, message: str) -> None:
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [{**box(0.0, 0.0), **change}]})
+    results = write_nuscenes(tmp_path / "found.json", {"a": [box(0.0, 0.0, detection_score=0.5)]})
+    with pytest.raises(InputError, match=message):
+        read_detections(results, truth)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": [{"id": 1, "width": 9, "height": 0}]}, r"image 1 has the size 9 x 0"),
+        ({"images": [{"id": 1}, {"id": 1}]}, r"images 1 has the id 1 again"),
+        ({"images": [{"id": [1]}]}, r"images 0 has no id"),
+        ({"categories": [{"name": "car"}]}, r"categories 0 has no id"),
+        ({"categories": [{"id": 3, "name": "car"}, {"id": 4, "name": "car"}]}, r"have the same name"),
+        ({"annotations": None}, r"has no list of annotations"),
+    ],
+)
+def test_wrong_image_truth_is_named(tmp_path: Path, change: dict, message: str) -> None:
+    truth = write_coco_truth(tmp_path / "gt.json", [])
+    truth.write_text(json.dumps(json.loads(truth.read_text()) | change))
+    with pytest.raises(InputError, match=r"gt\.json.* " + message):
+        read_detections(write_list(tmp_path / "found.json", []), truth)
+
+
+def test_wrong_lines_are_named(tmp_path: Path) -> None:
+    good = "Car 0 0 0 1 2 3 4 1.5 2 4 3 1.7 20 0.1"
+    for name in ("gt", "found"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "gt" / "0.txt").write_text(good)
+    for line, message in (
+        (good, "line 2 has 15 fields, not 16"),
+        (f"{good} x", "line 2 has something that is not a number"),
+        (f"{good} nan", "line 2 has a number that is not finite"),
+        (f"{good} 3.5", "detection 1 has a score outside"),
+        (good.replace("1.5 2 4", "0 2 4") + " 0.9", "box 1 has no size"),
+    ):
+        (tmp_path / "found" / "0.txt").write_text(f"{good} 0.5\n{line}\n")
+        with pytest.raises(InputError, match=rf"0\.txt: {message}"):
+            read_detections(tmp_path / "found", tmp_path / "gt")
+
+
 def test_wrong_files_are_named(tmp_path: Path) -> None:
     truth = write_nuscenes(tmp_path / "gt.json", {"a": []})
     elsewhere = write_nuscenes(tmp_path / "found.json", {"z": []})
@@ -120,6 +176,9 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "empty.json").write_text("")
     with pytest.raises(InputError, match=r"empty\.json: not JSON"):
         read_detections(tmp_path / "empty.json", truth)
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match=r"deep\.json: not JSON"):
+        read_detections(tmp_path / "deep.json", truth)
     with pytest.raises(InputError, match=r"nowhere\.json: No such file"):
         read_detections(tmp_path / "nowhere.json", truth)
     with pytest.raises(InputError, match=r"list\.json: neither an object"):

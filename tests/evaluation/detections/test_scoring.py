@@ -125,6 +125,9 @@ def test_relevance_stands_beside_what_is_not_weighted(tmp_path: Path) -> None:
     assert figures["object_cost"] == pytest.approx(cost.mean())
     assert figures["object_cost.by_relevance"] == pytest.approx((3 * cost[0] + cost[1]) / 4)
     assert cost[1] > 10 > cost[0]
+    silent = [{**each, "relevance": 0.0} for each in truth]
+    read = read_detections(tmp_path / "found.json", write_nuscenes(tmp_path / "gt.json", {"a": silent}))
+    assert summarise_scores(read, score_frames(read)).figures["object_cost.by_relevance"] is None
 
 
 def test_no_objects_at_all(tmp_path: Path) -> None:
@@ -150,3 +153,31 @@ def test_no_detections_at_all(tmp_path: Path) -> None:
     figures = summarise_scores(read, [score]).figures
     assert figures["map"] == 0.0
     assert figures["frames_without_detections"] == 1
+
+
+def test_what_else_a_detector_names_changes_no_other_frame(tmp_path: Path) -> None:
+    """The background is of the truth's classes, so that two detectors are compared by the same one."""
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [box(5.0, 5.0)], "b": [box(30.0, 5.0, "bus")]})
+    found = {"a": [box(5.0, 6.0, detection_score=0.9)], "b": []}
+    plain = read_detections(write_nuscenes(tmp_path / "found.json", found), truth)
+    found["b"].append(box(-30.0, 0.0, "moon", detection_score=0.5))
+    other = read_detections(write_nuscenes(tmp_path / "found.json", found), truth)
+    assert (plain.classes, other.classes) == (["bus", "car"], ["bus", "car", "moon"])
+    ours, theirs = score_frames(plain), score_frames(other)
+    assert theirs[0].nll == pytest.approx(ours[0].nll, abs=1e-5)  # a class has 1e-6 of another's probability
+    assert theirs[1].nll == pytest.approx(ours[1].nll - math.log(0.5), abs=1e-5)
+
+
+def test_ranges_are_those_of_frames_where_the_ego_vehicle_is_known(tmp_path: Path) -> None:
+    at = {"a": box(105.0, 0.0, ego_translation=[5.0, 0.0, 0.0]), "b": box(900.0, 0.0)}
+    truth = write_nuscenes(tmp_path / "gt.json", {name: [each] for name, each in at.items()})
+    found = {name: [{**each, "detection_score": 0.9}] for name, each in at.items()}
+    read = read_detections(write_nuscenes(tmp_path / "found.json", found), truth)
+    figures = summarise_scores(read, score_frames(read)).figures
+    assert figures["by_range.from_0_m.objects"] == 1
+    assert figures["calibration.d_ece.from_0_m"] == pytest.approx(0.1)
+    for each in at.values():
+        each.pop("ego_translation", None)
+    truth = write_nuscenes(tmp_path / "gt.json", {name: [each] for name, each in at.items()})
+    read = read_detections(tmp_path / "found.json", truth)
+    assert not [key for key in summarise_scores(read, score_frames(read)).figures if "range" in key]

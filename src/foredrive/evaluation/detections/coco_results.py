@@ -38,13 +38,15 @@ def read_coco(
     results: Sequence[Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
 ) -> DetectionSet:
     """Images of the truth, in its order; crowds are left out. Raises `InputError` that names the record."""
-    images, categories = _listed(truth, "images", truth_path), _listed(truth, "categories", truth_path)
+    images, categories = _named(truth, "images", truth_path), _named(truth, "categories", truth_path)
     label_of = {category["id"]: n for n, category in enumerate(categories)}
     classes = [str(category.get("name", category["id"])) for category in categories]
+    if len(set(classes)) < len(classes):
+        raise InputError(f"{truth_path}: two categories have the same name")
     found: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     true: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     crowds = 0
-    for n, record in enumerate(_listed(truth, "annotations", truth_path, "id")):
+    for n, record in enumerate(_listed(truth, "annotations", truth_path)):
         if record.get("iscrowd"):
             crowds += 1
         else:
@@ -70,7 +72,7 @@ def read_coco(
         _frame(image, found[image["id"]], true[image["id"]], label_of, classes, path, truth_path, family)
         for image in images
     ]
-    return DetectionSet(frames, classes, False, counts)
+    return DetectionSet(frames, classes, False, counts, len(classes))
 
 
 def _frame(
@@ -94,6 +96,8 @@ def _frame(
     score = all_numbers_of(records, "score", 1, names)[:, 0]
     labels = [label_of[record["category_id"]] for _, record in true]
     height, width = (numbers_of(image, key, 1, true_where)[0] for key in ("height", "width"))
+    if not (height > 0 and width > 0):
+        raise InputError(f"{true_where} has the size {width:g} x {height:g}")
     return Frame(
         str(image.get("file_name", image["id"])),
         str(image.get("sequence", image["id"])),
@@ -128,12 +132,19 @@ def _defaults(corners: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4 4"]:
     return np.eye(4) * ((STD_OF_SIDE * side) ** 2 + STD_PX**2)[:, None, :]
 
 
-def _listed(content: Mapping[str, Any], key: str, path: Path, needs: str | None = None) -> list[Any]:
+def _listed(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
     records = content.get(key)
     if not isinstance(records, list) or not all(isinstance(each, dict) for each in records):
         raise InputError(f"{path}: has no list of {key}")
-    if needs is None:
-        for n, record in enumerate(records):
-            if "id" not in record:
-                raise InputError(f"{path}: {key} {n} has no id")
+    return records
+
+
+def _named(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
+    """Records that each have an id of their own."""
+    records, known = _listed(content, key, path), set()
+    for n, record in enumerate(records):
+        name = _key(record, "id")
+        if name is None or name in known:
+            raise InputError(f"{path}: {key} {n} has {'no id' if name is None else f'the id {name} again'}")
+        known.add(name)
     return records

@@ -24,6 +24,9 @@ STD_OF_SIDE = 0.05
 """Standard deviation of an image box's edge where a detector states none: this share of the side across …"""
 STD_PX = 1.0
 """… and this, in quadrature."""
+LEAST_STD_YAW_RAD = 1e-6
+LARGEST = 1e12
+"""Of numbers in files: beyond it, squares and products lose what they are about."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class DetectionSet:
     upright: bool
     counts: dict[str, int]
     """By name, how often something was assumed or missing."""
+    true_classes: int
+    """The first so many of the classes are the truth's, others are named by detections alone."""
 
 
 def detections_of_file(
@@ -79,7 +84,8 @@ def detections_of_file(
     }
     if yaw is not None and yaw_std is not None:
         checks["a heading that is not finite"] = np.isfinite(yaw)
-        checks["a standard deviation of its heading that is not positive"] = yaw_std > 0
+        name = f"a standard deviation of its heading below {LEAST_STD_YAW_RAD:g} rad"
+        checks[name] = yaw_std >= LEAST_STD_YAW_RAD
     for fault, fine in checks.items():
         if not fine.all():
             raise InputError(f"{where}: detection {int(np.flatnonzero(~fine)[0])} has {fault}")
@@ -148,7 +154,7 @@ def _covariance_matrices(
     """All at once if they have the same form, which is much faster, else one after the other."""
     try:
         array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if len(values) == 1:
             raise InputError(f"{names[0]}: its covariance is not made of numbers") from error
         array = np.zeros(0)
@@ -185,9 +191,17 @@ def class_distributions(
             )
         try:
             share[n, [place[name] for name in stated]] = np.array([*stated.values()], dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{names[n]}: class_probabilities must be numbers") from error
     return share
+
+
+def classes_in_order(true: set[str], found: set[str]) -> tuple[list[str], int]:
+    """Of files that do not list them: the truth's, then those of detections alone; how many are the truth's.
+
+    All of them if the truth has none.
+    """
+    return sorted(true) + sorted(found - true), len(true) or len(found)
 
 
 def around(
@@ -200,15 +214,17 @@ def around(
 
 
 def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
-    """Finite numbers that a record of a file must have."""
+    """Finite numbers, none beyond `LARGEST`, that a record of a file must have."""
     try:
         value = np.atleast_1d(np.asarray(record[key], dtype=np.float64))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where} has no {key} of {count} number(s)") from error
     if value.shape != (count,):
         raise InputError(f"{where} has no {key} of {count} number(s)")
     if not np.isfinite(value).all():
         raise InputError(f"{where} has a {key} that is not finite")
+    if not (np.abs(value) <= LARGEST).all():
+        raise InputError(f"{where} has a {key} beyond {LARGEST:g}")
     return value
 
 
@@ -219,9 +235,9 @@ def all_numbers_of(
     try:
         values = np.array([record[key] for record in records], dtype=np.float64)
         shape = (len(records), count) if count > 1 else (len(records),)
-        if values.shape == shape and np.isfinite(values).all():
+        if values.shape == shape and (np.abs(values) <= LARGEST).all():
             return values.reshape(-1, count)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         pass
     found = [numbers_of(record, key, count, names[n]) for n, record in enumerate(records)]
     return np.array(found).reshape(-1, count)

@@ -13,11 +13,13 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import (
+    LARGEST,
     STD_YAW_RAD,
     DetectionSet,
     Family,
     Frame,
     around,
+    classes_in_order,
     detections_of_file,
     objects_of_file,
 )
@@ -38,7 +40,9 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
         raise InputError(f"{folder / unknown[0]}: there is no such frame in {truth}")
     true = {path.name: _lines(path, 15) for path in true_paths}
     found = {name: _lines(folder / name, 16) if name in paths else [] for name in true}
-    classes = sorted({kind for lines in (*true.values(), *found.values()) for kind, _ in lines})
+    classes, true_classes = classes_in_order(
+        *({kind for lines in each.values() for kind, _ in lines} for each in (true, found))
+    )
     counts = {
         "frames_without_detections": len(set(true) - paths),
         "boxes_without_covariance": sum(len(lines) for lines in found.values()),
@@ -67,7 +71,7 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
                 visibility=np.array([values[1] for _, values in lines]),
             )
         )
-    return DetectionSet(frames, classes, True, counts)
+    return DetectionSet(frames, classes, True, counts, true_classes)
 
 
 def _lines(path: Path, fields: int) -> list[Line]:
@@ -87,6 +91,8 @@ def _lines(path: Path, fields: int) -> list[Line]:
             raise InputError(f"{path}: line {n} has something that is not a number") from error
         if len(values) < fields - 1:
             raise InputError(f"{path}: line {n} has {len(words)} fields, not {fields}")
+        if not (np.abs(values) <= LARGEST).all():
+            raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {LARGEST:g}")
         lines.append((words[0], values))
     return lines
 

@@ -25,8 +25,10 @@ from foredrive.evaluation.detections.frames import (
     all_numbers_of,
     around,
     class_distributions,
+    classes_in_order,
     covariances_of,
     detections_of_file,
+    numbers_of,
     objects_of_file,
     relevance_of,
 )
@@ -47,16 +49,16 @@ def read_nuscenes(
     unknown = sorted(set(found) - set(true))
     if unknown:
         raise InputError(f"{path}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth_path}")
-    names = {str(box.get("detection_name")) for boxes in true.values() for box in boxes}
-    names |= {str(box.get("detection_name")) for boxes in found.values() for box in boxes}
-    classes = sorted(names)
+    classes, true_classes = classes_in_order(
+        *({box["detection_name"] for boxes in each.values() for box in boxes} for each in (true, found))
+    )
     counts = {"frames_without_detections": len(set(true) - set(found)), "boxes_without_covariance": 0}
     frames = []
     for token, boxes in true.items():
         said = found.get(token, ())
         counts["boxes_without_covariance"] += sum(box.get("covariance") is None for box in said)
         frames.append(_frame(token, said, boxes, classes, path, truth_path, family))
-    return DetectionSet(frames, classes, True, counts)
+    return DetectionSet(frames, classes, True, counts, true_classes)
 
 
 def _frame(
@@ -71,10 +73,12 @@ def _frame(
     where, true_where = f"{path}: frame {token}", f"{truth_path}: frame {token}"
     state, yaw = _states(said, where)
     true_state, true_yaw = _states(true, true_where)
-    origin = _origin(true, true_state, state)
+    ego = _ego(true, true_state, true_where)
+    every = np.concatenate([true_state, state])[:, :3]
+    origin = ego if ego is not None else every.mean(0) if len(every) else np.zeros(3)
     state[:, :3] -= origin
     true_state[:, :3] -= origin
-    label = [classes.index(str(box["detection_name"])) for box in said]
+    label = [classes.index(box["detection_name"]) for box in said]
     names = [f"{where}, box {n}" for n in range(len(said))]
     yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in said]
     detected = detections_of_file(
@@ -88,16 +92,20 @@ def _frame(
         family=family,
     )
     objects = objects_of_file(
-        true_where, [classes.index(str(box["detection_name"])) for box in true], true_state, true_yaw
+        true_where, [classes.index(box["detection_name"]) for box in true], true_state, true_yaw
     )
-    seen = [float(box.get("num_pts", np.nan)) for box in true]
+    true_names = [f"{true_where}, box {n}" for n in range(len(true))]
+    seen = [
+        numbers_of(box, "num_pts", 1, name)[0] if "num_pts" in box else np.nan
+        for box, name in zip(true, true_names, strict=True)
+    ]
     return Frame(
         token,
         str(true[0].get("scene_token", token)) if true else token,
         detected,
         objects,
         *around(LOWER, UPPER, true_state),
-        range_m=np.linalg.norm(true_state[:, :2], axis=1),
+        range_m=None if ego is None else np.linalg.norm(true_state[:, :2], axis=1),
         visibility=np.array(seen),
         relevance=relevance_of(true, true_where),
     )
@@ -109,7 +117,7 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
         raise InputError(f"{path}: `results` must have a list of boxes by sample token")
     for token, each in boxes.items():
         for n, box in enumerate(each):
-            if not isinstance(box, dict) or "detection_name" not in box:
+            if not isinstance(box, dict) or not isinstance(box.get("detection_name"), str):
                 raise InputError(f"{path}: frame {token}, box {n} has no detection_name")
     return boxes
 
@@ -132,11 +140,8 @@ def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Fl
     return np.concatenate([centre, np.log(size[:, [1, 0, 2]])], axis=1), yaw
 
 
-def _origin(
-    true: Sequence[Box], true_state: Float[ndarray, "N 6"], state: Float[ndarray, "M 6"]
-) -> Float[ndarray, "3"]:
-    """Where the ego vehicle is, if the truth says, else the middle of all boxes."""
-    if true and "ego_translation" in true[0]:
-        return true_state[0, :3] - np.asarray(true[0]["ego_translation"], dtype=np.float64)
-    every = np.concatenate([true_state, state])[:, :3]
-    return every.mean(0) if len(every) else np.zeros(3)
+def _ego(true: Sequence[Box], true_state: Float[ndarray, "N 6"], where: str) -> Float[ndarray, "3"] | None:
+    """Where the ego vehicle is, if the truth says: the devkit writes where boxes are from there."""
+    if not true or "ego_translation" not in true[0]:
+        return None
+    return true_state[0, :3] - numbers_of(true[0], "ego_translation", 3, f"{where}, box 0")

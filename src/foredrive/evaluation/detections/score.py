@@ -98,10 +98,15 @@ def score_frames(
     return scores
 
 
-def predicted_set(frame: Frame, classes: int) -> PoissonMultiBernoulli:
-    """A frame's detections as a PMB: unsure ones and a uniform process are its background."""
+def predicted_set(frame: Frame, classes: int, true_classes: int) -> PoissonMultiBernoulli:
+    """A frame's detections as a PMB: unsure ones and a uniform process are its background.
+
+    The latter is of the first `true_classes` alone: it does not depend on what else a detector names.
+    """
+    rate = torch.zeros(classes, dtype=torch.float64)
+    rate[:true_classes] = UNEXPLAINED_PER_FRAME / true_classes
     uniform = UniformPoisson(
-        torch.full((classes,), UNEXPLAINED_PER_FRAME / classes, dtype=torch.float64),
+        rate,
         torch.as_tensor(frame.lower),
         torch.as_tensor(frame.upper),
         frame.objects.yaw is not None,
@@ -110,7 +115,7 @@ def predicted_set(frame: Frame, classes: int) -> PoissonMultiBernoulli:
 
 
 def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
-    pmb = predicted_set(frame, len(read.classes))
+    pmb = predicted_set(frame, len(read.classes), read.true_classes)
     result = set_nll(pmb, frame.objects, k=k)
     sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(LOW_CONFIDENCE))
     closeness = _closeness(frame, read.upright)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import DetectionSet
+from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.evaluation.detections.score import PARTS, FrameScore
 from foredrive.metrics.detection import (
     COCO_OVERLAPS,
@@ -154,8 +154,8 @@ def _calibration(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
     outcomes = {} if read.upright else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
     for c, name in enumerate(read.classes):
         figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[at][label == c]).error
-    if all(frame.range_m is not None for frame in read.frames):
-        where = torch.cat([frame.detected.boxes.mean[:, :2] for frame in read.frames]).norm(dim=-1).numpy()
+    if any(frame.range_m is not None for frame in read.frames):
+        where = np.concatenate([_range_of_detections_m(frame) for frame in read.frames])
         for low, high in pairwise(RANGES_M):
             inside = (where >= low) & (where < high)
             error = reliability(score[inside], hit[at][inside]).error
@@ -205,8 +205,11 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
         figures |= _slice(f"by_size.from_{low:g}_{unit}", scores, inside)
     for c, name in enumerate(read.classes):
         figures |= _slice(f"by_class.{name}", scores, np.flatnonzero(label == c))
-    if all(frame.range_m is not None for frame in read.frames):
-        range_m = np.concatenate([frame.range_m for frame in read.frames if frame.range_m is not None])
+    if any(frame.range_m is not None for frame in read.frames):
+        unknown = [np.full(len(frame.objects.label), np.nan) for frame in read.frames]
+        range_m = np.concatenate(
+            [nan if f.range_m is None else f.range_m for f, nan in zip(read.frames, unknown, strict=True)]
+        )
         for low, high in pairwise(RANGES_M):
             inside = np.flatnonzero((range_m >= low) & (range_m < high))
             figures |= _slice(f"by_range.from_{low:g}_m", scores, inside)
@@ -229,8 +232,16 @@ def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
     weights = [np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in read.frames]
     if any(frame.relevance is not None for frame in read.frames):
         weight = np.concatenate(weights)
-        figures["object_cost.by_relevance"] = float((weight * cost).sum() / weight.sum())
+        weighted = float((weight * cost).sum() / weight.sum()) if weight.any() else None
+        figures["object_cost.by_relevance"] = weighted
     return figures
+
+
+def _range_of_detections_m(frame: Frame) -> Float[ndarray, "M"]:
+    """Over ground; NaN where nobody knows where the ego vehicle is."""
+    if frame.range_m is None:
+        return np.full(len(frame.detected.log_existence), np.nan)
+    return frame.detected.boxes.mean[:, :2].norm(dim=-1).numpy()
 
 
 def _size(objects: LabelledBoxes, upright: bool) -> Float[ndarray, "N"]:
