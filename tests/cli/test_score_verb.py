@@ -35,6 +35,8 @@ def test_figures_and_a_report_that_loads_nothing(files: dict[str, Path], tmp_pat
     assert summary["map"] == pytest.approx(1.0)
     expected = 2 * 0.5 * (0.2**2 - 1.5**2) / 0.5**2  # two cars whose x has a standard deviation of 0.5 m
     assert summary["against.difference"] == pytest.approx(expected, abs=0.05)
+    assert summary["against.map"] == pytest.approx(0.5)  # 1.5 m is within two of four thresholds
+    assert summary["against.p_value"] == pytest.approx(0.5, abs=0.05)  # two scenes prove nothing
     page = (out / "report.html").read_text()
     assert page.count("<svg") == 4  # two diagrams, two frames
     assert not re.search(r'(src|href)="(?!data:|#)', page)

@@ -49,8 +49,11 @@ def score(
     result = summarise_scores(read, scores)
     figures = result.figures
     if against is not None:
-        others = _scored(read_detections(against, truth, family), k, against)
+        other = read_detections(against, truth, family)
+        others = _scored(other, k, against)
         compared, uncompared = compare_scores(scores, others)
+        theirs = summarise_scores(other, others).figures
+        figures |= {f"against.{key}": value for key, value in theirs.items()}
         figures |= {
             "against": str(against),
             "against.difference": compared.mean,
@@ -63,7 +66,7 @@ def score(
     figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
     write_summary(out / "summary.json", figures)
     write_score_report(
-        out / "report.html", f"{results.name} against {truth.name}", read, scores, result, worst
+        out / "report.html", f"{results.name} and the truth, {truth.name}", read, scores, result, worst
     )
     print_scores(figures, Console())
     print(f"wrote {out / 'summary.json'} and {out / 'report.html'}")

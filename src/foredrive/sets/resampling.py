@@ -18,7 +18,10 @@ class BootstrapMean:
     low: float
     high: float
     p_value: float
-    """Two-sided, of the mean being 0: twice the smaller share of resampled means on either side of 0."""
+    """Two-sided, of the mean being 0: how often it is as large if every sequence has a sign by chance.
+
+    Few sequences cannot be significant: of n, no p-value is below 2^(1 - n) but for chance.
+    """
 
 
 def bootstrap_mean(
@@ -31,8 +34,10 @@ def bootstrap_mean(
 ) -> BootstrapMean:
     """Percentile interval of the mean over frames, by drawing whole sequences with replacement.
 
-    Of paired differences this tests whether two detectors differ. With one sequence there is nothing to
-    draw from: the interval is NaN. Raises `InputError` without values, or if any is not finite.
+    Of paired differences the p-value tests whether two detectors differ, by a randomisation test (Fisher
+    1935): resampled means would call any two sequences that agree significant. With one sequence there is
+    nothing to draw from: interval and p-value are NaN. Raises `InputError` without values, or if any is not
+    finite.
     """
     if len(values) == 0 or not np.isfinite(values).all():
         raise InputError("a mean needs values, all of them finite")
@@ -44,6 +49,7 @@ def bootstrap_mean(
     drawn = rng.integers(0, len(total), (resamples, len(total)))
     means = total[drawn].sum(1) / count[drawn].sum(1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    below = (np.sum(means <= 0) + 1) / (resamples + 1)
-    above = (np.sum(means >= 0) + 1) / (resamples + 1)
-    return BootstrapMean(mean, float(low), float(high), float(min(1.0, 2 * min(below, above))))
+    by_chance = np.abs(rng.choice([-1.0, 1.0], (resamples, len(total))) @ total)
+    as_large = by_chance >= (1 - 1e-9) * abs(total.sum())
+    p_value = float((as_large.sum() + 1) / (resamples + 1))
+    return BootstrapMean(mean, float(low), float(high), p_value)

@@ -44,7 +44,7 @@ def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
             pair = np.stack([corners.mean(0), _corners(mean[i], float(yaw[i]), upright).mean(0)])
             axes.plot(*pair.T, color=OBJECT, linewidth=1.0)
     axes.autoscale_view()
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", adjustable="datalim")
     if not upright:
         axes.invert_yaxis()
     unit = "m" if upright else "px"

@@ -33,21 +33,25 @@ SHOWN = {
     "calibration.object_level": "Object-level calibration error",
     "std.best_factor": "Factor on standard deviations that fits best",
     "conformal.coverage_90": "Coverage of conformal 90 % boxes",
-    "against.difference": "PMB-NLL less that of the other file",
+}
+COMPARED = {
+    "against.difference": "PMB-NLL less that of the other file, nats a frame",
     "against.difference_low_95": "  95 % interval, from",
     "against.difference_high_95": "  to",
     "against.p_value": "  p-value",
+    "against.frames_not_compared": "Frames in which either is infinite, not compared",
 }
 
 
 def print_scores(figures: Figures, console: Console) -> None:
     """The figures a reader looks for first."""
-    table = Table(title="Detections as a random finite set", show_header=False)
+    other = figures.get("against")
+    table = Table(title="Detections as a random finite set", show_header=other is not None)
     table.add_column(no_wrap=True)
-    table.add_column(justify="right")
-    for key, title in SHOWN.items():
-        if figures.get(key) is not None:
-            table.add_row(title, unescape(number(figures[key])))
+    for name in ("these",) if other is None else ("these", Path(str(other)).name):
+        table.add_column(name, justify="right")
+    for title, values in _rows(figures):
+        table.add_row(title, *(unescape(value) for value in values))
     console.print(table)
 
 
@@ -65,14 +69,9 @@ def write_score_report(
         f"<figcaption>{escape(_caption(scores[n]))}</figcaption></figure>"
         for n in ranked
     ]
-    rows = "".join(
-        f"<tr><th scope='row'>{_indented(name)}</th><td>{number(result.figures[key])}</td></tr>"
-        for key, name in SHOWN.items()
-        if result.figures.get(key) is not None
-    )
     parts = [
         f"<h1>{escape(title)}</h1>",
-        f"<table>{rows}</table>",
+        _table(result.figures),
         "<h2>Reliability</h2>",
         f"<div class='grid two'>{''.join(diagrams)}</div>",
         "<h2>Where likelihood was lost</h2>",
@@ -90,6 +89,29 @@ def write_score_report(
     )
     with atomic_path(path) as scratch:
         scratch.write_text(page, encoding="utf-8")
+
+
+def _rows(figures: Figures) -> list[tuple[str, list[str]]]:
+    """Titles with figures, and beside them those of the other file if there is one."""
+    prefixes = ("",) if figures.get("against") is None else ("", "against.")
+    rows = [
+        (title, [number(figures.get(prefix + key)) for prefix in prefixes])
+        for key, title in SHOWN.items()
+        if figures.get(key) is not None
+    ]
+    return rows + [(title, [number(figures[key]), ""]) for key, title in COMPARED.items() if key in figures]
+
+
+def _table(figures: Figures) -> str:
+    other = figures.get("against")
+    head = f"<tr><th></th><th>these</th><th>{escape(Path(str(other)).name)}</th></tr>" if other else ""
+    rows = "".join(
+        f"<tr><th scope='row'>{_indented(title)}</th>"
+        + "".join(f"<td>{value}</td>" for value in values)
+        + "</tr>"
+        for title, values in _rows(figures)
+    )
+    return f"<table>{head}{rows}</table>"
 
 
 def _indented(name: str) -> str:

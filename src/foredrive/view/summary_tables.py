@@ -40,7 +40,7 @@ def number(value: Figure, digits: int = 3) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return MISSING
     if isinstance(value, float):
-        return f"{value:.{digits}f}"
+        return f"{value:z.{digits}f}"
     return escape(str(value))
 
 

@@ -18,13 +18,13 @@ from foredrive.evaluation.detections import (
 
 
 def drives(folder: Path, *, error_m: float, seed: int = 0) -> DetectionSet:
-    """Twelve frames of four scenes: five cars, all found with the error; two detections of nothing."""
+    """Twelve frames of as many scenes: five cars, all found with the error; two detections of nothing."""
     rng, other = np.random.default_rng(seed), np.random.default_rng(99)
     truth, found = {}, {}
     for n in range(12):
         at = rng.uniform(-40, 40, (5, 2))
         moved = at + error_m * other.normal(size=at.shape)
-        truth[f"f{n}"] = [box(*xy, scene_token=f"s{n % 4}", ego_translation=[*xy, 0.0]) for xy in at]
+        truth[f"f{n}"] = [box(*xy, scene_token=f"s{n}", ego_translation=[*xy, 0.0]) for xy in at]
         found[f"f{n}"] = [box(*xy, detection_score=0.9) for xy in moved]
         found[f"f{n}"] += [box(*rng.uniform(-40, 40, 2), detection_score=s) for s in (0.3, 0.05)]
     return read_detections(
