@@ -14,10 +14,13 @@ from foredrive.models.detection import DetectionHead
 from foredrive.recipes.build import build_agent
 from foredrive.recipes.detection import (
     CLASSES,
+    DetectionSplit,
+    compare_losses,
     detection_samples,
     hits_volume,
     judge,
     objects_of,
+    observed_samples,
     unexplained,
 )
 from foredrive.scene import Category, Example, LidarSweep, VoxelSpec
@@ -96,6 +99,33 @@ def test_a_log_from_samples_to_figures(log: LogPath) -> None:
     assert figures["objects"] == sum(len(sample.objects.label) for sample in samples)
     with pytest.raises(InputError, match="fewer than a batch"):
         fit_head(head, [samples[0][:2]], matching_loss, steps=1, batch=2)
+
+
+def test_what_a_world_model_sees_has_the_objects_that_lidar_meets(log: LogPath) -> None:
+    recipe = miniature()
+    model = build_agent(recipe).world_model.eval()
+    seen = observed_samples(log, model, recipe.clips)
+    hit = detection_samples(log, recipe.clips.voxels)
+    assert seen[-1].volume.shape[1:] == hit[-1].volume.shape[1:]
+    assert not seen[-1].volume.requires_grad
+    assert len(seen[-1].volume) > 1
+    first = len(hit) - len(seen)  # what it sees has a past
+    for one, other in zip(seen, hit[first:], strict=True):
+        assert one.objects.state.tolist() == other.objects.state.tolist()
+
+
+def test_arms_of_a_comparison_go_on_from_one_head(log: LogPath) -> None:
+    """A step of either loss makes a small difference; calibration brings existence nearer to the truth."""
+    spec = miniature().clips.voxels
+    samples = detection_samples(log, spec, stride_s=1.0)
+    split = DetectionSplit((samples * 8)[:8], samples, samples)
+    arms = compare_losses(lambda: split, spec, first_steps=2, more_steps=1)
+    assert list(arms) == ["matching", "mb_nll", "matching_calibrated", "mb_nll_calibrated"]
+    found = {name: measure(3) for name, measure in arms.items()}
+    assert found["mb_nll"]["pmb_nll"] == pytest.approx(found["matching"]["pmb_nll"], rel=0.2)
+    assert found["mb_nll"]["pmb_nll"] != found["matching"]["pmb_nll"]
+    assert found["matching_calibrated"]["existence_error"] < found["matching"]["existence_error"]
+    assert {figures["frames"] for figures in found.values()} == {len(samples)}
 
 
 def test_what_is_unexplained_is_over_the_volume() -> None:

@@ -1,8 +1,9 @@
-"""The detection task on lidar: samples from any log, a head's figures on them, losses compared.
+"""The detection task: samples from any log, a head's figures on them, losses compared.
 
 A head (`models.detection`) learns from samples by `training.detection.fit_head`; docs/sets.md shows how.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.models.detection import DetectionHead
-from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec
+from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
 from foredrive.sets import LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
 from foredrive.training.detection import Loss, fit_head, matching_loss, said_of, set_loss
 
@@ -37,7 +38,7 @@ HALF_HEIGHT_M, LARGEST_LOG_SIZE = 5.0, 4.0
 class DetectionSample(NamedTuple):
     """One moment of a log."""
 
-    volume: Float[Tensor, "1 Z Y X"]
+    volume: Float[Tensor, "D Z Y X"]
     objects: LabelledBoxes
     log: str
 
@@ -52,16 +53,39 @@ class DetectionSplit(NamedTuple):
 
 def detection_samples(log: LogPath, spec: VoxelSpec, *, stride_s: float = 0.5) -> list[DetectionSample]:
     """Hits and objects every `stride_s` of a log that has lidar and boxes."""
+
+    def volume_of(clip: Clip) -> Float[Tensor, "1 Z Y X"]:
+        return hits_volume(clip.sweeps[clip.now], spec)
+
     config = ClipConfig(
         past_frames=0, future_frames=0, image_hw=_IMAGE_HW, voxels=spec, horizon_steps=1, lidar=True,
         now_stride_s=stride_s,
     )  # fmt: skip
+    return _samples(log, config, volume_of)
+
+
+def observed_samples(
+    log: LogPath, world_model: WorldModel, clips: ClipConfig, *, stride_s: float = 0.5
+) -> list[DetectionSample]:
+    """What a world model makes of a log's images, and the objects that its lidar meets, every `stride_s`.
+
+    `clips` are those of the model's recipe; the model is not trained.
+    """
+    config = dataclasses.replace(clips, future_frames=0, lidar=True, now_stride_s=stride_s)
+
+    def volume_of(clip: Clip) -> Float[Tensor, "D Z Y X"]:
+        with torch.no_grad():
+            return world_model.observe(clip.map_tensors(lambda tensor: tensor[None]).observed()).volume[0]
+
+    return _samples(log, config, volume_of)
+
+
+def _samples(
+    log: LogPath, config: ClipConfig, volume_of: Callable[[Clip], Float[Tensor, "D Z Y X"]]
+) -> list[DetectionSample]:
     dataset = ClipDataset([log], config, cache_dir=None)
-    found = []
-    for clip in map(dataset.clip, range(len(dataset))):
-        volume = hits_volume(clip.sweeps[clip.now], spec)
-        found.append(DetectionSample(volume, objects_of(clip, spec), log.name))
-    return found
+    clips = map(dataset.clip, range(len(dataset)))
+    return [DetectionSample(volume_of(clip), objects_of(clip, config.voxels), log.name) for clip in clips]
 
 
 def hits_volume(sweep: LidarSweep, spec: VoxelSpec) -> Float[Tensor, "1 Z Y X"]:
@@ -135,7 +159,7 @@ def compare_losses(
         if loss is not None:
             return fit_head(trained(None, seed), data, loss, steps=more_steps, seed=seed + 100)
         torch.manual_seed(seed)
-        head = DetectionHead(spec, channels=1, classes=len(CLASSES))
+        head = DetectionHead(spec, channels=len(data[0][0]), classes=len(CLASSES))
         return fit_head(head, data, matching_loss, steps=first_steps, seed=seed)
 
     def measure(loss: Loss, calibrated: bool, seed: int) -> dict[str, float]:

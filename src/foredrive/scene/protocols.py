@@ -43,6 +43,7 @@ class Decoded(Record):
     action: Float[Tensor, "b A"] | None = None
 
 
+@runtime_checkable
 class WorldModel(Protocol):
     """A model of what is around and what comes next (NeMo, DriveWorld)."""
 
