@@ -20,6 +20,7 @@ from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.record import record
 from foredrive.cli.score import score
+from foredrive.cli.search import search, search_index
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
@@ -33,6 +34,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "drive": drive,
     "score": score,
+    "search": search,
+    "search-index": search_index,
     "imagine": imagine,
     "export": export,
     "view": view,
@@ -67,6 +70,9 @@ def main(args: Sequence[str] | None = None) -> int:
     in SystemExit(2), `--help` in SystemExit(0).
     """
     hook, sys.unraisablehook = sys.unraisablehook, _interrupt_again
+    args = sys.argv[1:] if args is None else list(args)
+    if "-".join(args[:2]) in VERBS:  # such as `search index`
+        args = ["-".join(args[:2]), *args[2:]]
     try:
         tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:

@@ -96,6 +96,8 @@ class ClipDataset(Dataset[Example]):
             for frames in _clip_frames(log, config):
                 self._clips.append((number, frames))
                 self.command_source[self._command(log, frames[config.past_frames])[1]] += 1
+        if not self._clips:
+            raise InputError(f"{logs[0].folder}: none of the parts asked for is long enough for a clip")
 
     def __len__(self) -> int:
         return len(self._clips)
@@ -238,7 +240,10 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
     if config.part_s is not None:
         t_s = (log.t_us[frames[:, config.past_frames :]] - log.t_us[0]) * 1e-6
         whole &= (t_s[:, 0] >= config.part_s[0]) & (t_s[:, -1] < config.part_s[1])
-    if not whole.any():
+    if log.path.parts_s:
+        now_s = (log.t_us[frames[:, config.past_frames]] - log.t_us[0]) * 1e-6
+        whole &= np.any([(now_s >= start) & (now_s < end) for start, end in log.path.parts_s], axis=0)
+    if not whole.any() and not log.path.parts_s:  # of a list of clips some may lie at the end of their log
         raise InputError(
             f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"

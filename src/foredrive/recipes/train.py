@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -59,7 +59,7 @@ def open_run(folder: Path) -> Run:
     recipe = load_recipe(folder / CONFIG)
     try:
         written = json.loads((folder / LOGS).read_text())
-        logs = tuple(LogPath(Path(entry["folder"]), Path(entry["maps_dir"])) for entry in written["logs"])
+        logs = tuple(_read_log(entry) for entry in written["logs"])
         start = written.get("start")
         return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError) as error:
@@ -167,12 +167,21 @@ def load_agent(run: Run) -> PlanningAgent:
 
 
 def _write(run: Run) -> None:
-    logs = [{"folder": str(log.folder), "maps_dir": str(log.maps_dir)} for log in run.logs]
+    logs = [
+        {"folder": str(log.folder), "maps_dir": str(log.maps_dir)}
+        | ({"parts_s": log.parts_s} if log.parts_s else {})
+        for log in run.logs
+    ]
     with atomic_path(run.folder / LOGS) as temporary:
         start = None if run.start is None else str(run.start)
         entries = {"logs": logs, "cache_dir": str(run.cache_dir), "start": start}
         temporary.write_text(json.dumps(entries, indent=1))
     save_recipe(run.recipe, run.folder / CONFIG)
+
+
+def _read_log(entry: dict[str, Any]) -> LogPath:
+    parts = tuple((float(start), float(end)) for start, end in entry.get("parts_s", ()))
+    return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts)
 
 
 def _check_same(there: Run, wanted: Run) -> None:

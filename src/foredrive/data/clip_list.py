@@ -1,0 +1,74 @@
+"""A list of clips in a file: parts of logs that somebody chose, by a search or by hand."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+FORMAT = "foredrive clips 1"
+
+
+@dataclass(frozen=True)
+class ListedClip:
+    """A part of a log."""
+
+    folder: Path
+    maps_dir: Path
+    start_s: float
+    """Since the log's start."""
+    end_s: float
+    """Left out."""
+
+
+def write_clip_list(
+    path: Path, clips: Sequence[ListedClip], notes: Sequence[Mapping[str, object]] | None = None
+) -> None:
+    """Write a list.
+
+    Args:
+        notes: what else to say of each clip; nobody reads it.
+    """
+    told = notes if notes is not None else [{} for _ in clips]
+    entries = [
+        {
+            "folder": str(clip.folder), "maps_dir": str(clip.maps_dir),
+            "start_s": clip.start_s, "end_s": clip.end_s, **note,
+        }
+        for clip, note in zip(clips, told, strict=True)
+    ]  # fmt: skip
+    with atomic_path(path) as scratch:
+        scratch.write_text(json.dumps({"format": FORMAT, "clips": entries}, indent=1) + "\n")
+
+
+def read_clip_list(path: Path) -> list[ListedClip]:
+    """Read a list; folders that are not absolute are looked for beside it.
+
+    Raises:
+        InputError: it is not one, or has no clips.
+    """
+    try:
+        written = json.loads(path.read_text())
+        if written["format"] != FORMAT:
+            raise InputError(f"{path}: not a list of clips ({FORMAT}), but {written['format']!r}")
+        clips = [
+            ListedClip(
+                path.parent / entry["folder"],
+                path.parent / entry["maps_dir"],
+                float(entry["start_s"]),
+                float(entry["end_s"]),
+            )
+            for entry in written["clips"]
+        ]
+    except InputError:
+        raise
+    except (ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{path}: not a list of clips ({FORMAT}): {error}") from error
+    if not clips:
+        raise InputError(f"{path}: a list of no clips")
+    for clip in clips:
+        if not clip.start_s < clip.end_s:
+            raise InputError(f"{path}: a clip of {clip.folder} ends at {clip.end_s:g} s, before it starts")
+    return clips

@@ -1,0 +1,1 @@
+"""Finding data by asking for it: towers, an index of logs, queries."""

@@ -1,0 +1,164 @@
+"""From frames of a log to rows of an index: every sector embedded, and the whole of them."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.data.boxes import read_boxes
+from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.collate import stack_records
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log
+from foredrive.data.recorded import read_caption
+from foredrive.scene import Category, LidarSweep
+from foredrive.search.rows import COUNTS, FACTS, SCORES, WHOLE, row_schema
+from foredrive.search.sectors import Sector, blind_sectors
+from foredrive.search.towers import Towers, unit
+from foredrive.towns.labels.setting import Setting, read_setting
+
+FRAMES_AT_ONCE = 8
+"""Read and embedded together: memory stays flat over a log of any length."""
+_SMALLEST = 1e-12
+
+
+@dataclass(frozen=True)
+class View:
+    """One sector of one moment, with whatever sees it."""
+
+    sector: Sector
+    image: Tensor | None
+    sweep: LidarSweep | None
+
+
+def embed_frames(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
+    """The rows of some frames, those of one frame together, its whole first.
+
+    Raises:
+        InputError: on data that cannot be read.
+    """
+    parts = [
+        _embed_few(log, frames[start : start + FRAMES_AT_ONCE], towers)
+        for start in range(0, len(frames), FRAMES_AT_ONCE)
+    ]
+    return pa.concat_tables(parts)
+
+
+def _embed_few(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
+    seen = [read_views(log, frame, towers.image_side_px, with_lidar=towers.has_lidar) for frame in frames]
+    vectors = _embed_by_name(towers, seen)
+    rows: list[dict[str, object]] = []
+    by_image, by_lidar = [], []
+    for now, (frame, views) in enumerate(zip(frames, seen, strict=True)):
+        facts, counts = _facts(log, frame), _counts(log, frame, views)
+        found = np.array([vectors[now, name] for name in views], np.float32).reshape(-1, 2, towers.dim)
+        for name, (image, lidar) in zip((WHOLE, *views), [mean_direction(found), *found], strict=True):
+            azimuth = None if name == WHOLE else math.degrees(views[name].sector.azimuth_rad)
+            rows.append({**facts, "view": name, "azimuth_deg": azimuth, **counts[name]})
+            by_image.append(image)
+            by_lidar.append(lidar)
+    image, lidar = np.stack(by_image), np.stack(by_lidar)
+    embeddings = {"image": image, "lidar": lidar, "joint": mean_direction(np.stack([image, lidar]))}
+    table = pa.Table.from_pylist(rows, schema=FACTS)
+    for name, values in embeddings.items():
+        table = table.append_column(row_schema(towers.dim).field(name), _vector_column(values))
+    return table
+
+
+def _embed_by_name(
+    towers: Towers, seen: Sequence[Mapping[str, View]]
+) -> dict[tuple[int, str], Float[np.ndarray, "2 D"]]:
+    """By moment and view its unit vectors, image and lidar; cameras' images differ in size, so one by one."""
+    vectors: dict[tuple[int, str], np.ndarray] = {}
+    for name in {name for views in seen for name in views}:
+        moments = [now for now, views in enumerate(seen) if name in views]
+        embedded = embed_views(towers, [seen[now][name] for now in moments])
+        vectors |= {(now, name): pair for now, pair in zip(moments, embedded, strict=True)}
+    return vectors
+
+
+def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[str, View]:
+    """Every sector of a moment by its name: those of cameras that have an image, or four around."""
+    found = read_sweep(log, frame) if with_lidar else None
+    sweep = None if found is None else found[0]
+    views = {}
+    for name, metadata in pinhole_cameras(log).items():
+        scale = side_px / min(metadata.height, metadata.width)
+        size_hw = (round(metadata.height * scale), round(metadata.width * scale))
+        camera = read_camera(log, frame, metadata, size_hw, with_image=True)
+        if camera.image is not None:
+            sector = Sector.of_camera(camera, size_hw)
+            views[name] = View(sector, camera.image, None if sweep is None else sector.sweep(sweep))
+    if not views and sweep is not None:
+        views = {name: View(sector, None, sector.sweep(sweep)) for name, sector in blind_sectors().items()}
+    return views
+
+
+def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2 D"]:
+    """Unit vectors of views of one size, by image and by lidar; NaN where a tower has nothing to look at."""
+    out = np.full((len(views), 2, towers.dim), np.nan, dtype=np.float32)
+    images = [(n, view.image) for n, view in enumerate(views) if view.image is not None]
+    sweeps = [(n, v.sweep) for n, v in enumerate(views) if v.sweep is not None and len(v.sweep.valid)]
+    with torch.no_grad():
+        if images:
+            embedded = towers.embed_images(torch.stack([image for _, image in images]))
+            out[[n for n, _ in images], 0] = unit(embedded).numpy()
+        found = towers.embed_sweeps(stack_records([sweep for _, sweep in sweeps])) if sweeps else None
+        if found is not None:
+            out[[n for n, _ in sweeps], 1] = unit(found).numpy()
+    return out
+
+
+def mean_direction(vectors: Float[np.ndarray, "n *m D"]) -> Float[np.ndarray, "*m D"]:
+    """The normalised sum over n of unit vectors; those that are NaN are left out, NaN where all are."""
+    total = np.nansum(vectors, axis=0)
+    total /= np.linalg.norm(total, axis=-1, keepdims=True).clip(min=_SMALLEST)
+    return np.where(np.isnan(vectors).any(-1).all(0)[..., None], np.float32(np.nan), total)
+
+
+def _vector_column(vectors: Float[np.ndarray, "n D"]) -> pa.FixedSizeListArray:
+    """Vectors as Arrow has them; null where they are NaN."""
+    missing = np.isnan(vectors).any(-1)
+    flat = pa.array(np.where(missing[:, None], 0, vectors).astype(np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, vectors.shape[-1], mask=pa.array(missing))
+
+
+def _facts(log: Log, frame: int) -> dict[str, object]:
+    caption = read_caption(log, frame)
+    setting = Setting(None, None) if caption is None else read_setting(caption)
+    speed = float(log.speed_mps[frame])
+    return {
+        "log": log.path.name,
+        "folder": str(log.path.folder),
+        "maps_dir": str(log.path.maps_dir),
+        "frame": frame,
+        "t_us": int(log.t_us[frame]),
+        "t_s": float(log.t_us[frame] - log.t_us[0]) * 1e-6,
+        "dataset": log.metadata.dataset,
+        "place": log.metadata.location,
+        "ego_speed": speed if np.isfinite(speed) else None,
+        "time_of_day": setting.time_of_day,
+        "weather": setting.weather,
+        "caption": caption,
+        **{f"score_{name}": None for name in SCORES},
+    }
+
+
+def _counts(log: Log, frame: int, views: Mapping[str, View]) -> dict[str, dict[str, int | None]]:
+    """Annotated objects by class, of the whole scene and of each view; None where nothing is annotated."""
+    boxes = read_boxes(log, frame)
+    if boxes is None:
+        return {name: dict.fromkeys(COUNTS.values()) for name in (WHOLE, *views)}
+    inside = {WHOLE: boxes.valid}
+    inside |= {name: boxes.valid & view.sector.contains(boxes.centre) for name, view in views.items()}
+    return {name: _by_class(boxes.category[keep]) for name, keep in inside.items()}
+
+
+def _by_class(category: Tensor) -> dict[str, int | None]:
+    counted = torch.bincount(category, minlength=len(Category)).tolist()
+    return {name: counted[kind] for kind, name in COUNTS.items()}

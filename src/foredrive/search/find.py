@@ -1,0 +1,244 @@
+"""Answering a query: candidates from the index, compared in full, neighbours collapsed, ranked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.search.diversity import facility_location, k_centre
+from foredrive.search.embedding import mean_direction
+from foredrive.search.index import EXACT_UP_TO, FrameIndex
+from foredrive.search.kept import where_tagged
+from foredrive.search.query import Query
+from foredrive.search.rows import EMBEDDINGS, FACTS
+from foredrive.search.tables import quoted
+from foredrive.search.target import Target
+
+CANDIDATES_PER_HIT = 50
+"""Rows looked at for each hit, where not all are, or ranked again: neighbours and other views of a moment are
+many."""
+MORE = 4
+POOL_PER_HIT = 10
+"""Hits to choose diverse ones from, for each that is wanted."""
+SMALLEST_WORTH = 1e-3
+
+
+@dataclass(frozen=True)
+class Hit:
+    """A moment and the view of it that fits best."""
+
+    facts: dict[str, object]
+    """The row's columns, without embeddings."""
+    score: float
+    """What it was ranked by."""
+    scores: dict[str, float]
+    """Cosine with the query by modality, where there is one."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """An answer."""
+
+    hits: list[Hit]
+    compared: int
+    """Rows that were compared in full."""
+    exact: bool
+    """Whether that was all rows that the conditions leave."""
+
+
+def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to: int = EXACT_UP_TO) -> Found:
+    """The hits of a query, best first (in the order of choice if they are to be diverse).
+
+    Args:
+        target: what rows are compared with; None where the query compares with nothing.
+        exact_up_to: so many rows are all compared; of more those that a graph finds near.
+
+    Raises:
+        InputError: the condition does not parse; the query asks for what neither towers nor logs have.
+    """
+    _check(query, target)
+    where = _conditions(index, query, target)
+    total = index.count(where)
+    if not total and query.modality == "lidar" and not index.count("lidar IS NOT NULL"):
+        raise InputError(f"{index.uri}: no lidar embeddings; the towers {index.making.towers} made none")
+    exact = target is None or total <= exact_up_to
+    wanted = query.top * (POOL_PER_HIT if query.diverse else 1)
+    limit = wanted * CANDIDATES_PER_HIT
+    while True:
+        limit = min(limit, total)
+        rows = _candidates(index, query, target, where, None if exact else limit)
+        score, scores = _rank(rows, query, target)
+        order = collapse(score, rows["log"].to_pylist(), _column(rows, "t_us"), query.gap_s, wanted)
+        reranked = query.modality == "joint" and query.rule == "rerank"  # of so many and no more
+        if exact or reranked or len(order) >= wanted or limit >= total:
+            break
+        limit *= MORE
+    if query.diverse is not None:
+        order = [order[n] for n in _diverse(rows, order, score, query)]
+    kept = rows.select(FACTS.names).take(pa.array(order, pa.int64())).to_pylist()
+    hits = [Hit(facts, float(score[n]), _of_row(scores, n)) for n, facts in zip(order, kept, strict=True)]
+    return Found(hits, len(rows), exact)
+
+
+def _of_row(scores: dict[str, Float[ndarray, "n"]], n: int) -> dict[str, float]:
+    """Of what has one modality alone the joint likeness would say the same again."""
+    told = {name: float(values[n]) for name, values in scores.items() if not np.isnan(values[n])}
+    return told if {"image", "lidar"} <= told.keys() else {k: v for k, v in told.items() if k != "joint"}
+
+
+def collapse(
+    score: Float[ndarray, "n"], logs: Sequence[str], t_us: Int[ndarray, "n"], gap_s: float, top: int
+) -> list[int]:
+    """The best rows, best first, none closer than `gap_s` to a better one of its log; NaN is left out."""
+    kept: list[int] = []
+    times: dict[str, list[int]] = {}
+    for n in np.argsort(-score, kind="stable").tolist():
+        if np.isnan(score[n]) or len(kept) == top:
+            break  # NaN is sorted last
+        of_log = times.setdefault(logs[n], [])
+        if all(abs(int(t_us[n]) - other) >= max(gap_s * 1e6, 1) for other in of_log):
+            of_log.append(int(t_us[n]))
+            kept.append(n)
+    return kept
+
+
+def _check(query: Query, target: Target | None) -> None:
+    if query.compares and target is None:
+        raise InputError("the query compares, but there is nothing to compare with")
+    if target is None:
+        return
+    needs = {"image": ("image",), "lidar": ("lidar",), "joint": ("image", "lidar")}[query.modality]
+    if all(getattr(target, name) is None for name in needs):
+        raise InputError(f"the example has no {' and no '.join(needs)} to compare with")
+
+
+def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str | None:
+    conditions = [f"({query.where})"] if query.where else []
+    if query.where_view is not None:
+        conditions.append(query.where_view)
+    if query.tag is not None:
+        conditions.append(where_tagged(index.uri, query.tag))
+    if target is not None:
+        conditions.append(f"{query.modality} IS NOT NULL")
+    if target is not None and target.moment is not None:
+        log, t_us = target.moment
+        gap_us = max(round(query.gap_s * 1e6), 1)
+        near = f"t_us > {t_us - gap_us} AND t_us < {t_us + gap_us}"
+        conditions.append(f"NOT (log = {quoted(log)} AND {near})")
+    if query.where:
+        index.count(query.where)  # alone, so that an error names what the user wrote
+    return " AND ".join(conditions) or None
+
+
+def _candidates(
+    index: FrameIndex, query: Query, target: Target | None, where: str | None, limit: int | None
+) -> pa.Table:
+    """All rows, or those that are nearest by what the query ranks by; with embeddings if they are needed."""
+    columns = [*FACTS.names, *(EMBEDDINGS if target is not None or query.diverse else ())]
+    if target is None or limit is None:
+        return index.select(where, columns)
+    vectors = {"image": target.image, "lidar": target.lidar, "joint": _joint(target)}
+    by: tuple[str, ...] = (query.modality,)
+    if query.modality == "joint" and query.rule != "features":
+        by = ("image", "lidar") if query.rule == "logits" else ("image",)
+    found = [
+        index.nearest(vector, name, where, columns, limit)
+        for name in by
+        if (vector := vectors[name]) is not None
+    ]
+    return found[0] if len(found) == 1 else _without_twins(pa.concat_tables(found))
+
+
+def _without_twins(rows: pa.Table) -> pa.Table:
+    keys = zip(rows["log"].to_pylist(), rows["t_us"].to_pylist(), rows["view"].to_pylist(), strict=True)
+    first = {key: n for n, key in reversed(list(enumerate(keys)))}
+    return rows.take(pa.array(sorted(first.values())))
+
+
+def _rank(
+    rows: pa.Table, query: Query, target: Target | None
+) -> tuple[Float[ndarray, "n"], dict[str, Float[ndarray, "n"]]]:
+    """What rows are ranked by, NaN for those that are out, and their likeness by modality."""
+    scores = {} if target is None else likeness(rows, target)
+    score = np.zeros(len(rows)) if target is None else _joined(scores, query, target)
+    if query.by is not None:
+        wanted = _column(rows, query.by).astype(float)
+        mix = query.mix if target is not None else 1.0
+        score = (1 - mix) * _by_rank(score) + mix * _by_rank(wanted)
+        score[np.isnan(wanted)] = np.nan
+    return score, scores
+
+
+def likeness(rows: pa.Table, target: Target) -> dict[str, Float[ndarray, "n"]]:
+    """Cosine of each row with the target by modality; NaN where the row has none."""
+    vectors = {"image": target.image, "lidar": target.lidar, "joint": _joint(target)}
+    return {
+        name: _vectors(rows, name) @ vector.astype(np.float32)
+        for name, vector in vectors.items()
+        if vector is not None
+    }
+
+
+def _joined(scores: dict[str, Float[ndarray, "n"]], query: Query, target: Target) -> Float[ndarray, "n"]:
+    if query.modality != "joint" or query.rule == "features":
+        return scores[query.modality]
+    if target.image is None or target.lidar is None:
+        raise InputError(f"{query.rule} need an image and a sweep, and the example has one of them only")
+    image, lidar = scores["image"], scores["lidar"]
+    if query.rule == "logits":  # a row with one modality counts it twice, to its neither good nor harm
+        return np.where(np.isnan(lidar), 2 * image, np.where(np.isnan(image), 2 * lidar, image + lidar))
+    best = np.argsort(-image, kind="stable")[: query.top * CANDIDATES_PER_HIT]
+    again = np.full(len(image), np.nan)
+    again[best] = lidar[best]
+    return again
+
+
+def _joint(target: Target) -> Float[ndarray, "D"] | None:
+    there = [vector for vector in (target.image, target.lidar) if vector is not None]
+    return mean_direction(np.stack(there)) if there else None
+
+
+def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
+    """0 for the least to 1 for the greatest, equals alike; NaN stays."""
+    there = ~np.isnan(values)
+    out = np.full(len(values), np.nan)
+    _, rank = np.unique(values[there], return_inverse=True)
+    out[there] = rank / max(rank.max(initial=0), 1)
+    return out
+
+
+def _diverse(rows: pa.Table, order: list[int], score: Float[ndarray, "n"], query: Query) -> list[int]:
+    """Which of the collapsed hits, in the order of choice."""
+    pool = rows.take(pa.array(order, pa.int64()))
+    vectors = np.nan_to_num(_vectors(pool, query.modality))
+    worth = np.maximum(_by_rank(score[order]), SMALLEST_WORTH)
+    choose = {"k-centre": k_centre, "facility": facility_location}[query.diverse or "k-centre"]
+    return choose(vectors, query.top, worth)
+
+
+def _vectors(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
+    """Embeddings; NaN where there are none."""
+    dim = rows.schema.field(name).type.list_size
+    column = rows[name].combine_chunks()
+    if isinstance(column, pa.ChunkedArray):
+        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+    values: Float[ndarray, "n D"] = column.values.to_numpy(zero_copy_only=False)
+    values = values[column.offset * dim : (column.offset + len(column)) * dim].reshape(-1, dim)
+    missing = ~_mask(column.is_valid())
+    if missing.any():
+        values = values.copy()
+        values[missing] = np.nan
+    return values
+
+
+def _mask(column: pa.Array) -> Bool[ndarray, "n"]:
+    mask: Bool[ndarray, n] = column.to_numpy(zero_copy_only=False).astype(bool)
+    return mask
+
+
+def _column(rows: pa.Table, name: str) -> ndarray:
+    return rows[name].to_numpy()

@@ -1,0 +1,186 @@
+"""An index of logs: a LanceDB table with a row for each moment and view, which remembers how it was made."""
+
+import datetime
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float
+
+from foredrive.errors import InputError
+from foredrive.search.rows import EMBEDDINGS, FACTS, SCORES, row_schema
+from foredrive.search.tables import all_rows, find_table, make_table, quoted, understanding
+
+EXACT_UP_TO = 100_000
+"""So many rows are compared one by one; more are looked up in a graph and then compared."""
+KEPT_VERSIONS = datetime.timedelta(hours=1)
+"""Whoever reads meanwhile has so long to finish."""
+REFINEMENT = 3
+"""The graph knows vectors to 8 bits: so many times as many as are wanted are compared in full."""
+FRAMES, PARTS = "frames", "parts"
+_REMEMBERED = b"foredrive"
+_PART_SCHEMA = pa.schema(
+    [("log", pa.string()), ("first", pa.int32()), ("last", pa.int32()), ("digest", pa.string())]
+)
+Scores = Mapping[str, Mapping[int, Mapping[str, float]]]
+"""By log, time in µs and name in `rows.SCORES`."""
+
+
+@dataclass(frozen=True)
+class Making:
+    """How the rows of an index were made; all of them alike."""
+
+    towers: str
+    fingerprint: str
+    dim: int
+    stride_s: float
+
+
+class Part(NamedTuple):
+    """Some frames of a log, indexed together."""
+
+    log: str
+    first: int
+    last: int
+    digest: str
+    """Of the log's files."""
+
+    @property
+    def where(self) -> str:
+        """Its rows."""
+        return f"(log = {quoted(self.log)} AND frame BETWEEN {self.first} AND {self.last})"
+
+
+class FrameIndex:
+    """An index that is open.
+
+    Args:
+        uri: a folder or a place on object storage.
+
+    Raises:
+        InputError: there is none, or it is not one of ours.
+    """
+
+    making: Making
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        table = find_table(uri, FRAMES)
+        if table is None:
+            raise InputError(f"{uri}: no index here; foredrive search index LOGS --index {uri} makes one")
+        self._frames = table
+        told = (table.schema.metadata or {}).get(_REMEMBERED)
+        if told is None:
+            raise InputError(f"{uri}: its table {FRAMES} is none of Foredrive's")
+        self.making = Making(**json.loads(told))
+
+    @classmethod
+    def make(cls, uri: str, making: Making) -> "FrameIndex":
+        """Open an index to add to, or begin one.
+
+        Raises:
+            InputError: there is one that was made otherwise.
+        """
+        if find_table(uri, FRAMES) is None:
+            schema = row_schema(making.dim).with_metadata({_REMEMBERED: json.dumps(asdict(making))})
+            make_table(uri, FRAMES, schema)
+        index = cls(uri)
+        index.check_towers(making.towers, making.fingerprint)
+        if index.making.stride_s != making.stride_s:
+            raise InputError(
+                f"{uri}: has a moment every {index.making.stride_s:g} s of its logs, "
+                f"not {making.stride_s:g} s"
+            )
+        return index
+
+    def check_towers(self, name: str, fingerprint: str) -> None:
+        """Whether what towers embed can be compared with what is here.
+
+        Raises:
+            InputError: other towers made this index.
+        """
+        ours = self.making
+        if ours.fingerprint != fingerprint:
+            raise InputError(
+                f"{self.uri}: made by the towers {ours.towers} ({ours.fingerprint}), not by {name} "
+                f"({fingerprint}): their embeddings cannot be compared"
+            )
+
+    def parts(self) -> set[Part]:
+        """What is in."""
+        return {Part(**row) for row in all_rows(find_table(self.uri, PARTS))}  # type: ignore[arg-type]
+
+    def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
+        """Put parts in, in place of what an interrupted call left of them."""
+        self._frames.delete(" OR ".join(part.where for part, _ in parts))
+        self._frames.add(pa.concat_tables([rows for _, rows in parts]))
+        rows = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
+        make_table(self.uri, PARTS, _PART_SCHEMA).add(rows)
+
+    def drop(self, log: str) -> None:
+        """Take a log out: it has changed."""
+        table = find_table(self.uri, PARTS)
+        if table is not None:  # first: a log whose rows are gone must not count as in
+            table.delete(f"log = {quoted(log)}")
+        self._frames.delete(f"log = {quoted(log)}")
+
+    def optimise(self) -> None:
+        """Merge small files and drop old versions; bring the graphs that are looked up in up to date."""
+        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
+        if self.count() <= EXACT_UP_TO:
+            return
+        from lancedb.index import HnswSq
+
+        there = {column for index in self._frames.list_indices() for column in index.columns}
+        for name in EMBEDDINGS:
+            if name not in there and self.count(f"{name} IS NOT NULL") > EXACT_UP_TO:
+                self._frames.create_index(name, config=HnswSq(distance_type="cosine"))
+
+    def count(self, where: str | None = None) -> int:
+        """Rows for which a condition in SQL holds.
+
+        Raises:
+            InputError: it does not parse, or names a column that there is not.
+        """
+        with understanding(where):
+            return int(self._frames.count_rows(where))
+
+    def select(self, where: str | None, columns: Sequence[str]) -> pa.Table:
+        """Rows for which a condition holds. Raises `InputError` as `count`."""
+        query = self._frames.search().select(list(columns)).limit(None)
+        with understanding(where):
+            return (query if where is None else query.where(where)).to_arrow()
+
+    def nearest(
+        self, vector: Float[np.ndarray, "D"], to: str, where: str | None, columns: Sequence[str], limit: int
+    ) -> pa.Table:
+        """Nearly all of the `limit` rows whose embedding `to` lies nearest to a unit vector.
+
+        Raises `InputError` as `count`.
+        """
+        query = self._frames.search(vector, vector_column_name=to).distance_type("cosine")
+        query = query.select([*columns, "_distance"]).limit(limit).refine_factor(REFINEMENT)
+        with understanding(where):
+            found = (query if where is None else query.where(where, prefilter=True)).to_arrow()
+        return found.select(list(columns))
+
+    def set_scores(self, scores: Scores) -> int:
+        """Give moments their scores, in place of those they had; how many rows there are of them."""
+        changed = 0
+        for log, of_log in scores.items():
+            where = f"log = {quoted(log)} AND t_us IN ({', '.join(str(t_us) for t_us in of_log)})"
+            rows = self.select(where, row_schema(self.making.dim).names)
+            if not len(rows):
+                continue
+            for name in SCORES:
+                field = FACTS.field(f"score_{name}")
+                values = [of_log[t_us].get(name) for t_us in rows["t_us"].to_pylist()]
+                at = rows.schema.get_field_index(field.name)
+                rows = rows.set_column(at, field, pa.array(values, field.type))
+            self._frames.delete(where)
+            self._frames.add(rows)
+            changed += len(rows)
+        return changed

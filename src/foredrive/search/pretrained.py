@@ -1,0 +1,121 @@
+"""CLIP (Radford et al. 2021) and SigLIP (Zhai et al. 2023) as towers, through transformers."""
+
+import hashlib
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.scene import LidarSweep
+
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+"""RGB statistics that the released models were trained with."""
+SIGLIP_TOKENS = 64
+"""SigLIP was trained on texts padded to this many tokens, and its text tower reads the last."""
+KINDS = ("clip", "siglip", "siglip2")
+
+
+class PretrainedTowers:
+    """The towers of a CLIP or SigLIP model; they have none for lidar.
+
+    CLIP sees the middle square of an image and SigLIP all of it squeezed into one, as each was trained.
+
+    Args:
+        model: a name on Hugging Face's hub, or a local folder. A folder with a configuration but without
+            weights gives random ones, the same every time, and says so.
+
+    Raises:
+        InputError: there is no such model here, or it is of another kind.
+    """
+
+    has_lidar = False
+
+    def __init__(self, model: str) -> None:
+        self.name = model
+        self.model, self.tokenizer = _load(model)
+        config = self.model.config
+        self.is_clip = config.model_type == "clip"
+        self.image_side_px = int(config.vision_config.image_size)
+        self.dim = int(config.projection_dim if self.is_clip else config.vision_config.hidden_size)
+        self.fingerprint = f"{config.model_type}-{_digest(self.model)}"
+        mean, std = (CLIP_MEAN, CLIP_STD) if self.is_clip else (SIGLIP_MEAN, SIGLIP_STD)
+        self._mean, self._std = (torch.tensor(values).view(3, 1, 1) for values in (mean, std))
+
+    @torch.no_grad()
+    def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        side = self.image_side_px
+        if self.is_clip:
+            images = _middle_square(images)
+        pixels = images.float() / 255
+        if images.shape[-2:] != (side, side):
+            pixels = F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
+        found = self.model.get_image_features(pixel_values=(pixels - self._mean) / self._std)
+        return _features(found)
+
+    def embed_sweeps(self, sweeps: LidarSweep) -> None:
+        """See `Towers`."""
+        return
+
+    @torch.no_grad()
+    def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
+        """See `Towers`; what goes beyond the longest text that the tower can read is cut off."""
+        longest = int(self.model.config.text_config.max_position_embeddings)
+        padded = {"padding": True, "max_length": longest} if self.is_clip else {
+            "padding": "max_length", "max_length": min(SIGLIP_TOKENS, longest)
+        }  # fmt: skip
+        tokens = self.tokenizer(list(texts), truncation=True, return_tensors="pt", **padded)
+        kept = {key: tokens[key] for key in ("input_ids", "attention_mask") if key in tokens}
+        if not self.is_clip:
+            kept.pop("attention_mask", None)  # the towers were trained to read padding too
+        return _features(self.model.get_text_features(**kept))
+
+
+def _features(found: Any) -> Float[Tensor, "n D"]:
+    return (found if isinstance(found, Tensor) else found.pooler_output).float()
+
+
+def _middle_square(images: UInt8[Tensor, "n 3 H W"]) -> UInt8[Tensor, "n 3 S S"]:
+    height, width = images.shape[-2:]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    return images[..., top : top + side, left : left + side]
+
+
+def _load(model: str) -> tuple[Any, Any]:
+    from transformers import AutoConfig, AutoModel, AutoTokenizer  # takes seconds
+
+    try:
+        config = AutoConfig.from_pretrained(model)
+        if config.model_type not in KINDS:
+            raise InputError(f"{model}: a {config.model_type} model; towers are CLIP or SigLIP")
+        tokenizer = AutoTokenizer.from_pretrained(model)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(f"the towers {model!r} cannot be loaded: {str(error).splitlines()[0]}") from error
+    if Path(model).is_dir() and not any(Path(model).glob("*.safetensors")):
+        warnings.warn(f"towers start from RANDOM weights: {model} has none", stacklevel=3)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return AutoModel.from_config(config).eval(), tokenizer
+    try:
+        return AutoModel.from_pretrained(model, use_safetensors=True).eval(), tokenizer
+    except (OSError, ValueError) as error:
+        raise InputError(f"the towers {model!r} cannot be loaded: {str(error).splitlines()[0]}") from error
+
+
+def _digest(model: nn.Module) -> str:
+    """Of every weight, by name."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,33 @@
+"""Per-frame scores of detections (`foredrive.sets`), from a file."""
+
+import json
+from pathlib import Path
+
+from foredrive.errors import InputError
+from foredrive.search.rows import SCORES
+
+
+def read_scores(path: Path) -> dict[str, dict[int, dict[str, float]]]:
+    """Scores by log, time in µs and name; one JSON object a line.
+
+    A line is {"frame": "SPLIT/NAME@T_US", "nll": 31.2, "missed": 4.0, …} with any of `rows.SCORES`; frames
+    are named as clips are (`Example.key`).
+
+    Raises:
+        InputError: a line that is not such an object.
+    """
+    found: dict[str, dict[int, dict[str, float]]] = {}
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            told = json.loads(line)
+            log, _, t_us = told["frame"].rpartition("@")
+            found.setdefault(log, {})[int(t_us)] = {key: float(told[key]) for key in SCORES if key in told}
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise InputError(f"{path}: line {number} does not score a frame: {error}") from error
+    return found

@@ -1,0 +1,59 @@
+"""What lies in the sector that a camera looks at: its beams, its objects; sectors of logs without cameras."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.data.cameras import CameraFrame
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, rotate_vectors, transform_points
+from foredrive.scene import LidarSweep
+
+BLIND_SECTORS = {"ahead": 0.0, "left": 90.0, "behind": 180.0, "right": -90.0}
+"""Sectors of logs without cameras, by the direction of their middle, degrees from ahead to the left."""
+_HALF_RAD = math.pi / 4
+
+
+class Sector(NamedTuple):
+    """A direction, and what of a scene lies in it."""
+
+    azimuth_rad: float
+    """Of its middle in the ego frame, from ahead to the left."""
+    camera: CameraFrame | None = None
+    """Whose image bounds it; None: 45 degrees to either side of the middle."""
+    size_hw: tuple[int, int] = (0, 0)
+    """Of the camera's images, px."""
+
+    @classmethod
+    def of_camera(cls, camera: CameraFrame, size_hw: tuple[int, int]) -> "Sector":
+        """The sector a camera looks at."""
+        forward = camera.T_ego_cam[:2, 2]
+        return cls(float(torch.atan2(forward[1], forward[0])), camera, size_hw)
+
+    def contains(self, points_ego: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+        """Which points lie in the sector."""
+        if self.camera is None:
+            off_rad = torch.atan2(points_ego[:, 1], points_ego[:, 0]) - self.azimuth_rad
+            return torch.atan2(off_rad.sin(), off_rad.cos()).abs() <= _HALF_RAD
+        points_cam = transform_points(inverse_se3(self.camera.T_ego_cam), points_ego)
+        return project(points_cam, self.camera.K, self.camera.dist, self.size_hw)[2]
+
+    def sweep(self, sweep: LidarSweep) -> LidarSweep:
+        """The returns of an unbatched sweep that lie in the sector, x along its middle (see `Towers`)."""
+        hits = sweep[sweep.valid & sweep.returned]
+        inside = hits[self.contains(hits.points_ego)]
+        T_sector_ego = matrix_from_yaw(torch.tensor(-self.azimuth_rad), torch.zeros(3))
+        return dataclasses.replace(
+            inside,
+            origin_ego=rotate_vectors(T_sector_ego, inside.origin_ego),
+            dir_ego=rotate_vectors(T_sector_ego, inside.dir_ego),
+        )
+
+
+def blind_sectors() -> dict[str, Sector]:
+    """Four sectors around a vehicle without cameras."""
+    return {name: Sector(math.radians(deg)) for name, deg in BLIND_SECTORS.items()}

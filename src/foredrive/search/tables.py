@@ -1,0 +1,85 @@
+"""LanceDB, as far as an index needs it; imported late, and here alone."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from lancedb import DBConnection
+    from lancedb.table import Table
+
+_TROUBLE = (ValueError, RuntimeError, OSError)
+"""What LanceDB raises: its own mistakes, those of a query, and those of a disk, all of these kinds."""
+
+
+def connect(uri: str) -> "DBConnection":
+    """The tables at a folder or a place on object storage ("s3://…"), which has its own credentials.
+
+    Raises:
+        InputError: LanceDB is not installed.
+    """
+    try:
+        import lancedb
+    except ImportError:
+        raise InputError("an index needs LanceDB: pip install lancedb") from None
+    return lancedb.connect(uri)
+
+
+def find_table(uri: str, name: str) -> "Table | None":
+    """A table that is there already; None if it is not. Nothing is written.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if "://" not in uri and not (Path(uri) / f"{name}.lance").exists():
+        return None
+    try:
+        return connect(uri).open_table(name)
+    except _TROUBLE as error:
+        if "not found" in str(error).lower():
+            return None
+        raise InputError(f"{uri}: the table {name} cannot be read: {first_line(error)}") from error
+
+
+def make_table(uri: str, name: str, schema: pa.Schema) -> "Table":
+    """A table, made if it is not there."""
+    return connect(uri).create_table(name, schema=schema, exist_ok=True)
+
+
+def all_rows(table: "Table | None", where: str | None = None) -> list[dict[str, object]]:
+    """Rows of a small table."""
+    if table is None:
+        return []
+    query = table.search() if where is None else table.search().where(where)
+    rows: list[dict[str, object]] = query.limit(None).to_arrow().to_pylist()
+    return rows
+
+
+@contextlib.contextmanager
+def understanding(where: str | None) -> Iterator[None]:
+    """Say of a condition that LanceDB does not understand that it is at fault.
+
+    Raises:
+        InputError: in one line.
+    """
+    try:
+        yield
+    except _TROUBLE as error:
+        if where is None:
+            raise
+        raise InputError(f"the condition {where!r} cannot be understood: {first_line(error)}") from error
+
+
+def first_line(error: BaseException) -> str:
+    """What LanceDB says, without where in its code it does."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].split(", rust/")[0]
+
+
+def quoted(text: str) -> str:
+    """A text as SQL writes it."""
+    return "'" + text.replace("'", "''") + "'"

@@ -1,0 +1,122 @@
+"""The vectors a query's rows are compared with: of its texts, or of its example."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from foredrive.data.cameras import CameraFrame, find_camera, pinhole_cameras, read_camera
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log, LogPath, find_logs
+from foredrive.errors import InputError
+from foredrive.search.embedding import View, embed_views, mean_direction, read_views
+from foredrive.search.index import FrameIndex
+from foredrive.search.query import Like, Query
+from foredrive.search.rows import WHOLE
+from foredrive.search.sectors import Sector
+from foredrive.search.tables import quoted
+from foredrive.search.towers import PROMPTS, Towers, embed_prompt
+
+_ALONE = ("{}",)
+
+
+class Target(NamedTuple):
+    """Unit vectors by modality, None where there is none; and the moment that they were taken from."""
+
+    image: Float[np.ndarray, "D"] | None
+    lidar: Float[np.ndarray, "D"] | None
+    moment: tuple[str, int] | None = None
+    """Log and time in µs of an example: it is not to be found again."""
+
+
+def text_target(query: Query, towers: Towers, *, ensemble: bool = True) -> Target:
+    """Of texts: sweeps and images live in one space, so one text does for both if no other is given.
+
+    Args:
+        ensemble: word each text in several ways (`towers.PROMPTS`).
+
+    Raises:
+        InputError: a text is empty.
+    """
+    image_text = query.image_text or query.text or query.lidar_text
+    lidar_text = query.lidar_text or query.text or query.image_text
+    assert image_text is not None
+    assert lidar_text is not None
+    templates = PROMPTS if ensemble else _ALONE
+    by_image = embed_prompt(towers, image_text, templates).numpy()
+    same = lidar_text == image_text
+    return Target(by_image, by_image if same else embed_prompt(towers, lidar_text, templates).numpy())
+
+
+def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
+    """Of a moment, a view or a crop of a log, which need not be in the index.
+
+    Raises:
+        InputError: there is no such log, moment or view, or it cannot be read.
+    """
+    log = Log(_find_log(index, like.log))
+    frame, found = log.nearest_frames(np.array([log.t_us[0] + like.t_s * 1e6]))
+    if not found[0]:
+        raise InputError(f"{log.path.name}: has nothing at {like.t_s:g} s; it lasts {_length_s(log):.1f} s")
+    moment = (log.path.name, int(log.t_us[frame[0]]))
+    if like.crop_px is not None:
+        views = {like.view: _cropped(log, int(frame[0]), like, with_lidar=towers.has_lidar)}
+    else:
+        views = read_views(log, int(frame[0]), towers.image_side_px, with_lidar=towers.has_lidar)
+        if like.view != WHOLE:
+            if like.view not in views:
+                raise InputError(f"{log.path.name}: no view {like.view}; there are {', '.join(views)}")
+            views = {like.view: views[like.view]}
+    each = [embed_views(towers, [view]) for view in views.values()]
+    if not each:
+        raise InputError(f"{log.path.name}: neither cameras nor lidar at {like.t_s:g} s")
+    image, lidar = mean_direction(np.concatenate(each))
+    return Target(None if np.isnan(image).any() else image, None if np.isnan(lidar).any() else lidar, moment)
+
+
+def _find_log(index: FrameIndex, name: str) -> LogPath:
+    if (Path(name) / "sync.arrow").is_file():
+        return find_logs(Path(name))[0]
+    ends = quoted("%/" + name.replace("%", ""))
+    found = index.select(
+        f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR log LIKE {ends})", ["log", "folder", "maps_dir"]
+    ).to_pylist()
+    logs = {row["log"]: LogPath(Path(row["folder"]), Path(row["maps_dir"])) for row in found}
+    if len(logs) != 1:
+        raise InputError(
+            f"{name}: no log of this name in the index, and no folder of one"
+            if not logs
+            else f"{name}: may be {', '.join(sorted(logs))}; name the split too"
+        )
+    return next(iter(logs.values()))
+
+
+def _cropped(log: Log, frame: int, like: Like, *, with_lidar: bool) -> View:
+    """A part of an image as a view of its own: a camera with another middle."""
+    metadata = find_camera(pinhole_cameras(log), like.view)
+    if metadata is None:
+        raise InputError(
+            f"{log.path.name}: no camera {like.view}; there are {', '.join(pinhole_cameras(log))}"
+        )
+    camera = read_camera(log, frame, metadata, (metadata.height, metadata.width), with_image=True)
+    assert like.crop_px is not None
+    left, top, right, bottom = like.crop_px
+    if camera.image is None or right > metadata.width or bottom > metadata.height:
+        raise InputError(
+            f"{log.path.name}: the crop lies outside the image of {metadata.width} x {metadata.height} px"
+            if camera.image is not None
+            else f"{log.path.name}: no image of {like.view} at {like.t_s:g} s"
+        )
+    shift = torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    image = camera.image[:, top:bottom, left:right]
+    cut: CameraFrame = dataclasses.replace(camera, image=image, K=camera.K - shift)
+    sector = Sector.of_camera(cut, (bottom - top, right - left))
+    found = read_sweep(log, frame) if with_lidar else None
+    return View(sector, image, None if found is None else sector.sweep(found[0]))
+
+
+def _length_s(log: Log) -> float:
+    return float(log.t_us[-1] - log.t_us[0]) * 1e-6

@@ -1,0 +1,120 @@
+"""What a hit of a search looks like: its camera beside its sector's lidar from above, what to say of it."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw
+
+from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log, LogPath
+from foredrive.errors import InputError
+from foredrive.scene import Category, LidarSweep
+from foredrive.search.find import Hit
+from foredrive.search.rows import COUNTS
+from foredrive.view import palette
+
+HEIGHT_PX, WIDTH_PX = 198, 352
+"""Of the camera's picture; the lidar's is as high and square."""
+GAP_PX = 4
+REACH_M = 40.0
+"""The lidar's picture shows this much to each side."""
+
+
+def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
+    """Camera and lidar side by side, the same size for every hit; what is not there stays dark.
+
+    Of a whole scene the front camera is shown; a mark at the lidar's edge says where else one looks.
+    """
+    canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
+    canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
+    canvas.paste(palette.PANEL, (WIDTH_PX + GAP_PX, 0, canvas.width, HEIGHT_PX))
+    folder, frame = Path(str(hit.facts["folder"])), int(str(hit.facts["frame"]))
+    try:
+        log = _opened(folder, Path(str(hit.facts["maps_dir"])))
+        picture, sweep = _camera(log, frame, str(hit.facts["view"])), read_sweep(log, frame)
+    except InputError:
+        ImageDraw.Draw(canvas).text((12, 12), f"{folder} cannot be read", fill=palette.FAINT)
+        return np.asarray(canvas)
+    if picture is not None:
+        canvas.paste(picture, ((WIDTH_PX - picture.width) // 2, (HEIGHT_PX - picture.height) // 2))
+    if sweep is not None:
+        above = Image.fromarray(lidar_from_above(sweep[0], HEIGHT_PX))
+        if hit.facts["azimuth_deg"] is not None:
+            _point(above, float(str(hit.facts["azimuth_deg"])))
+        canvas.paste(above, (WIDTH_PX + GAP_PX, 0))
+    return np.asarray(canvas)
+
+
+def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 3"]:
+    """Returns by range, x up, and the vehicle in the middle."""
+    hits = sweep[sweep.valid & sweep.returned]
+    points, range_m = hits.points_ego.numpy(), hits.range_m.numpy()
+    scale = size_px / 2 / REACH_M
+    column = (size_px / 2 - points[:, 1] * scale).astype(int)
+    row = (size_px / 2 - points[:, 0] * scale).astype(int)
+    inside = (column >= 0) & (column < size_px) & (row >= 0) & (row < size_px)
+    picture = np.full((size_px, size_px, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
+    picture[row[inside], column[inside]] = palette.range_colours(range_m[inside])
+    half_h, half_w = round(2.2 * scale), max(1, round(0.9 * scale))
+    middle = size_px // 2
+    picture[middle - half_h : middle + half_h, middle - half_w : middle + half_w] = palette.rgb255(
+        palette.EGO
+    )
+    return picture
+
+
+def hit_name(hit: Hit) -> str:
+    """How an example names the hit: LOG@12.5s/VIEW."""
+    return f"{hit.facts['log']}@{float(str(hit.facts['t_s'])):.2f}s/{hit.facts['view']}"
+
+
+def why_matched(hit: Hit) -> str:
+    """What the hit was ranked by."""
+    return "   ".join(f"{name} {score:.3f}" for name, score in hit.scores.items()) or f"{hit.score:.3f}"
+
+
+def what_is_there(hit: Hit) -> str:
+    """Place, weather, speed and objects, as far as they are known."""
+    facts = hit.facts
+    told = [str(facts[name]) for name in ("place", "time_of_day", "weather") if facts[name] is not None]
+    if facts["ego_speed"] is not None:
+        told.append(f"{float(str(facts['ego_speed'])):.1f} m/s")
+    objects = [
+        _counted(int(str(facts[name])), palette.label(category))
+        for category, name in COUNTS.items()
+        if facts[name] and category in (Category.CAR, Category.TRUCK, Category.BUS, Category.PEDESTRIAN)
+    ]
+    return ", ".join([*told, *objects])
+
+
+def _point(above: Image.Image, azimuth_deg: float) -> None:
+    """Where the sector's middle lies."""
+    middle, along = (
+        HEIGHT_PX / 2,
+        np.array([-np.sin(np.deg2rad(azimuth_deg)), -np.cos(np.deg2rad(azimuth_deg))]),
+    )
+    start, end = middle + 0.86 * middle * along, middle + 0.98 * middle * along
+    ImageDraw.Draw(above).line([*start, *end], fill=palette.EXPERT, width=3)
+
+
+def _counted(count: int, kind: str) -> str:
+    return f"{count} {kind}" + ("" if count == 1 else "es" if kind.endswith("s") else "s")
+
+
+@functools.lru_cache(maxsize=16)
+def _opened(folder: Path, maps_dir: Path) -> Log:
+    return Log(LogPath(folder, maps_dir))
+
+
+def _camera(log: Log, frame: int, view: str) -> Image.Image | None:
+    cameras = pinhole_cameras(log)
+    metadata = find_camera(cameras, view) or next(iter(cameras.values()), None)
+    if metadata is None:
+        return None
+    scale = min(WIDTH_PX / metadata.width, HEIGHT_PX / metadata.height)
+    size_hw = (round(metadata.height * scale), round(metadata.width * scale))
+    image = read_camera(log, frame, metadata, size_hw, with_image=True).image
+    return None if image is None else Image.fromarray(image.permute(1, 2, 0).numpy())

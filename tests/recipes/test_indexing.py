@@ -1,0 +1,121 @@
+"""Indexing logs: what is in is not done again, what has changed is, and what is broken is named."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from miniature import write_log
+from transformers import BertTokenizerFast, CLIPConfig, CLIPModel
+
+from foredrive.data import LogPath, find_logs
+from foredrive.errors import InputError
+from foredrive.recipes import indexing
+from foredrive.recipes.indexing import index_logs
+from foredrive.recipes.searching import ask, write_hits
+from foredrive.search.index import FrameIndex
+from foredrive.search.query import Query
+
+pytest.importorskip("lancedb")
+FRAMES = 21
+"""Of 0.1 s: five moments half a second apart, of three views each."""
+ROWS = 5 * 3
+
+
+@pytest.fixture(scope="module")
+def towers(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("towers") / "clip"
+    folder.mkdir()
+    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "car", "rain", "at", "night"]
+    (folder / "vocab.txt").write_text("\n".join(words))
+    BertTokenizerFast(str(folder / "vocab.txt")).save_pretrained(folder)
+    torch.manual_seed(0)
+    size = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    text = {**size, "vocab_size": len(words), "eos_token_id": 3, "bos_token_id": 2, "pad_token_id": 0}
+    vision = {**size, "image_size": 16, "patch_size": 8}
+    CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=8)).save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[LogPath]:
+    root = tmp_path_factory.mktemp("logs")
+    return [write_log(root, name, FRAMES) for name in ("one", "two")]
+
+
+def test_an_index_is_made_once_goes_on_and_is_asked(
+    logs: list[LogPath], towers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = str(tmp_path / "index")
+    monkeypatch.setattr(indexing, "PART_FRAMES", 2)
+    first = index_logs(logs[:1], uri, towers, 0.5, 1)
+    assert (first.logs, first.rows, first.there_before, first.failed) == (1, ROWS, 0, {})
+    both = index_logs(logs, uri, towers, 0.5, 1)
+    assert (both.logs, both.rows, both.there_before) == (2, ROWS, 3)
+    again = index_logs(
+        logs, uri, towers, 0.5, 1, scores={"flat_train/two": {_t_us(logs[1], 5): {"nll": 7.0}}}
+    )
+    assert (again.logs, again.rows, again.there_before, again.scored) == (2, 0, 6, 3)
+    index = FrameIndex(uri)
+    assert index.count() == 2 * ROWS
+    assert index.count("score_nll = 7") == 3
+
+    hits = ask(index, Query(text="car at night", view="ahead", gap_s=0.4, top=3)).hits
+    assert len(hits) == 3
+    assert [hit.score for hit in hits] == sorted((hit.score for hit in hits), reverse=True)
+    itself = ask(index, Query(like="two@1s/left", gap_s=0.4, view="left", top=9)).hits
+    assert len(itself) == 9  # of ten moments one is the example
+    other = next(hit for hit in itself if hit.facts["log"] == "flat_train/one" and hit.facts["t_s"] == 1.0)
+    assert other.score == pytest.approx(1.0, abs=1e-5)  # the same drive under another name
+    listed = tmp_path / "clips.json"
+    write_hits(listed, hits[:1], 0.3, 0.4)
+    (log,) = find_logs(listed)
+    t_s = float(str(hits[0].facts["t_s"]))
+    assert log.parts_s == ((max(0.0, t_s - 0.3), t_s + 0.4),)
+
+
+def test_a_log_that_has_changed_is_put_in_anew(towers: str, tmp_path: Path) -> None:
+    uri = str(tmp_path / "index")
+    log = write_log(tmp_path, "changing", FRAMES)
+    index_logs([log], uri, towers, 0.5, 1)
+    os.utime(log.folder / "sync.arrow", (0, 0))
+    done = index_logs([log], uri, towers, 0.5, 1)
+    assert (done.failed, done.rows, done.there_before) == ({}, ROWS, 0)
+    assert FrameIndex(uri).count() == ROWS
+    assert len(FrameIndex(uri).parts()) == 1
+
+
+def test_broken_logs_are_skipped_and_named(logs: list[LogPath], towers: str, tmp_path: Path) -> None:
+    broken, unreadable = (write_log(tmp_path, name, FRAMES) for name in ("broken", "unreadable"))
+    (broken.folder / "ego_state_se3.arrow").write_bytes(b"not a table")
+    images = broken.folder.parent / "unreadable" / "camera.pcam_f0.arrow"
+    images.write_bytes(images.read_bytes().replace(b"\xff\xd8\xff", b"\x00\x00\x00"))
+    done = index_logs([*logs[:1], broken, unreadable], str(tmp_path / "index"), towers, 0.5, 1)
+    assert (done.logs, done.rows) == (1, ROWS)
+    assert set(done.failed) == {"flat_train/broken", "flat_train/unreadable"}
+    assert "ego_state" in done.failed["flat_train/broken"]
+    assert "frames 0 to 20" in done.failed["flat_train/unreadable"]
+    with pytest.raises(InputError, match="0 s: moments lie apart"):
+        index_logs(logs, str(tmp_path / "index"), towers, 0.0, 1)
+
+
+def test_other_towers_are_refused(logs: list[LogPath], towers: str, tmp_path: Path) -> None:
+    uri = str(tmp_path / "index")
+    index_logs(logs[:1], uri, towers, 1.0, 1)
+    others = tmp_path / "others"
+    shutil.copytree(towers, others)
+    model = CLIPModel.from_pretrained(others)
+    with torch.no_grad():
+        model.text_projection.weight += 0.1
+    model.save_pretrained(others)
+    with pytest.raises(InputError, match="cannot be compared"):
+        index_logs(logs[:1], uri, str(others), 1.0, 1)
+    with pytest.raises(InputError, match="cannot be compared"):
+        ask(FrameIndex(uri), Query(text="rain"), str(others))
+
+
+def _t_us(log: LogPath, frame: int) -> int:
+    from foredrive.data.logs import Log
+
+    return int(Log(log).t_us[frame])

@@ -1,0 +1,93 @@
+"""Rows of an index, on a log whose geometry is known in closed form."""
+
+import math
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from synthetic_log import EGO_SPEED_MPS
+
+from foredrive.data import LogPath
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log
+from foredrive.search.embedding import embed_frames, mean_direction, read_views
+from foredrive.search.rows import FACTS, WHOLE, row_schema
+from foredrive.search.sectors import Sector, blind_sectors
+from foredrive.search.towers import Towers
+
+
+@pytest.fixture(scope="module")
+def rows(log: LogPath, towers: Towers) -> pa.Table:
+    return embed_frames(Log(log), range(21), towers)
+
+
+def test_there_is_a_row_for_each_moment_and_view(rows: pa.Table) -> None:
+    assert rows.schema == row_schema(4)
+    assert rows["view"].to_pylist() == [WHOLE, "ahead", "left"] * 21
+    assert rows["t_s"].to_pylist()[::3] == pytest.approx([0.1 * n for n in range(21)])
+    assert rows["ego_speed"].to_pylist() == pytest.approx([EGO_SPEED_MPS] * 63)
+    assert rows["azimuth_deg"].to_pylist()[:3] == [None, pytest.approx(0), pytest.approx(90)]
+
+
+def test_objects_are_counted_where_they_are(rows: pa.Table) -> None:
+    whole, ahead, left = rows.slice(0, 3).to_pylist()
+    assert (whole["n_car"], whole["n_truck"], whole["n_pedestrian"]) == (1, 1, 0)
+    assert (ahead["n_car"], ahead["n_truck"]) == (1, 1)  # at 14, 4 and 8, -4 m
+    assert (left["n_car"], left["n_truck"]) == (0, 0)
+
+
+def test_what_the_log_does_not_tell_is_null(rows: pa.Table) -> None:
+    first = rows.slice(0, 1).to_pylist()[0]
+    assert [first[name] for name in ("caption", "weather", "place", "score_nll")] == [None] * 4
+
+
+def test_the_joint_embedding_is_the_normalised_sum_of_the_others(rows: pa.Table) -> None:
+    row = rows.slice(1, 1).to_pylist()[0]
+    total = np.add(row["image"], row["lidar"])
+    np.testing.assert_allclose(row["joint"], total / np.linalg.norm(total), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(row["image"]), 1, atol=1e-6)
+
+
+def test_a_whole_scene_is_the_direction_between_its_sectors(rows: pa.Table) -> None:
+    whole, ahead, left = rows.slice(0, 3).to_pylist()
+    total = np.add(ahead["image"], left["image"])
+    np.testing.assert_allclose(whole["image"], total / np.linalg.norm(total), atol=1e-6)
+
+
+def test_a_mean_leaves_out_what_is_missing() -> None:
+    one, none = np.array([0.6, 0.8], np.float32), np.full(2, np.nan, np.float32)
+    np.testing.assert_allclose(mean_direction(np.stack([one, none])), one)
+    assert np.isnan(mean_direction(np.stack([none, none]))).all()
+    assert np.isnan(mean_direction(np.zeros((0, 2), np.float32))).all()
+
+
+def test_parts_of_a_log_are_embedded_as_the_whole_is(rows: pa.Table, log: LogPath, towers: Towers) -> None:
+    part = embed_frames(Log(log), [7, 9, 20], towers)
+    again = pa.concat_tables([rows.slice(3 * n, 3) for n in (7, 9, 20)])
+    assert part.select(FACTS.names).equals(again.select(FACTS.names))
+    for name in ("image", "lidar", "joint"):
+        ours, theirs = (np.array(table[name].to_pylist()) for table in (part, again))
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+def test_a_sector_holds_the_returns_its_camera_can_see_and_looks_along_x(log: LogPath) -> None:
+    opened = Log(log)
+    views = read_views(opened, 0, 48, with_lidar=True)
+    for view in views.values():
+        assert view.sweep is not None
+        points = view.sweep.points_ego
+        assert len(points) > 100
+        assert view.sweep.returned.all()
+        azimuth = torch.atan2(points[:, 1], points[:, 0])
+        assert azimuth.abs().quantile(0.9) < math.radians(50)  # 90° wide, seen from the axle
+
+
+def test_sectors_without_cameras_share_every_return(log: LogPath) -> None:
+    found = read_sweep(Log(log), 0)
+    assert found is not None
+    hits = found[0][found[0].returned]
+    parts = [sector.sweep(hits) for sector in blind_sectors().values()]
+    assert sum(len(part.valid) for part in parts) == len(hits.valid)
+    behind = Sector(math.pi).sweep(hits)
+    assert (behind.points_ego[:, 0] > 0).all()  # turned about, what lies behind lies ahead

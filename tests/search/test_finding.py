@@ -1,0 +1,212 @@
+"""Answers of an index: by what rows are ranked, what is one hit, what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from foredrive.errors import InputError
+from foredrive.search.find import collapse, find
+from foredrive.search.index import FrameIndex, Making, Part
+from foredrive.search.kept import add_tag, remove_tag, save_query, saved_queries, tagged
+from foredrive.search.query import Query
+from foredrive.search.rows import row_schema
+from foredrive.search.target import Target
+
+pytest.importorskip("lancedb")
+DIM = 8
+MAKING = Making("plain", "plain-1", DIM, 0.5)
+LOGS, FRAMES = ("city_train/a", "city_train/b", "rural_val/it's"), 40
+
+
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    vectors = rng.normal(size=(count, DIM)).astype(np.float32)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def made_rows(seed: int = 0) -> pa.Table:
+    """Three logs of 20 s, two views each; the last log has no lidar."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for number, log in enumerate(LOGS):
+        for frame in range(FRAMES):
+            for view in ("all", "front"):
+                image, lidar = directions(rng, 2)
+                joint = (image + lidar) / np.linalg.norm(image + lidar)
+                blind = number == 2
+                rows.append(
+                    {
+                        "log": log, "folder": f"/logs/{log}", "maps_dir": "/maps", "frame": frame,
+                        "t_us": 1_000_000 + 500_000 * frame, "t_s": 0.5 * frame, "view": view,
+                        "ego_speed": float(frame % 10), "n_pedestrian": frame % 3,
+                        "image": image, "lidar": None if blind else lidar, "joint": image if blind else joint,
+                    }
+                )  # fmt: skip
+    return pa.Table.from_pylist(rows, schema=row_schema(DIM))
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> FrameIndex:
+    made = FrameIndex.make(str(tmp_path / "index"), MAKING)
+    rows = made_rows()
+    of_log = 2 * FRAMES
+    parts = [Part(log, 0, FRAMES - 1, "digest") for log in LOGS]
+    made.add([(part, rows.slice(n * of_log, of_log)) for n, part in enumerate(parts)])
+    return made
+
+
+@pytest.fixture
+def target() -> Target:
+    image, lidar = directions(np.random.default_rng(5), 2)
+    return Target(image, lidar)
+
+
+def test_hits_are_the_nearest_rows(index: FrameIndex, target: Target) -> None:
+    rows = made_rows()
+    cosine = np.array(rows["image"].to_pylist()) @ target.image
+    found = find(index, Query(text="x", gap_s=0.0, top=5), target)
+    best = {}
+    for n in np.argsort(-cosine):  # a moment is one hit, whichever view of it fits better
+        best.setdefault((rows["log"][n].as_py(), rows["t_us"][n].as_py()), float(cosine[n]))
+    expected = sorted(best.values(), reverse=True)[:5]
+    assert [hit.score for hit in found.hits] == pytest.approx(expected, abs=1e-5)
+    assert found.exact
+    assert found.compared == len(rows)
+
+
+@pytest.mark.parametrize("rule", ["features", "logits", "rerank"])
+@pytest.mark.parametrize("modality", ["image", "lidar", "joint"])
+def test_looking_up_finds_what_comparing_all_does(
+    index: FrameIndex, target: Target, modality: str, rule: str
+) -> None:
+    query = Query(text="x", modality=modality, rule=rule, top=4, where="ego_speed > 2")
+    exact, looked_up = find(index, query, target), find(index, query, target, exact_up_to=0)
+    assert not looked_up.exact
+    assert [hit.facts for hit in looked_up.hits] == [hit.facts for hit in exact.hits]
+    assert [hit.score for hit in looked_up.hits] == pytest.approx([hit.score for hit in exact.hits], abs=1e-5)
+
+
+def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
+    by_rule = {
+        rule: find(index, Query(text="x", modality="joint", rule=rule, top=3), target).hits
+        for rule in ("features", "logits", "rerank")
+    }
+    for hit in by_rule["features"]:
+        assert hit.score == pytest.approx(hit.scores["joint"])
+    for hit in by_rule["logits"]:
+        assert hit.score == pytest.approx(hit.scores["image"] + hit.scores.get("lidar", hit.scores["image"]))
+    for hit in by_rule["rerank"]:
+        assert hit.score == pytest.approx(hit.scores["lidar"])
+
+
+def test_what_has_no_lidar_is_not_found_by_it(index: FrameIndex, target: Target) -> None:
+    found = find(index, Query(text="x", modality="lidar", top=50), target)
+    assert {hit.facts["log"] for hit in found.hits} == set(LOGS[:2])
+
+
+def test_neighbours_in_a_log_are_one_hit(index: FrameIndex, target: Target) -> None:
+    hits = find(index, Query(text="x", gap_s=4.0, top=100), target).hits
+    for log in LOGS:
+        times = sorted(float(str(hit.facts["t_s"])) for hit in hits if hit.facts["log"] == log)
+        assert len(times) >= 3
+        assert np.diff(times).min() >= 4.0
+
+
+def test_an_example_does_not_find_itself(index: FrameIndex, target: Target) -> None:
+    moment = (LOGS[0], 1_000_000 + 500_000 * 10)
+    hits = find(index, Query(like="a@5s", gap_s=2.0, top=200), target._replace(moment=moment)).hits
+    ours = [float(str(hit.facts["t_s"])) for hit in hits if hit.facts["log"] == LOGS[0]]
+    assert ours
+    assert all(abs(t_s - 5.0) >= 2.0 for t_s in ours)
+
+
+def test_conditions_hold_for_every_hit(index: FrameIndex, target: Target) -> None:
+    query = Query(
+        text="x", where="ego_speed > 5 AND log = 'rural_val/it''s'", view="front", top=50, gap_s=0.0
+    )
+    hits = find(index, query, target).hits
+    assert len(hits) == 16  # four of ten frames
+    assert {(hit.facts["log"], hit.facts["view"]) for hit in hits} == {(LOGS[2], "front")}
+
+
+@pytest.mark.parametrize("where", ["ego_speed >", "nonsense = 3", "log = 'a"])
+def test_a_condition_that_makes_no_sense_is_one_line(index: FrameIndex, target: Target, where: str) -> None:
+    with pytest.raises(InputError) as caught:
+        find(index, Query(text="x", where=where), target)
+    assert repr(where) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) -> None:
+    missed = {LOGS[1]: {1_000_000 + 500_000 * frame: {"missed": float(frame)} for frame in range(FRAMES)}}
+    assert index.set_scores(missed) == 2 * FRAMES
+    assert index.count() == 6 * FRAMES
+    worst = find(index, Query(by="score_missed", top=3, gap_s=0.0), None).hits
+    assert [hit.facts["score_missed"] for hit in worst] == [39, 38, 37]
+    alone = find(index, Query(text="x", by="score_missed", mix=1.0, top=3, gap_s=0.0), target).hits
+    assert [hit.facts["t_us"] for hit in alone] == [hit.facts["t_us"] for hit in worst]
+    mixed = find(index, Query(text="x", by="score_missed", mix=0.5, top=1), target).hits[0]
+    assert mixed.facts["log"] == LOGS[1]
+
+
+def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
+    moments = [(LOGS[2], 1_500_000), (LOGS[0], 1_000_000)]
+    add_tag(index.uri, "odd", moments)
+    add_tag(index.uri, "odd", moments[:1])
+    assert sorted(tagged(index.uri, "odd")) == sorted(moments)
+    hits = find(index, Query(text="x", tag="odd", gap_s=0.0), target).hits
+    assert sorted((hit.facts["log"], hit.facts["t_us"]) for hit in hits) == sorted(moments)
+    remove_tag(index.uri, "odd")
+    assert find(index, Query(tag="odd"), None).hits == []
+    query = Query(text="rain", where="ego_speed > 5", diverse="facility")
+    save_query(index.uri, "wet", "old")
+    save_query(index.uri, "wet", query.to_json())
+    assert Query.from_json(saved_queries(index.uri)["wet"]) == query
+
+
+def test_parts_are_put_in_once(index: FrameIndex) -> None:
+    rows = made_rows(seed=1).slice(0, 2 * FRAMES)
+    part = Part(LOGS[0], 0, FRAMES - 1, "digest")
+    index.add([(part, rows)])
+    assert index.count() == 6 * FRAMES
+    assert index.count(f"log = '{LOGS[0]}'") == 2 * FRAMES
+    index.drop(LOGS[0])
+    assert {part.log for part in index.parts()} == set(LOGS[1:])
+    assert index.count() == 4 * FRAMES
+
+
+def test_an_index_is_its_towers_own(index: FrameIndex, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"made by the towers plain \(plain-1\), not by other \(clip-2\)"):
+        FrameIndex.make(index.uri, Making("other", "clip-2", DIM, 0.5))
+    with pytest.raises(InputError, match=r"a moment every 0\.5 s"):
+        FrameIndex.make(index.uri, Making("plain", "plain-1", DIM, 1.0))
+    with pytest.raises(InputError, match="no index here"):
+        FrameIndex(str(tmp_path / "nowhere"))
+    assert not (tmp_path / "nowhere").exists()
+
+
+@given(
+    times=st.lists(st.integers(0, 50), min_size=1, max_size=40),
+    gap_s=st.floats(0, 10),
+    top=st.integers(1, 10),
+)
+@settings(max_examples=50, deadline=None)
+def test_collapsing_leaves_no_neighbours_and_no_gaps(times: list[int], gap_s: float, top: int) -> None:
+    rng = np.random.default_rng(len(times))
+    t_us = np.array(times) * 1_000_000
+    logs = [f"log {n % 3}" for n in range(len(times))]
+    score = rng.normal(size=len(times))
+    score[::7] = np.nan
+    kept = collapse(score, logs, t_us, gap_s, top)
+
+    def near(a: int, b: int) -> bool:
+        return logs[a] == logs[b] and abs(t_us[a] - t_us[b]) < max(gap_s * 1e6, 1)
+
+    assert not any(near(a, b) for a in kept for b in kept if a != b)
+    assert (np.diff(score[kept]) <= 0).all()
+    left = [n for n in range(len(times)) if n not in kept and not np.isnan(score[n])]
+    if len(kept) < top:  # whatever was left out is a neighbour of something better
+        assert all(any(near(n, k) and score[k] >= score[n] for k in kept) for n in left)
