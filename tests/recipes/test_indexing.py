@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from miniature import write_log
-from transformers import BertTokenizerFast, CLIPConfig, CLIPModel
+from small_towers import save_clip
+from transformers import CLIPModel
 
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
@@ -25,17 +26,7 @@ ROWS = 5 * 3
 
 @pytest.fixture(scope="module")
 def towers(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("towers") / "clip"
-    folder.mkdir()
-    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "car", "rain", "at", "night"]
-    (folder / "vocab.txt").write_text("\n".join(words))
-    BertTokenizerFast(str(folder / "vocab.txt")).save_pretrained(folder)
-    torch.manual_seed(0)
-    size = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
-    text = {**size, "vocab_size": len(words), "eos_token_id": 3, "bos_token_id": 2, "pad_token_id": 0}
-    vision = {**size, "image_size": 16, "patch_size": 8}
-    CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=8)).save_pretrained(folder)
-    return str(folder)
+    return str(save_clip(tmp_path_factory.mktemp("towers") / "clip"))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from foredrive.recipes.indexing import Indexed
-    from foredrive.search.find import Found, Hit
+    from foredrive.search.find import Found
     from foredrive.search.index import FrameIndex
     from foredrive.search.query import Query
 
@@ -90,7 +90,10 @@ def search(
     from foredrive.search.index import FrameIndex
     from foredrive.search.kept import add_tag, remove_tag, save_query
     from foredrive.search.query import Query
+    from foredrive.view.search_sheet import check_sheet, write_search_sheet
 
+    if out is not None:
+        check_sheet(out)
     opened = FrameIndex(index)
     if untag is not None:
         remove_tag(index, untag)
@@ -104,7 +107,7 @@ def search(
             None if diverse == "no" else diverse, by, mix,
         )  # fmt: skip
     found = ask(opened, query, towers, ensemble=not plain)
-    _tell(opened, query, found)
+    _tell(opened, found)
     if save is not None:
         save_query(index, save, query.to_json())
     if tag is not None:
@@ -115,7 +118,8 @@ def search(
         write_hits(clips, found.hits, before, after)
         print(f"wrote {clips}: foredrive train RECIPE --logs {clips}")
     if out is not None:
-        _write_sheet(out, query, found.hits)
+        write_search_sheet(out, query, found.hits)
+        print(f"look: {out}")
 
 
 def search_index(
@@ -161,7 +165,7 @@ def _saved(index: str, name: str) -> "Query":
     return Query.from_json(kept[name])
 
 
-def _tell(index: "FrameIndex", query: "Query", found: "Found") -> None:
+def _tell(index: "FrameIndex", found: "Found") -> None:
     from rich.console import Console
 
     from foredrive.view.search_sheet import hits_table
@@ -173,13 +177,6 @@ def _tell(index: "FrameIndex", query: "Query", found: "Found") -> None:
     Console().print(hits_table(found.hits))
     how = "all compared" if found.exact else f"{found.compared} compared, the others passed over by a graph"
     print(f"{len(found.hits)} hits among {rows} rows of {index.uri}; {how}")
-
-
-def _write_sheet(out: Path, query: "Query", hits: "list[Hit]") -> None:
-    from foredrive.view.search_sheet import write_search_sheet
-
-    write_search_sheet(out, query, hits)
-    print(f"look: {out}")
 
 
 def _tell_indexed(done: "Indexed", index: str) -> None:

@@ -89,7 +89,7 @@ def index_logs(
     total = sum(len(job.frames) for job in todo)
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(embed_part, towers=towers, threads=threads)
-    writer, done = _Writer(index), 0
+    writer, done = IndexWriter(index), 0
     here = workers == 1 and not on_ray  # a process of its own would first have to load the towers
     results = _one_by_one(todo, work) if here else fan_out(todo, work, workers, on_ray=on_ray)
     with contextlib.closing(results):
@@ -121,8 +121,11 @@ def _one_by_one(
         yield job, result
 
 
-class _Writer:
-    """Puts finished parts into an index, many at a time."""
+class IndexWriter:
+    """Puts finished parts into an index, many at a time, and optimises it now and then."""
+
+    rows: int
+    """That were put in."""
 
     def __init__(self, index: FrameIndex) -> None:
         self.rows = 0
@@ -132,19 +135,20 @@ class _Writer:
         self._since_rows = self._since_writes = 0
 
     def add(self, part: Part, rows: pa.Table) -> None:
+        """Put a part in, now or with those that follow."""
         self._waiting.append((part, rows))
         waiting = sum(len(rows) for _, rows in self._waiting)
         if waiting >= FLUSH_ROWS or time.monotonic() - self._flushed_s > FLUSH_S:
             self.flush()
 
     def flush(self) -> None:
-        if not self._waiting:
-            return
-        self._index.add(self._waiting)
-        added = sum(len(rows) for _, rows in self._waiting)
-        self.rows += added
-        self._since_rows, self._since_writes = self._since_rows + added, self._since_writes + 1
-        self._waiting = []
+        """Put in whatever still waits."""
+        if self._waiting:
+            self._index.add(self._waiting)
+            added = sum(len(rows) for _, rows in self._waiting)
+            self.rows += added
+            self._since_rows, self._since_writes = self._since_rows + added, self._since_writes + 1
+            self._waiting = []
         if self._since_rows >= OPTIMISE_ROWS or self._since_writes >= OPTIMISE_WRITES:
             self._index.optimise()
             self._since_rows = self._since_writes = 0

@@ -42,15 +42,24 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
     Raises:
         InputError: it ends otherwise.
     """
+    check_sheet(path)
     if path.suffix == ".png":
         figure = draw_search_sheet(query, hits[:MOST_ON_PICTURE])
         with atomic_path(path) as scratch:
             figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
-    elif path.suffix == ".html":
-        page = search_html(query, hits)
-        with atomic_path(path) as scratch:
-            scratch.write_text(page, encoding="utf-8")
-    else:
+        return
+    page = search_html(query, hits)
+    with atomic_path(path) as scratch:
+        scratch.write_text(page, encoding="utf-8")
+
+
+def check_sheet(path: Path) -> None:
+    """Whether a contact sheet can be written under this name.
+
+    Raises:
+        InputError: it ends neither on .png nor on .html.
+    """
+    if path.suffix not in (".png", ".html"):
         raise InputError(f"{path}: a contact sheet ends on .png or .html")
 
 

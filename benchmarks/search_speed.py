@@ -1,0 +1,200 @@
+"""How long a query takes over a million embeddings, how much it misses, and what building the index holds.
+
+LanceDB as `foredrive.search` uses it, beside comparing all in NumPy and FAISS' flat and graph indices. The
+embeddings are made: directions of falling variance about a common mean, as those of image towers are, in
+kinds of scenes, drives of a kind, and moments along a drive that follow one another. Half of the queries are
+moments that are not in the index; the other half lie off to one side of all of them, as texts do.
+
+Needs 2 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
+"""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from statistics import median
+
+import numpy as np
+import pyarrow as pa
+
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.measuring import held_mib
+from foredrive.recipes.indexing import IndexWriter
+from foredrive.search.find import find
+from foredrive.search.index import FrameIndex, Making, Part
+from foredrive.search.query import Query
+from foredrive.search.rows import row_schema
+from foredrive.search.target import Target
+
+ROWS = int(os.environ.get("SEARCH_SPEED_ROWS", "1000000"))
+DIM, KINDS, DRIVE = 384, 300, 400
+"""Rows of a drive: 57 moments of seven views."""
+MEAN, KIND, ALONG, NOISE = 0.6, 0.55, 0.3, 0.25
+"""Lengths of what a direction is made of: two random moments have a cosine of about 0.4."""
+ASIDE = 0.8
+QUERIES, TOP = 60, 20
+
+
+def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random vectors of length about 1 whose variance falls as 1 / (1 + k / 20)."""
+    scale = 1 / np.sqrt(1 + np.arange(DIM) / 20)
+    return rng.normal(size=(count, DIM)).astype(np.float32) * (scale / np.linalg.norm(scale)).astype(
+        np.float32
+    )
+
+
+def drives(seed: int) -> Iterator[np.ndarray]:
+    """Unit vectors of one drive after the other, [DRIVE DIM], always the same for a seed."""
+    shared = np.random.default_rng(seed)
+    mean, kinds = MEAN * spectrum(shared, 1), KIND * spectrum(shared, KINDS)
+    number = 0
+    while True:
+        rng = np.random.default_rng((seed, number))
+        start, end = spectrum(rng, 1), spectrum(rng, 1)
+        along = np.linspace(0, 1, DRIVE, dtype=np.float32)[:, None]
+        vectors = mean + kinds[rng.integers(KINDS)] + ALONG * (start + along * (end - start))
+        vectors += NOISE * spectrum(rng, DRIVE)
+        yield vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+        number += 1
+
+
+def embeddings(seed: int) -> np.ndarray:
+    """All rows, [ROWS DIM]."""
+    made = drives(seed)
+    return np.concatenate([next(made) for _ in range(-(-ROWS // DRIVE))])[:ROWS]
+
+
+def queries(seed: int) -> np.ndarray:
+    """Unit vectors that are asked for, [QUERIES DIM]."""
+    made = drives(seed)
+    for _ in range(-(-ROWS // DRIVE)):
+        next(made)
+    rng = np.random.default_rng((seed, 1 << 40))
+    asked = np.stack([next(made)[rng.integers(DRIVE)] for _ in range(QUERIES)])
+    asked[QUERIES // 2 :] += ASIDE * spectrum(rng, 1)
+    return asked / np.linalg.norm(asked, axis=-1, keepdims=True)
+
+
+def nearest(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """The rows nearest to a query, by comparing all."""
+    likeness = vectors @ query
+    best = np.argpartition(-likeness, TOP)[:TOP]
+    return best[np.argsort(-likeness[best])]
+
+
+def asked(answer: Callable[[np.ndarray], np.ndarray], seed: int, truth: np.ndarray) -> dict[str, float]:
+    """Time of a warm query, the slowest of twenty, and what share of the nearest rows is found."""
+    took_ms, found = [], []
+    every = queries(seed)
+    for query in every[:5]:
+        answer(query)
+    for query, true in zip(every, truth, strict=True):
+        started = time.perf_counter()
+        rows = answer(query)
+        took_ms.append(1e3 * (time.perf_counter() - started))
+        found.append(len(set(rows.tolist()) & set(true.tolist())) / TOP)
+    half = QUERIES // 2
+    return {
+        "query_ms": median(took_ms),
+        "query_ms_95": float(np.quantile(took_ms, 0.95)),
+        "recall_images": float(np.mean(found[:half])),
+        "recall_texts": float(np.mean(found[half:])),
+    }
+
+
+def with_numpy(seed: int) -> dict[str, float]:
+    vectors = embeddings(seed)
+    truth = np.stack([nearest(vectors, query) for query in queries(seed)])
+    return asked(lambda query: nearest(vectors, query), seed, truth)
+
+
+def with_faiss(seed: int, *, graph: bool) -> dict[str, float]:
+    if find_spec("faiss") is None:
+        return {"installed": 0.0}
+    import faiss
+
+    vectors = embeddings(seed)
+    truth = np.stack([nearest(vectors, query) for query in queries(seed)])
+    metric = faiss.METRIC_INNER_PRODUCT
+    index = faiss.IndexHNSWFlat(DIM, 20, metric) if graph else faiss.IndexFlatIP(DIM)
+    if graph:
+        index.hnsw.efConstruction, index.hnsw.efSearch = 300, 100
+    started = time.perf_counter()
+    index.add(vectors)
+    build_s = time.perf_counter() - started
+    found = asked(lambda query: index.search(query[None], TOP)[1][0], seed, truth)
+    return {"installed": 1.0, "build_s": build_s, **found}
+
+
+def rows_of(number: int, vectors: np.ndarray) -> tuple[Part, pa.Table]:
+    """A drive as an index has it."""
+    log, count = f"made_train/{number:06d}", len(vectors)
+    frame = np.arange(count) // 7
+    known = {
+        "log": [log] * count, "folder": [f"/logs/{log}"] * count, "maps_dir": ["/maps"] * count,
+        "frame": frame, "t_us": 500_000 * frame, "t_s": 0.5 * frame,
+        "view": [f"v{n % 7}" for n in range(count)],
+        "ego_speed": np.full(count, number % 20),
+    }  # fmt: skip
+    flat = pa.array(vectors.reshape(-1))
+    vector = pa.FixedSizeListArray.from_arrays(flat, DIM)
+    columns = [
+        vector if field.name == "image"
+        else pa.array(known[field.name], field.type) if field.name in known
+        else pa.nulls(count, field.type)
+        for field in row_schema(DIM)
+    ]  # fmt: skip
+    return Part(log, 0, int(frame[-1]), "made"), pa.Table.from_arrays(columns, schema=row_schema(DIM))
+
+
+def with_lancedb(seed: int) -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        index = FrameIndex.make(f"{folder}/index", Making("made", f"made-{seed}", DIM, 0.5))
+        writer, held = IndexWriter(index), []
+        made, started = drives(seed), time.perf_counter()
+        for number in range(-(-ROWS // DRIVE)):
+            vectors = next(made)[: ROWS - number * DRIVE]
+            writer.add(*rows_of(number, vectors))
+            held.append(held_mib("cpu"))
+        writer.flush()
+        written_s = time.perf_counter() - started
+        index.optimise()
+        built_s = time.perf_counter() - started - written_s
+        vectors = embeddings(seed)
+        truth = np.stack([nearest(vectors, query) for query in queries(seed)])
+        del vectors
+
+        def answer(query: np.ndarray) -> np.ndarray:
+            rows = index.nearest(query, "image", None, ["log", "frame", "view"], TOP)
+            number = np.array([int(name[-6:]) for name in rows["log"].to_pylist()])
+            view = np.array([int(name[1:]) for name in rows["view"].to_pylist()])
+            return number * DRIVE + rows["frame"].to_numpy() * 7 + view
+
+        figures = asked(answer, seed, truth)
+        whole = [time.perf_counter()]
+        for query in queries(seed):
+            find(index, Query(text="x", top=TOP), Target(query, None))
+            whole.append(time.perf_counter())
+        return {
+            "rows": float(index.count()),
+            "write_s": written_s,
+            "graph_s": built_s,
+            "held_mib_at_tenth": held[len(held) // 10],
+            "held_mib_at_end": held[-1],
+            "collapsed_query_ms": 1e3 * float(np.median(np.diff(whole))),
+            **figures,
+        }
+
+
+BENCHMARK = Benchmark(
+    question=f"How long does a query over {ROWS} embeddings take, and what does it miss?",
+    arms={
+        "lancedb": with_lancedb,
+        "numpy": with_numpy,
+        "faiss_flat": lambda seed: with_faiss(seed, graph=False),
+        "faiss_graph": lambda seed: with_faiss(seed, graph=True),
+    },
+    seeds=(0,),
+    config={"rows": ROWS, "dim": DIM, "drive": DRIVE, "kinds": KINDS, "queries": QUERIES, "top": TOP},
+)

@@ -1,0 +1,71 @@
+"""`foredrive search` from logs to lists of clips, and what it says where it cannot go on."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from miniature import write_log
+from PIL import Image
+from small_towers import save_clip
+
+from foredrive.cli.main import main
+from foredrive.data import find_logs
+
+pytest.importorskip("lancedb")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An index of one log."""
+    root = tmp_path_factory.mktemp("search")
+    save_clip(root / "clip")
+    log = write_log(root, frames=11)
+    line = f"search index {log.folder} --index {root / 'index'} --towers {root / 'clip'} --workers 1"
+    assert main(shlex.split(line)) == 0
+    return root
+
+
+def test_a_text_finds_pictures_and_clips(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    index = ["--index", str(root / "index"), "--gap", "0.4"]
+    kept = ["--out", str(tmp_path / "hits.png"), "--clips", str(tmp_path / "clips.json"), "--tag", "few"]
+    assert main(["search", "a car at night", *index, "--top", "2", "--save", "cars", *kept]) == 0
+    assert "2 hits among 9 rows" in capsys.readouterr().out
+    with Image.open(tmp_path / "hits.png") as sheet:
+        assert sheet.width > 1000
+    assert find_logs(tmp_path / "clips.json")[0].parts_s
+    assert main(["search", "--tagged", "few", *index]) == 0
+    assert "2 hits" in capsys.readouterr().out
+    page = tmp_path / "hits.html"
+    assert main(["search", "--saved", "cars", *index, "--out", str(page)]) == 0
+    assert page.read_text().count("<figure>") == 2
+    assert main(["search", "--untag", "few", *index]) == 0
+    assert main(["search", "--tagged", "few", *index]) == 0
+    assert "nothing found among 9 rows" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ("", "an empty query"),
+        ("''", "an empty text"),
+        ("rain --where 'speed >>'", "the condition 'speed >>' cannot be understood"),
+        ("rain --modality lidar", "no lidar embeddings"),
+        ("--like flat@99s", "has nothing at 99 s"),
+        ("--like nowhere@1s", "no log of this name"),
+        ("--like flat@0.5s/roof", "no view roof; there are ahead, left"),
+        ("--like flat@0.5s/left:0,0,500,500", "outside the image of 96 x 48 px"),
+        ("--saved unknown", "no query is kept as unknown"),
+        ("rain --out hits.jpg", "a contact sheet ends on .png or .html"),
+        ("rain --index nowhere", "nowhere: no index here"),
+    ],
+)
+def test_what_cannot_be_found_is_one_line(
+    root: Path, asked: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = [] if "--index" in asked else ["--index", str(root / "index")]
+    assert main(["search", *shlex.split(asked), *where]) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith("foredrive: ")
+    assert why in told
