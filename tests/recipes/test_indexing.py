@@ -11,10 +11,11 @@ from small_towers import save_clip
 from transformers import CLIPModel
 
 from foredrive.data import LogPath, find_logs
+from foredrive.data.clip_list import write_clip_list
 from foredrive.errors import InputError
 from foredrive.recipes import indexing
 from foredrive.recipes.indexing import index_logs
-from foredrive.recipes.searching import ask, write_hits
+from foredrive.recipes.searching import ask, listed_clips
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
 
@@ -60,7 +61,7 @@ def test_an_index_is_made_once_goes_on_and_is_asked(
     other = next(hit for hit in itself if hit.facts["log"] == "flat_train/one" and hit.facts["t_s"] == 1.0)
     assert other.score == pytest.approx(1.0, abs=1e-5)  # the same drive under another name
     listed = tmp_path / "clips.json"
-    write_hits(listed, hits[:1], 0.3, 0.4)
+    write_clip_list(listed, listed_clips(hits[:1], 0.3, 0.4))
     (log,) = find_logs(listed)
     t_s = float(str(hits[0].facts["t_s"]))
     assert log.parts_s == ((max(0.0, t_s - 0.3), t_s + 0.4),)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from foredrive.data import ClipDataset, LogPath, find_logs
-from foredrive.data.clip_list import ListedClip, read_clip_list, write_clip_list
+from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
 from foredrive.errors import InputError
 from foredrive.search.query import Like, Query, parse_like
 from foredrive.search.rows import WHOLE
@@ -55,7 +55,8 @@ def test_what_cannot_be_asked_is_one_line(asked: dict[str, object], why: str) ->
 def test_a_list_of_clips_is_its_logs_with_the_parts_that_are_meant(log: LogPath, tmp_path: Path) -> None:
     path = tmp_path / "clips.json"
     spans = [(1.0, 1.5), (0.2, 0.6), (0.5, 0.8)]
-    write_clip_list(path, [ListedClip(log.folder, log.maps_dir, *span) for span in spans], [{"score": 1}] * 3)
+    clips = [ListedClip(log.folder, log.maps_dir, *span) for span in spans]
+    write_clip_list(path, clip_list(clips, [{"score": 1}] * 3))
     assert find_logs(path) == [dataclasses.replace(log, parts_s=((0.2, 0.8), (1.0, 1.5)))]
 
 

@@ -20,7 +20,7 @@ from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.record import record
 from foredrive.cli.score import score
-from foredrive.cli.search import search, search_index
+from foredrive.cli.search import search, search_index, search_page
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
@@ -36,6 +36,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "score": score,
     "search": search,
     "search-index": search_index,
+    "search-page": search_page,
     "imagine": imagine,
     "export": export,
     "view": view,

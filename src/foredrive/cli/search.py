@@ -1,4 +1,4 @@
-"""`foredrive search` and `foredrive search index`."""
+"""`foredrive search`, `search index` and `search page`."""
 
 import os
 from contextlib import contextmanager
@@ -86,7 +86,8 @@ def search(
         save: Keep this query under a name.
         saved: Ask the query that was kept under this name; of the others only --out, --clips and --tag count.
     """
-    from foredrive.recipes.searching import ask, write_hits
+    from foredrive.data.clip_list import write_clip_list
+    from foredrive.recipes.searching import ask, listed_clips
     from foredrive.search.index import FrameIndex
     from foredrive.search.kept import add_tag, remove_tag, save_query
     from foredrive.search.query import Query
@@ -115,7 +116,7 @@ def search(
     if not found.hits:
         return
     if clips is not None:
-        write_hits(clips, found.hits, before, after)
+        write_clip_list(clips, listed_clips(found.hits, before, after))
         print(f"wrote {clips}: foredrive train RECIPE --logs {clips}")
     if out is not None:
         write_search_sheet(out, query, found.hits)
@@ -153,6 +154,26 @@ def search_index(
         cores = len(os.sched_getaffinity(0))
         done = index_logs(found, index, towers, stride, workers or cores, on_ray=ray, scores=told, tick=tick)
     _tell_indexed(done, index)
+
+
+def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhost", port: int = 8090) -> None:
+    """Search in the browser: a grid of hits, conditions, a map of all scenes to draw around some.
+
+    Args:
+        index: The index: a folder, or a place on object storage.
+        towers: Where the towers that made the index lie now, if they have moved.
+        host: Where the page is served; other machines see it at 0.0.0.0.
+        port: The page's port.
+    """
+    from foredrive.search.index import FrameIndex
+    from foredrive.view.search_page import SearchPage
+
+    page = SearchPage(FrameIndex(index), towers, host, port)
+    print(f"{index} is asked at {page.url} until you press Ctrl-C", flush=True)
+    try:
+        page.serve()
+    finally:
+        page.close()
 
 
 def _saved(index: str, name: str) -> "Query":

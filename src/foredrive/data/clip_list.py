@@ -23,10 +23,10 @@ class ListedClip:
     """Left out."""
 
 
-def write_clip_list(
-    path: Path, clips: Sequence[ListedClip], notes: Sequence[Mapping[str, object]] | None = None
-) -> None:
-    """Write a list.
+def clip_list(
+    clips: Sequence[ListedClip], notes: Sequence[Mapping[str, object]] | None = None
+) -> dict[str, object]:
+    """A list as its file has it.
 
     Args:
         notes: what else to say of each clip; nobody reads it.
@@ -39,8 +39,13 @@ def write_clip_list(
         }
         for clip, note in zip(clips, told, strict=True)
     ]  # fmt: skip
+    return {"format": FORMAT, "clips": entries}
+
+
+def write_clip_list(path: Path, listed: Mapping[str, object]) -> None:
+    """Write a `clip_list`."""
     with atomic_path(path) as scratch:
-        scratch.write_text(json.dumps({"format": FORMAT, "clips": entries}, indent=1) + "\n")
+        scratch.write_text(json.dumps(listed, indent=1) + "\n")
 
 
 def read_clip_list(path: Path) -> list[ListedClip]:

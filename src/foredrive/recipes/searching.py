@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from foredrive.data.clip_list import ListedClip, write_clip_list
+from foredrive.data.clip_list import ListedClip, clip_list
 from foredrive.recipes.towers import find_towers
 from foredrive.search.find import Found, Hit, find
 from foredrive.search.index import FrameIndex
@@ -34,12 +34,12 @@ def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool)
     return text_target(query, chosen, ensemble=ensemble)
 
 
-def write_hits(path: Path, hits: Sequence[Hit], before_s: float, after_s: float) -> None:
-    """Write hits as a list of clips, each with some time before and after, that verbs take as logs."""
+def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[str, object]:
+    """Hits as a list of clips (`data.clip_list`), each with some time before and after."""
     clips, notes = [], []
     for hit in hits:
         t_s = float(str(hit.facts["t_s"]))
         folder, maps_dir = Path(str(hit.facts["folder"])), Path(str(hit.facts["maps_dir"]))
         clips.append(ListedClip(folder, maps_dir, max(0.0, t_s - before_s), t_s + after_s))
         notes.append({"log": hit.facts["log"], "t_s": t_s, "view": hit.facts["view"], "score": hit.score})
-    write_clip_list(path, clips, notes)
+    return clip_list(clips, notes)

@@ -85,7 +85,7 @@ def _embed_by_name(
 def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[str, View]:
     """Every sector of a moment by its name: those of cameras that have an image, or four around."""
     found = read_sweep(log, frame) if with_lidar else None
-    sweep = None if found is None else found[0]
+    sweep = None if found is None else found[0][found[0].valid & found[0].returned]
     views = {}
     for name, metadata in pinhole_cameras(log).items():
         scale = side_px / min(metadata.height, metadata.width)

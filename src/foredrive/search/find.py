@@ -177,7 +177,7 @@ def likeness(rows: pa.Table, target: Target) -> dict[str, Float[ndarray, "n"]]:
     """Cosine of each row with the target by modality; NaN where the row has none."""
     vectors = {"image": target.image, "lidar": target.lidar, "joint": _joint(target)}
     return {
-        name: _vectors(rows, name) @ vector.astype(np.float32)
+        name: vectors_of(rows, name) @ vector.astype(np.float32)
         for name, vector in vectors.items()
         if vector is not None
     }
@@ -214,14 +214,14 @@ def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
 def _diverse(rows: pa.Table, order: list[int], score: Float[ndarray, "n"], query: Query) -> list[int]:
     """Which of the collapsed hits, in the order of choice."""
     pool = rows.take(pa.array(order, pa.int64()))
-    vectors = np.nan_to_num(_vectors(pool, query.modality))
+    vectors = np.nan_to_num(vectors_of(pool, query.modality))
     worth = np.maximum(_by_rank(score[order]), SMALLEST_WORTH)
     choose = {"k-centre": k_centre, "facility": facility_location}[query.diverse or "k-centre"]
     return choose(vectors, query.top, worth)
 
 
-def _vectors(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
-    """Embeddings; NaN where there are none."""
+def vectors_of(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
+    """The embeddings of rows; NaN where there are none."""
     dim = rows.schema.field(name).type.list_size
     column = rows[name].combine_chunks()
     if isinstance(column, pa.ChunkedArray):

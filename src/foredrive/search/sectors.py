@@ -44,8 +44,7 @@ class Sector(NamedTuple):
 
     def sweep(self, sweep: LidarSweep) -> LidarSweep:
         """The returns of an unbatched sweep that lie in the sector, x along its middle (see `Towers`)."""
-        hits = sweep[sweep.valid & sweep.returned]
-        inside = hits[self.contains(hits.points_ego)]
+        inside = sweep[sweep.valid & sweep.returned & self.contains(sweep.points_ego)]
         T_sector_ego = matrix_from_yaw(torch.tensor(-self.azimuth_rad), torch.zeros(3))
         return dataclasses.replace(
             inside,

@@ -1,0 +1,49 @@
+"""All that is indexed on a plane: what lies close together there is alike."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.search.find import vectors_of
+from foredrive.search.index import FrameIndex
+from foredrive.search.rows import WHOLE
+from foredrive.search.tables import quoted
+
+MOST_POINTS = 5000
+
+
+class Plane(NamedTuple):
+    """Whole scenes and where they lie."""
+
+    xy: Float[ndarray, "n 2"]
+    """The two directions in which their embeddings vary most, scaled to -1 to 1."""
+    rows: list[dict[str, object]]
+    """`SHOWN` of each."""
+    share: float
+    """Of the variance that the plane shows."""
+    total: int
+    """Whole scenes that there are; of more than `MOST_POINTS` as many, evenly."""
+
+
+SHOWN = ("log", "t_us", "t_s", "view", "place", "weather", "time_of_day")
+
+
+def project_scenes(index: FrameIndex, name: str = "image") -> Plane:
+    """Principal components of the whole scenes' embeddings."""
+    where = f"view = {quoted(WHOLE)} AND {name} IS NOT NULL"
+    total = index.count(where)
+    step = -(-total // MOST_POINTS) if total else 1
+    if step > 1:
+        where += f" AND frame % {step} = 0"
+    rows = index.select(where, [*SHOWN, name])
+    vectors = vectors_of(rows, name)
+    if len(vectors) < 2:
+        return Plane(np.zeros((len(vectors), 2)), rows.select(list(SHOWN)).to_pylist(), 0.0, total)
+    centred = vectors - vectors.mean(0)
+    variance, axes = np.linalg.eigh(centred.T @ centred)
+    xy = centred @ axes[:, :-3:-1]
+    xy /= np.abs(xy).max(0).clip(min=1e-9)
+    share = float(variance[-2:].sum() / max(float(variance.sum()), 1e-12))
+    return Plane(xy, rows.select(list(SHOWN)).to_pylist(), share, total)

@@ -1,0 +1,204 @@
+"""A page in the browser that asks an index: a grid of hits, conditions, a map of all scenes with a lasso."""
+
+import functools
+import io
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from PIL import Image
+
+from foredrive.errors import InputError
+from foredrive.recipes.searching import ask, listed_clips
+from foredrive.search.find import Hit
+from foredrive.search.index import FrameIndex
+from foredrive.search.kept import add_tag, save_query, saved_queries
+from foredrive.search.projection import project_scenes
+from foredrive.search.query import Query
+from foredrive.search.rows import FACTS
+from foredrive.search.tables import quoted
+from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
+from foredrive.view.report_style import CSS
+
+JPEG_QUALITY = 85
+MOST_SHOWN = 60
+"""Of the scenes in a lasso."""
+Key = tuple[str, int, str]
+"""Log, time in µs and view: a row."""
+
+
+class SearchPage:
+    """Serves the page until it is closed.
+
+    Args:
+        towers: where the towers lie that made the index; by default where they lay then.
+        port: 0 takes any that is free.
+    """
+
+    def __init__(self, index: FrameIndex, towers: str | None, host: str, port: int) -> None:
+        self._index, self._towers = index, towers
+        self._one_at_a_time = threading.Lock()  # one query takes all cores
+        page = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                page._answer(self, None)
+
+            def do_POST(self) -> None:
+                length = int(self.headers.get("Content-Length") or 0)
+                page._answer(self, self.rfile.read(length))
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Say nothing."""
+
+        try:
+            self._server = ThreadingHTTPServer((host, port), Handler)
+        except OSError as error:
+            raise InputError(f"{host}:{port}: no page can be served there: {error.strerror}") from error
+        self.url = f"http://{host}:{self._server.server_address[1]}"
+
+    def serve(self) -> None:
+        """Answer until `close`, in this thread."""
+        self._server.serve_forever()
+
+    def close(self) -> None:
+        """Stop."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _answer(self, request: BaseHTTPRequestHandler, body: bytes | None) -> None:
+        url = urlsplit(request.path)
+        asked = {name: values[-1] for name, values in parse_qs(url.query).items()}
+        get: dict[str, Callable[[Mapping[str, str]], Any]] = {
+            "/find": self._find,
+            "/map": self._map,
+            "/queries": lambda _: saved_queries(self._index.uri),
+        }
+        post: dict[str, Callable[[Any], Any]] = {
+            "/moments": self._moments,
+            "/tag": self._tag,
+            "/clips": self._clips,
+            "/queries": self._save,
+        }
+        try:
+            if body is None and url.path == "/":
+                return _send(request, "text/html; charset=utf-8", page_html().encode())
+            if body is None and url.path == "/picture":
+                return _send(request, "image/jpeg", self._picture(asked))
+            if body is None and url.path in get:
+                return _send_json(request, get[url.path](asked))
+            if body is not None and url.path in post:
+                return _send_json(request, post[url.path](json.loads(body)))
+            _send_json(request, {"error": f"{url.path}: there is no such thing"}, HTTPStatus.NOT_FOUND)
+        except (InputError, ValueError, LookupError, TypeError) as error:
+            _send_json(request, {"error": " ".join(str(error).split())}, HTTPStatus.BAD_REQUEST)
+
+    def _find(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        query = query_of(asked)
+        with self._one_at_a_time:
+            found = ask(self._index, query, self._towers)
+        how = "all compared" if found.exact else f"{found.compared} compared"
+        return {"hits": [_told(hit) for hit in found.hits], "told": f"{len(found.hits)} hits, {how}"}
+
+    def _map(self, _: Mapping[str, str]) -> dict[str, Any]:
+        plane = project_scenes(self._index)
+        points = [
+            {"x": float(x), "y": float(y), "key": _key(row), "name": f"{row['log']}@{row['t_s']:.1f}s", **row}
+            for (x, y), row in zip(plane.xy, plane.rows, strict=True)
+        ]
+        return {"points": points, "share": plane.share, "total": plane.total}
+
+    def _picture(self, asked: Mapping[str, str]) -> bytes:
+        (hit,) = self._rows([_parse_key(asked["key"])])
+        buffer = io.BytesIO()
+        Image.fromarray(hit_picture(hit)).save(buffer, format="jpeg", quality=JPEG_QUALITY)
+        return buffer.getvalue()
+
+    def _moments(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        hits = self._rows([_parse_key(key) for key in told["keys"][:MOST_SHOWN]])
+        return {
+            "hits": [_told(hit) for hit in hits],
+            "told": f"{len(told['keys'])} scenes, {len(hits)} shown",
+        }
+
+    def _tag(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        name = str(told["tag"]).strip()
+        if not name:
+            raise InputError("a tag has a name")
+        add_tag(self._index.uri, name, [_parse_key(key)[:2] for key in told["keys"]])
+        return {"told": f"{len(told['keys'])} moments are tagged {name}"}
+
+    def _clips(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        hits = self._rows([_parse_key(key) for key in told["keys"]])
+        return listed_clips(hits, float(told["before"]), float(told["after"]))
+
+    def _save(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        save_query(self._index.uri, str(told["name"]), query_of(told["asked"]).to_json())
+        return {"told": f"kept as {told['name']}"}
+
+    def _rows(self, keys: Sequence[Key]) -> list[Hit]:
+        """Rows in the order of their keys, as hits that nothing was compared with."""
+        if not keys:
+            raise InputError("nothing is chosen")
+        where = " OR ".join(
+            f"(log = {quoted(log)} AND t_us = {t_us} AND view = {quoted(view)})" for log, t_us, view in keys
+        )
+        rows = {_key(row): row for row in self._index.select(where, FACTS.names).to_pylist()}
+        return [Hit(rows[key], 0.0, {}) for key in map("|".join, ((k[0], str(k[1]), k[2]) for k in keys))]
+
+
+def query_of(asked: Mapping[str, Any]) -> Query:
+    """A query from the page's fields; empty ones are left out.
+
+    Raises:
+        InputError: they do not make one.
+    """
+    kinds: dict[str, Callable[[Any], Any]] = {"top": int, "gap_s": float, "mix": float}
+    known = {field.name for field in fields(Query)}
+    told = {name: value for name, value in asked.items() if name in known and str(value).strip()}
+    return Query(**{name: kinds.get(name, str)(value) for name, value in told.items()})
+
+
+@functools.cache
+def page_html() -> str:
+    """The page, with its style inside; it loads nothing from anywhere else."""
+    return files("foredrive.view").joinpath("search_page.html").read_text("utf-8").replace("/*CSS*/", CSS)
+
+
+def _told(hit: Hit) -> dict[str, Any]:
+    return {
+        "key": _key(hit.facts),
+        "name": hit_name(hit),
+        "why": why_matched(hit) if hit.scores else "",
+        "there": what_is_there(hit),
+        "caption": hit.facts["caption"],
+    }
+
+
+def _key(row: Mapping[str, object]) -> str:
+    return f"{row['log']}|{row['t_us']}|{row['view']}"
+
+
+def _parse_key(key: str) -> Key:
+    log, t_us, view = key.rsplit("|", 2)
+    return log, int(t_us), view
+
+
+def _send_json(request: BaseHTTPRequestHandler, told: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
+    _send(request, "application/json", json.dumps(told).encode(), status)
+
+
+def _send(
+    request: BaseHTTPRequestHandler, kind: str, body: bytes, status: HTTPStatus = HTTPStatus.OK
+) -> None:
+    request.send_response(status)
+    request.send_header("Content-Type", kind)
+    request.send_header("Content-Length", str(len(body)))
+    request.end_headers()
+    request.wfile.write(body)
