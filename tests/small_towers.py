@@ -37,7 +37,7 @@ def save_clip(folder: Path) -> Path:
     _save_tokenizer(folder)
     torch.manual_seed(0)
     text = {**SMALL, "vocab_size": len(WORDS), "eos_token_id": 3, "bos_token_id": 2, "pad_token_id": 0}
-    CLIPModel(CLIPConfig(text_config=text, vision_config=VISION, projection_dim=8)).save_pretrained(folder)
+    CLIPModel(CLIPConfig(text_config=text, vision_config=VISION, projection_dim=12)).save_pretrained(folder)
     return folder
 
 

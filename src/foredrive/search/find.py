@@ -14,11 +14,11 @@ from foredrive.search.embedding import mean_direction
 from foredrive.search.index import EXACT_UP_TO, FrameIndex
 from foredrive.search.kept import where_tagged
 from foredrive.search.query import Query
-from foredrive.search.rows import EMBEDDINGS, FACTS
+from foredrive.search.rows import FACTS
 from foredrive.search.tables import quoted
 from foredrive.search.target import Target
 
-CANDIDATES_PER_HIT = 50
+CANDIDATES_PER_HIT = 25
 """Rows looked at for each hit, where not all are, or ranked again: neighbours and other views of a moment are
 many."""
 MORE = 4
@@ -71,7 +71,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     while True:
         limit = min(limit, total)
         rows = _candidates(index, query, target, where, None if exact else limit)
-        score, scores = _rank(rows, query, target)
+        score = _rank(rows, query, target)
         order = collapse(score, rows["log"].to_pylist(), _column(rows, "t_us"), query.gap_s, wanted)
         reranked = query.modality == "joint" and query.rule == "rerank"  # of so many and no more
         if exact or reranked or len(order) >= wanted or limit >= total:
@@ -79,15 +79,10 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
         limit *= MORE
     if query.diverse is not None:
         order = [order[n] for n in _diverse(rows, order, score, query)]
-    kept = rows.select(FACTS.names).take(pa.array(order, pa.int64())).to_pylist()
-    hits = [Hit(facts, float(score[n]), _of_row(scores, n)) for n, facts in zip(order, kept, strict=True)]
+    kept = rows.take(pa.array(order, pa.int64()))
+    facts, scores = kept.select(FACTS.names).to_pylist(), _scores(kept, target)
+    hits = [Hit(*each) for each in zip(facts, score[order].tolist(), scores, strict=True)]
     return Found(hits, len(rows), exact)
-
-
-def _of_row(scores: dict[str, Float[ndarray, "n"]], n: int) -> dict[str, float]:
-    """Of what has one modality alone the joint likeness would say the same again."""
-    told = {name: float(values[n]) for name, values in scores.items() if not np.isnan(values[n])}
-    return told if {"image", "lidar"} <= told.keys() else {k: v for k, v in told.items() if k != "joint"}
 
 
 def collapse(
@@ -138,17 +133,18 @@ def _candidates(
     index: FrameIndex, query: Query, target: Target | None, where: str | None, limit: int | None
 ) -> pa.Table:
     """All rows, or those that are nearest by what the query ranks by; with embeddings if they are needed."""
-    columns = [*FACTS.names, *(EMBEDDINGS if target is not None or query.diverse else ())]
+    columns = list(FACTS.names)
+    if target is not None or query.diverse is not None:
+        columns += ["image", "lidar", *(["joint"] if query.modality == "joint" else [])]
     if target is None or limit is None:
         return index.select(where, columns)
-    vectors = {"image": target.image, "lidar": target.lidar, "joint": _joint(target)}
     by: tuple[str, ...] = (query.modality,)
     if query.modality == "joint" and query.rule != "features":
         by = ("image", "lidar") if query.rule == "logits" else ("image",)
     found = [
         index.nearest(vector, name, where, columns, limit)
-        for name in by
-        if (vector := vectors[name]) is not None
+        for name, vector in _vectors(target).items()
+        if name in by
     ]
     return found[0] if len(found) == 1 else _without_twins(pa.concat_tables(found))
 
@@ -159,36 +155,23 @@ def _without_twins(rows: pa.Table) -> pa.Table:
     return rows.take(pa.array(sorted(first.values())))
 
 
-def _rank(
-    rows: pa.Table, query: Query, target: Target | None
-) -> tuple[Float[ndarray, "n"], dict[str, Float[ndarray, "n"]]]:
-    """What rows are ranked by, NaN for those that are out, and their likeness by modality."""
-    scores = {} if target is None else likeness(rows, target)
-    score = np.zeros(len(rows)) if target is None else _joined(scores, query, target)
-    if query.by is not None:
-        wanted = _column(rows, query.by).astype(float)
-        mix = query.mix if target is not None else 1.0
-        score = (1 - mix) * _by_rank(score) + mix * _by_rank(wanted)
-        score[np.isnan(wanted)] = np.nan
-    return score, scores
+def _rank(rows: pa.Table, query: Query, target: Target | None) -> Float[ndarray, "n"]:
+    """What rows are ranked by; NaN for those that are out."""
+    score = np.zeros(len(rows)) if target is None else _likeness(rows, query, target)
+    if query.by is None:
+        return score
+    wanted = _column(rows, query.by).astype(float)
+    mix = query.mix if target is not None else 1.0
+    return (1 - mix) * _by_rank(score) + mix * _by_rank(wanted)
 
 
-def likeness(rows: pa.Table, target: Target) -> dict[str, Float[ndarray, "n"]]:
-    """Cosine of each row with the target by modality; NaN where the row has none."""
-    vectors = {"image": target.image, "lidar": target.lidar, "joint": _joint(target)}
-    return {
-        name: vectors_of(rows, name) @ vector.astype(np.float32)
-        for name, vector in vectors.items()
-        if vector is not None
-    }
-
-
-def _joined(scores: dict[str, Float[ndarray, "n"]], query: Query, target: Target) -> Float[ndarray, "n"]:
+def _likeness(rows: pa.Table, query: Query, target: Target) -> Float[ndarray, "n"]:
+    """How like the target rows are, by the query's modality and rule (Paper B)."""
     if query.modality != "joint" or query.rule == "features":
-        return scores[query.modality]
+        return vectors_of(rows, query.modality) @ _vectors(target)[query.modality]
     if target.image is None or target.lidar is None:
         raise InputError(f"{query.rule} need an image and a sweep, and the example has one of them only")
-    image, lidar = scores["image"], scores["lidar"]
+    image, lidar = vectors_of(rows, "image") @ target.image, vectors_of(rows, "lidar") @ target.lidar
     if query.rule == "logits":  # a row with one modality counts it twice, to its neither good nor harm
         return np.where(np.isnan(lidar), 2 * image, np.where(np.isnan(image), 2 * lidar, image + lidar))
     best = np.argsort(-image, kind="stable")[: query.top * CANDIDATES_PER_HIT]
@@ -197,9 +180,26 @@ def _joined(scores: dict[str, Float[ndarray, "n"]], query: Query, target: Target
     return again
 
 
-def _joint(target: Target) -> Float[ndarray, "D"] | None:
-    there = [vector for vector in (target.image, target.lidar) if vector is not None]
-    return mean_direction(np.stack(there)) if there else None
+def _scores(rows: pa.Table, target: Target | None) -> list[dict[str, float]]:
+    """Of each row its cosine with the target by modality; the joint one only where there are two to join."""
+    if target is None:
+        return [{} for _ in range(len(rows))]
+    image, lidar = vectors_of(rows, "image"), vectors_of(rows, "lidar")
+    both = mean_direction(np.stack([image, lidar]))
+    both[np.isnan(image + lidar).any(-1)] = np.nan
+    of_rows = {"image": image, "lidar": lidar, "joint": both}
+    cosines = {name: of_rows[name] @ vector for name, vector in _vectors(target).items()}
+    return [
+        {name: float(values[n]) for name, values in cosines.items() if not np.isnan(values[n])}
+        for n in range(len(rows))
+    ]
+
+
+def _vectors(target: Target) -> dict[str, ndarray]:
+    """A target's unit vectors by modality."""
+    there = {"image": target.image, "lidar": target.lidar}
+    vectors = {name: vector for name, vector in there.items() if vector is not None}
+    return {**vectors, "joint": mean_direction(np.stack(list(vectors.values())))}
 
 
 def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
@@ -226,7 +226,7 @@ def vectors_of(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
     column = rows[name].combine_chunks()
     if isinstance(column, pa.ChunkedArray):
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-    values: Float[ndarray, "n D"] = column.values.to_numpy(zero_copy_only=False)
+    values = column.values.to_numpy(zero_copy_only=False)
     values = values[column.offset * dim : (column.offset + len(column)) * dim].reshape(-1, dim)
     missing = ~_mask(column.is_valid())
     if missing.any():
@@ -236,8 +236,7 @@ def vectors_of(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
 
 
 def _mask(column: pa.Array) -> Bool[ndarray, "n"]:
-    mask: Bool[ndarray, n] = column.to_numpy(zero_copy_only=False).astype(bool)
-    return mask
+    return np.asarray(column.to_numpy(zero_copy_only=False), dtype=bool)
 
 
 def _column(rows: pa.Table, name: str) -> ndarray:

@@ -116,7 +116,7 @@ class FrameIndex:
     def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
         """Put parts in, in place of what an interrupted call left of them."""
         self._frames.delete(" OR ".join(part.where for part, _ in parts))
-        self._frames.add(pa.concat_tables([rows for _, rows in parts]))
+        self._put(pa.concat_tables([rows for _, rows in parts]))
         rows = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
         make_table(self.uri, PARTS, _PART_SCHEMA).add(rows)
 
@@ -181,6 +181,9 @@ class FrameIndex:
                 at = rows.schema.get_field_index(field.name)
                 rows = rows.set_column(at, field, pa.array(values, field.type))
             self._frames.delete(where)
-            self._frames.add(rows)
+            self._put(rows)
             changed += len(rows)
         return changed
+
+    def _put(self, rows: pa.Table) -> None:
+        self._frames.add(rows, on_bad_vectors="null")  # else it takes rows without an embedding for mistakes
