@@ -151,13 +151,13 @@ def rows_of(number: int, vectors: np.ndarray) -> tuple[Part, pa.Table]:
 def with_lancedb(seed: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         index = FrameIndex.make(f"{folder}/index", Making("made", f"made-{seed}", DIM, 0.5))
-        writer, held = IndexWriter(index), []
+        held = []
         made, started = drives(seed), time.perf_counter()
-        for number in range(-(-ROWS // DRIVE)):
-            vectors = next(made)[: ROWS - number * DRIVE]
-            writer.add(*rows_of(number, vectors))
-            held.append(held_mib("cpu"))
-        writer.flush()
+        with IndexWriter(index) as writer:
+            for number in range(-(-ROWS // DRIVE)):
+                vectors = next(made)[: ROWS - number * DRIVE]
+                writer.add(*rows_of(number, vectors))
+                held.append(held_mib("cpu"))
         written_s = time.perf_counter() - started
         index.optimise()
         built_s = time.perf_counter() - started - written_s

@@ -4,6 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 import torch
 from miniature import write_log
@@ -14,7 +15,7 @@ from foredrive.data import LogPath, find_logs
 from foredrive.data.clip_list import write_clip_list
 from foredrive.errors import InputError
 from foredrive.recipes import indexing
-from foredrive.recipes.indexing import index_logs
+from foredrive.recipes.indexing import Job, index_logs
 from foredrive.recipes.searching import ask, listed_clips
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
@@ -65,6 +66,29 @@ def test_an_index_is_made_once_goes_on_and_is_asked(
     (log,) = find_logs(listed)
     t_s = float(str(hits[0].facts["t_s"]))
     assert log.parts_s == ((max(0.0, t_s - 0.3), t_s + 0.4),)
+
+
+def test_an_interrupted_index_goes_on_where_it_stopped(
+    logs: list[LogPath], towers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = str(tmp_path / "index")
+    monkeypatch.setattr(indexing, "PART_FRAMES", 2)
+    embed, done = indexing.embed_part, []
+
+    def interrupted_at_the_third(job: Job, towers: str, threads: int | None = None) -> pa.Table:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(job)
+        return embed(job, towers, threads)
+
+    monkeypatch.setattr(indexing, "embed_part", interrupted_at_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        index_logs(logs[:1], uri, towers, 0.5, 1)
+    assert FrameIndex(uri).count() == 4 * 3
+    monkeypatch.setattr(indexing, "embed_part", embed)
+    rest = index_logs(logs[:1], uri, towers, 0.5, 1)
+    assert (rest.rows, rest.there_before) == (3, 2)
+    assert FrameIndex(uri).count() == ROWS
 
 
 def test_a_log_that_has_changed_is_put_in_anew(towers: str, tmp_path: Path) -> None:

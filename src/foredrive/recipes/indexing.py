@@ -90,9 +90,10 @@ def index_logs(
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(embed_part, towers=towers, threads=threads)
     writer, done = IndexWriter(index), 0
+    tick(0, total)
     here = workers == 1 and not on_ray  # a process of its own would first have to load the towers
     results = _one_by_one(todo, work) if here else fan_out(todo, work, workers, on_ray=on_ray)
-    with contextlib.closing(results):
+    with contextlib.closing(results), writer:
         for job, result in results:
             if isinstance(result, BaseException):
                 why = reason(job.part.log, result)
@@ -101,7 +102,6 @@ def index_logs(
                 writer.add(job.part, result)
             done += len(job.frames)
             tick(done, total)
-    writer.flush()
     scored = index.set_scores(scores) if scores else 0
     if writer.rows or scored:
         index.optimise()
@@ -122,7 +122,10 @@ def _one_by_one(
 
 
 class IndexWriter:
-    """Puts finished parts into an index, many at a time, and optimises it now and then."""
+    """Puts finished parts into an index, many at a time, and optimises it now and then.
+
+    A context: whatever waits at its end is put in, after an interruption as well.
+    """
 
     rows: int
     """That were put in."""
@@ -133,6 +136,13 @@ class IndexWriter:
         self._waiting: list[tuple[Part, pa.Table]] = []
         self._flushed_s = time.monotonic()
         self._since_rows = self._since_writes = 0
+
+    def __enter__(self) -> "IndexWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None or kind is KeyboardInterrupt:
+            self.flush()
 
     def add(self, part: Part, rows: pa.Table) -> None:
         """Put a part in, now or with those that follow."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from foredrive.errors import InputError
+from foredrive.files import make_folder
 
 if TYPE_CHECKING:
     from lancedb import DBConnection
@@ -47,7 +48,14 @@ def find_table(uri: str, name: str) -> "Table | None":
 
 
 def make_table(uri: str, name: str, schema: pa.Schema) -> "Table":
-    """A table, made if it is not there."""
+    """A table, made if it is not there.
+
+    Raises:
+        InputError: no folder can be made there.
+        OSError: the disk refuses it.
+    """
+    if "://" not in uri:
+        make_folder(Path(uri))
     return connect(uri).create_table(name, schema=schema, exist_ok=True)
 
 
