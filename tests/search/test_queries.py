@@ -5,10 +5,12 @@ import json
 from pathlib import Path
 
 import pytest
+from miniature import miniature
 
 from foredrive.data import ClipDataset, LogPath, find_logs
 from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
 from foredrive.errors import InputError
+from foredrive.recipes import Run, open_run, train
 from foredrive.search.query import Like, Query, parse_like
 from foredrive.search.rows import WHOLE
 from foredrive.search.scores import read_scores
@@ -61,8 +63,6 @@ def test_a_list_of_clips_is_its_logs_with_the_parts_that_are_meant(log: LogPath,
 
 
 def test_a_data_set_of_listed_clips_has_no_others(log: LogPath) -> None:
-    from miniature import miniature
-
     config = dataclasses.replace(
         miniature().clips, past_frames=0, future_frames=0, now_stride_s=0.1, horizon_steps=1
     )
@@ -126,3 +126,10 @@ def test_settings_are_read_back_out_of_captions(name: str, setting: tuple[str, s
 
 def test_a_caption_of_somebody_elses_tells_no_setting() -> None:
     assert read_setting("A street. Rain at night.") == (None, None)
+
+
+def test_a_run_remembers_which_parts_of_its_logs_it_learned_from(log: LogPath, tmp_path: Path) -> None:
+    listed = dataclasses.replace(log, parts_s=((0.2, 0.8), (1.0, 1.5)))
+    run = Run(tmp_path, miniature(), (listed, log), tmp_path / "cache")
+    train._write(run)
+    assert open_run(tmp_path).logs == run.logs
