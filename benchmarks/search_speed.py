@@ -132,11 +132,16 @@ def rows_of(number: int, vectors: np.ndarray) -> tuple[Part, pa.Table]:
     log, count = f"made_train/{number:06d}", len(vectors)
     frame = np.arange(count) // 7
     known = {
-        "log": [log] * count, "folder": [f"/logs/{log}"] * count, "maps_dir": ["/maps"] * count,
-        "frame": frame, "t_us": 500_000 * frame, "t_s": 0.5 * frame,
+        "key": [f"{log}@{500_000 * n}" for n in frame],
+        "log": [log] * count,
+        "folder": [f"/logs/{log}"] * count,
+        "maps_dir": ["/maps"] * count,
+        "frame": frame,
+        "t_us": 500_000 * frame,
+        "t_s": 0.5 * frame,
         "view": [f"v{n % 7}" for n in range(count)],
         "ego_speed": np.full(count, number % 20),
-    }  # fmt: skip
+    }
     flat = pa.array(vectors.reshape(-1))
     vector = pa.FixedSizeListArray.from_arrays(flat, DIM)
     columns = [

@@ -47,7 +47,7 @@ def test_an_index_is_made_once_goes_on_and_is_asked(
     both = index_logs(logs, uri, towers, 0.5, 1)
     assert (both.logs, both.rows, both.there_before) == (2, ROWS, 3)
     again = index_logs(
-        logs, uri, towers, 0.5, 1, scores={"flat_train/two": {_t_us(logs[1], 5): {"nll": 7.0}}}
+        logs, uri, towers, 0.5, 1, scores={f"flat_train/two@{_t_us(logs[1], 5)}": {"nll": 7.0}}
     )
     assert (again.logs, again.rows, again.there_before, again.scored) == (2, 0, 6, 3)
     index = FrameIndex(uri)

@@ -39,6 +39,7 @@ def made_rows(seed: int = 0) -> pa.Table:
                 blind = number == 2
                 rows.append(
                     {
+                        "key": f"{log}@{1_000_000 + 500_000 * frame}",
                         "log": log, "folder": f"/logs/{log}", "maps_dir": "/maps", "frame": frame,
                         "t_us": 1_000_000 + 500_000 * frame, "t_s": 0.5 * frame, "view": view,
                         "ego_speed": float(frame % 10), "n_pedestrian": frame % 3,
@@ -141,7 +142,7 @@ def test_a_condition_that_makes_no_sense_is_one_line(index: FrameIndex, target: 
 
 
 def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) -> None:
-    missed = {LOGS[1]: {1_000_000 + 500_000 * frame: {"missed": float(frame)} for frame in range(FRAMES)}}
+    missed = {f"{LOGS[1]}@{1_000_000 + 500_000 * n}": {"missed": float(n)} for n in range(FRAMES)}
     assert index.set_scores(missed) == 2 * FRAMES
     assert index.count() == 6 * FRAMES
     worst = find(index, Query(by="score_missed", top=3, gap_s=0.0), None).hits
@@ -153,12 +154,12 @@ def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) ->
 
 
 def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
-    moments = [(LOGS[2], 1_500_000), (LOGS[0], 1_000_000)]
+    moments = [f"{LOGS[2]}@1500000", f"{LOGS[0]}@1000000"]
     add_tag(index.uri, "odd", moments)
     add_tag(index.uri, "odd", moments[:1])
     assert sorted(tagged(index.uri, "odd")) == sorted(moments)
     hits = find(index, Query(text="x", tag="odd", gap_s=0.0), target).hits
-    assert sorted((hit.facts["log"], hit.facts["t_us"]) for hit in hits) == sorted(moments)
+    assert sorted(str(hit.facts["key"]) for hit in hits) == sorted(moments)
     remove_tag(index.uri, "odd")
     assert find(index, Query(tag="odd"), None).hits == []
     query = Query(text="rain", where="ego_speed > 5", diverse="facility")

@@ -101,7 +101,7 @@ def test_folders_of_a_list_may_lie_beside_it(tmp_path: Path) -> None:
 def test_scores_come_by_frame(tmp_path: Path) -> None:
     path = tmp_path / "scores.jsonl"
     path.write_text('{"frame": "town_train/a@17", "nll": 3, "missed": 1.5, "else": 9}\n\n')
-    assert read_scores(path) == {"town_train/a": {17: {"nll": 3.0, "missed": 1.5}}}
+    assert read_scores(path) == {"town_train/a@17": {"nll": 3.0, "missed": 1.5}}
     path.write_text('{"frame": "a@17"}\n{"frame": "a"}\n')
     with pytest.raises(InputError, match="line 2"):
         read_scores(path)

@@ -112,7 +112,7 @@ def search(
     if save is not None:
         save_query(index, save, query.to_json())
     if tag is not None:
-        add_tag(index, tag, [(str(hit.facts["log"]), int(str(hit.facts["t_us"]))) for hit in found.hits])
+        add_tag(index, tag, [str(hit.facts["key"]) for hit in found.hits])
     if not found.hits:
         return
     if clips is not None:

@@ -133,6 +133,7 @@ def _facts(log: Log, frame: int) -> dict[str, object]:
     setting = Setting(None, None) if caption is None else read_setting(caption)
     speed = float(log.speed_mps[frame])
     return {
+        "key": f"{log.path.name}@{log.t_us[frame]}",
         "log": log.path.name,
         "folder": str(log.path.folder),
         "maps_dir": str(log.path.maps_dir),

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foredrive.errors import InputError
 from foredrive.search.rows import EMBEDDINGS, FACTS, SCORES, row_schema
-from foredrive.search.tables import all_rows, find_table, make_table, quoted, understanding
+from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list, understanding
 
 EXACT_UP_TO = 100_000
 """So many rows are compared one by one; more are looked up in a graph and then compared."""
@@ -25,8 +25,10 @@ _REMEMBERED = b"foredrive"
 _PART_SCHEMA = pa.schema(
     [("log", pa.string()), ("first", pa.int32()), ("last", pa.int32()), ("digest", pa.string())]
 )
-Scores = Mapping[str, Mapping[int, Mapping[str, float]]]
-"""By log, time in µs and name in `rows.SCORES`."""
+Scores = Mapping[str, Mapping[str, float]]
+"""By the key of a moment, and the names in `rows.SCORES`."""
+SCORED_AT_ONCE = 2000
+"""Moments whose rows are written anew together."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,6 @@ class Part(NamedTuple):
     last: int
     digest: str
     """Of the log's files."""
-
-    @property
-    def where(self) -> str:
-        """Its rows."""
-        return f"(log = {quoted(self.log)} AND frame BETWEEN {self.first} AND {self.last})"
 
 
 class FrameIndex:
@@ -114,11 +111,12 @@ class FrameIndex:
         return {Part(**row) for row in all_rows(find_table(self.uri, PARTS))}  # type: ignore[arg-type]
 
     def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
-        """Put parts in, in place of what an interrupted call left of them."""
-        self._frames.delete(" OR ".join(part.where for part, _ in parts))
-        self._put(pa.concat_tables([rows for _, rows in parts]))
-        rows = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
-        make_table(self.uri, PARTS, _PART_SCHEMA).add(rows)
+        """Put parts in; rows of the same moments, which an interrupted call has left, give way."""
+        rows = pa.concat_tables([rows for _, rows in parts])
+        self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
+        self._put(rows)
+        told = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
+        make_table(self.uri, PARTS, _PART_SCHEMA).add(told)
 
     def drop(self, log: str) -> None:
         """Take a log out: it has changed."""
@@ -170,14 +168,15 @@ class FrameIndex:
     def set_scores(self, scores: Scores) -> int:
         """Give moments their scores, in place of those they had; how many rows there are of them."""
         changed = 0
-        for log, of_log in scores.items():
-            where = f"log = {quoted(log)} AND t_us IN ({', '.join(str(t_us) for t_us in of_log)})"
+        keys = list(scores)
+        for start in range(0, len(keys), SCORED_AT_ONCE):
+            where = f"key IN ({quoted_list(keys[start : start + SCORED_AT_ONCE])})"
             rows = self.select(where, row_schema(self.making.dim).names)
             if not len(rows):
                 continue
             for name in SCORES:
                 field = FACTS.field(f"score_{name}")
-                values = [of_log[t_us].get(name) for t_us in rows["t_us"].to_pylist()]
+                values = [scores[key].get(name) for key in rows["key"].to_pylist()]
                 at = rows.schema.get_field_index(field.name)
                 rows = rows.set_column(at, field, pa.array(values, field.type))
             self._frames.delete(where)

@@ -7,20 +7,15 @@ from collections.abc import Iterable
 
 import pyarrow as pa
 
-from foredrive.search.tables import all_rows, find_table, make_table, quoted
+from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list
 
-_TAGS = pa.schema([("tag", pa.string()), ("log", pa.string()), ("t_us", pa.int64())])
+_TAGS = pa.schema([("tag", pa.string()), ("key", pa.string())])
 _QUERIES = pa.schema([("name", pa.string()), ("query", pa.string())])
-Moment = tuple[str, int]
-"""A log's name, and a time of it in µs."""
 
 
-def add_tag(uri: str, tag: str, moments: Iterable[Moment]) -> None:
-    """Give moments of the index at `uri` a tag; those that have it keep it."""
-    rows = [
-        {"tag": tag, "log": log, "t_us": t_us}
-        for log, t_us in sorted({*moments} - {*tagged(uri, tag)})
-    ]  # fmt: skip
+def add_tag(uri: str, tag: str, keys: Iterable[str]) -> None:
+    """Give moments of the index at `uri`, by their keys, a tag; those that have it keep it."""
+    rows = [{"tag": tag, "key": key} for key in sorted({*keys} - {*tagged(uri, tag)})]
     if rows:
         make_table(uri, "tags", _TAGS).add(pa.Table.from_pylist(rows, schema=_TAGS))
 
@@ -32,19 +27,15 @@ def remove_tag(uri: str, tag: str) -> None:
         table.delete(f"tag = {quoted(tag)}")
 
 
-def tagged(uri: str, tag: str) -> list[Moment]:
-    """The moments that have a tag."""
-    rows = all_rows(find_table(uri, "tags"), f"tag = {quoted(tag)}")
-    return [(str(row["log"]), int(str(row["t_us"]))) for row in rows]
+def tagged(uri: str, tag: str) -> list[str]:
+    """The keys of the moments that have a tag."""
+    return [str(row["key"]) for row in all_rows(find_table(uri, "tags"), f"tag = {quoted(tag)}")]
 
 
 def where_tagged(uri: str, tag: str) -> str:
     """A condition that holds for the moments that have a tag."""
-    of_log: dict[str, list[str]] = {}
-    for log, t_us in tagged(uri, tag):
-        of_log.setdefault(log, []).append(str(t_us))
-    each = [f"(log = {quoted(log)} AND t_us IN ({', '.join(times)}))" for log, times in of_log.items()]
-    return f"({' OR '.join(each)})" if each else "false"
+    keys = tagged(uri, tag)
+    return f"key IN ({quoted_list(keys)})" if keys else "false"
 
 
 def save_query(uri: str, name: str, query: str) -> None:

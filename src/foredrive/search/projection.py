@@ -27,7 +27,7 @@ class Plane(NamedTuple):
     """Whole scenes that there are; of more than `MOST_POINTS` as many, evenly."""
 
 
-SHOWN = ("log", "t_us", "t_s", "view", "place", "weather", "time_of_day")
+SHOWN = ("key", "log", "t_s", "view", "place", "weather", "time_of_day")
 
 
 def project_scenes(index: FrameIndex, name: str = "image") -> Plane:

@@ -14,6 +14,7 @@ COUNTS = {category: f"n_{category.name.lower()}" for category in Category}
 """Annotated objects by class: of the whole scene, or of those whose centre lies in the sector."""
 FACTS = pa.schema(
     [
+        ("key", pa.string()),  # of the moment: LOG@T_US, as clips have it
         ("log", pa.string()),  # split/name
         ("folder", pa.string()),
         ("maps_dir", pa.string()),

@@ -7,8 +7,8 @@ from foredrive.errors import InputError
 from foredrive.search.rows import SCORES
 
 
-def read_scores(path: Path) -> dict[str, dict[int, dict[str, float]]]:
-    """Scores by log, time in µs and name; one JSON object a line.
+def read_scores(path: Path) -> dict[str, dict[str, float]]:
+    """Scores by the key of a moment and their names; one JSON object a line.
 
     A line is {"frame": "SPLIT/NAME@T_US", "nll": 31.2, "missed": 4.0, …} with any of `rows.SCORES`; frames
     are named as clips are (`Example.key`).
@@ -16,7 +16,7 @@ def read_scores(path: Path) -> dict[str, dict[int, dict[str, float]]]:
     Raises:
         InputError: a line that is not such an object.
     """
-    found: dict[str, dict[int, dict[str, float]]] = {}
+    found: dict[str, dict[str, float]] = {}
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -27,7 +27,7 @@ def read_scores(path: Path) -> dict[str, dict[int, dict[str, float]]]:
         try:
             told = json.loads(line)
             log, _, t_us = told["frame"].rpartition("@")
-            found.setdefault(log, {})[int(t_us)] = {key: float(told[key]) for key in SCORES if key in told}
+            found[f"{log}@{int(t_us)}"] = {name: float(told[name]) for name in SCORES if name in told}
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise InputError(f"{path}: line {number} does not score a frame: {error}") from error
     return found

@@ -1,7 +1,7 @@
 """LanceDB, as far as an index needs it; imported late, and here alone."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,6 +86,11 @@ def understanding(where: str | None) -> Iterator[None]:
 def first_line(error: BaseException) -> str:
     """What LanceDB says, without where in its code it does."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0].split(", rust/")[0]
+
+
+def quoted_list(texts: Iterable[str]) -> str:
+    """Texts as SQL lists them."""
+    return ", ".join(map(quoted, texts))
 
 
 def quoted(text: str) -> str:

@@ -22,15 +22,15 @@ from foredrive.search.kept import add_tag, save_query, saved_queries
 from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import FACTS
-from foredrive.search.tables import quoted
+from foredrive.search.tables import quoted_list
 from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
 from foredrive.view.report_style import CSS
 
 JPEG_QUALITY = 85
 MOST_SHOWN = 60
 """Of the scenes in a lasso."""
-Key = tuple[str, int, str]
-"""Log, time in µs and view: a row."""
+Key = tuple[str, str]
+"""A moment's key and a view: a row."""
 
 
 class SearchPage:
@@ -109,8 +109,15 @@ class SearchPage:
     def _map(self, _: Mapping[str, str]) -> dict[str, Any]:
         plane = project_scenes(self._index)
         points = [
-            {"x": float(x), "y": float(y), "key": _key(row), "name": f"{row['log']}@{row['t_s']:.1f}s", **row}
-            for (x, y), row in zip(plane.xy, plane.rows, strict=True)
+            {
+                **row,
+                "x": x,
+                "y": y,
+                "key": _key(row),
+                "moment": row["key"],
+                "name": f"{row['log']}@{row['t_s']:.1f}s",
+            }
+            for (x, y), row in zip(plane.xy.tolist(), plane.rows, strict=True)
         ]
         return {"points": points, "share": plane.share, "total": plane.total}
 
@@ -131,7 +138,7 @@ class SearchPage:
         name = str(told["tag"]).strip()
         if not name:
             raise InputError("a tag has a name")
-        add_tag(self._index.uri, name, [_parse_key(key)[:2] for key in told["keys"]])
+        add_tag(self._index.uri, name, [_parse_key(key)[0] for key in told["keys"]])
         return {"told": f"{len(told['keys'])} moments are tagged {name}"}
 
     def _clips(self, told: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,11 +153,9 @@ class SearchPage:
         """Rows in the order of their keys, as hits that nothing was compared with."""
         if not keys:
             raise InputError("nothing is chosen")
-        where = " OR ".join(
-            f"(log = {quoted(log)} AND t_us = {t_us} AND view = {quoted(view)})" for log, t_us, view in keys
-        )
+        where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
         rows = {_key(row): row for row in self._index.select(where, FACTS.names).to_pylist()}
-        return [Hit(rows[key], 0.0, {}) for key in map("|".join, ((k[0], str(k[1]), k[2]) for k in keys))]
+        return [Hit(rows["|".join(key)], 0.0, {}) for key in keys]
 
 
 def query_of(asked: Mapping[str, Any]) -> Query:
@@ -181,13 +186,17 @@ def _told(hit: Hit) -> dict[str, Any]:
     }
 
 
+def _moment_name(row: Mapping[str, Any]) -> str:
+    return f"{row['log']}@{row['t_s']:.1f}s"
+
+
 def _key(row: Mapping[str, object]) -> str:
-    return f"{row['log']}|{row['t_us']}|{row['view']}"
+    return f"{row['key']}|{row['view']}"
 
 
 def _parse_key(key: str) -> Key:
-    log, t_us, view = key.rsplit("|", 2)
-    return log, int(t_us), view
+    moment, _, view = key.rpartition("|")
+    return moment, view
 
 
 def _send_json(request: BaseHTTPRequestHandler, told: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
