@@ -67,9 +67,11 @@ def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
     else:
         views = read_views(log, int(frame[0]), towers.image_side_px, with_lidar=towers.has_lidar)
         if like.view != WHOLE:
-            if like.view not in views:
+            camera = find_camera(pinhole_cameras(log), like.view)  # by its own name or 123D's
+            name = like.view if camera is None else camera.camera_name
+            if name not in views:
                 raise InputError(f"{log.path.name}: no view {like.view}; there are {', '.join(views)}")
-            views = {like.view: views[like.view]}
+            views = {name: views[name]}
     each = [embed_views(towers, [view]) for view in views.values()]
     if not each:
         raise InputError(f"{log.path.name}: neither cameras nor lidar at {like.t_s:g} s")
