@@ -11,8 +11,6 @@ from small_towers import save_clip
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 
-pytest.importorskip("lancedb")
-
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -20,7 +20,6 @@ from foredrive.recipes.searching import ask, listed_clips
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
 
-pytest.importorskip("lancedb")
 FRAMES = 21
 """Of 0.1 s: five moments half a second apart, of three views each."""
 ROWS = 5 * 3

@@ -16,7 +16,6 @@ from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.target import Target
 
-pytest.importorskip("lancedb")
 DIM = 16
 MAKING = Making("plain", "plain-1", DIM, 0.5)
 LOGS, FRAMES = ("city_train/a", "city_train/b", "rural_val/it's"), 40

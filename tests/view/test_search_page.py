@@ -21,7 +21,6 @@ from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
 from foredrive.view.search_page import SearchPage, query_of
 
-pytest.importorskip("lancedb")
 MOMENTS = 3
 """Half a second apart, each with its whole and two views."""
 
