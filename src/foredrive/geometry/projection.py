@@ -23,6 +23,23 @@ def distort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[T
     )
 
 
+def distortion_jacobian(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 3"]:
+    """The Jacobian of `distort` at normalised image coordinates: its entries xx, xy = yx and yy."""
+    k1, k2, p1, p2, k3 = (d[..., None] for d in dist.unbind(-1))
+    x, y = xy.unbind(-1)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # of radial over r2, twice
+    return torch.stack(
+        [
+            radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
+            slope * x * y + 2 * p1 * x + 2 * p2 * y,
+            radial + slope * y * y + 6 * p1 * y + 2 * p2 * x,
+        ],
+        dim=-1,
+    )
+
+
 def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
     """Inverse of `distort`, by fixed-point iteration; accurate where the distortion is invertible."""
     if _is_ideal(dist):

@@ -60,6 +60,16 @@ def exp_se3(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
     return torch.cat([top, bottom], dim=-2)
 
 
+def sensor_twist(T_ego_sensor: Float[Tensor, "4 4"], twist_ego: Float[Tensor, "6"]) -> Float[Tensor, "6"]:
+    """Velocity (m/s) and turn rate (rad/s) of a sensor that is fixed to the ego frame, in its own axes.
+
+    Args:
+        twist_ego: the same of the ego frame, in the ego frame's axes.
+    """
+    linear = twist_ego[:3] + torch.linalg.cross(twist_ego[3:], T_ego_sensor[:3, 3])
+    return torch.cat([T_ego_sensor[:3, :3].T @ linear, T_ego_sensor[:3, :3].T @ twist_ego[3:]])
+
+
 def log_so3(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Rotation vectors, rad, of rotations by less than π."""
     v = torch.stack(

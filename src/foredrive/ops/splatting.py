@@ -1,0 +1,216 @@
+"""Compositing of projected Gaussians on pixels and beams alike (Kerbl et al., "3D Gaussian Splatting", 2023;
+Hess et al., "SplatAD", 2025).
+
+At a point p that is looked at at time t a splat has the opacity
+
+    α = min(o · exp(-dᵀ A d / 2), 0.999),   d = p - mean - velocity · t,
+
+and lies at the range r = range + slope · d + range rate · t. Splats come in the order of `range_m`. A splat
+with α < 1/255 is skipped; the first that would leave a transmittance of 1e-4 or less ends the ray and is not
+counted itself.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.ops.splat_points import TiledPoints
+
+MIN_ALPHA = 1 / 255
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+REFERENCE_SIZE = 2**21
+"""Most (point, splat) pairs that plain PyTorch looks at together."""
+
+
+class Splats(NamedTuple):
+    """N Gaussians as a sensor sees them, in any order. Lengths on the plane are px or rad."""
+
+    mean: Float[Tensor, "N 2"]
+    """Where the centre is at time 0."""
+    inverse_covariance: Float[Tensor, "N 3"]
+    """A: its entries xx, xy, yy."""
+    opacity: Float[Tensor, "N"]
+    """0 to 1."""
+    range_m: Float[Tensor, "N"]
+    """Of the centre at time 0: depth along a camera's axis, or a lidar's range. Above 0."""
+    range_slope: Float[Tensor, "N 2"]
+    """How range changes over the plane, m per px or rad."""
+    velocity: Float[Tensor, "N 2"]
+    """Of the centre on the plane, px/s or rad/s."""
+    range_rate_mps: Float[Tensor, "N"]
+    feature: Float[Tensor, "N D"]
+
+
+class Composited(NamedTuple):
+    """What P points see. The weight of a splat is α times the transmittance in front of it."""
+
+    feature: Float[Tensor, "P D"]
+    """Σ weight · feature: over a background b it is this plus (1 - alpha) · b."""
+    expected_range_m: Float[Tensor, "P"]
+    """Σ weight · range. Divide by `alpha` for the range of the rays that end."""
+    median_range_m: Float[Tensor, "P"]
+    """Range of the splat that half of the light does not pass; infinite where none is. Without gradient."""
+    alpha: Float[Tensor, "P"]
+    """Σ weight, the probability that the ray ends."""
+    alpha_before_hit: Float[Tensor, "P"] | None
+    """Σ weight over the splats nearer than the hit; None if no hits are given."""
+
+
+class SplatLists(NamedTuple):
+    """Which splats touch which tiles."""
+
+    splat: Int[Tensor, "L"]
+    """Tile after tile, in each front to back."""
+    first: Int[Tensor, "T1"]
+    """Where a tile's list begins; L at the end."""
+
+
+def composite_splats(
+    splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
+) -> Composited:
+    """Look at splats from all points.
+
+    Gradients reach everything in `splats`.
+
+    Args:
+        points: from `pixel_points` or `beam_points`, on the splats' device.
+        hit_range_m: where a lidar's return came from, less some margin; infinite: nowhere. It asks for
+            `alpha_before_hit`.
+
+    Raises:
+        ValueError: on values that are not finite, or points of another number.
+    """
+    _check(splats, points, hit_range_m)
+    return composite_splats_reference(splats, points, hit_range_m)
+
+
+def composite_splats_reference(
+    splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
+) -> Composited:
+    """`composite_splats` in plain PyTorch."""
+    points = points.to(splats.mean.device, splats.mean.dtype)
+    lists = list_splats(splats, points)
+    lengths = lists.first.diff()
+    hits = splats.range_m.new_zeros(points.count) if hit_range_m is None else hit_range_m
+    columns = splats.feature.shape[1] + 4
+    out = splats.feature.new_zeros(points.count, columns)
+    tiles = lengths.argsort(descending=True)  # alike lists together: little padding
+    while len(tiles):
+        longest = int(lengths[tiles[0]])
+        chunk, tiles = tiles.split([n := min(_chunk(points, longest), len(tiles)), len(tiles) - n])
+        index = points.index[chunk].flatten()
+        seen = _look(splats, points, hits, lists, chunk, longest).flatten(0, 1)
+        out = out.index_copy(0, index[index >= 0], seen[index >= 0])
+    expected, median, alpha, before = out[:, -4:].unbind(1)
+    return Composited(out[:, :-4], expected, median.detach(), alpha, None if hit_range_m is None else before)
+
+
+def _chunk(points: TiledPoints, longest: int) -> int:
+    """Of how many tiles plain PyTorch looks at the lists at once."""
+    return max(REFERENCE_SIZE // (max(longest, 1) * points.index.shape[1]), 1)
+
+
+def _look(
+    splats: Splats,
+    points: TiledPoints,
+    hit_range_m: Float[Tensor, "P"],
+    lists: SplatLists,
+    tiles: Int[Tensor, "C"],
+    longest: int,
+) -> Float[Tensor, "C S D4"]:
+    """What slots of tiles see: feature, expected range, median range, alpha, alpha before the hit."""
+    place = lists.first[tiles, None] + torch.arange(longest, device=tiles.device)  # [C L]
+    listed = (place < lists.first[tiles + 1, None])[:, None]
+    chosen = lists.splat[place.clamp(max=len(lists.splat) - 1)]
+    position, time_s = points.position[tiles], points.time_s[tiles, :, None]
+    mean = _nearest_image(splats.mean[chosen], position, points.period)[:, None]
+    offset = position[:, :, None] - mean - splats.velocity[chosen][:, None] * time_s[..., None]  # [C S L 2]
+    dx, dy = offset.unbind(-1)
+    xx, xy, yy = splats.inverse_covariance[chosen][:, None].unbind(-1)
+    exponent = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
+    alpha = (splats.opacity[chosen][:, None] * exponent.exp()).clamp(max=MAX_ALPHA)
+    alpha = torch.where(listed & (alpha >= MIN_ALPHA), alpha, 0.0)
+    passed = torch.cumprod(1 - alpha, -1)
+    before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], -1)
+    weight = torch.where(passed > MIN_TRANSMITTANCE, alpha * before, 0.0)
+    range_m = splats.range_m[chosen][:, None] + (splats.range_slope[chosen][:, None] * offset).sum(-1)
+    range_m = range_m + splats.range_rate_mps[chosen][:, None] * time_s
+    half = (weight > 0) & (before > 0.5) & (passed <= 0.5)
+    median = F.pad(torch.where(half, range_m.detach(), math.inf), (0, 1), value=math.inf).amin(-1)
+    hit = hit_range_m[points.index[tiles].clamp(min=0)][..., None]
+    sums = (weight * range_m).sum(-1), median, weight.sum(-1), (weight * (range_m < hit)).sum(-1)
+    return torch.cat([weight @ splats.feature[chosen], torch.stack(sums, -1)], -1)
+
+
+@torch.no_grad()
+def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
+    """For each tile the splats whose opacity reaches 1/255 somewhere in the box around its points."""
+    points = points.to(splats.mean.device, splats.mean.dtype)
+    bounds = points.block_bounds()
+    low, high = bounds[..., 0::2].amin(1), bounds[..., 1::2].amax(1)  # [T 3]: x y time
+    tiles, count = len(low), len(splats.opacity)
+    cut = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # least exponent that counts
+    order = splats.range_m.argsort(stable=True)
+    order = order[cut[order] >= 0]
+    found, tile_of = [], []
+    for start in range(0, tiles, step := max(REFERENCE_SIZE // max(count, 1), 1)):
+        touched = _touch(splats, order, cut, low[start : start + step], high[start : start + step], points)
+        tile, rank = touched.nonzero(as_tuple=True)
+        found.append(order[rank])
+        tile_of.append(tile + start)
+    empty = torch.zeros(0, dtype=torch.long, device=splats.mean.device)
+    in_tile = torch.cat([empty, *tile_of]).bincount(minlength=tiles)
+    return SplatLists(torch.cat([empty, *found]), torch.cat([in_tile.new_zeros(1), in_tile.cumsum(0)]))
+
+
+def _touch(
+    splats: Splats,
+    chosen: Int[Tensor, "M"],
+    cut: Float[Tensor, "N"],
+    low: Float[Tensor, "C 3"],
+    high: Float[Tensor, "C 3"],
+    points: TiledPoints,
+) -> Bool[Tensor, "C M"]:
+    """Whether the ellipse dᵀ A d ≤ cut of splats reaches boxes in x, y and time."""
+    mean = splats.mean[chosen].expand(len(low), -1, -1)
+    mean = _nearest_image(mean, torch.stack([low[:, :2], high[:, :2]], 1), points.period)
+    moved = splats.velocity[chosen] * torch.stack([low[:, 2:], high[:, 2:]])[..., None]  # [2 C M 2]
+    x0, y0 = (low[:, None, :2] - mean - moved.amax(0)).unbind(-1)
+    x1, y1 = (high[:, None, :2] - mean - moved.amin(0)).unbind(-1)
+    xx, xy, yy = splats.inverse_covariance[chosen].unbind(-1)
+    near_x, near_y = x0.clamp(min=0) + x1.clamp(max=0), y0.clamp(min=0) + y1.clamp(max=0)
+    along_y = torch.minimum(torch.maximum(-xy / yy * near_x, y0), y1)  # the least on the side that is nearest
+    along_x = torch.minimum(torch.maximum(-xy / xx * near_y, x0), x1)
+    least = torch.minimum(
+        xx * near_x * near_x + 2 * xy * near_x * along_y + yy * along_y * along_y,
+        xx * along_x * along_x + 2 * xy * along_x * near_y + yy * near_y * near_y,
+    )
+    return least <= cut[chosen] * (1 + 1e-5) + 1e-5
+
+
+def _nearest_image(
+    mean: Float[Tensor, "C L 2"], position: Float[Tensor, "C S 2"], period: float
+) -> Float[Tensor, "C L 2"]:
+    """Means, turned by whole periods to where they are nearest to their tile's middle."""
+    if not period:
+        return mean
+    x = position[..., 0].detach()
+    middle = 0.5 * (x.amin(1) + x.amax(1))[:, None]
+    turns = ((middle - mean[..., 0].detach()) / period).round()
+    return torch.stack([mean[..., 0] + period * turns, mean[..., 1]], -1)
+
+
+def _check(splats: Splats, points: TiledPoints, hit_range_m: Tensor | None) -> None:
+    for name, value in splats._asdict().items():
+        if not value.detach().sum().isfinite() and not (finite := value.isfinite()).all():
+            bad = int((~finite).flatten(1).any(1).sum() if value.dim() > 1 else (~finite).sum())
+            raise ValueError(f"{name} of {bad} of {len(value)} splats is not finite")
+    if hit_range_m is not None and len(hit_range_m) != points.count:
+        raise ValueError(f"{len(hit_range_m)} hits for {points.count} points")
+    if hit_range_m is not None and hit_range_m.isnan().any():
+        raise ValueError(f"hit_range_m of {int(hit_range_m.isnan().sum())} points is NaN")

@@ -1,0 +1,108 @@
+"""Gaussians on the image plane of a camera (Zwicker et al., "EWA splatting", 2002)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.geometry.projection import distort, distortion_jacobian, pixels_to_rays
+from foredrive.ops.splatting import Splats
+from foredrive.rendering.gaussians.footprint import footprint, in_sensor, positions_in_sensor, through
+from foredrive.rendering.gaussians.gaussians import Gaussians
+
+NEAR_M = 0.2
+"""Gaussians whose centre is nearer than this are not seen."""
+SPREAD_PX2 = 0.3
+"""ε: variance that a pixel adds to a splat, px²."""
+BEYOND, BEYOND_BENT = 0.15, 0.025
+"""How far beyond each border of the image, in image sizes, projections are linearised where the centre is;
+from there on they go on as they are at that limit. A bent image may fold soon after its border."""
+REACH = 4.0
+"""Standard deviations that an opaque Gaussian is seen over, and some."""
+
+
+def project_camera(
+    gaussians: Gaussians,
+    T_cam_scene: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    dist: Float[Tensor, "5"],
+    size_hw: tuple[int, int],
+    *,
+    velocity_mps: Float[Tensor, "N 3"] | None = None,
+    twist_cam: Float[Tensor, "6"] | None = None,
+    compensate: bool = True,
+) -> Splats:
+    """Splats on the image plane, for `pixel_points`; those that cannot reach the image are left out.
+
+    Centres are projected exactly, lens distortion included, covariances by the projection's Jacobian there.
+    `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors.
+
+    Args:
+        gaussians: in the scene's frame.
+        T_cam_scene: scene -> camera (x right, y down, z forward) when the middle row is exposed.
+        K, dist: intrinsics, px, for images of `size_hw`, and distortion k1 k2 p1 p2 k3.
+        velocity_mps: of each Gaussian in the scene's axes; None: all stand still.
+        twist_cam: velocity (m/s) then turn rate (rad/s) of the camera in its own axes, which a rolling
+            shutter makes visible; None: it stands still. See `geometry.se3.sensor_twist`.
+        compensate: take as much opacity away as ε = 0.3 px² spreads a splat.
+    """
+    position = positions_in_sensor(gaussians, T_cam_scene)
+    lower, upper = _limits(K.detach(), dist.detach(), size_hw)
+    with torch.no_grad():
+        reach_m = REACH * gaussians.log_scale.amax(-1).exp()
+        x, y, z = position
+        seen = z > NEAR_M
+        for across, low, high in ((x, lower[0], upper[0]), (y, lower[1], upper[1])):
+            seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
+            seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m
+        chosen = seen.nonzero()[:, 0]
+    them = in_sensor(gaussians, position, chosen, T_cam_scene, velocity_mps, twist_cam)
+    uv, jacobian = _project(them.position_m, K, dist, lower, upper)
+    spread = footprint(through(jacobian, them.factor_m), SPREAD_PX2)
+    return Splats(
+        mean=uv,
+        inverse_covariance=spread.inverse,
+        opacity=them.opacity * spread.compensation if compensate else them.opacity,
+        range_m=them.position_m[2],
+        range_slope=torch.zeros_like(uv),
+        velocity=(jacobian * them.velocity_mps).sum(1).T,
+        range_rate_mps=them.velocity_mps[2],
+        feature=them.feature,
+    )
+
+
+def _limits(
+    K: Float[Tensor, "3 3"], dist: Float[Tensor, "5"], size_hw: tuple[int, int]
+) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+    """Least and greatest x/z, y/z of the image and some way beyond it."""
+    height, width = size_hw
+    border = [(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)]
+    rays = pixels_to_rays(K.new_tensor(border), K, dist)
+    xy = rays[:, :2] / rays[:, 2:]
+    lower, upper = xy.amin(0), xy.amax(0)
+    beyond = (BEYOND_BENT if dist.any() else BEYOND) * (upper - lower)
+    return lower - beyond, upper + beyond
+
+
+def _project(
+    position_m: Float[Tensor, "3 N"],
+    K: Float[Tensor, "3 3"],
+    dist: Float[Tensor, "5"],
+    lower: Float[Tensor, "2"],
+    upper: Float[Tensor, "2"],
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "2 3 N"]]:
+    """Pixels of points, and how they change with them, px/m."""
+    near = 1 / position_m[2]
+    xy = (position_m[:2] * near).T
+    within = torch.minimum(torch.maximum(xy, lower), upper)
+    if dist.any():
+        xx, xy_, yy = distortion_jacobian(within, dist).unbind(-1)
+        dx, dy = (xy - within).unbind(-1)
+        bent = distort(within, dist) + torch.stack([xx * dx + xy_ * dy, xy_ * dx + yy * dy], -1)
+    else:
+        xx, xy_, yy = torch.ones_like(near), torch.zeros_like(near), torch.ones_like(near)
+        bent = xy
+    (fx, fy), centre = (K[0, 0], K[1, 1]), K[:2, 2]
+    x, y = within.unbind(-1)
+    across = torch.stack([fx * xx, fx * xy_, -fx * (xx * x + xy_ * y)])
+    down = torch.stack([fy * xy_, fy * yy, -fy * (xy_ * x + yy * y)])
+    return bent * torch.stack([fx, fy]) + centre, torch.stack([across, down]) * near

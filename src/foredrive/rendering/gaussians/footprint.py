@@ -1,0 +1,84 @@
+"""What projections have in common: Gaussians in a sensor's frame, and their footprints on its plane.
+
+Components come first, [3 N] and [3 3 N], as in `Gaussians.factor`.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from foredrive.rendering.gaussians.gaussians import Gaussians
+
+MIN_RATIO = 1e-12
+"""Least ratio of areas, where the compensated opacity has a gradient still."""
+
+
+class InSensor(NamedTuple):
+    """N Gaussians in the frame of a sensor at the splats' time."""
+
+    position_m: Float[Tensor, "3 N"]
+    factor_m: Float[Tensor, "3 3 N"]
+    """M of the covariance M Mᵀ, as in `Gaussians.factor`."""
+    velocity_mps: Float[Tensor, "3 N"]
+    """As the sensor sees it, its own motion included."""
+    opacity: Float[Tensor, "N"]
+    feature: Float[Tensor, "N D"]
+
+
+class Footprint(NamedTuple):
+    """Covariances on a plane, widened by what a pixel or a beam takes in."""
+
+    inverse: Float[Tensor, "N 3"]
+    """Inverse of the widened covariance: xx, xy, yy."""
+    compensation: Float[Tensor, "N"]
+    """√(det Σ / det(Σ + ε)): by how much the opacity falls for the wider splat to weigh what it did (Yu et
+    al., "Mip-Splatting", 2024)."""
+
+
+def positions_in_sensor(gaussians: Gaussians, T_sensor_scene: Float[Tensor, "4 4"]) -> Float[Tensor, "3 N"]:
+    """Where the centres lie, m."""
+    return T_sensor_scene[:3, :3] @ gaussians.mean_m.T + T_sensor_scene[:3, 3:]
+
+
+def in_sensor(
+    gaussians: Gaussians,
+    position_m: Float[Tensor, "3 N"],
+    chosen: Int[Tensor, "M"],
+    T_sensor_scene: Float[Tensor, "4 4"],
+    velocity_mps: Float[Tensor, "N 3"] | None,
+    twist_sensor: Float[Tensor, "6"] | None,
+) -> InSensor:
+    """The chosen Gaussians in a sensor's frame; the arguments are those of `project_camera`."""
+    gaussians = gaussians[chosen]
+    position_m = position_m[:, chosen]
+    R = T_sensor_scene[:3, :3]
+    velocity = torch.zeros_like(position_m)
+    if velocity_mps is not None:
+        velocity = R @ velocity_mps[chosen].T
+    if twist_sensor is not None:
+        turning = torch.linalg.cross(twist_sensor[3:, None].expand_as(position_m), position_m, dim=0)
+        velocity = velocity - twist_sensor[:3, None] - turning
+    return InSensor(
+        position_m,
+        (R @ gaussians.factor().flatten(1)).unflatten(1, (3, -1)),
+        velocity,
+        gaussians.opacity_logit.sigmoid(),
+        gaussians.feature,
+    )
+
+
+def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) -> Float[Tensor, "K 3 N"]:
+    """J M for every Gaussian."""
+    return sum(jacobian[:, k, None] * factor[k] for k in range(3))  # type: ignore[return-value]  # not int
+
+
+def footprint(spread: Float[Tensor, "2 3 N"], epsilon: float) -> Footprint:
+    """Footprints whose covariance on the plane is U Uᵀ, for U = `spread`, plus ε on its diagonal."""
+    u, v = spread
+    xx, xy, yy = (u * u).sum(0), (u * v).sum(0), (v * v).sum(0)
+    area = torch.linalg.cross(u, v, dim=0).square().sum(0)  # det U Uᵀ, without what cancels
+    widened = area + epsilon * (xx + yy) + epsilon * epsilon
+    inverse = torch.stack([yy + epsilon, -xy, xx + epsilon], -1) / widened[:, None]
+    return Footprint(inverse, (area / widened).clamp(min=MIN_RATIO).sqrt())
