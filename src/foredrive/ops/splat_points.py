@@ -6,6 +6,7 @@ pixels and the uneven beams of real lidars are the same thing to whoever composi
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -45,13 +46,26 @@ class TiledPoints:
     size_hw: tuple[int, int] | None = None
     """Of the image whose pixels these are, row by row; None: no image."""
 
-    def block_bounds(self) -> Float[Tensor, "T B 6"]:
+    @cached_property
+    def rows(self) -> Float[Tensor, "T 3 S"]:
+        """x, y and time, each side by side for all points of a tile."""
+        return torch.cat([self.position, self.time_s[..., None]], -1).transpose(1, 2).contiguous()
+
+    @cached_property
+    def block_bounds(self) -> Float[Tensor, "T 6 B"]:
         """Of each block: least and greatest x, then y, then time."""
-        values = torch.cat([self.position, self.time_s[..., None]], -1).unflatten(1, (LANES, LANES))
-        return torch.stack([values.amin(2), values.amax(2)], -1).flatten(-2)
+        blocks = self.rows.unflatten(2, (LANES, LANES))
+        return torch.stack([blocks.amin(3), blocks.amax(3)], 2).flatten(1, 2)
+
+    @cached_property
+    def tile_bounds(self) -> Float[Tensor, "T 6"]:
+        """The same of each tile."""
+        return torch.stack([self.rows.amin(2), self.rows.amax(2)], 2).flatten(1, 2)
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> "TiledPoints":
-        """The same on another device, in another precision."""
+        """The same on another device, in another precision; these points themselves where nothing changes."""
+        if self.position.device == torch.device(device) and dtype in (self.position.dtype, None):
+            return self
         return TiledPoints(
             position=self.position.to(device, dtype),
             time_s=self.time_s.to(device, dtype),

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from foredrive.ops.precision import numba_can
 from foredrive.ops.splat_points import TiledPoints
 
 MIN_ALPHA = 1 / 255
@@ -86,15 +87,27 @@ def composite_splats(
         ValueError: on values that are not finite, or points of another number.
     """
     _check(splats, points, hit_range_m)
-    return composite_splats_reference(splats, points, hit_range_m)
+    if not numba_can(*splats):
+        return composite_splats_reference(splats, points, hit_range_m)
+    from foredrive.ops.splatting_numba import CompositeSplats  # numba takes its time to be imported
+
+    *where, feature = (field.float() for field in splats)
+    hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.float()
+    return _composited(CompositeSplats.apply(points.to("cpu", torch.float32), hits, feature, *where), hit_range_m is not None)
 
 
 def composite_splats_reference(
     splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
 ) -> Composited:
     """`composite_splats` in plain PyTorch."""
+    return composite_lists(splats, points, list_splats(splats, points), hit_range_m)
+
+
+def composite_lists(
+    splats: Splats, points: TiledPoints, lists: SplatLists, hit_range_m: Float[Tensor, "P"] | None = None
+) -> Composited:
+    """What points see of the splats on their tiles' lists, in plain PyTorch."""
     points = points.to(splats.mean.device, splats.mean.dtype)
-    lists = list_splats(splats, points)
     lengths = lists.first.diff()
     hits = splats.range_m.new_zeros(points.count) if hit_range_m is None else hit_range_m
     columns = splats.feature.shape[1] + 4
@@ -106,8 +119,12 @@ def composite_splats_reference(
         index = points.index[chunk].flatten()
         seen = _look(splats, points, hits, lists, chunk, longest).flatten(0, 1)
         out = out.index_copy(0, index[index >= 0], seen[index >= 0])
+    return _composited(out, hit_range_m is not None)
+
+
+def _composited(out: Float[Tensor, "P D4"], has_hits: bool) -> Composited:
     expected, median, alpha, before = out[:, -4:].unbind(1)
-    return Composited(out[:, :-4], expected, median.detach(), alpha, None if hit_range_m is None else before)
+    return Composited(out[:, :-4], expected, median.detach(), alpha, before if has_hits else None)
 
 
 def _chunk(points: TiledPoints, longest: int) -> int:
@@ -151,8 +168,7 @@ def _look(
 def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
     """For each tile the splats whose opacity reaches 1/255 somewhere in the box around its points."""
     points = points.to(splats.mean.device, splats.mean.dtype)
-    bounds = points.block_bounds()
-    low, high = bounds[..., 0::2].amin(1), bounds[..., 1::2].amax(1)  # [T 3]: x y time
+    low, high = points.tile_bounds[:, 0::2], points.tile_bounds[:, 1::2]  # [T 3]: x y time
     tiles, count = len(low), len(splats.opacity)
     cut = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # least exponent that counts
     order = splats.range_m.argsort(stable=True)

@@ -1,0 +1,231 @@
+"""Sixteen float32 numbers as one value in numba kernels, with the arithmetic that goes with it.
+
+LLVM lowers a row to whatever the processor has: one register with AVX-512, two with AVX, four with NEON. As
+with `lanes`, numba's cache on disk looks at the file of the kernel only: delete it (`*.nbi`) after changes here.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any, no_type_check
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+from foredrive.ops.lanes import kernel_part
+
+ROW = 16
+_VECTOR = ir.VectorType(ir.FloatType(), ROW)
+_WHOLE = ir.VectorType(cgutils.int32_t, ROW)
+_FLAGS = ("contract", "nsz", "reassoc")
+
+
+class Row(types.Type):
+    """Numba type of sixteen float32."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Row")
+
+
+a_row = Row()
+
+
+@register_model(Row)
+class _RowModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: types.Type) -> None:
+        super().__init__(manager, numba_type, _VECTOR)
+
+
+def _broadcast(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(cgutils.int32_t, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_WHOLE, [0] * ROW))
+
+
+def _as_rows(builder: ir.IRBuilder, args: Any) -> list[ir.Value]:
+    """Arguments as rows, scalars broadcast."""
+    return [value if value.type == _VECTOR else _broadcast(builder, value) for value in args]
+
+
+def _of_rows(name: str, *arguments: ir.Type) -> Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]:
+    """A function that LLVM has for vectors."""
+
+    def call(builder: ir.IRBuilder, args: list[ir.Value]) -> ir.Value:
+        kind = ir.FunctionType(_VECTOR, arguments or [_VECTOR] * len(args))
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{ROW}f32")
+        return builder.call(function, args, fastmath=_FLAGS)
+
+    return call
+
+
+def _elementwise(emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> Any:
+    """An intrinsic of two rows, one of which may be a float32."""
+
+    @intrinsic
+    @no_type_check
+    def apply(typing_context, a, b):
+        if a_row not in (a, b):
+            return None
+
+        def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+            return emit(builder, _as_rows(builder, args))
+
+        kinds = [kind if kind is a_row else types.float32 for kind in (a, b)]
+        return a_row(*kinds), codegen
+
+    return apply
+
+
+least = _elementwise(_of_rows("minnum"))
+"""The lesser of each pair."""
+greatest = _elementwise(_of_rows("maxnum"))
+"""The greater of each pair."""
+
+
+def _operator(symbol: Any, emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> None:
+    apply = _elementwise(emit)
+
+    @overload(symbol)
+    @no_type_check
+    def implement(a, b):
+        if a_row in (a, b) and all(kind is a_row or isinstance(kind, types.Float) for kind in (a, b)):
+            return lambda a, b: apply(a, b)
+        return None
+
+
+_operator(operator.add, lambda builder, args: builder.fadd(*args, flags=_FLAGS))
+_operator(operator.sub, lambda builder, args: builder.fsub(*args, flags=_FLAGS))
+_operator(operator.mul, lambda builder, args: builder.fmul(*args, flags=_FLAGS))
+_operator(operator.truediv, lambda builder, args: builder.fdiv(*args, flags=_FLAGS))
+
+
+@intrinsic
+@no_type_check
+def row_of(typing_context, scalar):
+    """Sixteen times the same."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        return _broadcast(builder, args[0])
+
+    return a_row(types.float32), codegen
+
+
+def _place(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+    array = context.make_array(signature.args[0])(context, builder, args[0])
+    return builder.bitcast(builder.gep(array.data, [args[1]]), _VECTOR.as_pointer())
+
+
+@intrinsic
+@no_type_check
+def load_row(typing_context, array, index):
+    """Read sixteen numbers from flat `index` of a C-contiguous float32 array. No bounds check."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        return builder.load(_place(context, builder, signature, args), align=4)
+
+    return a_row(array, types.intp), codegen
+
+
+@intrinsic
+@no_type_check
+def store_row(typing_context, array, index, value):
+    """Write a row to flat `index` of a C-contiguous float32 array. No bounds check."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        builder.store(args[2], _place(context, builder, signature, args), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, a_row), codegen
+
+
+@intrinsic
+@no_type_check
+def where_more(typing_context, a, b, yes, no):
+    """Numbers of `yes` where a > b, else those of `no`; each a row or a float32."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        a, b, yes, no = _as_rows(builder, args)
+        return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
+
+    kinds = [kind if kind is a_row else types.float32 for kind in (a, b, yes, no)]
+    return a_row(*kinds), codegen
+
+
+@intrinsic
+@no_type_check
+def bits_more(typing_context, a, b):
+    """An integer whose bit k says whether number k of a is above that of b."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        above = builder.fcmp_ordered(">", *_as_rows(builder, args))
+        return builder.zext(builder.bitcast(above, ir.IntType(ROW)), cgutils.int32_t)
+
+    kinds = [kind if kind is a_row else types.float32 for kind in (a, b)]
+    return types.uint32(*kinds), codegen
+
+
+@intrinsic
+@no_type_check
+def lowest_bit(typing_context, bits):
+    """Place of the lowest bit of an integer that is not 0."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        return builder.zext(builder.cttz(args[0], ir.Constant(ir.IntType(1), 1)), cgutils.intp_t)
+
+    return types.intp(types.uint32), codegen
+
+
+@intrinsic
+@no_type_check
+def total(typing_context, row):
+    """The sum of a row."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), _VECTOR])
+        function = cgutils.get_or_insert_function(
+            builder.module, kind, f"llvm.vector.reduce.fadd.v{ROW}f32"
+        )
+        return builder.call(function, [ir.Constant(ir.FloatType(), -0.0), args[0]], fastmath=_FLAGS)
+
+    return types.float32(a_row), codegen
+
+
+@intrinsic
+@no_type_check
+def _floor(typing_context, row):
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        return _of_rows("floor")(builder, list(args))
+
+    return a_row(a_row), codegen
+
+
+@intrinsic
+@no_type_check
+def _power_of_2(typing_context, row):
+    """2^n of whole numbers n from -126 to 127, written into the exponent."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        whole = builder.add(builder.fptosi(args[0], _WHOLE), ir.Constant(_WHOLE, [127] * ROW))
+        return builder.bitcast(builder.shl(whole, ir.Constant(_WHOLE, [23] * ROW)), _VECTOR)
+
+    return a_row(a_row), codegen
+
+
+_C5, _C4, _C3, _C2, _C1 = (
+    np.float32(c) for c in (1.86713e-3, 9.01703e-3, 5.579991e-2, 2.4016445e-1, 6.9315131e-1)
+)
+"""2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1: the polynomial of degree 5 with the least greatest relative
+error, 8e-8, found by reweighted least squares."""
+_LEAST, _ONE = np.float32(-126), np.float32(1)
+
+
+@kernel_part
+@no_type_check
+def exp2_row(x):
+    """2^x for x ≤ 127, to within 3e-7 of it; below 2^-126 that."""
+    x = greatest(x, _LEAST)
+    whole = _floor(x)
+    f = x - whole
+    polynomial = ((((f * _C5 + _C4) * f + _C3) * f + _C2) * f + _C1) * f + _ONE
+    return polynomial * _power_of_2(whole)
