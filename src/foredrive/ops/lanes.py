@@ -22,6 +22,8 @@ kernel = numba.njit(cache=True, nogil=True, **_OPTIONS)
 """Compiled at the first call, without the GIL; NaN and infinity stay what they are."""
 kernel_part = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 """The same for what only kernels call, which compiles faster."""
+inlined_part = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True, **_OPTIONS)
+"""The same for what is called so often that handing over its arguments would take long."""
 
 WIDTH = 8
 """Lanes of a `Float8`."""

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
-from foredrive.ops.lanes import kernel_part
+from foredrive.ops.lanes import inlined_part
 
 ROW = 16
 _VECTOR = ir.VectorType(ir.FloatType(), ROW)
@@ -48,17 +48,6 @@ def _as_rows(builder: ir.IRBuilder, args: Any) -> list[ir.Value]:
     return [value if value.type == _VECTOR else _broadcast(builder, value) for value in args]
 
 
-def _of_rows(name: str, *arguments: ir.Type) -> Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]:
-    """A function that LLVM has for vectors."""
-
-    def call(builder: ir.IRBuilder, args: list[ir.Value]) -> ir.Value:
-        kind = ir.FunctionType(_VECTOR, arguments or [_VECTOR] * len(args))
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{ROW}f32")
-        return builder.call(function, args, fastmath=_FLAGS)
-
-    return call
-
-
 def _elementwise(emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> Any:
     """An intrinsic of two rows, one of which may be a float32."""
 
@@ -77,10 +66,17 @@ def _elementwise(emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> An
     return apply
 
 
-least = _elementwise(_of_rows("minnum"))
-"""The lesser of each pair."""
-greatest = _elementwise(_of_rows("maxnum"))
-"""The greater of each pair."""
+def _select(order: str) -> Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]:
+    def emit(builder: ir.IRBuilder, args: list[ir.Value]) -> ir.Value:
+        return builder.select(builder.fcmp_ordered(order, *args), *args)
+
+    return emit
+
+
+least = _elementwise(_select("<"))
+"""The lesser of each pair; the second where one is NaN."""
+greatest = _elementwise(_select(">"))
+"""The greater of each pair; the second where one is NaN."""
 
 
 def _operator(symbol: Any, emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> None:
@@ -178,24 +174,56 @@ def lowest_bit(typing_context, bits):
 
 @intrinsic
 @no_type_check
-def total(typing_context, row):
-    """The sum of a row."""
+def totals(typing_context, array, index):
+    """The sums of sixteen rows that follow each other from flat `index` of an array, as one row."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), _VECTOR])
-        function = cgutils.get_or_insert_function(
-            builder.module, kind, f"llvm.vector.reduce.fadd.v{ROW}f32"
-        )
-        return builder.call(function, [ir.Constant(ir.FloatType(), -0.0), args[0]], fastmath=_FLAGS)
+        first = _place(context, builder, signature, args)
+        places = [builder.gep(first, [ir.Constant(cgutils.int32_t, k)]) for k in range(ROW)]
+        rows = [builder.load(place, align=4) for place in places]
+        while len(rows) > 1:  # halve the rows and the lanes that belong to the same row
+            run = ROW // len(rows)
+            rows = [_add_runs(builder, a, b, run) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+        return rows[0]
 
-    return types.float32(a_row), codegen
+    return a_row(array, types.intp), codegen
+
+
+def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.Value:
+    """Add neighbouring runs of lanes within a and within b; the sums of a and of b alternate."""
+    even = [lane for lane in range(ROW) if lane // run % 2 == 0]
+    order = [
+        lane + shift for at in range(0, len(even), run) for shift in (0, ROW) for lane in even[at : at + run]
+    ]
+    halves = ([lane + shift for lane in order] for shift in (0, run))
+    picked = (builder.shuffle_vector(a, b, ir.Constant(_WHOLE, lanes)) for lanes in halves)
+    return builder.fadd(*picked)
+
+
+@intrinsic
+@no_type_check
+def prefetch(typing_context, array, index):
+    """Have the cache line at flat `index` of an array come nearer."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        pointer = ir.IntType(8).as_pointer()
+        place = builder.bitcast(_place(context, builder, signature, args), pointer)
+        flags = [ir.Constant(cgutils.int32_t, k) for k in (0, 3, 1)]  # to read, soon, data
+        kind = ir.FunctionType(ir.VoidType(), [pointer, *(flag.type for flag in flags)])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        builder.call(function, [place, *flags])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
 
 
 @intrinsic
 @no_type_check
 def _floor(typing_context, row):
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return _of_rows("floor")(builder, list(args))
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.floor.v{ROW}f32")
+        return builder.call(function, args)
 
     return a_row(a_row), codegen
 
@@ -220,7 +248,7 @@ error, 8e-8, found by reweighted least squares."""
 _LEAST, _ONE = np.float32(-126), np.float32(1)
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def exp2_row(x):
     """2^x for x ≤ 127, to within 3e-7 of it; below 2^-126 that."""

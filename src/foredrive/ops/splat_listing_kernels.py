@@ -4,10 +4,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import kernel, kernel_part
+from foredrive.ops.lanes import inlined_part, kernel
 
 LOG2_E = np.float32(1.4426950408889634)
-HALF = np.float32(0.5)
+ZERO, HALF = np.float32(0), np.float32(0.5)
 SLACK = np.float32(1e-3)
 """Of an exponent: what rounding may do to it."""
 LEAST = np.float32(np.log2(1 / 255) - SLACK)
@@ -79,7 +79,7 @@ def pack_splats(start, stop, raw, period, packed):
         row[REACH_X], row[REACH_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def touches(row, bounds, x):
     """Whether the opacity of a packed splat whose mean is at x reaches 1/255 in a tile's box.
@@ -97,7 +97,7 @@ def touches(row, bounds, x):
     return row[LOG_OPACITY] + max(at_side, at_edge) >= LEAST
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def turned(x, bounds, period):
     """The mean's place x, whole periods away, that is nearest to the middle of a tile."""
@@ -107,21 +107,24 @@ def turned(x, bounds, period):
     return x
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _last_at_most(values, start, stop, x):
-    """Place of the last of ascending values[start:stop] that is at most x; start if none is."""
-    low, high = start, stop
-    while high - low > 1:
-        middle = (low + high) // 2
-        if values[middle] <= x:
-            low = middle
-        else:
-            high = middle
-    return low
+    """Place of the last of ascending values[start:stop] that is at most x; start if none is.
+
+    Tiles are about equally wide: a guess is seldom far off.
+    """
+    span = values[stop - 1] - values[start]
+    guess = (x - values[start]) / span * np.float32(stop - 1 - start) if span > 0 else ZERO
+    k = start + int(min(max(guess, ZERO), np.float32(stop - 1 - start)))
+    while k > start and values[k] > x:
+        k -= 1
+    while k + 1 < stop and values[k + 1] <= x:
+        k += 1
+    return k
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _list_row(row, tiles, r, x0, x1, turn, found, count):
     """Add the tiles of row r that a splat touches between x0 and x1, which are so many turns away."""

@@ -93,7 +93,9 @@ def composite_splats(
 
     *where, feature = (field.float() for field in splats)
     hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.float()
-    return _composited(CompositeSplats.apply(points.to("cpu", torch.float32), hits, feature, *where), hit_range_m is not None)
+    return _composited(
+        CompositeSplats.apply(points.to("cpu", torch.float32), hits, feature, *where), hit_range_m is not None
+    )
 
 
 def composite_splats_reference(

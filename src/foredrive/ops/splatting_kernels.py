@@ -9,7 +9,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import kernel, kernel_part
+from foredrive.ops.lanes import inlined_part, kernel
 from foredrive.ops.rows import (
     ROW,
     bits_more,
@@ -18,9 +18,10 @@ from foredrive.ops.rows import (
     least,
     load_row,
     lowest_bit,
+    prefetch,
     row_of,
     store_row,
-    total,
+    totals,
     where_more,
 )
 from foredrive.ops.splat_listing_kernels import (
@@ -51,6 +52,8 @@ EXTRA = 4
 """Columns of a result behind the features: expected range, median range, alpha, alpha before the hit."""
 SUMS = 12
 """Columns of a pair's gradient in front of the features, see `composite_back`."""
+BATCH = 64
+"""Splats of a tile that are looked for at once: while one is fetched, others are."""
 
 
 class Scene(NamedTuple):
@@ -84,7 +87,7 @@ class Places(NamedTuple):
     period: np.float32
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _aligned(rows):
     """Room for rows, at the beginning of a cache line."""
@@ -93,7 +96,7 @@ def _aligned(rows):
     return room[skip : skip + rows * ROW]
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _touched(splat, bounds, x):
     """Bits of the blocks in which a splat's opacity reaches 1/255; see `touches`, here 16 boxes at a time."""
@@ -114,7 +117,7 @@ def _touched(splat, bounds, x):
     return bits_more(greatest(at_side, at_edge) + splat[LOG_OPACITY], LEAST)
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _offsets(splat, rows, at, x):
     """d of a block's points from a splat, and their time."""
@@ -124,7 +127,7 @@ def _offsets(splat, rows, at, x):
     return dx, dy, t
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _opacity(splat, dx, dy):
     """The opacity of a splat at d, before it is cut off above."""
@@ -133,20 +136,20 @@ def _opacity(splat, dx, dy):
     return where_more(MIN_ALPHA, opacity, ZERO, opacity)
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _range(splat, dx, dy, t):
     return dx * splat[SLOPE_X] + dy * splat[SLOPE_Y] + (t * splat[RATE] + splat[RANGE])
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _gather_hits(places, tile, hits):
     for s in range(POINTS):
         hits[s] = places.hit[max(places.index[tile, s], 0)]
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _start(state, columns):
     """Nothing seen yet: transmittance 1, then the columns of a result with the features last."""
@@ -157,7 +160,7 @@ def _start(state, columns):
         store_row(state, base + 2 * ROW, row_of(np.float32(np.inf)))
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _add(splat, feature, base, state, dx, dy, t, hit):
     """Put a splat behind what a block has seen; returns whether any of its rays goes on."""
@@ -182,35 +185,56 @@ def _add(splat, feature, base, state, dx, dy, t, hit):
     return bits_more(passed, MIN_LEFT) != 0
 
 
+@inlined_part
+@no_type_check
+def _look_for(scene, places, tile, begin, end, touched):
+    """Fill `touched` with the blocks that the entries begin … end of a tile's list touch."""
+    bounds, tile_bounds = places.block_bounds[tile], places.tile_bounds[tile]
+    for at in range(begin, end):
+        splat = scene.packed[scene.splat[at]]
+        prefetch(scene.feature, scene.splat[at] * scene.feature.shape[1])
+        touched[at - begin] = _touched(splat, bounds, turned(splat[MEAN_X], tile_bounds, places.period))
+
+
 @kernel
 @no_type_check
 def composite_tiles(start, stop, scene, places, out):
     """Write what the points of tiles start … stop see to `out`, Float32[P D + 4], features first."""
-    depth = scene.feature.shape[1]
-    columns = depth + EXTRA + 1
-    state, hits = _aligned(ROW * columns), _aligned(ROW)
+    columns = scene.feature.shape[1] + EXTRA + 1
+    state, hits, touched = _aligned(ROW * columns), _aligned(ROW), np.empty(BATCH, np.uint32)
     for tile in range(start, stop):
-        rows, bounds = places.rows[tile], places.block_bounds[tile]
         _start(state, columns)
         _gather_hits(places, tile, hits)
         going = ALL
-        for at in range(scene.first[tile], scene.first[tile + 1]):
-            splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
-            x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
-            blocks = going & _touched(splat, bounds, x)
-            while blocks != 0:
-                block = lowest_bit(blocks)
-                blocks &= blocks - np.uint32(1)
-                dx, dy, t = _offsets(splat, rows, block * ROW, x)
-                hit = load_row(hits, block * ROW)
-                if not _add(splat, feature, block * columns * ROW, state, dx, dy, t, hit):
-                    going &= ~(np.uint32(1) << np.uint32(block))
+        for begin in range(scene.first[tile], scene.first[tile + 1], BATCH):
+            end = min(begin + BATCH, scene.first[tile + 1])
+            _look_for(scene, places, tile, begin, end, touched)
+            for at in range(begin, end):
+                going = _pass(scene, places, tile, at, touched[at - begin], going, hits, state)
             if going == 0:
                 break
         _write(places, tile, state, columns, out)
 
 
-@kernel_part
+@inlined_part
+@no_type_check
+def _pass(scene, places, tile, at, touched, going, hits, state):
+    """Put the splat of entry `at` behind what the blocks it touches have seen; returns those that go on."""
+    splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
+    rows, columns = places.rows[tile], feature.size + EXTRA + 1
+    x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
+    blocks = going & touched
+    while blocks != 0:
+        block = lowest_bit(blocks)
+        blocks &= blocks - np.uint32(1)
+        dx, dy, t = _offsets(splat, rows, block * ROW, x)
+        hit = load_row(hits, block * ROW)
+        if not _add(splat, feature, block * columns * ROW, state, dx, dy, t, hit):
+            going &= ~(np.uint32(1) << np.uint32(block))
+    return going
+
+
+@inlined_part
 @no_type_check
 def _write(places, tile, state, columns, out):
     depth = columns - EXTRA - 1
@@ -224,7 +248,7 @@ def _write(places, tile, state, columns, out):
                 out[p, depth + k] = state[base + (1 + k) * ROW]
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _start_back(places, tile, out, grad_out, state, columns):
     """Rows of a block: transmittance, what is left of the result times its gradient, gradients of range, alpha
@@ -249,7 +273,7 @@ def _start_back(places, tile, out, grad_out, state, columns):
             state[base + ROW] = left
 
 
-@kernel_part
+@inlined_part
 @no_type_check
 def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
     """What a splat's place in a block changes, see `composite_back`; the features' gradient is added to `sums`.
@@ -270,7 +294,8 @@ def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
     for d in range(feature.size):
         grad = load_row(state, at)
         worth = worth + grad * feature[d]
-        store_row(sums, d * ROW, load_row(sums, d * ROW) + weight * grad)
+        to_feature = (SUMS + d) * ROW
+        store_row(sums, to_feature, load_row(sums, to_feature) + weight * grad)
         at += ROW
     behind = load_row(state, base + ROW) - weight * worth
     store_row(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
@@ -282,50 +307,63 @@ def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
 @kernel
 @no_type_check
 def composite_back(start, stop, scene, places, out, grad_out, pairs):
-    """Write the gradients of tiles start … stop, pair by pair of splat and tile, to `pairs`, Float32[L 12 + D].
+    """Write the gradients of tiles start … stop, pair by pair of splat and tile, to `pairs`.
 
     With e = dL/d log α and h = weight · dL/d range of each point, the columns are the sums over points of e,
-    e dx, e dy, e dx², e dx dy, e dy², e t dx, e t dy, h, h dx, h dy, h t, and weight · dL/d feature. `pairs` comes
-    filled with zeros.
+    e dx, e dy, e dx², e dx dy, e dy², e t dx, e t dy, h, h dx, h dy, h t, and weight · dL/d feature.
+
+    Args:
+        out, grad_out: Float32[P D + 4], the result and its gradient.
+        pairs: Float32[L C], zeros; C is 12 + D or more, a multiple of 16.
     """
-    depth = scene.feature.shape[1]
-    columns = depth + 5
-    state, hits, sums = _aligned(ROW * columns), _aligned(ROW), _aligned(depth)
+    columns = scene.feature.shape[1] + 5
+    state, hits, sums = _aligned(ROW * columns), _aligned(ROW), _aligned(pairs.shape[1])
+    touched = np.empty(BATCH, np.uint32)
     for tile in range(start, stop):
-        rows, bounds = places.rows[tile], places.block_bounds[tile]
         _start_back(places, tile, out, grad_out, state, columns)
         _gather_hits(places, tile, hits)
         going = ALL
-        for at in range(scene.first[tile], scene.first[tile + 1]):
-            splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
-            x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
-            blocks = going & _touched(splat, bounds, x)
-            if blocks == 0:
-                continue
-            sums[:] = 0
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = row_of(ZERO)
-            while blocks != 0:
-                block = lowest_bit(blocks)
-                blocks &= blocks - np.uint32(1)
-                dx, dy, t = _offsets(splat, rows, block * ROW, x)
-                hit = load_row(hits, block * ROW)
-                base = block * columns * ROW
-                on, e, h = _add_back(splat, feature, base, state, dx, dy, t, hit, sums)
-                if not on:
-                    going &= ~(np.uint32(1) << np.uint32(block))
-                ex, ey = e * dx, e * dy
-                s0, s1, s2 = s0 + e, s1 + ex, s2 + ey
-                s3, s4, s5 = s3 + ex * dx, s4 + ex * dy, s5 + ey * dy
-                s6, s7 = s6 + ex * t, s7 + ey * t
-                s8, s9, s10, s11 = s8 + h, s9 + h * dx, s10 + h * dy, s11 + h * t
-            pair = pairs[scene.slot[at]]
-            pair[0], pair[1], pair[2], pair[3] = total(s0), total(s1), total(s2), total(s3)
-            pair[4], pair[5], pair[6], pair[7] = total(s4), total(s5), total(s6), total(s7)
-            pair[8], pair[9], pair[10], pair[11] = total(s8), total(s9), total(s10), total(s11)
-            for d in range(depth):
-                pair[SUMS + d] = total(load_row(sums, d * ROW))
+        for begin in range(scene.first[tile], scene.first[tile + 1], BATCH):
+            end = min(begin + BATCH, scene.first[tile + 1])
+            _look_for(scene, places, tile, begin, end, touched)
+            for at in range(begin, end):
+                blocks = going & touched[at - begin]
+                if blocks == 0:
+                    continue
+                going = _pass_back(scene, places, tile, at, blocks, going, hits, state, sums)
+                pair = scene.slot[at] * pairs.shape[1]
+                for c in range(0, pairs.shape[1], ROW):
+                    store_row(pairs, pair + c, totals(sums, c * ROW))
             if going == 0:
                 break
+
+
+@inlined_part
+@no_type_check
+def _pass_back(scene, places, tile, at, blocks, going, hits, state, sums):
+    """Fill `sums` with the rows that add up to a pair's gradient; returns the blocks that go on."""
+    splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
+    rows, columns = places.rows[tile], feature.size + 5
+    x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = row_of(ZERO)
+    for d in range(feature.size):
+        store_row(sums, (SUMS + d) * ROW, s0)
+    while blocks != 0:
+        block = lowest_bit(blocks)
+        blocks &= blocks - np.uint32(1)
+        dx, dy, t = _offsets(splat, rows, block * ROW, x)
+        hit = load_row(hits, block * ROW)
+        on, e, h = _add_back(splat, feature, block * columns * ROW, state, dx, dy, t, hit, sums)
+        if not on:
+            going &= ~(np.uint32(1) << np.uint32(block))
+        ex, ey = e * dx, e * dy
+        s0, s1, s2 = s0 + e, s1 + ex, s2 + ey
+        s3, s4, s5 = s3 + ex * dx, s4 + ex * dy, s5 + ey * dy
+        s6, s7 = s6 + ex * t, s7 + ey * t
+        s8, s9, s10, s11 = s8 + h, s9 + h * dx, s10 + h * dy, s11 + h * t
+    for k, row in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)):
+        store_row(sums, k * ROW, row)
+    return going
 
 
 class Gradients(NamedTuple):
@@ -345,7 +383,7 @@ class Gradients(NamedTuple):
 @no_type_check
 def gather_gradients(start, stop, pairs, first_slot, raw, grads):
     """Add up what `composite_back` wrote about the splats start … stop, which lies together."""
-    sums = np.empty(pairs.shape[1], np.float32)
+    sums = np.empty(SUMS + grads.feature.shape[1], np.float32)
     for i in range(start, stop):
         sums[:] = 0
         for k in range(first_slot[i], first_slot[i + 1]):

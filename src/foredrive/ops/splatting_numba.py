@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from foredrive.ops.rows import ROW
 from foredrive.ops.splat_listing_kernels import (
     COLUMNS,
     Raw,
@@ -77,7 +78,7 @@ class CompositeSplats(torch.autograd.Function):
         """Gradients of the splats' fields."""
         out, feature, *where = ctx.saved_tensors
         scene, places, first_slot = ctx.found
-        pairs = torch.zeros(len(scene.splat), SUMS + feature.shape[1]).numpy()
+        pairs = torch.zeros(len(scene.splat), -(-(SUMS + feature.shape[1]) // ROW) * ROW).numpy()
         seen, upstream = out.numpy(), grad_out.contiguous().numpy()
 
         def look(start: int, stop: int) -> None:
