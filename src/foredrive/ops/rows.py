@@ -1,7 +1,8 @@
 """Sixteen float32 numbers as one value in numba kernels, with the arithmetic that goes with it.
 
-LLVM lowers a row to whatever the processor has: one register with AVX-512, two with AVX, four with NEON. As
-with `lanes`, numba's cache on disk looks at the file of the kernel only: delete it (`*.nbi`) after changes here.
+LLVM lowers a row to whatever the processor has: one register with AVX-512, two with AVX, four with NEON.
+
+Numba's cache on disk looks at the file of the kernel only: delete it (`*.nbi`) after changes in this one.
 """
 
 import operator
@@ -243,8 +244,8 @@ def _power_of_2(typing_context, row):
 _C5, _C4, _C3, _C2, _C1 = (
     np.float32(c) for c in (1.86713e-3, 9.01703e-3, 5.579991e-2, 2.4016445e-1, 6.9315131e-1)
 )
-"""2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1: the polynomial of degree 5 with the least greatest relative
-error, 8e-8, found by reweighted least squares."""
+"""2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1, to within 8e-8 of it: the least greatest relative error of
+degree 5, found by reweighted least squares."""
 _LEAST, _ONE = np.float32(-126), np.float32(1)
 
 

@@ -16,12 +16,12 @@ LEAST = np.float32(np.log2(1 / 255) - SLACK)
 # columns of a packed splat
 MEAN_X, MEAN_Y, VELOCITY_X, VELOCITY_Y = 0, 1, 2, 3
 XX, XY, YY, LOG_OPACITY = 4, 5, 6, 7
-"""log2 α = log opacity + xx dx² + xy dx dy + yy dy²."""
+"""log2 of the opacity at d is log opacity + xx dx² + xy dx dy + yy dy²."""
 RANGE, SLOPE_X, SLOPE_Y, RATE = 8, 9, 10, 11
 TILT_Y, TILT_X = 12, 13
 """Where along y the exponent is greatest is tilt_y · dx; along x, tilt_x · dy."""
 REACH_X, REACH_Y = 14, 15
-"""How far from the mean α reaches 1/255."""
+"""How far from the mean the opacity reaches 1/255."""
 COLUMNS = 16
 """One cache line."""
 

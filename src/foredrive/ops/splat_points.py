@@ -16,6 +16,8 @@ LANES = 16
 """Points in a block, blocks in a tile."""
 SLOTS = LANES * LANES
 """Most points in a tile."""
+PARTS = 4
+"""Of a turn: no tile of beams reaches over two."""
 SIDE_PX = 16
 """Pixels along each side of a camera's tile; its blocks are squares of 4."""
 
@@ -114,7 +116,8 @@ def beam_points(
     """Any beams in tiles of 256.
 
     Rows of tiles hold about as many beams each, and end in the widest gap between elevations that is near:
-    between two channels where there are channels. Within a row tiles follow each other in azimuth.
+    between two channels where there are channels. Within a row tiles follow each other in azimuth; each lies
+    in one quarter of a turn, so that it is clear on which side of a tile a splat lies.
 
     Args:
         azimuth_rad, elevation_rad: in the sensor's frame at the moment that the beam is fired.
@@ -123,17 +126,17 @@ def beam_points(
     azimuth_rad = torch.remainder(azimuth_rad + math.pi, 2 * math.pi) - math.pi
     by_elevation = elevation_rad.argsort(stable=True)
     starts = _row_starts(elevation_rad[by_elevation])
-    lengths = starts.diff()
-    row = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
-    in_order = _sorted_within(row, azimuth_rad[by_elevation])
-    order = by_elevation[in_order]  # rows one after the other, along azimuth in each
-    tiles_in = -(-lengths // SLOTS)
-    first_tile = torch.cat([torch.zeros(1, dtype=torch.long), tiles_in.cumsum(0)])
-    place = torch.arange(len(order)) - starts[row]
-    tile = first_tile[row] + place // SLOTS
+    row = torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff())
+    order = by_elevation[_sorted_within(row, azimuth_rad[by_elevation])]
+    part = row * PARTS + ((azimuth_rad[order] + math.pi) * (PARTS / (2 * math.pi))).long().clamp(0, PARTS - 1)
+    lengths = part.bincount(minlength=PARTS * (len(starts) - 1))
+    zero = torch.zeros(1, dtype=torch.long)
+    first_in_part = torch.cat([zero, (-(-lengths // SLOTS)).cumsum(0)])  # tiles
+    place = torch.arange(len(order)) - torch.cat([zero, lengths.cumsum(0)])[part]
+    tile = first_in_part[part] + place // SLOTS
     quarter = tile * 4 + place % SLOTS // (SLOTS // 4)  # four columns of blocks, four blocks in each
     order = order[_sorted_within(quarter, elevation_rad[order])]
-    index = torch.full((int(first_tile[-1]) * SLOTS,), -1)
+    index = torch.full((int(first_in_part[-1]) * SLOTS,), -1)
     index[tile * SLOTS + place % SLOTS] = order
     index = index.view(-1, SLOTS)
     filled = torch.where(index >= 0, index, index.amax(1, keepdim=True))
@@ -145,7 +148,7 @@ def beam_points(
         count=len(order),
         left_edge=position[..., 0].amin(1),
         lower_edge=elevation_rad[by_elevation][starts[:-1]],
-        first_tile=first_tile,
+        first_tile=first_in_part[::PARTS],
         period=2 * math.pi,
     )
 

@@ -19,16 +19,8 @@ from foredrive.ops.splat_listing_kernels import (
     pack_splats,
 )
 from foredrive.ops.splat_points import TiledPoints
-from foredrive.ops.splatting_kernels import (
-    EXTRA,
-    SUMS,
-    Gradients,
-    Places,
-    Scene,
-    composite_back,
-    composite_tiles,
-    gather_gradients,
-)
+from foredrive.ops.splatting_back_kernels import SUMS, Gradients, composite_back, gather_gradients
+from foredrive.ops.splatting_kernels import EXTRA, Places, Scene, composite_tiles
 from foredrive.ops.threads import in_parallel
 
 MIN_SPLATS, MIN_TILES = 4096, 8
@@ -84,7 +76,7 @@ class CompositeSplats(torch.autograd.Function):
         def look(start: int, stop: int) -> None:
             composite_back(start, stop, scene, places, seen, upstream, pairs)
 
-        in_parallel(look, len(places.index), grain=MIN_TILES)
+        in_parallel(look, len(places.point), grain=MIN_TILES)
         raw = Raw(*(tensor.numpy() for tensor in where))
         to_where, to_feature = [torch.empty_like(tensor) for tensor in where], torch.empty_like(feature)
         grads = Gradients(*(tensor.numpy() for tensor in (*to_where, to_feature)))

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from foredrive.geometry.se3 import hat
 from foredrive.rendering.gaussians.gaussians import Gaussians
 
 MIN_RATIO = 1e-12
@@ -51,15 +52,14 @@ def in_sensor(
     twist_sensor: Float[Tensor, "6"] | None,
 ) -> InSensor:
     """The chosen Gaussians in a sensor's frame; the arguments are those of `project_camera`."""
-    gaussians = gaussians[chosen]
-    position_m = position_m[:, chosen]
+    gaussians = gaussians.map_tensors(lambda tensor: tensor.index_select(0, chosen))
+    position_m = position_m.index_select(1, chosen)
     R = T_sensor_scene[:3, :3]
     velocity = torch.zeros_like(position_m)
     if velocity_mps is not None:
-        velocity = R @ velocity_mps[chosen].T
+        velocity = R @ velocity_mps.index_select(0, chosen).T
     if twist_sensor is not None:
-        turning = torch.linalg.cross(twist_sensor[3:, None].expand_as(position_m), position_m, dim=0)
-        velocity = velocity - twist_sensor[:3, None] - turning
+        velocity = velocity - twist_sensor[:3, None] - hat(twist_sensor[3:]) @ position_m
     return InSensor(
         position_m,
         (R @ gaussians.factor().flatten(1)).unflatten(1, (3, -1)),
@@ -71,14 +71,18 @@ def in_sensor(
 
 def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) -> Float[Tensor, "K 3 N"]:
     """J M for every Gaussian."""
-    return sum(jacobian[:, k, None] * factor[k] for k in range(3))  # type: ignore[return-value]  # not int
+    columns = [column.unbind() for column in factor.unbind(1)]
+    products = [j * x + k * y + m * z for j, k, m in jacobian for x, y, z in columns]
+    return torch.stack(products).unflatten(0, jacobian.shape[:2])
 
 
 def footprint(spread: Float[Tensor, "2 3 N"], epsilon: float) -> Footprint:
     """Footprints whose covariance on the plane is U Uᵀ, for U = `spread`, plus ε on its diagonal."""
     u, v = spread
     xx, xy, yy = (u * u).sum(0), (u * v).sum(0), (v * v).sum(0)
-    area = torch.linalg.cross(u, v, dim=0).square().sum(0)  # det U Uᵀ, without what cancels
+    (a, b, c), (d, e, f) = u, v
+    minors = a * e - b * d, a * f - c * d, b * f - c * e
+    area = minors[0].square() + minors[1].square() + minors[2].square()  # det U Uᵀ, without what cancels
     widened = area + epsilon * (xx + yy) + epsilon * epsilon
     inverse = torch.stack([yy + epsilon, -xy, xx + epsilon], -1) / widened[:, None]
     return Footprint(inverse, (area / widened).clamp(min=MIN_RATIO).sqrt())

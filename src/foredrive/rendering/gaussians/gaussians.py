@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,11 +27,14 @@ class Gaussians(Record):
 
         Components come first because arithmetic on long vectors is many times as fast as on small matrices.
         """
-        w, x, y, z = F.normalize(self.quaternion, dim=-1).unbind(-1)
-        a, b, c = self.log_scale.exp().unbind(-1)
-        rows = (
-            ((1 - 2 * (y * y + z * z)) * a, 2 * (x * y - w * z) * b, 2 * (x * z + w * y) * c),
-            (2 * (x * y + w * z) * a, (1 - 2 * (x * x + z * z)) * b, 2 * (y * z - w * x) * c),
-            (2 * (x * z - w * y) * a, 2 * (y * z + w * x) * b, (1 - 2 * (x * x + y * y)) * c),
-        )
-        return torch.stack([entry for row in rows for entry in row]).unflatten(0, (3, 3))
+        w, x, y, z = self.quaternion.T.contiguous()
+        a, b, c = self.log_scale.exp().T.contiguous()
+        twice = 2 / (w * w + x * x + y * y + z * z)
+        wx, wy, wz = twice * w * x, twice * w * y, twice * w * z
+        xx, xy, xz, yy, yz, zz = (twice * i * j for i, j in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z)))
+        entries = [
+            *((1 - yy - zz) * a, (xy - wz) * b, (xz + wy) * c),
+            *((xy + wz) * a, (1 - xx - zz) * b, (yz - wx) * c),
+            *((xz - wy) * a, (yz + wx) * b, (1 - xx - yy) * c),
+        ]
+        return torch.stack(entries).unflatten(0, (3, 3))

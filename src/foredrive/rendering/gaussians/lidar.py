@@ -44,8 +44,10 @@ def project_lidar(
     """
     position = positions_in_sensor(gaussians, T_lidar_scene)
     with torch.no_grad():
-        range_m = position.norm(dim=0)
-        seen = (range_m > NEAR_M) & (position[:2].norm(dim=0) > UPRIGHT * range_m)
+        x, y, z = position
+        level2 = x * x + y * y
+        range2 = level2 + z * z
+        seen = (range2 > NEAR_M**2) & (level2 > UPRIGHT**2 * range2)
         chosen = seen.nonzero()[:, 0]
     them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     angles, range_m, jacobian = _project(them.position_m)
