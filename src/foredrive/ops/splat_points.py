@@ -64,6 +64,11 @@ class TiledPoints:
         """The same of each tile."""
         return torch.stack([self.rows.amin(2), self.rows.amax(2)], 2).flatten(1, 2)
 
+    @cached_property
+    def at_once(self) -> bool:
+        """Whether these are the pixels of an image of one instant."""
+        return self.size_hw is not None and not bool(self.time_s.any())
+
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> "TiledPoints":
         """The same on another device, in another precision; these points themselves where nothing changes."""
         if self.position.device == torch.device(device) and dtype in (self.position.dtype, None):

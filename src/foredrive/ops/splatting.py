@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.ops.precision import numba_can
+from foredrive.ops.precision import full_precision, numba_can
 from foredrive.ops.splat_points import TiledPoints
 
 MIN_ALPHA = 1 / 255
@@ -55,7 +55,8 @@ class Composited(NamedTuple):
     expected_range_m: Float[Tensor, "P"]
     """Σ weight · range. Divide by `alpha` for the range of the rays that end."""
     median_range_m: Float[Tensor, "P"]
-    """Range of the splat that half of the light does not pass; infinite where none is. Without gradient."""
+    """Range of the splat that half of the light does not pass; infinite where none is; NaN if not asked for.
+    Without gradient."""
     alpha: Float[Tensor, "P"]
     """Σ weight, the probability that the ray ends."""
     alpha_before_hit: Float[Tensor, "P"] | None
@@ -72,21 +73,52 @@ class SplatLists(NamedTuple):
 
 
 def composite_splats(
-    splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
+    splats: Splats,
+    points: TiledPoints,
+    hit_range_m: Float[Tensor, "P"] | None = None,
+    *,
+    median: bool = True,
 ) -> Composited:
     """Look at splats from all points.
 
-    Gradients reach everything in `splats`.
+    Gradients reach everything in `splats`. On a GPU gsplat makes images of one instant, if their median range
+    is not wanted; whatever else is asked for there is plain PyTorch.
 
     Args:
         points: from `pixel_points` or `beam_points`, on the splats' device.
         hit_range_m: where a lidar's return came from, less some margin; infinite: nowhere. It asks for
             `alpha_before_hit`.
+        median: whether `median_range_m` is wanted; if not, it is NaN.
 
     Raises:
         ValueError: on values that are not finite, or points of another number.
+        InputError: gsplat is needed and not installed.
     """
     _check(splats, points, hit_range_m)
+    if splats.mean.is_cuda and points.at_once and hit_range_m is None and not median:
+        return _composite_image(splats, points)
+    seen = _composite(splats, points, hit_range_m)
+    return seen if median else seen._replace(median_range_m=torch.full_like(seen.alpha, math.nan))
+
+
+def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
+    from foredrive.ops.splatting_gsplat import composite_gsplat  # it may not be installed elsewhere
+
+    assert points.size_hw is not None
+    with full_precision(*splats) as fields:
+        splats = Splats(*fields)
+        feature, expected_m, alpha = composite_gsplat(
+            splats.mean,
+            splats.inverse_covariance,
+            splats.opacity,
+            splats.range_m,
+            splats.feature,
+            points.size_hw,
+        )
+    return Composited(feature, expected_m, torch.full_like(alpha.detach(), math.nan), alpha, None)
+
+
+def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None) -> Composited:
     if not numba_can(*splats):
         return composite_splats_reference(splats, points, hit_range_m)
     from foredrive.ops.splatting_numba import CompositeSplats  # numba takes its time to be imported

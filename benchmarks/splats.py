@@ -1,0 +1,258 @@
+"""How fast cameras and lidars see a street of Gaussians: `foredrive bench splats`.
+
+The street: ground, façades, parked cars and trees, covered by flat Gaussians side by side (as wide as their
+spacing, log-normal by a factor of e^0.5, an eighth as thick), spread evenly over the surfaces, so that near ones
+are large in the image and far ones small; 1 % large ones 200 m away stand for the far field. Opacities are spread
+from clear to opaque (logit 0.5 ± 2). The camera stands at its end and sees 0.9 of 200 k, the lidar (a Pandar64,
+64 × 1800 beams) in its middle. Both drive and turn, with rolling shutter. Projection, lists, compositing and, for
+training, the gradients of all parameters are timed together; each path runs in a process of its own.
+
+Beside it: plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the textbook's loop, pixel
+by pixel over its tile's list, in numba (compositing alone, forward, on the same lists). No CPU rasteriser of
+Gaussians can be installed from PyPI.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.measuring import in_a_process
+from foredrive.evaluation.measuring import measure as time_of
+from foredrive.geometry.se3 import exp_se3
+from foredrive.ops.splat_points import TiledPoints, pixel_points
+from foredrive.ops.splatting import (
+    Composited,
+    Splats,
+    composite_splats,
+    composite_splats_reference,
+    list_splats,
+)
+from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
+from foredrive.sensors import pandar64
+
+RUNS = 7
+READOUT_S = 0.03
+CAM_SCENE = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 1.6], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""scene (x forward, z up) -> a camera 1.6 m above the ground."""
+WIDTH_M, HEIGHT_M, CARS, TREES = 24.0, 10.0, 24, 20
+
+
+class View(NamedTuple):
+    """What is timed: a sensor, and what it sees."""
+
+    project: Callable[[Gaussians], Splats]
+    points: TiledPoints
+    gaussians: Gaussians
+
+
+def street(count: int, begin_m: float, end_m: float) -> Gaussians:
+    """See this file's docstring; the street runs along x."""
+    rng = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=rng)
+
+    def along(n: int) -> Tensor:
+        return begin_m + (end_m - begin_m) * uniform(n)
+
+    shares = {"ground": 0.41, "fronts": 0.36, "cars": 0.1, "trees": 0.12}
+    n = {name: int(share * count) for name, share in shares.items()}
+    up, left = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0])
+    side = torch.where(uniform(n["fronts"]) < 0.5, -0.5, 0.5) * WIDTH_M
+    ground = torch.stack(
+        [along(n["ground"]), WIDTH_M * (uniform(n["ground"]) - 0.5), torch.zeros(n["ground"])], -1
+    )
+    fronts = torch.stack([along(n["fronts"]), side, HEIGHT_M * uniform(n["fronts"])], -1)
+    face = torch.nn.functional.one_hot(torch.randint(0, 3, (n["cars"],), generator=rng), 3).float()
+    on_box = torch.where(face > 0, uniform(n["cars"], 3).round(), uniform(n["cars"], 3)) - 0.5
+    car = torch.randint(0, CARS, (n["cars"],), generator=rng)
+    stands = torch.stack([begin_m + (end_m - begin_m) * car / CARS, torch.where(car % 2 == 0, -6.0, 5.0)], -1)
+    cars = torch.cat([stands, torch.full((n["cars"], 1), 0.8)], -1) + on_box * torch.tensor([4.4, 1.8, 1.5])
+    out = torch.nn.functional.normalize(torch.randn(n["trees"], 3, generator=rng), dim=-1)
+    tree = torch.randint(0, TREES, (n["trees"],), generator=rng)
+    stands = torch.stack(
+        [begin_m + (end_m - begin_m) * tree / TREES, torch.where(tree % 2 == 0, -9.0, 9.0)], -1
+    )
+    trees = (
+        torch.cat([stands, torch.full((n["trees"], 1), 4.0)], -1) + 2 * out * uniform(n["trees"], 1) ** 0.33
+    )
+    mean = torch.cat([ground, fronts, cars, trees])
+    normal = torch.cat([up.expand_as(ground), left.expand_as(fronts), face, out])
+    area_m2 = (end_m - begin_m) * (WIDTH_M + 2 * HEIGHT_M) + 27 * CARS + 50 * TREES
+    log_scale = math.log(0.6 * math.sqrt(area_m2 / len(mean))) + 0.5 * torch.randn(
+        len(mean), 3, generator=rng
+    )
+    log_scale[:, 2] -= 2.0
+    half_way = torch.cat(
+        [1.001 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], torch.zeros(len(mean), 1)], -1
+    )
+    far, around = count - len(mean), 2 * math.pi * uniform(count - len(mean))
+    sky = torch.stack([200 * around.cos(), 200 * around.sin(), 100 * uniform(far)], -1)
+    return Gaussians(
+        mean_m=torch.cat([mean, sky]),
+        quaternion=torch.cat([half_way, torch.tensor([1.0, 0, 0, 0]).expand(far, 4)]),
+        log_scale=torch.cat([log_scale, torch.full((far, 3), math.log(5.0))]),
+        opacity_logit=0.5 + 2 * torch.randn(count, generator=rng),
+        feature=uniform(count, 3),
+    )
+
+
+def camera(count: int, size_hw: tuple[int, int], device: str) -> View:
+    """RGB and range, 60° wide; 10 m/s, 0.1 rad/s."""
+    height, width = size_hw
+    focal = 830.0 * width / 960
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], device=device)
+    T, dist = CAM_SCENE.to(device), torch.zeros(5, device=device)
+    twist = torch.tensor([0.0, 0, 10, 0, 0.1, 0], device=device)
+
+    def project(gaussians: Gaussians) -> Splats:
+        return project_camera(gaussians, T, K, dist, size_hw, twist_cam=twist)
+
+    return View(
+        project, pixel_points(size_hw, READOUT_S).to(device), _learnable(street(count, 2, 120), device)
+    )
+
+
+def lidar(count: int, device: str) -> View:
+    """64 × 1800 beams of a Pandar64, three features, range and median."""
+    T_ego_lidar = exp_se3(torch.tensor([0.0, 0, 1.8, 0, 0, 0]))
+    twist = torch.tensor([10.0, 0, 0, 0, 0, 0.1])
+    points = lidar_points(pandar64(T_ego_lidar).beams(twist), T_ego_lidar, twist).to(device)
+    T, twist = exp_se3(torch.tensor([0.0, 0, -1.8, 0, 0, 0])).to(device), twist.to(device)
+
+    def project(gaussians: Gaussians) -> Splats:
+        return project_lidar(gaussians, T, twist_lidar=twist)
+
+    return View(project, points, _learnable(street(count, -80, 80), device))
+
+
+def _learnable(gaussians: Gaussians, device: str) -> Gaussians:
+    return gaussians.map_tensors(lambda tensor: tensor.to(device).requires_grad_())
+
+
+def _times(view: View, device: str, composite: Callable[..., Composited], runs: int) -> dict[str, float]:
+    """Seconds by the clock and of computing (all threads), forward and for a training step."""
+    project, points, gaussians = view
+    leaves = [getattr(gaussians, name) for name in vars(gaussians)]
+
+    @torch.no_grad()
+    def forward() -> Composited:
+        return composite(project(gaussians), points)
+
+    def train() -> tuple[Tensor, ...]:
+        seen = composite(project(gaussians), points)
+        return torch.autograd.grad((seen.feature - 0.5).abs().sum() + seen.expected_range_m.sum(), leaves)
+
+    forward(), train()  # compiles
+    figures = {}
+    for name, call in (("forward", forward), ("train", train)):
+        took = time_of(call, runs, device)
+        figures |= {f"{name}_s": took.wall_s, f"{name}_cpu_s": took.cpu_s}
+    return figures
+
+
+@numba.njit(error_model="numpy", fastmath=True, nogil=True)
+def textbook(packed: Any, feature: Any, splat: Any, first: Any, place: Any, index: Any, out: Any) -> None:
+    """Kerbl et al.'s loop: every pixel walks along its tile's list; libm's exp, `out` [P D + 2]."""
+    for tile in range(index.shape[0]):
+        for s in range(index.shape[1]):
+            if index[tile, s] < 0:
+                continue
+            row, left = out[index[tile, s]], np.float32(1)
+            row[:] = 0
+            for at in range(first[tile], first[tile + 1]):
+                i = splat[at]
+                dx = place[tile, 0, s] - packed[i, 0] - packed[i, 3] * place[tile, 2, s]
+                dy = place[tile, 1, s] - packed[i, 1] - packed[i, 4] * place[tile, 2, s]
+                exponent = packed[i, 5] * dx * dx + packed[i, 6] * dx * dy + packed[i, 7] * dy * dy
+                alpha = min(packed[i, 2] * np.exp(exponent), np.float32(0.999))
+                if alpha < np.float32(1 / 255):
+                    continue
+                if left * (1 - alpha) <= np.float32(1e-4):
+                    break
+                for d in range(feature.shape[1]):
+                    row[d] += left * alpha * feature[i, d]
+                row[feature.shape[1]] += left * alpha * packed[i, 8]
+                row[feature.shape[1] + 1] += left * alpha
+                left *= 1 - alpha
+
+
+def _textbook(view: View) -> dict[str, float]:
+    """Compositing alone, one thread, on lists that ours made; and ours on one thread, lists included."""
+    with torch.no_grad():
+        splats, points = view.project(view.gaussians), view.points
+        seen = composite_splats(splats, points, median=False)
+        lists = list_splats(splats, points)
+    shape = splats.inverse_covariance * torch.tensor([-0.5, -1.0, -0.5])
+    packed = torch.cat(
+        [splats.mean, splats.opacity[:, None], splats.velocity, shape, splats.range_m[:, None]], -1
+    ).detach()
+    arrays = [packed, splats.feature.detach(), lists.splat, lists.first, points.rows, points.index]
+    arguments = [array.numpy() for array in arrays]
+    out = np.zeros((points.count, splats.feature.shape[1] + 2), np.float32)
+    textbook(*arguments, out)
+    assert np.abs(out[:, -1] - seen.alpha.numpy()).mean() < 1e-4
+    torch.set_num_threads(1)
+    with torch.no_grad():
+        ours = time_of(lambda: composite_splats(splats, points, median=False), RUNS, "cpu")
+    return {
+        "textbook_s": time_of(lambda: textbook(*arguments, out), 3, "cpu").cpu_s,
+        "ours_s": ours.cpu_s,
+        "listed": float(len(lists.splat)),
+        "seen": float(len(splats.mean)),
+    }
+
+
+def _fast(splats: Splats, points: TiledPoints) -> Composited:
+    return composite_splats(splats, points, median=points.size_hw is None)
+
+
+def _measure_here(device: str, path: str) -> dict[str, float]:
+    if path == "camera":
+        return _times(camera(200_000, (540, 960), device), device, _fast, RUNS)
+    if path == "lidar":
+        return _times(lidar(200_000, device), device, _fast, RUNS)
+    if path == "textbook":
+        return _textbook(camera(200_000, (540, 960), device))
+    reference = path == "reference"
+    view = camera(20_000, (135, 240), device)
+    return _times(view, device, composite_splats_reference if reference else _fast, 2 if reference else RUNS)
+
+
+def measure(device: str) -> dict[str, float]:
+    """All figures of a device. Those "per CPU second" are of computing: what one core does if it does no more."""
+    paths = ("camera", "lidar", "small", "reference", *(("textbook",) if device == "cpu" else ()))
+    found = {path: in_a_process(__file__, device, path) for path in paths}
+    figures: dict[str, float] = {"threads": float(torch.get_num_threads())}
+    for path, unit, millions in (("camera", "mp", 540 * 960 / 1e6), ("lidar", "mrays", 64 * 1800 / 1e6)):
+        for step in ("forward", "train"):
+            figures[f"{path}_{step}_{unit}_per_s"] = millions / found[path][f"{step}_s"]
+            figures[f"{path}_{step}_{unit}_per_cpu_s"] = millions / found[path][f"{step}_cpu_s"]
+    for clock, end in (("s", ""), ("cpu_s", "_cpu")):
+        took = [sum(found[path][f"{step}_{clock}"] for step in ("forward", "train")) for path in paths[2:4]]
+        figures[f"small.speedup_over_reference{end}"] = took[1] / took[0]
+    if device == "cpu":
+        figures |= {f"compositing.{name}": value for name, value in found["textbook"].items()}
+        figures["compositing.speedup_over_textbook"] = (
+            found["textbook"]["textbook_s"] / found["textbook"]["ours_s"]
+        )
+    return figures
+
+
+DEVICES = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+BENCHMARK = Benchmark(
+    question="How fast do cameras and lidars see a street of 200 k Gaussians?",
+    arms={device: lambda seed, device=device: measure(device) for device in DEVICES},  # type: ignore[misc]
+    seeds=(0,),
+)
+
+if __name__ == "__main__":
+    print(json.dumps(_measure_here(*sys.argv[1:])))
