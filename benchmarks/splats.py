@@ -1,15 +1,15 @@
 """How fast cameras and lidars see a street of Gaussians: `foredrive bench splats`.
 
-The street: ground, façades, parked cars and trees, covered by flat Gaussians side by side (as wide as their
-spacing, log-normal by a factor of e^0.5, an eighth as thick), spread evenly over the surfaces, so that near ones
-are large in the image and far ones small; 1 % large ones 200 m away stand for the far field. Opacities are spread
-from clear to opaque (logit 0.5 ± 2). The camera stands at its end and sees 0.9 of 200 k, the lidar (a Pandar64,
-64 × 1800 beams) in its middle. Both drive and turn, with rolling shutter. Projection, lists, compositing and, for
-training, the gradients of all parameters are timed together; each path runs in a process of its own.
+The street: ground, façades, parked cars and trees under flat Gaussians, spread evenly over the surfaces, so
+that near ones are large in the image and far ones small: 0.6 of their spacing wide (log-normal, by e^0.5), an
+eighth as thick, from clear to opaque (logit 0.5 ± 2); 1 % large ones 200 m away for the far field. The camera
+stands at its end and sees 0.9 of 200 k, the lidar (a Pandar64, 64 × 1800 beams) in its middle. Both drive and
+turn, with rolling shutter. Projection, lists, compositing and, for training, the gradients of all parameters
+are timed together; each path runs in a process of its own.
 
-Beside it: plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the textbook's loop, pixel
-by pixel over its tile's list, in numba (compositing alone, forward, on the same lists). No CPU rasteriser of
-Gaussians can be installed from PyPI.
+Beside it: plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the textbook's loop in
+numba, pixel by pixel over its tile's list (compositing alone, forward, on the same lists). No CPU rasteriser
+of Gaussians under a permissive licence was found on PyPI.
 """
 
 import json
@@ -56,53 +56,58 @@ class View(NamedTuple):
 def street(count: int, begin_m: float, end_m: float) -> Gaussians:
     """See this file's docstring; the street runs along x."""
     rng = torch.Generator().manual_seed(0)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=rng)
-
-    def along(n: int) -> Tensor:
-        return begin_m + (end_m - begin_m) * uniform(n)
-
-    shares = {"ground": 0.41, "fronts": 0.36, "cars": 0.1, "trees": 0.12}
-    n = {name: int(share * count) for name, share in shares.items()}
-    up, left = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0])
-    side = torch.where(uniform(n["fronts"]) < 0.5, -0.5, 0.5) * WIDTH_M
-    ground = torch.stack(
-        [along(n["ground"]), WIDTH_M * (uniform(n["ground"]) - 0.5), torch.zeros(n["ground"])], -1
-    )
-    fronts = torch.stack([along(n["fronts"]), side, HEIGHT_M * uniform(n["fronts"])], -1)
-    face = torch.nn.functional.one_hot(torch.randint(0, 3, (n["cars"],), generator=rng), 3).float()
-    on_box = torch.where(face > 0, uniform(n["cars"], 3).round(), uniform(n["cars"], 3)) - 0.5
-    car = torch.randint(0, CARS, (n["cars"],), generator=rng)
-    stands = torch.stack([begin_m + (end_m - begin_m) * car / CARS, torch.where(car % 2 == 0, -6.0, 5.0)], -1)
-    cars = torch.cat([stands, torch.full((n["cars"], 1), 0.8)], -1) + on_box * torch.tensor([4.4, 1.8, 1.5])
-    out = torch.nn.functional.normalize(torch.randn(n["trees"], 3, generator=rng), dim=-1)
-    tree = torch.randint(0, TREES, (n["trees"],), generator=rng)
-    stands = torch.stack(
-        [begin_m + (end_m - begin_m) * tree / TREES, torch.where(tree % 2 == 0, -9.0, 9.0)], -1
-    )
-    trees = (
-        torch.cat([stands, torch.full((n["trees"], 1), 4.0)], -1) + 2 * out * uniform(n["trees"], 1) ** 0.33
-    )
-    mean = torch.cat([ground, fronts, cars, trees])
-    normal = torch.cat([up.expand_as(ground), left.expand_as(fronts), face, out])
+    shares = ((_ground, 0.41), (_fronts, 0.36), (_cars, 0.1), (_trees, 0.12))
+    parts = [surface(int(share * count), rng) for surface, share in shares]
+    mean, normal = (torch.cat(both) for both in zip(*parts, strict=True))
+    mean = mean * torch.tensor([end_m - begin_m, 1, 1]) + torch.tensor([begin_m, 0, 0])
     area_m2 = (end_m - begin_m) * (WIDTH_M + 2 * HEIGHT_M) + 27 * CARS + 50 * TREES
-    log_scale = math.log(0.6 * math.sqrt(area_m2 / len(mean))) + 0.5 * torch.randn(
-        len(mean), 3, generator=rng
-    )
+    width_m = 0.6 * math.sqrt(area_m2 / len(mean))
+    log_scale = math.log(width_m) + 0.5 * torch.randn(len(mean), 3, generator=rng)
     log_scale[:, 2] -= 2.0
-    half_way = torch.cat(
-        [1.001 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], torch.zeros(len(mean), 1)], -1
-    )
-    far, around = count - len(mean), 2 * math.pi * uniform(count - len(mean))
-    sky = torch.stack([200 * around.cos(), 200 * around.sin(), 100 * uniform(far)], -1)
+    nx, ny, nz = normal.unbind(-1)
+    from_z = torch.stack([1.001 + nz, -ny, nx, torch.zeros_like(nx)], -1)  # turns z to the normal
+    far = count - len(mean)
+    around = 2 * math.pi * torch.rand(far, generator=rng)
+    sky = torch.stack([200 * around.cos(), 200 * around.sin(), 100 * torch.rand(far, generator=rng)], -1)
     return Gaussians(
         mean_m=torch.cat([mean, sky]),
-        quaternion=torch.cat([half_way, torch.tensor([1.0, 0, 0, 0]).expand(far, 4)]),
+        quaternion=torch.cat([from_z, torch.tensor([1.0, 0, 0, 0]).expand(far, 4)]),
         log_scale=torch.cat([log_scale, torch.full((far, 3), math.log(5.0))]),
         opacity_logit=0.5 + 2 * torch.randn(count, generator=rng),
-        feature=uniform(count, 3),
+        feature=torch.rand(count, 3, generator=rng),
     )
+
+
+def _ground(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points and normals; x from 0 to 1 along the street, y and z in m, here and in what follows."""
+    place = (torch.rand(n, 3, generator=rng) - torch.tensor([0, 0.5, 0])) * torch.tensor([1, WIDTH_M, 0])
+    return place, torch.tensor([0.0, 0, 1]).expand(n, 3)
+
+
+def _fronts(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    place = torch.rand(n, 3, generator=rng)
+    place[:, 1] = place[:, 1].round() - 0.5
+    return place * torch.tensor([1, WIDTH_M, HEIGHT_M]), torch.tensor([0.0, 1, 0]).expand(n, 3)
+
+
+def _cars(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    face = torch.nn.functional.one_hot(torch.randint(0, 3, (n,), generator=rng), 3).float()
+    within = torch.rand(n, 3, generator=rng)
+    within = torch.where(face > 0, within.round(), within) - 0.5
+    return _stands(n, CARS, 6.0, 0.8, rng) + within * torch.tensor([0.037, 1.8, 1.5]), face
+
+
+def _trees(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    out = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng), dim=-1)
+    within = out * torch.rand(n, 1, generator=rng) ** 0.33 * torch.tensor([0.017, 2, 2])
+    return _stands(n, TREES, 9.0, 4.0, rng) + within, out
+
+
+def _stands(n: int, many: int, aside_m: float, up_m: float, rng: torch.Generator) -> Tensor:
+    """For each point the middle of one of many things that stand on either side."""
+    k = torch.randint(0, many, (n,), generator=rng)
+    y = torch.where(k % 2 == 0, -aside_m, aside_m)
+    return torch.stack([k / many, y, torch.full((n,), up_m)], -1)
 
 
 def camera(count: int, size_hw: tuple[int, int], device: str) -> View:
@@ -228,7 +233,7 @@ def _measure_here(device: str, path: str) -> dict[str, float]:
 
 
 def measure(device: str) -> dict[str, float]:
-    """All figures of a device. Those "per CPU second" are of computing: what one core does if it does no more."""
+    """All figures of a device; those per CPU second are of computing, whatever else the machine does."""
     paths = ("camera", "lidar", "small", "reference", *(("textbook",) if device == "cpu" else ()))
     found = {path: in_a_process(__file__, device, path) for path in paths}
     figures: dict[str, float] = {"threads": float(torch.get_num_threads())}

@@ -44,9 +44,8 @@ def test_it_gives_what_the_reference_gives() -> None:
     truth = composite_splats_reference(exact, points)
     seen = composite_splats(fast, points.to("cuda"), median=False)
     assert seen.median_range_m.isnan().all()
-    upstream = torch.rand(
-        truth.feature.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
+    rng = torch.Generator().manual_seed(1)
+    upstream = torch.rand(truth.feature.shape, generator=rng, dtype=torch.float64)
     for name in ("feature", "expected_range_m", "alpha"):  # a few pixels lie next to a cut-off
         error = (getattr(seen, name).cpu().double() - getattr(truth, name)).abs()
         assert error.flatten().quantile(0.99) < 1e-3 * getattr(truth, name).abs().max()

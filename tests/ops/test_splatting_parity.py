@@ -159,6 +159,25 @@ def test_threads_change_nothing() -> None:
         assert torch.equal(one, other)
 
 
+def test_a_splat_wider_than_half_a_turn_is_seen_once() -> None:
+    """It reaches beams that look ahead from both sides."""
+    azimuth = torch.linspace(-0.5, 0.5, 40)
+    points = beam_points(azimuth, torch.zeros(40), torch.zeros(40))
+    wide = Splats(
+        mean=torch.tensor([[3.0, 0.0]]),
+        inverse_covariance=torch.tensor([[0.25, 0.0, 100.0]]),
+        opacity=torch.tensor([0.5]),
+        range_m=torch.tensor([9.0]),
+        range_slope=torch.zeros(1, 2),
+        velocity=torch.zeros(1, 2),
+        range_rate_mps=torch.zeros(1),
+        feature=torch.ones(1, 1),
+    )
+    truth = composite_splats(Splats(*(field.double() for field in wide)), points)
+    assert truth.alpha.max() < 0.5
+    torch.testing.assert_close(composite_splats(wide, points).alpha.double(), truth.alpha, rtol=1e-4, atol=0)
+
+
 def test_many_features_and_none() -> None:
     splats, points = image()
     wide = torch.rand(len(splats.mean), 37)

@@ -126,20 +126,34 @@ def _last_at_most(values, start, stop, x):
 
 @inlined_part
 @no_type_check
-def _list_row(row, tiles, r, x0, x1, turn, found, count):
-    """Add the tiles of row r that a splat touches between x0 and x1, which are so many turns away."""
-    first, last = tiles.first_tile[r], tiles.first_tile[r + 1]
-    if first == last:
-        return count
-    t = _last_at_most(tiles.left_edge, first, last, x0)
-    while t < last and tiles.left_edge[t] <= x1:
-        x = turned(row[MEAN_X], tiles.bounds[t], tiles.period)
-        nearest = tiles.period == 0 or abs(x - row[MEAN_X] - turn * tiles.period) < HALF * tiles.period
-        if nearest and touches(row, tiles.bounds[t], x):
-            if count < found.size:
-                found[count] = t
-            count += 1
-        t += 1
+def _list_box(row, tiles, box, turn, found, count):
+    """Add the tiles that a splat touches within a box, x0 x1 y0 y1, that is so many turns away from it."""
+    x0, x1, y0, y1 = box
+    rows = tiles.lower_edge.size
+    first_row = _last_at_most(tiles.lower_edge, 0, rows, y0)
+    r = first_row
+    while r < rows and tiles.lower_edge[r] <= y1:
+        first, last = tiles.first_tile[r], tiles.first_tile[r + 1]
+        first_here = _last_at_most(tiles.left_edge, first, last, x0)
+        t = first_here
+        while t < last and tiles.left_edge[t] <= x1:
+            bounds = tiles.bounds[t]
+            alone = r == first_row and t == first_here
+            alone = alone and (r + 1 == rows or tiles.lower_edge[r + 1] > y1)
+            alone = alone and (t + 1 == last or tiles.left_edge[t + 1] > x1)
+            x = turned(row[MEAN_X], bounds, tiles.period)
+            if abs(x - row[MEAN_X] - turn * tiles.period) > HALF * tiles.period:
+                yes = False  # another turn is nearer to this tile
+            elif alone:  # a small splat in one tile: a closer look would change little
+                yes = x0 <= bounds[1] and x1 >= bounds[0] and y0 <= bounds[3] and y1 >= bounds[2]
+            else:
+                yes = touches(row, bounds, x)
+            if yes:
+                if count < found.size:
+                    found[count] = t
+                count += 1
+            t += 1
+        r += 1
     return count
 
 
@@ -152,22 +166,20 @@ def list_tiles(start, stop, packed, tiles, per_splat, found):
     short for them, it has to be called again.
     """
     count = 0
-    rows = tiles.lower_edge.size
     turns = 1 if tiles.period > 0 else 0
+    half_turn = HALF * tiles.period
     for i in range(start, stop):
         row, before = packed[i], count
-        if row[LOG_OPACITY] >= LEAST and rows > 0:
+        if row[LOG_OPACITY] >= LEAST and tiles.lower_edge.size > 0:
             vx, vy, t0, t1 = row[VELOCITY_X], row[VELOCITY_Y], tiles.first_s, tiles.last_s
             x0 = row[MEAN_X] - row[REACH_X] + min(vx * t0, vx * t1)
             x1 = row[MEAN_X] + row[REACH_X] + max(vx * t0, vx * t1)
             y0 = row[MEAN_Y] - row[REACH_Y] + min(vy * t0, vy * t1)
             y1 = row[MEAN_Y] + row[REACH_Y] + max(vy * t0, vy * t1)
-            r = _last_at_most(tiles.lower_edge, 0, rows, y0)
-            while r < rows and tiles.lower_edge[r] <= y1:
-                for turn in range(-turns, turns + 1):
-                    away = turn * tiles.period
-                    count = _list_row(row, tiles, r, x0 + away, x1 + away, turn, found, count)
-                r += 1
+            for turn in range(-turns, turns + 1):
+                away = turn * tiles.period
+                if turns == 0 or (x1 + away >= -half_turn and x0 + away <= half_turn):
+                    count = _list_box(row, tiles, (x0 + away, x1 + away, y0, y1), turn, found, count)
         per_splat[i] = count - before
     return count
 
