@@ -68,6 +68,15 @@ def test_two_behind_each_other(dtype: torch.dtype) -> None:
 
 
 @BOTH
+def test_order_is_that_of_ranges_and_then_of_the_list(dtype: torch.dtype) -> None:
+    ranges = [3.0, -2.0, 3.0, 0.5, -7.0]
+    all_here = splats([[0.5, 0.5]] * 5, opacity=[0.5] * 5, range_m=ranges, dtype=dtype)
+    seen = composite_splats(all_here, pixel_points((1, 1)))
+    expected = torch.tensor([0.0625, 0.25, 0.03125, 0.125, 0.5], dtype=dtype)
+    torch.testing.assert_close(seen.feature[0], expected)
+
+
+@BOTH
 def test_opacity_saturates_and_rays_end(dtype: torch.dtype) -> None:
     """Three of opacity 1: each takes 0.999; the second would leave 1e-6, so the ray ends before it."""
     three = splats([[0.5, 0.5]] * 3, opacity=[1.0] * 3, range_m=[1.0, 2.0, 3.0], dtype=dtype)

@@ -187,9 +187,10 @@ def list_tiles(start, stop, packed, tiles, per_splat, found):
 @kernel
 @no_type_check
 def front_to_back(packed, order):
-    """Fill `order`, Int32[N], with the splats by ascending range (above 0), equal ones as they come.
+    """Fill `order`, Int32[N], with the splats by ascending range, equal ones as they come.
 
-    Radix sort by 11 bits at a time: the bits of positive float32 are ordered as they are themselves.
+    Radix sort by 11 bits at a time: the bits of positive float32 are ordered as they are themselves, those of
+    negative ones the other way round.
     """
     count = order.size
     keys, other_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
@@ -197,6 +198,7 @@ def front_to_back(packed, order):
     places = np.zeros((3, 2048), np.int32)
     for i in range(count):
         key = np.float32(packed[i, RANGE]).view(np.uint32)
+        key = ~key if key >> np.uint32(31) else key | np.uint32(1 << 31)
         keys[i], order[i] = key, i
         for digit in range(3):
             places[digit, (key >> np.uint32(11 * digit)) & np.uint32(2047)] += 1

@@ -38,7 +38,7 @@ class Splats(NamedTuple):
     opacity: Float[Tensor, "N"]
     """0 to 1."""
     range_m: Float[Tensor, "N"]
-    """Of the centre at time 0: depth along a camera's axis, or a lidar's range. Above 0."""
+    """Of the centre at time 0: depth along a camera's axis, or a lidar's range."""
     range_slope: Float[Tensor, "N 2"]
     """How range changes over the plane, m per px or rad."""
     velocity: Float[Tensor, "N 2"]
@@ -124,7 +124,7 @@ def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "
     from foredrive.ops.splatting_numba import CompositeSplats  # numba takes its time to be imported
 
     *where, feature = (field.float() for field in splats)
-    hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.float()
+    hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.detach().float()
     return _composited(
         CompositeSplats.apply(points.to("cpu", torch.float32), hits, feature, *where), hit_range_m is not None
     )
