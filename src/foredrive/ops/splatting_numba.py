@@ -53,13 +53,13 @@ class CompositeSplats(torch.autograd.Function):
             np.float32(points.period),
         )
         scene, first_slot = _list(raw, feature.numpy(), points)
-        out = feature.new_empty(points.count, feature.shape[1] + EXTRA)
-        seen = out.numpy()
+        seen = np.empty((points.count, feature.shape[1] + EXTRA), np.float32)  # numpy asks for huge pages
 
         def job(start: int, stop: int) -> None:
             composite_tiles(start, stop, scene, places, seen)
 
         in_parallel(job, len(points.index), grain=MIN_TILES)
+        out = torch.from_numpy(seen)
         ctx.save_for_backward(out, feature, *where)
         ctx.found = scene, places, first_slot
         return out
@@ -70,7 +70,8 @@ class CompositeSplats(torch.autograd.Function):
         """Gradients of the splats' fields."""
         out, feature, *where = ctx.saved_tensors
         scene, places, first_slot = ctx.found
-        pairs = torch.zeros(len(scene.splat), -(-(SUMS + feature.shape[1]) // ROW) * ROW).numpy()
+        columns = -(-(SUMS + feature.shape[1]) // ROW) * ROW
+        pairs = np.zeros((len(scene.splat), columns), np.float32)
         seen, upstream = out.numpy(), grad_out.contiguous().numpy()
 
         def look(start: int, stop: int) -> None:

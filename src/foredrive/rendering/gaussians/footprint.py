@@ -52,12 +52,12 @@ def in_sensor(
     twist_sensor: Float[Tensor, "6"] | None,
 ) -> InSensor:
     """The chosen Gaussians in a sensor's frame; the arguments are those of `project_camera`."""
-    gaussians = gaussians.map_tensors(lambda tensor: tensor.index_select(0, chosen))
-    position_m = position_m.index_select(1, chosen)
+    if len(chosen) < len(gaussians.mean_m):
+        gaussians = gaussians.map_tensors(lambda tensor: tensor.index_select(0, chosen))
+        position_m = position_m.index_select(1, chosen)
+        velocity_mps = None if velocity_mps is None else velocity_mps.index_select(0, chosen)
     R = T_sensor_scene[:3, :3]
-    velocity = torch.zeros_like(position_m)
-    if velocity_mps is not None:
-        velocity = R @ velocity_mps.index_select(0, chosen).T
+    velocity = torch.zeros_like(position_m) if velocity_mps is None else R @ velocity_mps.T
     if twist_sensor is not None:
         velocity = velocity - twist_sensor[:3, None] - hat(twist_sensor[3:]) @ position_m
     return InSensor(
@@ -72,7 +72,9 @@ def in_sensor(
 def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) -> Float[Tensor, "K 3 N"]:
     """J M for every Gaussian."""
     columns = [column.unbind() for column in factor.unbind(1)]
-    products = [j * x + k * y + m * z for j, k, m in jacobian for x, y, z in columns]
+    products = [
+        torch.addcmul(torch.addcmul(j * x, k, y), m, z) for j, k, m in jacobian for x, y, z in columns
+    ]
     return torch.stack(products).unflatten(0, jacobian.shape[:2])
 
 

@@ -27,14 +27,16 @@ class Gaussians(Record):
 
         Components come first because arithmetic on long vectors is many times as fast as on small matrices.
         """
-        w, x, y, z = self.quaternion.T.contiguous()
-        a, b, c = self.log_scale.exp().T.contiguous()
-        twice = 2 / (w * w + x * x + y * y + z * z)
-        wx, wy, wz = twice * w * x, twice * w * y, twice * w * z
-        xx, xy, xz, yy, yz, zz = (twice * i * j for i, j in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z)))
-        entries = [
-            *((1 - yy - zz) * a, (xy - wz) * b, (xz + wy) * c),
-            *((xy + wz) * a, (1 - xx - zz) * b, (yz - wx) * c),
-            *((xz - wy) * a, (yz + wx) * b, (1 - xx - yy) * c),
+        q = self.quaternion.T.contiguous()
+        w, x, y, z = (
+            q * (0.5 * (q * q).sum(0)).rsqrt()
+        )  # of length √2: products are twice those of the unit's
+        xx, yy, zz = x * x, y * y, z * z
+        xy, xz, yz = x * y, x * z, y * z
+        wx, wy, wz = w * x, w * y, w * z
+        rotation = [
+            *(1 - yy - zz, xy - wz, xz + wy),
+            *(xy + wz, 1 - xx - zz, yz - wx),
+            *(xz - wy, yz + wx, 1 - xx - yy),
         ]
-        return torch.stack(entries).unflatten(0, (3, 3))
+        return torch.stack(rotation).unflatten(0, (3, 3)) * self.log_scale.exp().T.contiguous()
