@@ -28,9 +28,7 @@ class Gaussians(Record):
         Components come first because arithmetic on long vectors is many times as fast as on small matrices.
         """
         q = self.quaternion.T.contiguous()
-        w, x, y, z = (
-            q * (0.5 * (q * q).sum(0)).rsqrt()
-        )  # of length √2: products are twice those of the unit's
+        w, x, y, z = q * (0.5 * (q * q).sum(0)).rsqrt()  # length √2: products are twice those of units
         xx, yy, zz = x * x, y * y, z * z
         xy, xz, yz = x * y, x * z, y * z
         wx, wy, wz = w * x, w * y, w * z
