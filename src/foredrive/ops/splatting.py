@@ -184,7 +184,7 @@ def _look(
     dx, dy = offset.unbind(-1)
     xx, xy, yy = splats.inverse_covariance[chosen][:, None].unbind(-1)
     exponent = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
-    alpha = (splats.opacity[chosen][:, None] * exponent.exp()).clamp(max=MAX_ALPHA)
+    alpha = (splats.opacity[chosen][:, None] * exponent.clamp(max=0).exp()).clamp(max=MAX_ALPHA)
     alpha = torch.where(listed & (alpha >= MIN_ALPHA), alpha, 0.0)
     passed = torch.cumprod(1 - alpha, -1)
     before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], -1)

@@ -48,8 +48,8 @@ POINTS = ROW * ROW
 ALL = np.uint32(0xFFFF)
 EXTRA = 4
 """Columns of a result behind the features: expected range, median range, alpha, alpha before the hit."""
-BATCH = 64
-"""Splats of a tile that are looked for at once: while one is fetched, others are."""
+BATCH, AHEAD = 64, 12
+"""Splats of a tile that are looked for at once, and how long before that they are fetched."""
 
 
 class Scene(NamedTuple):
@@ -127,8 +127,10 @@ def offsets(splat, rows, at, x):
 @no_type_check
 def opacity_at(splat, dx, dy):
     """The opacity of a splat at d, before it is cut off above."""
-    exponent = dx * (dx * splat[XX] + dy * splat[XY]) + (dy * dy * splat[YY] + splat[LOG_OPACITY])
-    opacity = exp2_row(exponent)
+    exponent = dx * (dx * splat[XX] + dy * splat[XY]) + dy * dy * splat[YY]
+    opacity = exp2_row(
+        least(exponent, ZERO) + splat[LOG_OPACITY]
+    )  # rounding may lift long thin splats above 0
     return where_more(MIN_ALPHA, opacity, ZERO, opacity)
 
 
@@ -188,9 +190,12 @@ def _add(splat, feature, base, state, dx, dy, t, hit):
 def look_for(scene, places, tile, begin, end, touched):
     """Fill `touched` with the blocks that the entries begin … end of a tile's list touch."""
     bounds, tile_bounds = places.block_bounds[tile], places.tile_bounds[tile]
+    last = scene.splat.size - 1
     for at in range(begin, end):
         splat = scene.packed[scene.splat[at]]
-        prefetch(scene.feature, scene.splat[at] * scene.feature.shape[1])
+        soon = scene.splat[min(at + AHEAD, last)]
+        prefetch(scene.packed, soon * scene.packed.shape[1])
+        prefetch(scene.feature, soon * scene.feature.shape[1])
         touched[at - begin] = blocks_touched(splat, bounds, turned(splat[MEAN_X], tile_bounds, places.period))
 
 
