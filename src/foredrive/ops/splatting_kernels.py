@@ -128,9 +128,7 @@ def offsets(splat, rows, at, x):
 def opacity_at(splat, dx, dy):
     """The opacity of a splat at d, before it is cut off above."""
     exponent = dx * (dx * splat[XX] + dy * splat[XY]) + dy * dy * splat[YY]
-    opacity = exp2_row(
-        least(exponent, ZERO) + splat[LOG_OPACITY]
-    )  # rounding may lift long thin splats above 0
+    opacity = exp2_row(least(exponent, ZERO) + splat[LOG_OPACITY])  # rounding may lift it above 0
     return where_more(MIN_ALPHA, opacity, ZERO, opacity)
 
 
