@@ -8,8 +8,8 @@ turn, with rolling shutter. Projection, lists, compositing and, for training, th
 are timed together; each path runs in a process of its own.
 
 Beside it: plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the textbook's loop in
-numba, pixel by pixel over its tile's list (compositing alone, forward, on the same lists). No CPU rasteriser
-of Gaussians under a permissive licence was found on PyPI.
+numba, pixel by pixel over its tile's list (compositing alone, forward, on the same lists). Rasterisers on
+PyPI that may run on a CPU (splax in JAX, gausscam) are not measured here.
 """
 
 import json
