@@ -182,3 +182,16 @@ def _track_velocity(
     out = np.empty_like(velocity)
     out[order] = velocity
     return out
+
+
+def no_boxes() -> Boxes:
+    """Boxes of a frame without any."""
+    return Boxes(
+        centre=torch.zeros(0, 3),
+        size_lwh=torch.zeros(0, 3),
+        yaw=torch.zeros(0),
+        velocity=torch.zeros(0, 2),
+        track_id=torch.zeros(0, dtype=torch.int64),
+        category=torch.zeros(0, dtype=torch.int64),
+        valid=torch.zeros(0, dtype=torch.bool),
+    )

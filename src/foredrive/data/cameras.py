@@ -41,6 +41,8 @@ class CameraFrame:
     """From the camera at the time of its middle row."""
     dist: Float[Tensor, "5"]
     readout_s: float
+    exposed_dt_s: float
+    """When the middle row is exposed, relative to the frame's time; 0 where there is no image."""
 
 
 def pinhole_cameras(log: Log) -> dict[str, PinholeCameraMetadata]:
@@ -73,6 +75,7 @@ def read_camera(
     file = log.file(metadata.modality_key)
     with reading(file, "the camera's poses"):
         T_ego_cam = _extrinsics(log, metadata.modality_key)[frame]
+        exposed_us = _exposed_us(log, metadata.modality_key)[frame]
     if np.isnan(T_ego_cam).any():
         raise InputError(f"{file}: the camera pose at frame {frame} is not finite")
     image = None
@@ -92,6 +95,7 @@ def read_camera(
         T_ego_cam=torch.from_numpy(T_ego_cam).float(),
         dist=torch.zeros(5) if ideal else torch.from_numpy(dist.array.copy()).float(),
         readout_s=last_s - first_s,
+        exposed_dt_s=float(exposed_us - log.t_us[frame]) * 1e-6,
     )
 
 
@@ -104,6 +108,18 @@ def _rows_exposed_s(log: Log, modality_key: str) -> tuple[float, float]:
         return (0.0, 0.0)
     readout_s = get_metadata_from_arrow_schema(table.schema, RollingCameraMetadata).readout_s
     return (-0.5 * readout_s, 0.5 * readout_s)
+
+
+@functools.lru_cache(maxsize=64)
+def _exposed_us(log: Log, modality_key: str) -> Float64[np.ndarray, "F"]:
+    """When the middle row is exposed at every frame, in the log's time; the frame's time without an image."""
+    exposed_us = log.t_us.astype(np.float64)
+    frames, rows = log.rows(modality_key)
+    table = get_modality_table(log.path.folder, modality_key)
+    if table is not None and len(rows):
+        stamp_us = table[f"{modality_key}.timestamp_us"].to_numpy()[rows]
+        exposed_us[frames] = stamp_us + 0.5e6 * sum(_rows_exposed_s(log, modality_key))
+    return exposed_us
 
 
 @functools.lru_cache(maxsize=64)
@@ -123,7 +139,7 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
     logged = column_array(table, f"{modality_key}.camera_to_global_se3")
     T_world_cam = pose_matrices(fixed_lists(logged, 7)[rows])
     T_stamped = log.poses_at(stamp_us)[0]
-    T_exposed = log.poses_at(stamp_us + 0.5e6 * sum(_rows_exposed_s(log, modality_key)))[0]
+    T_exposed = log.poses_at(_exposed_us(log, modality_key)[frames])[0]
     unlogged = logged.is_null().to_numpy(zero_copy_only=False)[rows]
     T_world_cam[unlogged] = T_stamped[unlogged] @ mounted
     T_ego_cam[frames] = (

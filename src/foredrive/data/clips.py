@@ -7,11 +7,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
-from torch import Tensor
+from jaxtyping import Float64
 from torch.utils.data import Dataset
 
-from foredrive.data.boxes import read_boxes
+from foredrive.data.boxes import no_boxes, read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.collate import stack_records
 from foredrive.data.commands import command_at, target_at
@@ -22,8 +21,9 @@ from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_taught_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
+from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
-from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
+from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,14 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clips[index]
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
-        images, image_valid, rig = self._read_cameras(number, frames)
+        images, image_valid, rig = read_rig(
+            log,
+            frames,
+            [find_camera(self._cameras[number], name) for name in self.camera_names],
+            self.camera_names,
+            self._images,
+            frames if config.future_images else frames[: config.past_frames + 1],
+        )
         sweeps = [read_sweep(log, frame) if config.lidar else None for frame in frames]
         boxes = [read_boxes(log, frame) for frame in frames]
         speed_mps = torch.from_numpy(log.speed_mps[frames]).float()
@@ -177,10 +184,10 @@ class ClipDataset(Dataset[Example]):
             images=images,
             image_valid=image_valid,
             rig=rig,
-            sweeps=_stack_sweeps([sweep[0] if sweep else None for sweep in sweeps]),
+            sweeps=stack_records([empty_sweep() if sweep is None else sweep[0] for sweep in sweeps]),
             sweep_valid=torch.tensor([sweep is not None for sweep in sweeps]),
             misses_known=torch.tensor([sweep is not None and sweep[1] for sweep in sweeps]),
-            boxes=stack_records([_no_boxes() if b is None else b for b in boxes]),
+            boxes=stack_records([no_boxes() if b is None else b for b in boxes]),
             boxes_valid=torch.tensor([b is not None for b in boxes]),
             ego_speed_mps=speed_mps.nan_to_num(),
             ego_speed_valid=speed_mps.isfinite(),
@@ -191,39 +198,6 @@ class ClipDataset(Dataset[Example]):
             future=self._future(log, now),
             map=read_map_patch(log, now) if config.map else None,
         )
-
-    def _read_cameras(
-        self, number: int, frames: list[int]
-    ) -> tuple[UInt8[Tensor, "T C 3 H W"], Bool[Tensor, "T C"], CameraRig]:
-        """Images, which of them are there, and the rig; a camera that the log lacks has identity matrices."""
-        names, image_hw = self.camera_names, self.config.image_hw
-        shape = (len(frames), len(names))
-        images = torch.zeros(*shape, 3, *image_hw, dtype=torch.uint8)
-        image_valid = torch.zeros(shape, dtype=torch.bool)
-        K = torch.eye(3).repeat(*shape, 1, 1)
-        T_ego_cam = torch.eye(4).repeat(*shape, 1, 1)
-        dist = torch.zeros(*shape, 5)
-        readout_s = torch.zeros(shape)
-        for c, name in enumerate(names):
-            metadata = find_camera(self._cameras[number], name)
-            if metadata is None:
-                continue
-            for t, frame in enumerate(frames):
-                with_image = self.config.future_images or t <= self.config.past_frames
-                camera = self._images.camera(self._logs[number], frame, metadata, with_image)
-                K[t, c], T_ego_cam[t, c], dist[t, c] = camera.K, camera.T_ego_cam, camera.dist
-                readout_s[t, c] = camera.readout_s
-                if camera.image is not None:
-                    images[t, c], image_valid[t, c] = camera.image, True
-        rig = CameraRig(
-            K=K,
-            T_ego_cam=T_ego_cam,
-            dist=dist,
-            readout_s=readout_s,
-            names=names,
-            size_hw=image_hw,
-        )
-        return images, image_valid, rig
 
 
 def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
@@ -265,20 +239,4 @@ def _at_times(plan: Trajectory, times_s: Float64[np.ndarray, "T"]) -> Trajectory
         valid=torch.from_numpy(times_s <= known_s[-1] + 1e-6)[None],
         log_prob=plan.log_prob,
         dt_s=float(times_s[0]),
-    )
-
-
-def _stack_sweeps(sweeps: list[LidarSweep | None]) -> LidarSweep:
-    return stack_records([empty_sweep() if sweep is None else sweep for sweep in sweeps])
-
-
-def _no_boxes() -> Boxes:
-    return Boxes(
-        centre=torch.zeros(0, 3),
-        size_lwh=torch.zeros(0, 3),
-        yaw=torch.zeros(0),
-        velocity=torch.zeros(0, 2),
-        track_id=torch.zeros(0, dtype=torch.int64),
-        category=torch.zeros(0, dtype=torch.int64),
-        valid=torch.zeros(0, dtype=torch.bool),
     )

@@ -28,19 +28,19 @@ class ImageStore:
 
     def __init__(self, cache_dir: Path | None, image_hw: tuple[int, int]) -> None:
         self._folder = None if cache_dir is None else Path(cache_dir) / "images"
-        self._image_hw = image_hw
+        self.image_hw = image_hw
 
     def camera(self, log: Log, frame: int, metadata: PinholeCameraMetadata, with_image: bool) -> CameraFrame:
         """One camera at one frame, as `read_camera` does it."""
-        shrinks = metadata.width * metadata.height > self._image_hw[0] * self._image_hw[1]
+        shrinks = metadata.width * metadata.height > self.image_hw[0] * self.image_hw[1]
         if self._folder is None or not with_image or not shrinks:
-            return read_camera(log, frame, metadata, self._image_hw, with_image)
+            return read_camera(log, frame, metadata, self.image_hw, with_image)
         file = self._file(self._folder, log, frame, metadata)
-        image = _read_entry(file, (3, *self._image_hw))
+        image = _read_entry(file, (3, *self.image_hw))
         if image is not None:
-            camera = read_camera(log, frame, metadata, self._image_hw, with_image=False)
+            camera = read_camera(log, frame, metadata, self.image_hw, with_image=False)
             return dataclasses.replace(camera, image=torch.from_numpy(image))
-        camera = read_camera(log, frame, metadata, self._image_hw, with_image)
+        camera = read_camera(log, frame, metadata, self.image_hw, with_image)
         if camera.image is not None:
             with atomic_path(file) as temporary, temporary.open("wb") as out:
                 np.save(out, camera.image.numpy())
@@ -49,7 +49,7 @@ class ImageStore:
     def _file(self, folder: Path, log: Log, frame: int, metadata: PinholeCameraMetadata) -> Path:
         source = log.file(metadata.modality_key)
         stat = source.stat()
-        key = (IMAGE_VERSION, str(source), stat.st_size, stat.st_mtime_ns, frame, self._image_hw)
+        key = (IMAGE_VERSION, str(source), stat.st_size, stat.st_mtime_ns, frame, self.image_hw)
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return folder / name[:2] / f"{name}.npy"
 

@@ -29,3 +29,5 @@ class CameraRig(Record):
     """C camera names in the order of the C dimension, the same for the whole batch."""
     size_hw: tuple[int, int]
     """Height and width of the images, px."""
+    exposed_dt_s: Float[Tensor, "*b C"] | None = None
+    """When the middle row is exposed, relative to the frame's time, s; None: at the frame's time."""

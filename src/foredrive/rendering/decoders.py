@@ -1,0 +1,77 @@
+"""From composited features to what sensors report (Hess et al., "SplatAD", 2025, §3.4)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+ALBEDO = 3
+"""Leading features that are colour already."""
+_LAST_LAYER_GAIN = 1e-2
+"""At first an image is little else than its albedo."""
+
+
+class CameraDecoder(nn.Module):
+    """Colour that depends on view and camera: rgb = albedo · (1 + s) + b, with s, b from a small CNN over the
+    other features, the camera's appearance and the viewing direction.
+    """
+
+    def __init__(self, features: int, cameras: int, appearance: int = 8, width: int = 32) -> None:
+        """A decoder for `features` features beside albedo."""
+        super().__init__()
+        self.appearance = nn.Parameter(0.1 * torch.randn(cameras, appearance))
+        last = nn.Conv2d(width, 2 * ALBEDO, 1)
+        with torch.no_grad():
+            last.weight *= _LAST_LAYER_GAIN
+            last.bias.zero_()  # type: ignore[union-attr]
+        self.net = nn.Sequential(
+            nn.Conv2d(features + appearance + 3, width, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.ReLU(),
+            last,
+        )
+
+    def forward(
+        self, feature: Float[Tensor, "H W D"], direction: Float[Tensor, "H W 3"], camera: int
+    ) -> Float[Tensor, "3 H W"]:
+        """Linear in albedo, not clamped.
+
+        Args:
+            feature: composited albedo and features.
+            direction: unit viewing direction in the scene's frame.
+            camera: which of the rig.
+        """
+        albedo = feature[..., :ALBEDO].permute(2, 0, 1)
+        appearance = self.appearance[camera].expand(*feature.shape[:2], -1)
+        seen = torch.cat([feature[..., ALBEDO:], appearance, direction], dim=-1)
+        gain, offset = self.net(seen.permute(2, 0, 1)[None])[0].split(ALBEDO)
+        return albedo * (1 + gain) + offset
+
+
+class LidarDecoder(nn.Module):
+    """Intensity and ray drop of beams, by an MLP over features, the lidar's appearance and the direction."""
+
+    def __init__(self, features: int, appearance: int = 8, width: int = 32) -> None:
+        """A decoder for `features` features beside albedo."""
+        super().__init__()
+        self.appearance = nn.Parameter(0.1 * torch.randn(appearance))
+        self.net = nn.Sequential(
+            nn.Linear(features + appearance + 3, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, 2),
+        )
+
+    def forward(
+        self, feature: Float[Tensor, "P D"], direction: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
+        """Intensity in 0 to 1, and the logit of the probability that the beam does not return.
+
+        Args:
+            feature: composited albedo and features.
+            direction: unit direction of the beams in the scene's frame.
+        """
+        appearance = self.appearance.expand(len(feature), -1)
+        intensity, drop = self.net(torch.cat([feature[:, ALBEDO:], appearance, direction], dim=-1)).unbind(-1)
+        return intensity.sigmoid(), drop

@@ -1,0 +1,220 @@
+"""A rebuilt scene: Gaussians, tracks, sensor corrections and decoders, all of which are learned."""
+
+import functools
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors, sensor_twist
+from foredrive.ops.splat_points import TiledPoints, pixel_points
+from foredrive.ops.splatting import composite_splats
+from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
+from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
+from foredrive.rendering.scene_graph import SceneGraph, place
+from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.sensors import TimedRays
+
+BACKGROUND = 0.5
+"""Albedo of what no Gaussian covers."""
+_LEAST_ALPHA = 1e-6
+
+
+@dataclass(frozen=True)
+class CameraPicture:
+    """A rendered image."""
+
+    rgb: Float[Tensor, "3 H W"]
+    """Not clamped."""
+    range_m: Float[Tensor, "H W"]
+    """Expected depth along the camera's axis of the light that something stopped."""
+    alpha: Float[Tensor, "H W"]
+
+
+@dataclass(frozen=True)
+class SweepPicture:
+    """A rendered sweep, beam by beam."""
+
+    range_m: Float[Tensor, "P"]
+    """Expected range of the light that something stopped."""
+    median_range_m: Float[Tensor, "P"]
+    """Infinite where less than half was stopped; without gradient."""
+    intensity: Float[Tensor, "P"]
+    drop_logit: Float[Tensor, "P"]
+    """Of the probability that the beam does not return."""
+    alpha: Float[Tensor, "P"]
+    alpha_before_hit: Float[Tensor, "P"] | None
+
+
+@dataclass(frozen=True)
+class SweepPoints:
+    """A sweep's beams as they are composited: prepared once, used in every step."""
+
+    tiles: TiledPoints
+    dir_scene: Float[Tensor, "P 3"]
+    T_scene_lidar: Float[Tensor, "4 4"]
+    twist_lidar: Float[Tensor, "6"]
+
+
+class RebuiltScene(nn.Module):
+    """What is learned of a log.
+
+    Args:
+        graph: to begin with.
+        cameras: in the rig.
+        rolling: sensors look at different times within an image or a sweep; False takes all rows and beams
+            to be of one moment.
+    """
+
+    actor: Tensor
+    category: Tensor
+    key_t_s: Tensor
+    present: Tensor
+    size_lwh: Tensor
+    track_id: Tensor
+    T_scene_actor: Tensor
+
+    def __init__(self, graph: SceneGraph, cameras: int, rolling: bool = True) -> None:
+        super().__init__()
+        own = graph.gaussians
+        self.mean_m = nn.Parameter(own.mean_m)
+        self.quaternion = nn.Parameter(own.quaternion)
+        self.log_scale = nn.Parameter(own.log_scale)
+        self.opacity_logit = nn.Parameter(own.opacity_logit)
+        self.albedo = nn.Parameter(own.feature[:, :ALBEDO])
+        self.feature = nn.Parameter(own.feature[:, ALBEDO:])
+        self.register_buffer("actor", graph.actor)
+        tracks = graph.tracks
+        for name in ("track_id", "category", "size_lwh", "T_scene_actor", "present"):
+            self.register_buffer(name, getattr(tracks, name))
+        self.register_buffer("key_t_s", tracks.t_s)
+        self.actor_offset = nn.Parameter(torch.zeros(*tracks.present.shape, 6))
+        """Of key poses, in the actors' own axes: m, rad."""
+        self.camera_offset = nn.Parameter(torch.zeros(cameras, 6))
+        """Of where each camera is mounted, in its own axes: m, rad."""
+        self.camera_twist = nn.Parameter(torch.zeros(cameras, 6))
+        """What is added to each camera's velocity and turn rate."""
+        self.camera_late_s = nn.Parameter(torch.zeros(cameras))
+        """How much later than it says each camera exposes."""
+        features = self.feature.shape[1]
+        self.camera_decoder = CameraDecoder(features, cameras)
+        self.lidar_decoder = LidarDecoder(features)
+        self.rolling = rolling
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """All Gaussians, those of actors in their own frames."""
+        feature = torch.cat([self.albedo, self.feature], dim=-1)
+        return Gaussians(self.mean_m, self.quaternion, self.log_scale, self.opacity_logit, feature)
+
+    @property
+    def tracks(self) -> Tracks:
+        """Tracks with the offsets that were learned."""
+        logged = Tracks(
+            self.track_id, self.category, self.size_lwh, self.key_t_s, self.T_scene_actor, self.present
+        )
+        return logged.moved(self.actor_offset)
+
+    @property
+    def graph(self) -> SceneGraph:
+        """The scene as it is now."""
+        return SceneGraph(self.gaussians, self.actor, self.tracks)
+
+    def forward(
+        self, graph: SceneGraph, view: CameraView, mirror: Bool[Tensor, "A"] | None = None
+    ) -> CameraPicture:
+        """Render an image.
+
+        Args:
+            graph: this scene, or one made of it by edits.
+            view: the camera; what its image shows is not looked at.
+            mirror: see `place`.
+        """
+        late_s, twist = self.camera_late_s[view.sensor], view.twist_cam + self.camera_twist[view.sensor]
+        T_scene_cam = view.T_scene_cam @ exp_se3(self.camera_offset[view.sensor]) @ exp_se3(late_s * twist)
+        placed = place(graph, view.t_s + late_s, mirror)
+        splats = project_camera(
+            placed.gaussians,
+            inverse_se3(T_scene_cam),
+            view.K,
+            view.dist,
+            view.size_hw,
+            velocity_mps=placed.velocity_mps,
+            twist_cam=twist,
+        )
+        seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.rolling else 0.0))
+        empty = (1 - seen.alpha)[:, None]
+        background = seen.feature.new_tensor([BACKGROUND] * ALBEDO)
+        feature = torch.cat([seen.feature[:, :ALBEDO] + empty * background, seen.feature[:, ALBEDO:]], dim=-1)
+        rays = pixels_to_rays(pixel_centres(view.size_hw).to(view.K).flatten(0, 1), view.K, view.dist)
+        direction = rotate_vectors(view.T_scene_cam, rays)
+        alpha = seen.alpha.unflatten(0, view.size_hw)
+        return CameraPicture(
+            rgb=self.camera_decoder(
+                feature.unflatten(0, view.size_hw), direction.unflatten(0, view.size_hw), view.sensor
+            ),
+            range_m=seen.expected_range_m.unflatten(0, view.size_hw) / alpha.clamp_min(_LEAST_ALPHA),
+            alpha=alpha,
+        )
+
+    def prepare_sweep(self, view: SweepView) -> SweepPoints:
+        """A sweep's beams in the lidar's frame: the vehicle's axes, where the lidar is then."""
+        beams = view.beams
+        rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
+        T_ego_lidar = torch.eye(4).to(beams.origin_ego)
+        if len(beams.dt_s):
+            T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
+        twist = view.twist_ego
+        tiles = lidar_points(rays, T_ego_lidar, twist)
+        if not self.rolling:
+            rays = TimedRays(rays.origin_ego, rays.dir_ego, torch.zeros_like(rays.dt_s))
+            tiles = lidar_points(rays, T_ego_lidar, torch.zeros_like(twist))
+        return SweepPoints(
+            tiles=tiles,
+            dir_scene=rotate_vectors(view.T_scene_ego, beams.dir_ego),
+            T_scene_lidar=view.T_scene_ego @ T_ego_lidar,
+            twist_lidar=sensor_twist(T_ego_lidar, twist),
+        )
+
+    def sweep(
+        self,
+        graph: SceneGraph,
+        points: SweepPoints,
+        t_s: float,
+        hit_range_m: Float[Tensor, "P"] | None = None,
+        mirror: Bool[Tensor, "A"] | None = None,
+    ) -> SweepPicture:
+        """Render a sweep.
+
+        Args:
+            graph: this scene, or one made of it by edits.
+            points: from `prepare_sweep`.
+            t_s: the sweep's time.
+            hit_range_m: see `composite_splats`.
+            mirror: see `place`.
+        """
+        placed = place(graph, t_s, mirror)
+        splats = project_lidar(
+            placed.gaussians,
+            inverse_se3(points.T_scene_lidar),
+            velocity_mps=placed.velocity_mps,
+            twist_lidar=points.twist_lidar,
+        )
+        seen = composite_splats(splats, points.tiles, hit_range_m)
+        intensity, drop_logit = self.lidar_decoder(seen.feature, points.dir_scene)
+        return SweepPicture(
+            range_m=seen.expected_range_m / seen.alpha.clamp_min(_LEAST_ALPHA),
+            median_range_m=seen.median_range_m,
+            intensity=intensity,
+            drop_logit=drop_logit,
+            alpha=seen.alpha,
+            alpha_before_hit=seen.alpha_before_hit,
+        )
+
+
+@functools.lru_cache(maxsize=16)
+def _pixels(size_hw: tuple[int, int], readout_s: float) -> TiledPoints:
+    return pixel_points(size_hw, readout_s)

@@ -1,0 +1,100 @@
+"""A scene: what stands and what moves, each with its own Gaussians, put together for one moment."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.geometry.quaternions import multiply, quaternion_of
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.scene.record import Record
+
+STATIC = -1
+"""Stands for no actor."""
+_MIRROR_XYZ = (1.0, -1.0, 1.0)
+_MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
+"""Mirroring y turns a rotation about the axis a by θ into one about (-aₓ, a_y, -a_z)."""
+
+
+@dataclass(frozen=True)
+class SceneGraph(Record):
+    """N Gaussians of a static part and of A actors."""
+
+    gaussians: Gaussians
+    """The static part's in the scene's frame, those of actors in the frame of their boxes."""
+    actor: Int[Tensor, "N"]
+    """Row in `tracks`, or `STATIC`."""
+    tracks: Tracks
+
+    def of_actor(self, row: int) -> Gaussians:
+        """The Gaussians of an actor, in its frame; of the static part for `STATIC`."""
+        return self.gaussians[self.actor == row]
+
+
+@dataclass(frozen=True)
+class Placed(Record):
+    """M of a scene's Gaussians where they are at one moment."""
+
+    gaussians: Gaussians
+    """In the scene's frame."""
+    velocity_mps: Float[Tensor, "M 3"]
+    """Of their centres, in the scene's axes."""
+    source: Int[Tensor, "M"]
+    """Which of the scene's Gaussians each is."""
+
+
+def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None) -> Placed:
+    """The static part, and every actor that is there at a time, turned and moving with its Gaussians.
+
+    Args:
+        graph: the scene.
+        t_s: seconds since the drive's start.
+        mirror: actors whose left and right change sides; None: none.
+    """
+    states = states_at(graph.tracks, t_s)
+    shown = torch.cat([states.present, states.present.new_ones(1)])[graph.actor]  # -1 is the last entry
+    moving = (shown & (graph.actor >= 0)).nonzero()[:, 0]
+    still = (graph.actor < 0).nonzero()[:, 0]
+    standing = graph.gaussians[still]
+    if len(moving) == 0:
+        return Placed(standing, torch.zeros_like(standing.mean_m), still)
+    owner = graph.actor[moving]
+    own = graph.gaussians[moving]
+    if mirror is not None:
+        own = _mirrored(own, mirror[owner])
+    T = states.T_scene_actor
+    R = T[:, :3, :3]
+    arm = (R[owner] @ own.mean_m[..., None])[..., 0]
+    moved = dataclasses.replace(
+        own,
+        mean_m=T[owner, :3, 3] + arm,
+        quaternion=multiply(quaternion_of(R)[owner], own.quaternion),
+    )
+    velocity = states.velocity_mps[owner] + torch.linalg.cross(states.turn_radps[owner], arm)
+    return Placed(
+        gaussians=joined([standing, moved]),
+        velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),
+        source=torch.cat([still, moving]),
+    )
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """Several sets of Gaussians as one."""
+    names = [field.name for field in dataclasses.fields(Gaussians)]
+    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Left and right exchanged: y to -y, in the frame of the box."""
+    return _mirrored(gaussians, torch.ones_like(gaussians.opacity_logit, dtype=torch.bool))
+
+
+def _mirrored(gaussians: Gaussians, which: Bool[Tensor, "M"]) -> Gaussians:
+    xyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_XYZ), 1.0)
+    wxyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_WXYZ), 1.0)
+    return dataclasses.replace(
+        gaussians, mean_m=gaussians.mean_m * xyz, quaternion=gaussians.quaternion * wxyz
+    )

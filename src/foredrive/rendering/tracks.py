@@ -1,0 +1,146 @@
+"""Where tracked actors are at any time: key poses, offsets that can be learned, and motion between them."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import exp_se3, inverse_se3, log_so3, matrix_from_yaw
+from foredrive.scene import Category, Clip
+from foredrive.scene.record import Record
+
+MIRRORED = (
+    *(Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER),
+    *(Category.CONSTRUCTION_VEHICLE, Category.MOTORCYCLE, Category.BICYCLE),
+)
+"""What looks the same from both sides."""
+LONGEST_STAY_S = 0.5
+"""How long before and after it an actor stays that was seen at one time alone."""
+
+
+@dataclass(frozen=True)
+class Tracks(Record):
+    """A rigid actors at K common key times, in the scene's frame; an actor's frame is its box's."""
+
+    track_id: Int[Tensor, "A"]
+    category: Int[Tensor, "A"]
+    """A `Category`."""
+    size_lwh: Float[Tensor, "A 3"]
+    """m."""
+    t_s: Float[Tensor, "K"]
+    """Key times in ascending order; all actors share them."""
+    T_scene_actor: Float[Tensor, "A K 4 4"]
+    present: Bool[Tensor, "A K"]
+    """Whether an actor is there; poses where it is not mean nothing."""
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    @property
+    def mirrored(self) -> Bool[Tensor, "A"]:
+        """Which actors look the same from both sides."""
+        return torch.isin(self.category, torch.tensor(MIRRORED, device=self.category.device))
+
+    def index_of(self, track_id: int) -> int:
+        """Row of an actor.
+
+        Raises:
+            InputError: naming the actors there are, if there is none of this id.
+        """
+        rows = (self.track_id == track_id).nonzero()
+        if len(rows) == 0:
+            known = ", ".join(str(i) for i in self.track_id.tolist()) or "none"
+            raise InputError(f"no actor {track_id}; there are: {known}")
+        return int(rows[0])
+
+    def moved(self, offset: Float[Tensor, "A K 6"]) -> "Tracks":
+        """With every key pose changed in the actor's own frame by exp(offset): m, then rad."""
+        return dataclasses.replace(self, T_scene_actor=self.T_scene_actor @ exp_se3(offset))
+
+
+@dataclass(frozen=True)
+class ActorStates(Record):
+    """A actors at one moment."""
+
+    T_scene_actor: Float[Tensor, "A 4 4"]
+    velocity_mps: Float[Tensor, "A 3"]
+    """Of the actor's origin, in the scene's axes."""
+    turn_radps: Float[Tensor, "A 3"]
+    """Angular velocity in the scene's axes."""
+    present: Bool[Tensor, "A"]
+
+
+def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
+    """All actors at a time: positions on straight lines between key poses, rotations about one axis.
+
+    An actor is there between two key times if it is there at both. Before the first key time and after the
+    last, by at most one step between key times, it goes on as it moved; one key time alone stands still.
+
+    Differentiable in the poses and in `t_s`, where it is a tensor.
+    """
+    if len(tracks.t_s) == 1:
+        near = abs(float(tracks.t_s[0]) - float(t_s)) <= LONGEST_STAY_S
+        still = torch.zeros(len(tracks), 3).to(tracks.T_scene_actor)
+        return ActorStates(tracks.T_scene_actor[:, 0], still, still, tracks.present[:, 0] & near)
+    after = int(torch.searchsorted(tracks.t_s, float(t_s)))
+    after = min(max(after, 1), len(tracks.t_s) - 1)
+    step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
+    share = (t_s - float(tracks.t_s[after - 1])) / step_s
+    T0, T1 = tracks.T_scene_actor[:, after - 1], tracks.T_scene_actor[:, after]
+    turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in the actor's axes
+    way = T1[:, :3, 3] - T0[:, :3, 3]
+    T = T0 @ exp_se3(torch.cat([torch.zeros_like(turn), share * turn], dim=-1))
+    T = torch.cat([T[..., :3], T[..., 3:] + share * (T1 - T0)[..., 3:]], dim=-1)
+    return ActorStates(
+        T_scene_actor=T,
+        velocity_mps=way / step_s,
+        turn_radps=(T0[:, :3, :3] @ turn[..., None])[..., 0] / step_s,
+        present=tracks.present[:, after - 1] & tracks.present[:, after] & (-1.0 <= float(share) <= 2.0),
+    )
+
+
+def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:
+    """The tracks of an unbatched clip, in the scene's frame; key times are those of its frames.
+
+    Gaps between two sightings are filled with motion from one to the other, and an actor stays for one frame
+    before its first and after its last sighting, moving on as it did.
+    """
+    boxes = clip.boxes
+    T_scene_ego = (inverse_se3(T_world_scene) @ clip.T_world_ego).float()
+    T_scene_box = T_scene_ego[:, None] @ matrix_from_yaw(boxes.yaw, boxes.centre)
+    seen = boxes.valid & clip.boxes_valid[:, None]
+    ids = boxes.track_id[seen].unique()
+    frames = len(clip.t_s)
+    poses = torch.eye(4).repeat(len(ids), frames, 1, 1)
+    present = torch.zeros(len(ids), frames, dtype=torch.bool)
+    size, category = torch.zeros(len(ids), 3), torch.zeros(len(ids), dtype=torch.int64)
+    for a, track_id in enumerate(ids):
+        t, m = (seen & (boxes.track_id == track_id)).nonzero(as_tuple=True)
+        poses[a, t], present[a, t] = T_scene_box[t, m], True
+        size[a] = boxes.size_lwh[t, m].median(0).values
+        category[a] = boxes.category[t, m].mode().values
+    return _filled(Tracks(ids, category, size, clip.t_s, poses, present))
+
+
+def _filled(tracks: Tracks) -> Tracks:
+    """With poses between an actor's sightings and one key time around them."""
+    poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()
+    for a in range(len(tracks)):
+        keys = tracks.present[a].nonzero()[:, 0]
+        one = slice(a, a + 1)
+        sightings = Tracks(
+            tracks.track_id[one],
+            tracks.category[one],
+            tracks.size_lwh[one],
+            tracks.t_s[keys],
+            tracks.T_scene_actor[one, keys],
+            tracks.present[one, keys],
+        )
+        for k in range(max(int(keys[0]) - 1, 0), min(int(keys[-1]) + 2, len(tracks.t_s))):
+            if not tracks.present[a, k]:
+                poses[a, k] = states_at(sightings, float(tracks.t_s[k])).T_scene_actor[0]
+                present[a, k] = True
+    return dataclasses.replace(tracks, T_scene_actor=poses, present=present)

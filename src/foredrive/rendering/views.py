@@ -1,0 +1,118 @@
+"""What sensors saw, as rendering compares with it: one image or one sweep, placed and timed in the scene."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Float64, UInt8
+from torch import Tensor
+
+from foredrive.geometry.se3 import inverse_se3, log_so3, sensor_twist
+from foredrive.scene import Clip, LidarSweep
+from foredrive.scene.record import Record
+
+
+@dataclass(frozen=True)
+class CameraView(Record):
+    """A camera at one exposure."""
+
+    K: Float[Tensor, "3 3"]
+    dist: Float[Tensor, "5"]
+    T_scene_cam: Float[Tensor, "4 4"]
+    """When the middle row is exposed."""
+    twist_cam: Float[Tensor, "6"]
+    """Velocity (m/s), then turn rate (rad/s) of the camera over ground, in its own axes."""
+    t_s: float
+    """When the middle row is exposed, since the drive's start."""
+    readout_s: float
+    """From the first to the last row; 0 is a global shutter."""
+    size_hw: tuple[int, int]
+    sensor: int
+    """Which camera of the rig."""
+    image: UInt8[Tensor, "3 H W"] | None = None
+
+    def shrunk(self, factor: int) -> "CameraView":
+        """The view at a lower resolution, the image averaged."""
+        height, width = self.size_hw
+        size_hw = (max(height // factor, 1), max(width // factor, 1))
+        if factor == 1:
+            return self
+        scale = torch.tensor([size_hw[1] / width, size_hw[0] / height, 1.0]).to(self.K)
+        image = self.image
+        if image is not None:
+            image = F.interpolate(image[None].float(), size_hw, mode="area")[0].round().to(torch.uint8)
+        return dataclasses.replace(self, K=scale[:, None] * self.K, size_hw=size_hw, image=image)
+
+
+@dataclass(frozen=True)
+class SweepView(Record):
+    """A lidar revolution: its beams in the ego frame of time `t_s`."""
+
+    beams: LidarSweep
+    """Those that are rendered and compared with, all valid."""
+    misses_known: bool
+    T_scene_ego: Float[Tensor, "4 4"]
+    twist_ego: Float[Tensor, "6"]
+    """Velocity (m/s), then turn rate (rad/s) of the ego vehicle over ground, in its own axes."""
+    t_s: float
+
+
+def camera_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[list[CameraView]]:
+    """The images of an unbatched clip, by camera, in the order of time; cameras without images have none."""
+    T_scene_ego = _scene_poses(clip, T_world_scene)
+    twists = ego_twists(clip)
+    rig = clip.rig
+    views: list[list[CameraView]] = [[] for _ in rig.names]
+    for frame, camera in clip.image_valid.nonzero().tolist():
+        T_ego_cam = rig.T_ego_cam[frame, camera]
+        late_s = 0.0 if rig.exposed_dt_s is None else float(rig.exposed_dt_s[frame, camera])
+        views[camera].append(
+            CameraView(
+                K=rig.K[frame, camera],
+                dist=rig.dist[frame, camera],
+                T_scene_cam=T_scene_ego[frame] @ T_ego_cam,
+                twist_cam=sensor_twist(T_ego_cam, twists[frame]),
+                t_s=float(clip.t_s[frame]) + late_s,
+                readout_s=float(rig.readout_s[frame, camera]),
+                size_hw=rig.size_hw,
+                sensor=camera,
+                image=clip.images[frame, camera],
+            )
+        )
+    return views
+
+
+def sweep_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[SweepView]:
+    """The sweeps of an unbatched clip in the order of time."""
+    T_scene_ego = _scene_poses(clip, T_world_scene)
+    twists = ego_twists(clip)
+    return [
+        SweepView(
+            beams=clip.sweeps[frame][clip.sweeps.valid[frame]],
+            misses_known=bool(clip.misses_known[frame]),
+            T_scene_ego=T_scene_ego[frame],
+            twist_ego=twists[frame],
+            t_s=float(clip.t_s[frame]),
+        )
+        for frame in clip.sweep_valid.nonzero()[:, 0].tolist()
+    ]
+
+
+def ego_twists(clip: Clip) -> Float[Tensor, "T 6"]:
+    """Velocity and turn rate over ground in the ego axes, m/s and rad/s: from the poses before and after."""
+    frames = len(clip.t_s)
+    if frames == 1:
+        return torch.zeros(1, 6)
+    before = (torch.arange(frames) - 1).clamp_min(0)
+    after = (torch.arange(frames) + 1).clamp_max(frames - 1)
+    span_s = (clip.t_s[after] - clip.t_s[before]).double()[:, None]
+    R_ego_world = clip.T_world_ego[:, :3, :3].transpose(-1, -2)
+    way = clip.T_world_ego[after, :3, 3] - clip.T_world_ego[before, :3, 3]
+    velocity = (R_ego_world @ way[..., None])[..., 0]
+    turn = log_so3(clip.T_world_ego[before, :3, :3].transpose(-1, -2) @ clip.T_world_ego[after, :3, :3])
+    return (torch.cat([velocity, turn], dim=-1) / span_s).float()
+
+
+def _scene_poses(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Float[Tensor, "T 4 4"]:
+    return (inverse_se3(T_world_scene) @ clip.T_world_ego).float()
