@@ -2,9 +2,11 @@
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
@@ -20,6 +22,8 @@ from foredrive.sensors import TimedRays
 
 BACKGROUND = 0.5
 """Albedo of what no Gaussian covers."""
+OF_GAUSSIANS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
+"""Parameters with one row a Gaussian."""
 _LEAST_ALPHA = 1e-6
 
 
@@ -123,6 +127,15 @@ class RebuiltScene(nn.Module):
         """The scene as it is now."""
         return SceneGraph(self.gaussians, self.actor, self.tracks)
 
+    def resize(self, file: Path) -> None:
+        """Make room for the weights in a file, which may hold another number of Gaussians."""
+        with safe_open(file, "pt") as saved:
+            count = saved.get_slice("actor").get_shape()[0]
+        self.actor = self.actor.new_zeros(count)
+        for name in OF_GAUSSIANS:
+            old = getattr(self, name)
+            setattr(self, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
+
     def forward(
         self, graph: SceneGraph, view: CameraView, mirror: Bool[Tensor, "A"] | None = None
     ) -> CameraPicture:
@@ -199,12 +212,12 @@ class RebuiltScene(nn.Module):
         placed = place(graph, t_s, mirror)
         splats = project_lidar(
             placed.gaussians,
-            inverse_se3(points.T_scene_lidar),
+            inverse_se3(points.T_scene_lidar.to(placed.velocity_mps)),
             velocity_mps=placed.velocity_mps,
-            twist_lidar=points.twist_lidar,
+            twist_lidar=points.twist_lidar.to(placed.velocity_mps),
         )
         seen = composite_splats(splats, points.tiles, hit_range_m)
-        intensity, drop_logit = self.lidar_decoder(seen.feature, points.dir_scene)
+        intensity, drop_logit = self.lidar_decoder(seen.feature, points.dir_scene.to(seen.feature))
         return SweepPicture(
             range_m=seen.expected_range_m / seen.alpha.clamp_min(_LEAST_ALPHA),
             median_range_m=seen.median_range_m,

@@ -81,11 +81,12 @@ def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
 
     Differentiable in the poses and in `t_s`, where it is a tensor.
     """
+    now_s = float(t_s.detach()) if isinstance(t_s, Tensor) else t_s
     if len(tracks.t_s) == 1:
-        near = abs(float(tracks.t_s[0]) - float(t_s)) <= LONGEST_STAY_S
+        near = abs(float(tracks.t_s[0]) - now_s) <= LONGEST_STAY_S
         still = torch.zeros(len(tracks), 3).to(tracks.T_scene_actor)
         return ActorStates(tracks.T_scene_actor[:, 0], still, still, tracks.present[:, 0] & near)
-    after = int(torch.searchsorted(tracks.t_s, float(t_s)))
+    after = int(torch.searchsorted(tracks.t_s.contiguous(), now_s))
     after = min(max(after, 1), len(tracks.t_s) - 1)
     step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
     share = (t_s - float(tracks.t_s[after - 1])) / step_s
@@ -98,7 +99,9 @@ def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
         T_scene_actor=T,
         velocity_mps=way / step_s,
         turn_radps=(T0[:, :3, :3] @ turn[..., None])[..., 0] / step_s,
-        present=tracks.present[:, after - 1] & tracks.present[:, after] & (-1.0 <= float(share) <= 2.0),
+        present=tracks.present[:, after - 1]
+        & tracks.present[:, after]
+        & (-1.0 <= (now_s - float(tracks.t_s[after - 1])) / step_s <= 2.0),
     )
 
 

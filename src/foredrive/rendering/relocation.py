@@ -1,0 +1,61 @@
+"""Gaussians as samples of a distribution: dead ones move to live ones, faint ones walk at random (Kheradmand
+et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", 2024).
+"""
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from foredrive.geometry.quaternions import multiply
+from foredrive.rendering.gaussians import Gaussians
+
+MIN_OPACITY = 0.005
+"""Gaussians that are less opaque are dead."""
+MOST_COPIES = 51
+_STEEPNESS = 100.0
+
+
+def shared_among(
+    opacity: Float[Tensor, "N"], copies: Int[Tensor, "N"]
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """Opacity and change of scale of Gaussians that are to be `copies`, themselves counted (eq. 9).
+
+    With o' = 1 - (1 - o)^(1/n) the centre stays as opaque, and the scale is divided by
+    Σ_{i=1..n} Σ_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / √(k+1) over o, so that what is
+    seen keeps its integral.
+    """
+    copies = copies.clamp(1, MOST_COPIES)
+    shared = 1 - (1 - opacity.double()) ** (1 / copies)
+    weight = torch.zeros(MOST_COPIES + 1, MOST_COPIES, dtype=torch.float64)
+    for i in range(1, MOST_COPIES + 1):
+        for k in range(i):
+            weight[i, k] = math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1)
+    total = weight.cumsum(0).to(opacity.device)  # over i, up to n
+    powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacity.device)
+    integral = (total[copies] * powers).sum(-1)
+    return shared.to(opacity), (opacity / integral).to(opacity)
+
+
+def random_walk_m(gaussians: Gaussians, step_m: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+    """How far centres walk: normal noise of the Gaussian's own shape, for those that hardly show (eq. 8).
+
+    Args:
+        gaussians: that walk.
+        step_m: λ_noise times the centres' learning rate.
+        generator: on the CPU, so that a run is the same on any device.
+    """
+    noise = torch.randn(len(gaussians.mean_m), 3, generator=generator).to(gaussians.mean_m)
+    free = torch.sigmoid(-_STEEPNESS * (gaussians.opacity_logit.sigmoid() - MIN_OPACITY))
+    scaled = gaussians.log_scale.exp() ** 2 * _turned(gaussians.quaternion, noise, inverse=True)
+    return step_m * free[:, None] * _turned(gaussians.quaternion, scaled)
+
+
+def _turned(
+    quaternion: Float[Tensor, "N 4"], vector: Float[Tensor, "N 3"], inverse: bool = False
+) -> Float[Tensor, "N 3"]:
+    unit = torch.nn.functional.normalize(quaternion, dim=-1)
+    back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
+    first, last = (back, unit) if inverse else (unit, back)
+    return multiply(multiply(first, torch.nn.functional.pad(vector, (1, 0))), last)[:, 1:]

@@ -1,0 +1,259 @@
+"""Learning a scene from the images and sweeps of a drive, one of them a step."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.optim import Adam
+
+from foredrive.errors import InputError
+from foredrive.losses.rendering import (
+    drop_loss,
+    intensity_loss,
+    line_of_sight_loss,
+    photometric_loss,
+    range_loss,
+)
+from foredrive.rendering.rebuilt import RebuiltScene, SweepPoints
+from foredrive.rendering.relocation import random_walk_m
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from foredrive.training.gaussian_steps import grow, relocate
+from foredrive.training.interrupts import hold_interrupts
+from foredrive.training.loop import MetricsLog
+
+_SMOOTHING = 0.95
+"""Of the PSNR that is shown."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Of Adam, at the first step; all fall exponentially to `final` of it."""
+
+    mean_m: float = 1.6e-4
+    quaternion: float = 1e-3
+    log_scale: float = 5e-3
+    opacity_logit: float = 5e-2
+    albedo: float = 2.5e-3
+    feature: float = 2.5e-3
+    decoders: float = 1e-3
+    actor_offset: float = 1e-4
+    camera_offset: float = 1e-5
+    camera_twist: float = 1e-4
+    camera_late_s: float = 1e-5
+    final: float = 0.1
+    final_mean: float = 0.01
+    """The same for centres."""
+
+
+@dataclass(frozen=True)
+class RebuildWeights:
+    """Of the losses (Hess et al., "SplatAD", 2025, §3.5 and supplement)."""
+
+    ssim: float = 0.2
+    """Share of 1 - SSIM, of L1 the rest."""
+    depth: float = 0.1
+    intensity: float = 1.0
+    drop: float = 0.1
+    line_of_sight: float = 0.1
+    scale: float = 1e-3
+    opacity: float = 5e-3
+
+
+@dataclass(frozen=True)
+class RebuildSchedule:
+    """How long a scene is learned, and how it grows."""
+
+    steps: int
+    most_gaussians: int
+    rates: LearningRates = field(default_factory=LearningRates)
+    weights: RebuildWeights = field(default_factory=RebuildWeights)
+    images_per_sweep: int = 1
+    beam_stride: int = 1
+    """Every so manieth beam of a sweep is looked at."""
+    shrink_steps: tuple[int, ...] = ()
+    """Until which steps images are shrunk: by 4 until the first, by 2 until the second of two."""
+    grow_from: int = 500
+    grow_until: int = 15_000
+    grow_every: int = 100
+    growth: float = 0.05
+    walk: float = 5e5
+    """λ_noise: noise of centres in units of their learning rate."""
+    mirror_share: float = 0.5
+    """How often an actor that looks the same from both sides is mirrored."""
+    before_hit_m: float = 0.8
+    """Nothing may stop the light up to so far before a lidar's return."""
+    checkpoint_every: int = 500
+    seed: int = 0
+
+    def shrink_at(self, step: int) -> int:
+        """By how much images are shrunk at a step."""
+        return int(2 ** sum(step < end for end in self.shrink_steps))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is learned from."""
+
+    cameras: Sequence[CameraView]
+    sweeps: Sequence[SweepView]
+
+
+def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: Path) -> None:
+    """Learn `scene`; go on from `folder` where a checkpoint lies there.
+
+    Writes `folder/metrics.jsonl` and `folder/checkpoints/step_N`. A run that is interrupted and started again
+    comes to the same scene as one that was not: all random numbers follow from the seed and the step. Ctrl-C
+    ends it after the step that is under way, with a checkpoint.
+
+    Raises:
+        InputError: if there is nothing to learn from, or a loss is not finite.
+    """
+    if not seen.cameras and not seen.sweeps:
+        raise InputError("there is nothing to learn from: neither images nor sweeps")
+    checkpoints = folder / "checkpoints"
+    found = latest_checkpoint(checkpoints)
+    done = 0
+    if found is not None:
+        scene.resize(found / "model.safetensors")
+    optimizer = make_optimizer(scene, schedule.rates)
+    if found is not None:
+        done = load_checkpoint(found, scene, optimizer)
+    if done >= schedule.steps:
+        return
+    log = MetricsLog(folder / "metrics.jsonl", done)
+    trainer = _Trainer(scene, seen, schedule, optimizer)
+    with hold_interrupts() as interrupted, _progress() as progress:
+        task = progress.add_task(folder.name, total=schedule.steps, completed=done, note="")
+        shown_db: float | None = None
+        for step in range(done, schedule.steps):
+            losses = trainer.step(step)
+            log.add(step + 1, losses)
+            if "psnr_db" in losses:
+                now_db = float(losses["psnr_db"])
+                shown_db = now_db if shown_db is None else _SMOOTHING * shown_db + (1 - _SMOOTHING) * now_db
+            note = f"{len(scene.actor)} Gaussians" + ("" if shown_db is None else f"  PSNR {shown_db:.1f} dB")
+            progress.update(task, completed=step + 1, note=note)
+            last = step + 1 == schedule.steps or interrupted()
+            if last or (step + 1) % schedule.checkpoint_every == 0:
+                save_checkpoint(checkpoints, scene, optimizer, step + 1)
+            if last:
+                break
+
+
+def make_optimizer(scene: RebuiltScene, rates: LearningRates) -> Adam:
+    """Adam with a group a kind of parameter, named as in `LearningRates`."""
+    groups = []
+    for rate in dataclasses.fields(rates):
+        if rate.name in ("final", "final_mean"):
+            continue
+        if rate.name == "decoders":
+            parameters = [*scene.camera_decoder.parameters(), *scene.lidar_decoder.parameters()]
+        else:
+            parameters = [getattr(scene, rate.name)]
+        groups.append({"params": parameters, "name": rate.name, "lr": getattr(rates, rate.name)})
+    return Adam(groups, eps=1e-15)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+
+
+class _Trainer:
+    """One step after the other."""
+
+    def __init__(self, scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, optimizer: Adam) -> None:
+        self.scene, self.seen, self.schedule, self.optimizer = scene, seen, schedule, optimizer
+        self.sweeps: dict[int, tuple[SweepView, SweepPoints]] = {}
+
+    def step(self, step: int) -> dict[str, Tensor]:
+        schedule = self.schedule
+        generator = torch.Generator().manual_seed((schedule.seed * 1_000_003 + step) * 1009)
+        for group in self.optimizer.param_groups:
+            final = schedule.rates.final_mean if group["name"] == "mean_m" else schedule.rates.final
+            group["lr"] = getattr(schedule.rates, group["name"]) * final ** (step / schedule.steps)
+        kind, number = self._item(step)
+        mirrored = torch.rand(len(self.scene.track_id), generator=generator) < schedule.mirror_share
+        mirror = mirrored.to(self.scene.actor.device) & self.scene.tracks.mirrored
+        if kind == "image":
+            losses = self._image(self.seen.cameras[number].shrunk(schedule.shrink_at(step)), mirror)
+        else:
+            losses = self._sweep(number, mirror)
+        losses["loss"] = losses["loss"] + self._regularisers()
+        if not bool(losses["loss"].isfinite()):
+            bad = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
+            raise InputError(f"step {step + 1}: loss is not finite ({bad}) on {kind} {number}")
+        self.optimizer.zero_grad(set_to_none=True)
+        losses["loss"].backward()
+        self.optimizer.step()
+        self._evolve(step, generator)
+        return {name: value.detach() for name, value in losses.items()}
+
+    def _item(self, step: int) -> tuple[Literal["image", "sweep"], int]:
+        """What is looked at: after every few images a sweep, each in a fresh order once all were seen."""
+        images, sweeps = len(self.seen.cameras), len(self.seen.sweeps)
+        turn = self.schedule.images_per_sweep + 1
+        if not images or (sweeps and step % turn == turn - 1):
+            return "sweep", self._shuffled(step // turn if images else step, sweeps, 1)
+        return "image", self._shuffled(step - step // turn if sweeps else step, images, 0)
+
+    def _shuffled(self, number: int, items: int, kind: int) -> int:
+        seed = ((self.schedule.seed * 1_000_003 + number // items) * 2 + kind) * 7919
+        order = torch.randperm(items, generator=torch.Generator().manual_seed(seed))
+        return int(order[number % items])
+
+    def _image(self, view: CameraView, mirror: Tensor) -> dict[str, Tensor]:
+        view = view.to(self.scene.actor.device)
+        assert view.image is not None
+        real = view.image.float() / 255
+        rgb = self.scene(self.scene.graph, view, mirror).rgb
+        loss = photometric_loss(rgb, real, self.schedule.weights.ssim)
+        psnr = -10 * ((rgb.detach().clamp(0, 1) - real) ** 2).mean().log10()
+        return {"loss": loss, "photometric": loss, "psnr_db": psnr}
+
+    def _sweep(self, number: int, mirror: Tensor) -> dict[str, Tensor]:
+        if number not in self.sweeps:
+            stride = self.schedule.beam_stride
+            view = self.seen.sweeps[number]
+            view = dataclasses.replace(view, beams=view.beams[number % stride :: stride])
+            self.sweeps[number] = (view, self.scene.prepare_sweep(view))
+        view, points = self.sweeps[number]
+        beams = view.beams.to(self.scene.actor.device)
+        hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
+        seen = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
+        assert seen.alpha_before_hit is not None
+        losses = {
+            "depth": range_loss(seen.range_m, beams.range_m, beams.returned),
+            "intensity": intensity_loss(seen.intensity, beams.intensity, beams.returned),
+            "line_of_sight": line_of_sight_loss(seen.alpha_before_hit, beams.returned),
+        }
+        if view.misses_known:
+            losses["drop"] = drop_loss(seen.drop_logit, beams.returned)
+        loss = torch.stack([getattr(self.schedule.weights, name) * value for name, value in losses.items()])
+        return {"loss": loss.sum(), **losses}
+
+    def _regularisers(self) -> Tensor:
+        weights = self.schedule.weights
+        small = self.scene.log_scale.exp().mean()
+        return weights.scale * small + weights.opacity * self.scene.opacity_logit.sigmoid().mean()
+
+    @torch.no_grad()
+    def _evolve(self, step: int, generator: torch.Generator) -> None:
+        """Relocate, grow, walk."""
+        schedule, scene = self.schedule, self.scene
+        if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
+            relocate(scene, self.optimizer, generator)
+            grow(scene, self.optimizer, schedule.most_gaussians, schedule.growth, generator)
+        rate = next(group["lr"] for group in self.optimizer.param_groups if group["name"] == "mean_m")
+        scene.mean_m.add_(random_walk_m(scene.gaussians, schedule.walk * rate, generator))
