@@ -1,8 +1,12 @@
 """A whole log as one clip: every frame it has, at its own rate."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from foredrive.data.boxes import no_boxes, read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras
@@ -12,7 +16,13 @@ from foredrive.data.lidar import empty_sweep, read_sweep
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
-from foredrive.scene import Clip
+from foredrive.geometry.se3 import log_so3
+from foredrive.scene import Clip, LidarSweep
+from foredrive.sensors import SpinningLidar, pandar64
+from foredrive.sensors.missed_beams import with_missed_beams
+
+_LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {"pandaset": pandar64}
+"""What data sets drive with that keep no beam without a return: lidar -> ego to its pattern."""
 
 
 def read_drive(
@@ -23,6 +33,7 @@ def read_drive(
 ) -> Clip:
     """Read all frames of a log, its sweeps and boxes with them; now is the first, so all times are >= 0.
 
+    Beams that did not return are put back where the lidar's pattern is known (`sensors.missed_beams`).
     Nothing is asked of anyone here: there is no command, no target and no future.
 
     Args:
@@ -43,7 +54,7 @@ def read_drive(
             raise InputError(f"{path.folder}: no camera {name!r}; there are: {', '.join(there) or 'none'}")
     frames = list(range(len(log)))
     images, image_valid, rig = read_rig(log, frames, chosen, names, ImageStore(cache_dir, image_hw), frames)
-    sweeps = [read_sweep(log, frame) for frame in frames]
+    sweeps = [_read_beams(log, frame) for frame in frames]
     boxes = [read_boxes(log, frame) for frame in frames]
     speed_mps = torch.from_numpy(log.speed_mps).float()
     return Clip(
@@ -65,3 +76,22 @@ def read_drive(
         target_valid=torch.tensor(False),
         future=log.driven_future(0, 0, log.period_s),
     )
+
+
+def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
+    """`read_sweep` with the beams that did not return, if they are recorded or can be told."""
+    read = read_sweep(log, frame)
+    make_lidar = _LIDARS.get(log.metadata.dataset)
+    if read is None or read[1] or make_lidar is None or not len(read[0].dt_s):
+        return read
+    sweep = read[0]
+    T_ego_lidar = torch.eye(4)
+    T_ego_lidar[:3, 3] = sweep.origin_ego[sweep.dt_s.abs().argmin()]
+    around_us = log.t_us[frame] + 1e6 * np.array([sweep.dt_s.min(), sweep.dt_s.max()])
+    first, last = torch.from_numpy(log.poses_at(around_us)[0])
+    span_s = float(sweep.dt_s.max() - sweep.dt_s.min()) or 1.0
+    R_ego_world = torch.from_numpy(log.T_world_ego[frame, :3, :3]).T
+    velocity = R_ego_world @ (last - first)[:3, 3] / span_s
+    turn = log_so3(first[:3, :3].T @ last[:3, :3]) / span_s
+    twist_ego = torch.cat([velocity, turn]).float()
+    return with_missed_beams(sweep, make_lidar(T_ego_lidar), twist_ego), True
