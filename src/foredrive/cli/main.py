@@ -18,6 +18,7 @@ from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
+from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
 from foredrive.cli.score import score
 from foredrive.cli.search import search, search_index, search_page
@@ -37,6 +38,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search": search,
     "search-index": search_index,
     "search-page": search_page,
+    "reconstruct": reconstruct,
     "imagine": imagine,
     "export": export,
     "view": view,

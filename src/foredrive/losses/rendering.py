@@ -14,16 +14,17 @@ _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 def photometric_loss(
     rendered: Float[Tensor, "3 H W"], real: Float[Tensor, "3 H W"], ssim_share: float = 0.2
 ) -> Float[Tensor, ""]:
-    """(1 - λ) L1 + λ (1 - SSIM), RGB in 0 to 1 (Kerbl et al., 2023, eq. 7); 11 px a side at least."""
+    """(1 - λ) L1 + λ (1 - SSIM), RGB in 0 to 1 (Kerbl et al., 2023, eq. 7); 6 px a side at least."""
     l1 = (rendered - real).abs().mean()
     return (1 - ssim_share) * l1 + ssim_share * (1 - _mean_ssim(rendered[None], real[None]))
 
 
 def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Float[Tensor, ""]:
-    """Structural similarity (Wang et al., 2004) where the window fits; the window is separable."""
+    """Structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
     offset = torch.arange(_SSIM_WINDOW_PX, device=a.device) - _SSIM_WINDOW_PX // 2
     window = torch.softmax(-0.5 * (offset / _SSIM_SIGMA_PX) ** 2, dim=0).to(a)
     stack = torch.cat([a, b, a * a, b * b, a * b]).flatten(0, 1)[:, None]  # [15 1 H W]
+    stack = F.pad(stack, (_SSIM_WINDOW_PX // 2,) * 4, mode="reflect")
     stack = F.conv2d(F.conv2d(stack, window[None, None, None]), window[None, None, :, None])
     mean_a, mean_b, aa, bb, ab = stack[:, 0].unflatten(0, (5, 3)).unbind(0)
     var_a, var_b, cov = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b

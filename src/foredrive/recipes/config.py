@@ -231,8 +231,11 @@ def labelled_by(recipe: Recipe, occupancy_source: Literal["lidar", "recorded"]) 
     return replace(recipe, name=f"{recipe.name} ({occupancy_source} occupancy)", clips=clips)
 
 
-def save_recipe(recipe: Recipe, path: Path) -> None:
-    """Write a recipe as YAML."""
+V = TypeVar("V")
+
+
+def save_recipe(recipe: Any, path: Path) -> None:
+    """Write a recipe of any kind, a dataclass of plain values, as YAML."""
     with atomic_path(path) as temporary:
         temporary.write_text(yaml.safe_dump(_plain(asdict(recipe)), sort_keys=False))
 
@@ -243,8 +246,13 @@ def load_recipe(path: Path) -> Recipe:
     Raises:
         InputError: naming the file, and the entry that is wrong, missing or unknown.
     """
+    return load_values(Recipe, path)
+
+
+def load_values(kind: type[V], path: Path) -> V:
+    """`load_recipe` for any kind of recipe."""
     try:
-        return TypeAdapter(Recipe).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
+        return TypeAdapter(kind).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
     except OSError as error:
         raise InputError(f"{path.parent}: not a run folder, {path.name} cannot be read") from error
     except ValidationError as error:

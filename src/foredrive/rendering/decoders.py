@@ -8,6 +8,8 @@ ALBEDO = 3
 """Leading features that are colour already."""
 _LAST_LAYER_GAIN = 1e-2
 """At first an image is little else than its albedo."""
+_LEAST_CHANCE = 1e-4
+"""That a beam returns, or does not."""
 
 
 class CameraDecoder(nn.Module):
@@ -64,14 +66,19 @@ class LidarDecoder(nn.Module):
         )
 
     def forward(
-        self, feature: Float[Tensor, "P D"], direction: Float[Tensor, "P 3"]
+        self, feature: Float[Tensor, "P D"], alpha: Float[Tensor, "P"], direction: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Intensity in 0 to 1, and the logit of the probability that the beam does not return.
 
+        It returns if something stops it, and if that sends it back, which is what the MLP says.
+
         Args:
             feature: composited albedo and features.
+            alpha: share of the beam's light that something stops.
             direction: unit direction of the beams in the scene's frame.
         """
         appearance = self.appearance.expand(len(feature), -1)
-        intensity, drop = self.net(torch.cat([feature[:, ALBEDO:], appearance, direction], dim=-1)).unbind(-1)
-        return intensity.sigmoid(), drop
+        seen = torch.cat([feature[:, ALBEDO:], appearance, direction], dim=-1)
+        intensity, sent_back = self.net(seen).unbind(-1)
+        returns = (alpha * sent_back.sigmoid()).clamp(_LEAST_CHANCE, 1 - _LEAST_CHANCE)
+        return intensity.sigmoid(), -returns.logit()

@@ -1,5 +1,6 @@
 """Gaussians before anything is learned: lidar points in their colours, the far field, random points."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +16,16 @@ from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, joined, mirrored
 from foredrive.rendering.tracks import ActorStates, Tracks, states_at
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene.record import Record
 
 GREY = 0.5
 """Of what no camera saw."""
+SEEN_SHARE = 0.75
+"""Of the lidar points that are taken, how many a camera saw."""
+BEAM_WIDTH_RAD = 0.01
+"""Of its range the most that a Gaussian at a lidar's point may measure (standard deviation)."""
+NEAR_IN_IMAGE = 0.06
+"""How far from a pixel, in heights of the image, a beam says how far that pixel looks."""
 _NEIGHBOURS = 3
 _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
 _BOX_MARGIN_M = 0.1
@@ -29,8 +37,10 @@ class InitialSize:
 
     lidar_points: int
     """At most, over the static part."""
-    far_points: int
+    pixel_points: int
+    """Along random pixels, at the range of the beam nearest in the image, or far away where none is near."""
     near_points: int
+    """Along random pixels, anywhere."""
     actor_points: int = 500
     """At least, of each actor; where lidar saw fewer, random points in its box make up for it."""
     actor_points_most: int = 5000
@@ -40,15 +50,21 @@ class InitialSize:
     near_opacity: float = 0.1
     scale: float = 0.5
     """Standard deviation in units of the mean distance to the nearest neighbours."""
+    pixel_scale: float = 0.6
+    """The same of points along pixels, in units of the distance between pixels drawn of a camera."""
     near_m: float = 2.0
     far_from_m: float = 60.0
     far_m: float = 2000.0
 
 
 @dataclass(frozen=True)
-class _Points:
+class _Points(Record):
     xyz_m: Float[Tensor, "N 3"]
     rgb: Float[Tensor, "N 3"]
+    seen: Bool[Tensor, "N"]
+    """By a camera."""
+    scale_m: Float[Tensor, "N"]
+    """Standard deviation at most."""
 
 
 def initial_scene(
@@ -58,10 +74,10 @@ def initial_scene(
     size: InitialSize,
     generator: torch.Generator,
 ) -> SceneGraph:
-    """Gaussians at lidar points, coloured by the image nearest in time, and where lidar cannot reach.
+    """Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
-    Far points lie along pixels that look upwards, near ones along any, at distances even in 1/m. Points of
-    mirrored actors (`Tracks.mirrored`) are taken from both sides. Without sweeps near points stand for all.
+    Of the lidar's points most are taken from those that a camera saw. Points of mirrored actors
+    (`Tracks.mirrored`) are taken from both sides. Without sweeps points anywhere along pixels stand for all.
 
     Args:
         cameras: that may be learned from, with images.
@@ -71,14 +87,15 @@ def initial_scene(
         generator: of which points are taken.
     """
     standing, of_actors = _lidar_points(cameras, sweeps, tracks)
-    parts = [_gaussians(_some(standing, size.lidar_points, generator), size, size.opacity)]
-    near = size.near_points if sweeps else size.near_points + size.lidar_points
-    for count, nearest_m, farthest_m, opacity, up in (
-        (near, size.near_m, size.far_from_m, size.near_opacity if sweeps else size.opacity, False),
-        (size.far_points, size.far_from_m, size.far_m, size.opacity, True),
-    ):
-        points, scale_m = _along_pixels(cameras, count, (nearest_m, farthest_m), up, generator)
-        parts.append(_gaussians(points, size, opacity, scale_m))
+    standing = _some(standing, size.lidar_points, generator)
+    along = _along_pixels(cameras, sweeps, tracks, size, generator) if sweeps else _nothing()
+    anywhere = size.near_points + (0 if sweeps else size.lidar_points + size.pixel_points)
+    near = _anywhere_along_pixels(cameras, anywhere, size, generator)
+    parts = [
+        _gaussians(standing, size, size.opacity, by_neighbours=True),
+        _gaussians(along, size, size.opacity),
+        _gaussians(near, size, size.near_opacity if sweeps else size.opacity),
+    ]
     actor = [torch.full((len(part.opacity_logit),), STATIC) for part in parts]
     for row, points in enumerate(of_actors):
         part = _actor(points, tracks.size_lwh[row], bool(tracks.mirrored[row]), size, generator)
@@ -100,18 +117,22 @@ def _lidar_points(
         states = states_at(tracks, sweep.t_s)
         owner = _owners(xyz, returned.dt_s, states, tracks)
         velocity = torch.cat([states.velocity_mps, torch.zeros(1, 3)])[owner]
-        rgb = torch.full_like(xyz, GREY)
+        points = _Points(
+            xyz,
+            torch.full_like(xyz, GREY),
+            torch.zeros(len(xyz), dtype=torch.bool),
+            BEAM_WIDTH_RAD * returned.range_m,
+        )
         for view in _nearest_views(cameras, exposed_s, sweep.t_s):
             at_exposure = xyz + velocity * (view.t_s - sweep.t_s - returned.dt_s)[:, None]
-            seen, colour = _colours(at_exposure, view)
-            rgb[seen] = colour
-        standing.append(_Points(xyz[owner == STATIC], rgb[owner == STATIC]))
+            inside, colour = _colours(at_exposure, view)
+            points.rgb[inside], points.seen[inside] = colour, True
+        standing.append(points[owner == STATIC])
         at_sweep = xyz - velocity * returned.dt_s[:, None]
         for row in owner[owner != STATIC].unique().tolist():
-            T_actor_scene = inverse_se3(states.T_scene_actor[row])
-            found[row].append(
-                _Points(transform_points(T_actor_scene, at_sweep[owner == row]), rgb[owner == row])
-            )
+            T_actor_scene, mine = inverse_se3(states.T_scene_actor[row]), owner == row
+            own_xyz = transform_points(T_actor_scene, at_sweep[mine])
+            found[row].append(dataclasses.replace(points[mine], xyz_m=own_xyz))
     return _all([_nothing(), *standing]), [_all(points) for points in found]
 
 
@@ -151,34 +172,96 @@ def _colours(xyz: Float[Tensor, "N 3"], view: CameraView) -> tuple[Bool[Tensor, 
 
 def _along_pixels(
     cameras: list[CameraView],
-    count: int,
-    range_m: tuple[float, float],
-    up: bool,
+    sweeps: list[SweepView],
+    tracks: Tracks,
+    size: InitialSize,
     generator: torch.Generator,
-) -> tuple[_Points, Float[Tensor, "N"]]:
-    """Points along random pixels, and a size that lets neighbours touch, m."""
-    if not cameras or count == 0:
-        return _nothing(), torch.zeros(0)
-    share = -(-4 * count // len(cameras)) if up else -(-count // len(cameras))
-    found, distance, apart = [], [], []
-    for view in cameras:
-        assert view.image is not None
-        height, width = view.size_hw
-        uv = torch.rand(share, 2, generator=generator) * torch.tensor([width, height])
-        direction = rotate_vectors(view.T_scene_cam, pixels_to_rays(uv, view.K, view.dist))
-        chosen = direction[:, 2] > 0 if up else direction[:, 2] > -1
-        inverse = torch.rand(share, generator=generator) * (1 / range_m[0] - 1 / range_m[1]) + 1 / range_m[1]
-        u, v = uv.long().unbind(-1)
-        points = _Points(view.T_scene_cam[:3, 3] + direction / inverse[:, None], view.image[:, v, u].T / 255)
-        found.append(_Points(points.xyz_m[chosen], points.rgb[chosen]))
-        distance.append(1 / inverse[chosen])
-        apart.append(
-            torch.full((share,), float((height * width / (view.K[0, 0] * view.K[1, 1])).sqrt()))[chosen]
+) -> _Points:
+    """Points along random pixels of all images, as far as the beam that is nearest in the image.
+
+    Where none is near they lie far away. Pixels beside beams that met an actor are left to it.
+    """
+    found = [_nothing()]
+    moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
+    for view, count in zip(cameras, _shares(size.pixel_points, len(cameras)), strict=True):
+        uv, direction = _random_pixels(view, count, generator)
+        sweep = sweeps[int((moments_s - view.t_s).abs().argmin())]
+        beams = sweep.beams[sweep.beams.returned]
+        xyz = transform_points(sweep.T_scene_ego, beams.points_ego)
+        standing = _owners(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
+        T_cam_scene = inverse_se3(view.T_scene_cam)
+        uv_beam, _, inside = project(transform_points(T_cam_scene, xyz), view.K, view.dist, view.size_hw)
+        far_m = _even_in_inverse(count, (size.far_from_m, size.far_m), generator)
+        if not bool(inside.any()):
+            range_m, kept = far_m, torch.ones(count, dtype=torch.bool)
+        else:
+            apart_px, index = cKDTree(uv_beam[inside].numpy()).query(uv.numpy())
+            nearest = torch.from_numpy(np.asarray(index))
+            met = torch.from_numpy(np.asarray(apart_px)) < NEAR_IN_IMAGE * view.size_hw[0]
+            beam_m = (xyz[inside] - view.T_scene_cam[:3, 3]).norm(dim=-1)[nearest]
+            range_m, kept = torch.where(met, beam_m, far_m), standing[inside][nearest] | ~met
+        drawn = size.pixel_points * sum(other.sensor == view.sensor for other in cameras) / len(cameras)
+        scale_m = size.pixel_scale * range_m * _pixels_apart_rad(view, drawn)
+        found.append(_at(view, uv, direction, range_m, scale_m)[kept])
+    return _all(found)
+
+
+def _anywhere_along_pixels(
+    cameras: list[CameraView], count: int, size: InitialSize, generator: torch.Generator
+) -> _Points:
+    """Points along random pixels of all images, at ranges even in 1/m."""
+    found = [_nothing()]
+    for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
+        uv, direction = _random_pixels(view, share, generator)
+        range_m = _even_in_inverse(share, (size.near_m, size.far_m), generator)
+        scale_m = (
+            size.scale * (view.size_hw[0] * view.size_hw[1] / max(share, 1)) ** 0.5 / view.K[0, 0] * range_m
         )
-    points, spread_m = _all(found), torch.cat(distance) * torch.cat(apart)
-    pick = torch.randperm(len(spread_m), generator=generator)[:count]
-    per_view = max(len(pick) / len({view.sensor for view in cameras}), 1)
-    return _Points(points.xyz_m[pick], points.rgb[pick]), 0.5 * spread_m[pick] / per_view**0.5
+        found.append(_at(view, uv, direction, range_m, scale_m))
+    return _all(found)
+
+
+def _pixels_apart_rad(view: CameraView, drawn: float) -> float:
+    """How far apart so many places in an image are."""
+    height, width = view.size_hw
+    return (height * width / max(drawn, 1.0)) ** 0.5 / float(view.K[0, 0])
+
+
+def _shares(count: int, parts: int) -> list[int]:
+    return [count * (k + 1) // parts - count * k // parts for k in range(parts)]
+
+
+def _random_pixels(
+    view: CameraView, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 3"]]:
+    """Places in an image, px, and unit directions in the scene's frame."""
+    height, width = view.size_hw
+    uv = torch.rand(count, 2, generator=generator) * torch.tensor([width, height])
+    return uv, rotate_vectors(view.T_scene_cam, pixels_to_rays(uv, view.K, view.dist))
+
+
+def _even_in_inverse(
+    count: int, range_m: tuple[float, float], generator: torch.Generator
+) -> Float[Tensor, "N"]:
+    near, far = 1 / range_m[0], 1 / range_m[1]
+    return 1 / (torch.rand(count, generator=generator) * (near - far) + far)
+
+
+def _at(
+    view: CameraView,
+    uv: Float[Tensor, "N 2"],
+    direction: Float[Tensor, "N 3"],
+    range_m: Float[Tensor, "N"],
+    scale_m: Float[Tensor, "N"],
+) -> _Points:
+    assert view.image is not None
+    u, v = uv.long().unbind(-1)
+    return _Points(
+        view.T_scene_cam[:3, 3] + direction * range_m[:, None],
+        view.image[:, v, u].T / 255,
+        torch.ones(len(uv), dtype=torch.bool),
+        scale_m,
+    )
 
 
 def _actor(
@@ -190,26 +273,32 @@ def _actor(
 ) -> Gaussians:
     """What lidar saw of an actor, from both sides if it is mirrored, and random points in its box."""
     points = _some(points, size.actor_points_most, generator)
-    part = _gaussians(points, size, size.opacity)
+    part = _gaussians(points, size, size.opacity, by_neighbours=True)
     if both_sides:
         part = joined([part, mirrored(part)])
     missing = max(size.actor_points - len(part.opacity_logit), 0)
     if missing == 0:
         return part
     rgb = points.rgb.mean(0) if len(points.rgb) else torch.full((3,), GREY)
-    inside = _Points((torch.rand(missing, 3, generator=generator) - 0.5) * size_lwh, rgb.expand(missing, 3))
     apart_m = float(size_lwh.prod() / size.actor_points) ** (1 / 3)
-    return joined([part, _gaussians(inside, size, size.near_opacity, torch.full((missing,), 0.5 * apart_m))])
+    inside = _Points(
+        (torch.rand(missing, 3, generator=generator) - 0.5) * size_lwh,
+        rgb.expand(missing, 3),
+        torch.zeros(missing, dtype=torch.bool),
+        torch.full((missing,), size.scale * apart_m),
+    )
+    return joined([part, _gaussians(inside, size, size.near_opacity)])
 
 
 def _gaussians(
-    points: _Points, size: InitialSize, opacity: float, scale_m: Float[Tensor, "N"] | None = None
+    points: _Points, size: InitialSize, opacity: float, *, by_neighbours: bool = False
 ) -> Gaussians:
     count = len(points.xyz_m)
-    if scale_m is None:
-        scale_m = size.scale * _neighbour_distance_m(points.xyz_m)
     quaternion = torch.zeros(count, 4)
     quaternion[:, 0] = 1
+    scale_m = points.scale_m
+    if by_neighbours:
+        scale_m = scale_m.minimum(size.scale * _neighbour_distance_m(points.xyz_m))
     return Gaussians(
         mean_m=points.xyz_m.float(),
         quaternion=quaternion,
@@ -230,15 +319,18 @@ def _neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
 
 
 def _some(points: _Points, most: int, generator: torch.Generator) -> _Points:
-    if len(points.xyz_m) <= most:
-        return points
-    pick = torch.randperm(len(points.xyz_m), generator=generator)[:most]
-    return _Points(points.xyz_m[pick], points.rgb[pick])
+    """At most so many, `SEEN_SHARE` of them among those that a camera saw, where there are so many."""
+    order = torch.randperm(len(points.seen), generator=generator)
+    seen, unseen = order[points.seen[order]], order[~points.seen[order]]
+    of_seen = max(round(SEEN_SHARE * most), most - len(unseen))
+    picked = torch.cat([seen[:of_seen], unseen[: most - min(of_seen, len(seen))]])
+    return points[picked]
 
 
 def _nothing() -> _Points:
-    return _Points(torch.zeros(0, 3), torch.zeros(0, 3))
+    return _Points(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0))
 
 
 def _all(parts: list[_Points]) -> _Points:
-    return _Points(torch.cat([part.xyz_m for part in parts]), torch.cat([part.rgb for part in parts]))
+    names = [field.name for field in dataclasses.fields(_Points)]
+    return _Points(*(torch.cat([getattr(part, name) for part in parts]) for name in names))

@@ -71,6 +71,7 @@ class RebuiltScene(nn.Module):
         cameras: in the rig.
         rolling: sensors look at different times within an image or a sweep; False takes all rows and beams
             to be of one moment.
+        decoder_width: channels of the camera's decoder.
     """
 
     actor: Tensor
@@ -81,7 +82,9 @@ class RebuiltScene(nn.Module):
     track_id: Tensor
     T_scene_actor: Tensor
 
-    def __init__(self, graph: SceneGraph, cameras: int, rolling: bool = True) -> None:
+    def __init__(
+        self, graph: SceneGraph, cameras: int, rolling: bool = True, decoder_width: int = 32
+    ) -> None:
         super().__init__()
         own = graph.gaussians
         self.mean_m = nn.Parameter(own.mean_m)
@@ -104,7 +107,7 @@ class RebuiltScene(nn.Module):
         self.camera_late_s = nn.Parameter(torch.zeros(cameras))
         """How much later than it says each camera exposes."""
         features = self.feature.shape[1]
-        self.camera_decoder = CameraDecoder(features, cameras)
+        self.camera_decoder = CameraDecoder(features, cameras, width=decoder_width)
         self.lidar_decoder = LidarDecoder(features)
         self.rolling = rolling
 
@@ -217,7 +220,9 @@ class RebuiltScene(nn.Module):
             twist_lidar=points.twist_lidar.to(placed.velocity_mps),
         )
         seen = composite_splats(splats, points.tiles, hit_range_m)
-        intensity, drop_logit = self.lidar_decoder(seen.feature, points.dir_scene.to(seen.feature))
+        intensity, drop_logit = self.lidar_decoder(
+            seen.feature, seen.alpha, points.dir_scene.to(seen.feature)
+        )
         return SweepPicture(
             range_m=seen.expected_range_m / seen.alpha.clamp_min(_LEAST_ALPHA),
             median_range_m=seen.median_range_m,

@@ -1,6 +1,7 @@
 """Learning a scene from the images and sweeps of a drive, one of them a step."""
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,8 +133,9 @@ def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: 
         task = progress.add_task(folder.name, total=schedule.steps, completed=done, note="")
         shown_db: float | None = None
         for step in range(done, schedule.steps):
+            before_s = time.process_time()
             losses = trainer.step(step)
-            log.add(step + 1, losses)
+            log.add(step + 1, losses | {"computing_s": torch.tensor(time.process_time() - before_s)})
             if "psnr_db" in losses:
                 now_db = float(losses["psnr_db"])
                 shown_db = now_db if shown_db is None else _SMOOTHING * shown_db + (1 - _SMOOTHING) * now_db

@@ -1,0 +1,62 @@
+"""A real log rebuilt, and what each part of the sensors' models is worth.
+
+`foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. The front
+camera and the lidar are learned from every second frame and judged on the others. Each arm is a run, kept in
+runs/rebuild/COMMIT, that goes on where it stopped.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from foredrive.data import LogPath, find_logs
+from foredrive.data.convert import convert
+from foredrive.errors import InputError
+from foredrive.evaluation import Benchmark
+from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
+from foredrive.recipes.reconstruct import reconstruct
+from foredrive.recipes.study import work_folder
+
+WORK = work_folder(Path("runs/rebuild"))
+RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))
+ARMS: dict[str, RebuildRecipe] = {
+    "gaussians": RECIPE,
+    "static_only": dataclasses.replace(RECIPE, actors=False),
+    "no_rolling_shutter_nor_drop": dataclasses.replace(RECIPE, rolling=False, drop=False),
+}
+FIGURES = (
+    *("psnr_db", "ssim", "depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
+    *("minutes", "computing_minutes", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
+    *("nearest.psnr_db", "nearest.ssim", "moving.psnr_db", "moving.nearest.psnr_db"),
+)
+"""`nearest` is the nearest image in time that was learned from, `moving` the frames in which the ego vehicle
+drives."""
+
+
+def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
+    def measure(seed: int) -> dict[str, float]:
+        recipe = ARMS[arm]
+        recipe = dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, seed=seed))
+        summary = reconstruct(recipe, _pandaset(), WORK / f"{arm}_seed{seed}", WORK / "cache").summary
+        return {name: float(value) for name in FIGURES if isinstance(value := summary.get(name), float | int)}
+
+    return measure
+
+
+def _pandaset() -> LogPath:
+    root = WORK / "pandaset"
+    if root.is_dir():
+        return find_logs(root)[0]
+    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
+    if not source.is_dir():
+        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
+    return convert(source, "pandaset", root)[0]
+
+
+BENCHMARK = Benchmark(
+    question="How well is a real log rebuilt, and what are actors, rolling shutter and ray drop worth?",
+    arms={arm: rebuilt(arm) for arm in ARMS},
+    seeds=(0,),
+    config={"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}},
+)

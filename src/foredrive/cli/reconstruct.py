@@ -1,0 +1,51 @@
+"""`foredrive reconstruct`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath
+
+
+def reconstruct(
+    log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    out: Path,
+    method: Literal["gaussians"] = "gaussians",
+    recipe: str = "gaussians_tiny",
+    cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
+    cache: OptionalPath = None,
+) -> None:
+    """Rebuild a log as a scene to render cameras and lidars from, or go on with an interrupted run.
+
+    Every second frame is held out, and the scene is judged on those.
+
+    Args:
+        log: Folder of a 123D log, or of a split or data root with exactly one log in it.
+        out: Folder of the run. Where it holds this run already, it goes on from the last checkpoint.
+        method: What the scene is made of.
+        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_base (a GPU).
+        cameras: Only these, by their own names or 123D's, such as pcam_f0; by default the recipe's.
+        cache: Folder for shrunk images; by default "cache" in the run's folder.
+    """
+    import dataclasses
+
+    from foredrive.data import find_logs
+    from foredrive.errors import InputError
+    from foredrive.recipes.gaussians import find_rebuild_recipe
+    from foredrive.recipes.reconstruct import reconstruct as rebuild_log
+
+    logs = find_logs(log)
+    if len(logs) > 1:
+        raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
+    chosen = find_rebuild_recipe(recipe)
+    if cameras:
+        chosen = dataclasses.replace(chosen, cameras=cameras)
+    run = rebuild_log(chosen, logs[0], out, cache)
+    print(f"rebuilt {logs[0].name} by {method}: {out}")
+    for name in (
+        *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),
+        *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
+    ):
+        if run.summary.get(name) is not None:
+            print(f"  {name}: {run.summary[name]:.4g}")

@@ -1,0 +1,105 @@
+"""How well a rebuilt scene shows what its sensors saw at times it has not learned from."""
+
+import dataclasses
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from statistics import fmean
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.metrics import psnr_db, ssim
+from foredrive.metrics.lidar_rendering import SweepScores, score_sweep
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.views import CameraView, SweepView
+
+MOVING_MPS = 0.5
+"""From this speed on a vehicle is on its way."""
+
+
+@torch.no_grad()
+def judge_cameras(
+    scene: RebuiltScene, views: Sequence[CameraView], learned: Sequence[CameraView]
+) -> dict[str, float]:
+    """PSNR and SSIM, mean over images; beside them those of the nearest image that was learned from.
+
+    Under "moving." the same over the images that were taken on the way: where a vehicle stands, the image
+    before is nearly the one that is asked for.
+
+    Args:
+        scene: that is judged.
+        views: with images, that it has not seen.
+        learned: what it has seen; the nearest in time of the same camera is the rival.
+    """
+    if not views:
+        return {}
+    found: dict[str, list[float]] = defaultdict(list)
+    graph, took_s, pixels = scene.graph, 0.0, 0
+    for view in views:
+        started = time.perf_counter()
+        rgb = scene(graph, view.to(scene.actor.device)).rgb.clamp(0, 1)[None].cpu()
+        took_s += time.perf_counter() - started
+        pixels += view.size_hw[0] * view.size_hw[1]
+        real = _image(view)
+        known = torch.ones_like(real[:, 0], dtype=torch.bool)
+        rivals = [other for other in learned if other.sensor == view.sensor]
+        shown = {"": rgb}
+        if rivals:
+            shown["nearest."] = _image(min(rivals, key=lambda other: abs(other.t_s - view.t_s)))
+        for prefix, image in shown.items():
+            figures = {"psnr_db": psnr_db(image, real, known), "ssim": ssim(image, real, known)}
+            for name, value in figures.items():
+                found[prefix + name].append(float(value))
+                if float(view.twist_cam[:3].norm()) > MOVING_MPS:
+                    found[f"moving.{prefix}{name}"].append(float(value))
+    return {name: fmean(values) for name, values in found.items()} | {
+        "images": float(len(views)),
+        "camera_mp_per_s": pixels / took_s * 1e-6,
+    }
+
+
+def _image(view: CameraView) -> Float[Tensor, "1 3 H W"]:
+    assert view.image is not None
+    return view.image[None].cpu().float() / 255
+
+
+@torch.no_grad()
+def judge_sweeps(scene: RebuiltScene, views: Sequence[SweepView], *, drop: bool = True) -> dict[str, float]:
+    """The figures of `SweepScores`, mean over sweeps.
+
+    Args:
+        scene: that is judged.
+        views: that it has not seen.
+        drop: beams that are more likely to be lost than not are taken as such; False: all return.
+    """
+    if not views:
+        return {}
+    scores: list[SweepScores] = []
+    graph, took_s, beams_seen = scene.graph, 0.0, 0
+    for view in views:
+        points = scene.prepare_sweep(view)
+        started = time.perf_counter()
+        seen = scene.sweep(graph, points, view.t_s)
+        took_s += time.perf_counter() - started
+        beams, beams_seen = view.beams, beams_seen + len(view.beams.dt_s)
+        range_m = torch.where(seen.median_range_m.isfinite(), seen.median_range_m, seen.range_m).cpu()
+        dropped = (seen.drop_logit > 0).cpu() & drop
+        scores.append(
+            score_sweep(
+                range_m=range_m,
+                intensity=seen.intensity.cpu(),
+                dropped=dropped,
+                real_range_m=beams.range_m,
+                real_intensity=beams.intensity,
+                returned=beams.returned,
+                origin=beams.origin_ego,
+                direction=beams.dir_ego,
+            )
+        )
+    figures = {
+        field.name: fmean(getattr(score, field.name) for score in scores)
+        for field in dataclasses.fields(SweepScores)
+    }
+    return figures | {"sweeps": float(len(views)), "lidar_mrays_per_s": beams_seen / took_s * 1e-6}

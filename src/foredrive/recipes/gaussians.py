@@ -1,0 +1,95 @@
+"""How logs are rebuilt from Gaussians."""
+
+from dataclasses import dataclass
+
+from foredrive.errors import InputError
+from foredrive.rendering.initial import InitialSize
+from foredrive.training.rebuilding import LearningRates, RebuildSchedule
+
+
+@dataclass(frozen=True)
+class RebuildRecipe:
+    """Everything that decides a reconstruction, but for where the log is."""
+
+    name: str
+    image_hw: tuple[int, int]
+    initial: InitialSize
+    schedule: RebuildSchedule
+    cameras: tuple[str, ...] | None = None
+    """By their own or 123D's names; None takes all."""
+    hold_out_every: int = 2
+    """Of so many frames the last is not learned from, and judged on; 0 learns from all."""
+    actors: bool = True
+    """What moves has Gaussians of its own; False: all stands still."""
+    decoder_width: int = 32
+    """Channels of the camera's decoder."""
+    rolling: bool = True
+    """Rows of an image and beams of a sweep look at their own times."""
+    drop: bool = True
+    """Beams may fail to return; False: all do."""
+
+
+def gaussians_tiny() -> RebuildRecipe:
+    """Some minutes on two cores, images of 480×270."""
+    steps = 800
+    return RebuildRecipe(
+        name="gaussians_tiny",
+        image_hw=(270, 480),
+        initial=InitialSize(
+            lidar_points=60_000,
+            pixel_points=100_000,
+            near_points=0,
+            actor_points=50,
+            actor_points_most=1000,
+            features=8,
+        ),
+        schedule=RebuildSchedule(
+            steps=steps,
+            most_gaussians=260_000,
+            rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=2e-3),
+            images_per_sweep=3,
+            beam_stride=4,
+            shrink_steps=(steps // 10,),
+            grow_from=steps // 10,
+            grow_until=steps * 8 // 10,
+            grow_every=50,
+            checkpoint_every=100,
+        ),
+        decoder_width=12,
+    )
+
+
+def gaussians_base() -> RebuildRecipe:
+    """SplatAD as published, for a GPU: all cameras at full size, 30 000 steps, five million Gaussians."""
+    return RebuildRecipe(
+        name="gaussians_base",
+        image_hw=(1080, 1920),
+        initial=InitialSize(
+            lidar_points=2_000_000,
+            pixel_points=300_000,
+            near_points=300_000,
+            actor_points=500,
+            actor_points_most=100_000,
+            features=13,
+            scale=0.2,
+        ),
+        schedule=RebuildSchedule(
+            steps=30_000, most_gaussians=5_000_000, shrink_steps=(3_000, 6_000), checkpoint_every=1_000
+        ),
+    )
+
+
+REBUILD_RECIPES: dict[str, RebuildRecipe] = {
+    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base())
+}
+
+
+def find_rebuild_recipe(name: str) -> RebuildRecipe:
+    """The recipe of a name.
+
+    Raises:
+        InputError: naming the known ones, if there is none of that name.
+    """
+    if name not in REBUILD_RECIPES:
+        raise InputError(f"no recipe {name!r} to rebuild logs; there are: {', '.join(REBUILD_RECIPES)}")
+    return REBUILD_RECIPES[name]

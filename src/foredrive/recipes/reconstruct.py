@@ -1,0 +1,225 @@
+"""A log becomes a scene that can be rendered: a folder with its recipe, weights, figures and pictures."""
+
+import dataclasses
+import json
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from foredrive.data import LogPath
+from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.drives import read_drive
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
+from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.files import atomic_path
+from foredrive.recipes.config import load_values, save_recipe
+from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.rendering.initial import initial_scene
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.tracks import Tracks, read_tracks
+from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.scene import Clip
+from foredrive.training.checkpoints import load_weights, save_weights
+from foredrive.training.loop import read_metrics
+from foredrive.training.rebuilding import Seen, rebuild
+
+CONFIG, LOG, WEIGHTS, SUMMARY = "config.yaml", "log.json", "model.safetensors", "summary.json"
+_log = logging.getLogger(__name__)
+
+_COPIES = 14
+"""Of each number of a Gaussian: itself, its gradient, two moments, and what autograd keeps of a step."""
+_OF_A_PIXEL = 600
+"""Floats that autograd keeps of each: features, the decoder's hidden layers, SSIM."""
+_OF_A_BEAM = 120
+"""Bytes that are kept of each beam of the log."""
+_BEAMS_A_SWEEP = 120_000
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a drive offers: what is learned from, and what is held out."""
+
+    learned: Seen
+    held_out: Seen
+    tracks: Tracks
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """A run on disk."""
+
+    folder: Path
+    recipe: RebuildRecipe
+    log: LogPath
+    summary: dict[str, float | int | str | None]
+
+
+def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None) -> Rebuilt:
+    """Rebuild a log, and judge the scene on the frames that were held out.
+
+    Goes on where an earlier call with the same recipe and log stopped.
+
+    Args:
+        recipe: what is done.
+        path: of the log.
+        folder: of the run.
+        cache_dir: for shrunk images; by default in `folder`.
+
+    Raises:
+        InputError: if `folder` holds a run of another recipe or log; on a log that cannot be read, that has
+            neither images nor sweeps, or for which there is too little memory.
+    """
+    _check_same(recipe, path, folder)
+    check_memory(recipe, path)
+    material = read_material(recipe, path, (cache_dir or folder / "cache").absolute())
+    if not (folder / CONFIG).is_file():
+        with atomic_path(folder / LOG) as temporary:
+            temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))
+        save_recipe(recipe, folder / CONFIG)
+    scene = begin(recipe, material)
+    scene.to("cuda" if torch.cuda.is_available() else "cpu")
+    weights = folder / WEIGHTS
+    if not weights.is_file():
+        rebuild(scene, material.learned, recipe.schedule, folder)
+        with atomic_path(weights) as temporary:
+            save_weights(scene, temporary)
+    scene.resize(weights)
+    load_weights(scene, weights)
+    if not (folder / SUMMARY).is_file():
+        write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, material))
+    return Rebuilt(folder, recipe, path, read_summary(folder / SUMMARY))
+
+
+def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:
+    """Read a log's frames, and part them; says what the log lacks."""
+    drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
+    if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
+        raise InputError(f"{path.folder}: neither images nor lidar sweeps, nothing to rebuild from")
+    every, frames = recipe.hold_out_every, torch.arange(len(drive.t_s))
+    held = (frames % every == every - 1) if every else torch.zeros_like(frames, dtype=torch.bool)
+    T_world_scene = drive.T_world_ego[0]
+    known = drive.frames(frames[~held].tolist())
+    tracks = read_tracks(known, T_world_scene)
+    for lacking, what in (
+        (not bool(drive.sweep_valid.any()), "no lidar: rebuilt from its images alone"),
+        (len(tracks) == 0, "no tracks: everything in it is taken to stand still"),
+        (len(drive.rig.names) == 1, "one camera: what it never looks at is rebuilt from lidar alone"),
+        (len(drive.rig.names) == 0, "no cameras: rebuilt from its sweeps alone"),
+    ):
+        if lacking:
+            _log.warning("%s: %s", path.folder, what)
+    if not recipe.actors:
+        tracks = tracks_without_actors(tracks)
+    return Material(
+        learned=_seen(known, T_world_scene),
+        held_out=_seen(drive.frames(frames[held].tolist()), T_world_scene),
+        tracks=tracks,
+        cameras=drive.rig.names,
+    )
+
+
+def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
+    """The scene before anything is learned."""
+    generator = torch.Generator().manual_seed(recipe.schedule.seed)
+    graph = initial_scene(
+        list(material.learned.cameras),
+        list(material.learned.sweeps),
+        material.tracks,
+        recipe.initial,
+        generator,
+    )
+    torch.manual_seed(recipe.schedule.seed)  # the decoders' weights
+    return RebuiltScene(graph, len(material.cameras), recipe.rolling, recipe.decoder_width)
+
+
+def tracks_without_actors(tracks: Tracks) -> Tracks:
+    """No actors at the same key times."""
+    nobody = {
+        field.name: getattr(tracks, field.name)[:0]
+        for field in dataclasses.fields(tracks)
+        if field.name != "t_s"
+    }
+    return dataclasses.replace(tracks, **nobody)
+
+
+def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
+    """Refuse what does not fit, before it is begun.
+
+    Raises:
+        InputError: saying what would be needed and what there is.
+    """
+    log = Log(path)
+    cameras = len(pinhole_cameras(log)) if recipe.cameras is None else len(recipe.cameras)
+    pixels = recipe.image_hw[0] * recipe.image_hw[1]
+    needed_gib = memory_needed_gib(recipe, frames=len(log), cameras=cameras)
+    free_gib = _free_memory_gib()
+    if needed_gib > free_gib:
+        raise InputError(
+            f"{recipe.name} needs about {needed_gib:.1f} GiB for {cameras} cameras of {pixels * 1e-6:.1f} MP "
+            f"and {len(log)} frames with {recipe.schedule.most_gaussians} Gaussians; "
+            f"{free_gib:.1f} GiB are free"
+        )
+
+
+def memory_needed_gib(recipe: RebuildRecipe, *, frames: int, cameras: int) -> float:
+    """About how much memory a reconstruction takes."""
+    pixels = recipe.image_hw[0] * recipe.image_hw[1]
+    of_one = 3 + 4 + 3 + 1 + 3 + recipe.initial.features
+    learning = 4 * (recipe.schedule.most_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
+    kept = frames * (cameras * pixels * 3 + _BEAMS_A_SWEEP * _OF_A_BEAM)
+    return (learning + kept) / 1024**3
+
+
+def _free_memory_gib() -> float:
+    if torch.cuda.is_available():
+        return torch.cuda.mem_get_info()[0] / 1024**3
+    meminfo = Path("/proc/meminfo")
+    if meminfo.is_file():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) / 1024**2
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1024**3
+
+
+def _seen(clip: Clip, T_world_scene: torch.Tensor) -> Seen:
+    cameras: list[CameraView] = [view for views in camera_views(clip, T_world_scene) for view in views]
+    sweeps: list[SweepView] = sweep_views(clip, T_world_scene)
+    return Seen(cameras, sweeps)
+
+
+def _summary(
+    recipe: RebuildRecipe, path: LogPath, folder: Path, scene: RebuiltScene, material: Material
+) -> dict[str, float | int | str | None]:
+    steps = read_metrics(folder / "metrics.jsonl")
+    held = material.held_out
+    return {
+        "recipe": recipe.name,
+        "log": path.name,
+        "gaussians": len(scene.actor),
+        "actors": len(material.tracks),
+        "minutes": sum(float(line["step_s"]) for line in steps) / 60,
+        "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
+        "peak_memory_gib": peak_rss_gib(),
+        **judge_cameras(scene, held.cameras, material.learned.cameras),
+        **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
+        **collect_provenance(),
+    }
+
+
+def _check_same(recipe: RebuildRecipe, path: LogPath, folder: Path) -> None:
+    if not (folder / CONFIG).is_file():
+        return
+    if load_values(RebuildRecipe, folder / CONFIG) != recipe:
+        raise InputError(f"{folder}: holds a run with another recipe; choose another folder")
+    try:
+        same = json.loads((folder / LOG).read_text())["folder"] == str(path.folder)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+    if not same:
+        raise InputError(f"{folder}: holds a run of another log; choose another folder")

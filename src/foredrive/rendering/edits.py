@@ -1,0 +1,212 @@
+"""Changes to a rebuilt scene, as a short list that can be kept in a file and applied again."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Discriminator, TypeAdapter, ValidationError
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.rendering.scene_graph import SceneGraph, joined
+from foredrive.rendering.tracks import Tracks
+
+Offset = tuple[float, float, float]
+"""Forward, left, up, m."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """Let an actor be elsewhere all the time: by an offset and a turn in its own frame."""
+
+    actor: int
+    offset_m: Offset = (0.0, 0.0, 0.0)
+    yaw_rad: float = 0.0
+    kind: Literal["move"] = "move"
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Let an actor not be there."""
+
+    actor: int
+    kind: Literal["remove"] = "remove"
+
+
+@dataclass(frozen=True)
+class Duplicate:
+    """Let there be another one like an actor, elsewhere."""
+
+    actor: int
+    copy: int
+    """Its id; no other actor's."""
+    offset_m: Offset = (0.0, 0.0, 0.0)
+    yaw_rad: float = 0.0
+    kind: Literal["duplicate"] = "duplicate"
+
+
+@dataclass(frozen=True)
+class Insert:
+    """Let an actor of another run drive where one of this scene does, beside it by an offset."""
+
+    run: str
+    """Folder of the run it comes from."""
+    actor: int
+    """Its id there."""
+    copy: int
+    """Its id here."""
+    follows: int
+    """Whose way it takes."""
+    offset_m: Offset = (0.0, 0.0, 0.0)
+    yaw_rad: float = 0.0
+    kind: Literal["insert"] = "insert"
+
+
+@dataclass(frozen=True)
+class ShiftEgo:
+    """Let the ego vehicle, and its sensors, be elsewhere all the time: by an offset in its own frame."""
+
+    offset_m: Offset
+    yaw_rad: float = 0.0
+    kind: Literal["shift_ego"] = "shift_ego"
+
+
+Edit = Annotated[Move | Remove | Duplicate | Insert | ShiftEgo, Discriminator("kind")]
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A scene after edits."""
+
+    graph: SceneGraph
+    T_ego_shifted: Float[Tensor, "4 4"]
+    """Where the ego vehicle is, in the frame it was driven in: what is behind every T_scene_ego."""
+
+
+def apply_edits(
+    graph: SceneGraph, edits: Sequence[Edit], open_run: Callable[[str], SceneGraph] | None = None
+) -> Edited:
+    """Apply edits one after the other.
+
+    Args:
+        graph: is left as it is.
+        edits: in their order.
+        open_run: the scene of another run's folder, for `Insert`.
+
+    Raises:
+        InputError: on an actor that is not there (naming those that are), or a copy with an id that is taken.
+    """
+    T_ego_shifted = torch.eye(4).to(graph.tracks.T_scene_actor)
+    for edit in edits:
+        if isinstance(edit, ShiftEgo):
+            T_ego_shifted = T_ego_shifted @ _offset(edit.offset_m, edit.yaw_rad).to(T_ego_shifted)
+        elif isinstance(edit, Remove):
+            graph = _without(graph, graph.tracks.index_of(edit.actor))
+        elif isinstance(edit, Move):
+            row = graph.tracks.index_of(edit.actor)
+            graph = dataclasses.replace(graph, tracks=_moved(graph.tracks, row, edit.offset_m, edit.yaw_rad))
+        elif isinstance(edit, Duplicate):
+            graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, edit.offset_m, edit.yaw_rad)
+        else:
+            if open_run is None:
+                raise InputError(
+                    f"actor {edit.actor} is to come from {edit.run}, but no run can be opened here"
+                )
+            source = open_run(edit.run)
+            graph = _with_copy(
+                graph, source, edit.actor, edit.follows, edit.copy, edit.offset_m, edit.yaw_rad
+            )
+    return Edited(graph, T_ego_shifted)
+
+
+def save_edits(edits: Sequence[Edit], path: Path) -> None:
+    """Write edits as JSON."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps([dataclasses.asdict(edit) for edit in edits], indent=1) + "\n")
+
+
+def load_edits(path: Path) -> list[Edit]:
+    """Read what `save_edits` wrote.
+
+    Raises:
+        InputError: naming the file and the entry that is wrong.
+    """
+    try:
+        edits: list[Edit] = TypeAdapter(list[Edit]).validate_json(path.read_bytes(), extra="forbid")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path}: not a list of edits: {f'{where}: ' if where else ''}{first['msg']}"
+        ) from error
+    return edits
+
+
+def _offset(offset_m: Offset, yaw_rad: float) -> Float[Tensor, "4 4"]:
+    return matrix_from_yaw(torch.tensor(yaw_rad), torch.tensor(offset_m))
+
+
+def _moved(tracks: Tracks, row: int, offset_m: Offset, yaw_rad: float) -> Tracks:
+    poses = tracks.T_scene_actor.clone()
+    poses[row] = poses[row] @ _offset(offset_m, yaw_rad).to(poses)
+    return dataclasses.replace(tracks, T_scene_actor=poses)
+
+
+def _without(graph: SceneGraph, row: int) -> SceneGraph:
+    kept = graph.actor != row
+    actor = graph.actor[kept]
+    tracks, others = graph.tracks, torch.arange(len(graph.tracks)) != row
+    names = ("track_id", "category", "size_lwh", "T_scene_actor", "present")
+    return SceneGraph(
+        gaussians=graph.gaussians[kept],
+        actor=actor - (actor > row).to(actor),
+        tracks=dataclasses.replace(tracks, **{name: getattr(tracks, name)[others] for name in names}),
+    )
+
+
+def _with_copy(
+    graph: SceneGraph,
+    source: SceneGraph,
+    actor: int,
+    follows: int,
+    copy: int,
+    offset_m: Offset,
+    yaw_rad: float,
+) -> SceneGraph:
+    """With an actor of `source`, called `copy` here, on the way of one of this scene's, standing as high."""
+    row, way = source.tracks.index_of(actor), graph.tracks.index_of(follows)
+    if copy in graph.tracks.track_id.tolist():
+        raise InputError(f"there is an actor {copy} already: a copy needs an id of its own")
+    own = source.of_actor(row).to(graph.actor.device)
+    if own.feature.shape[1] != graph.gaussians.feature.shape[1]:
+        raise InputError(
+            f"actor {actor} has {own.feature.shape[1]} features, this scene's have another number"
+        )
+    tracks = graph.tracks
+    lift_m = 0.5 * float(source.tracks.size_lwh[row, 2] - tracks.size_lwh[way, 2])
+    forward_m, left_m, up_m = offset_m
+    pose = tracks.T_scene_actor[way] @ _offset((forward_m, left_m, up_m + lift_m), yaw_rad).to(
+        tracks.size_lwh
+    )
+    added = torch.full((len(own.opacity_logit),), len(tracks)).to(graph.actor)
+    return SceneGraph(
+        gaussians=joined([graph.gaussians, own]),
+        actor=torch.cat([graph.actor, added]),
+        tracks=Tracks(
+            track_id=torch.cat([tracks.track_id, tracks.track_id.new_tensor([copy])]),
+            category=torch.cat([tracks.category, source.tracks.category[row : row + 1]]),
+            size_lwh=torch.cat([tracks.size_lwh, source.tracks.size_lwh[row : row + 1]]),
+            t_s=tracks.t_s,
+            T_scene_actor=torch.cat([tracks.T_scene_actor, pose[None]]),
+            present=torch.cat([tracks.present, tracks.present[way : way + 1]]),
+        ),
+    )

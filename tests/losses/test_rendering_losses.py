@@ -1,0 +1,43 @@
+"""Losses of renderings by hand and against torchmetrics."""
+
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from foredrive.losses.rendering import (
+    drop_loss,
+    intensity_loss,
+    line_of_sight_loss,
+    photometric_loss,
+    range_loss,
+)
+
+
+def test_photometric_is_l1_and_the_ssim_of_torchmetrics() -> None:
+    rng = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, 3, 24, 40, generator=rng)
+    b = 0.7 * a + 0.3 * b
+    ssim = structural_similarity_index_measure(a[None], b[None], data_range=1.0)
+    assert isinstance(ssim, torch.Tensor)
+    expected = 0.8 * float((a - b).abs().mean()) + 0.2 * (1 - float(ssim))
+    assert float(photometric_loss(a, b)) == pytest.approx(expected, abs=1e-5)
+    assert float(photometric_loss(a, a)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_worst_twentieth_of_ranges_does_not_count() -> None:
+    real, returned = torch.full((41,), 10.0), torch.ones(41, dtype=torch.bool)
+    rendered = real + 0.5
+    rendered[:2] = 200.0
+    returned[-1], rendered[-1] = False, 1e6
+    assert float(range_loss(rendered, real, returned)) == pytest.approx(0.5)
+    assert float(range_loss(rendered, real, returned & False)) == 0.0
+
+
+def test_beams_that_return_are_compared_alone() -> None:
+    returned = torch.tensor([True, True, False])
+    assert float(intensity_loss(torch.tensor([0.5, 0.2, 1]), torch.tensor([0.1, 0.2, 0]), returned)) == (
+        pytest.approx(0.08)
+    )
+    assert float(line_of_sight_loss(torch.tensor([0.4, 0.2, 0.9]), returned)) == pytest.approx(0.3)
+    assert float(drop_loss(torch.zeros(3), returned)) == pytest.approx(0.693147)
+    assert float(drop_loss(torch.tensor([-9.0, -9, 9]), returned)) < 1e-3

@@ -1,0 +1,95 @@
+"""Edits by hand, and from their file."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from test_scene_graph import graph_of, two_actors
+
+from foredrive.errors import InputError
+from foredrive.rendering.edits import (
+    Duplicate,
+    Edit,
+    Insert,
+    Move,
+    Remove,
+    ShiftEgo,
+    apply_edits,
+    load_edits,
+    save_edits,
+)
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, place
+
+
+def scene() -> SceneGraph:
+    return graph_of([[5.0, 5, 5], [1.0, 0, 0], [0.0, 0, 0]], [STATIC, 0, 1], two_actors())
+
+
+def test_moving_is_in_the_actors_own_frame() -> None:
+    edited = apply_edits(scene(), [Move(7, offset_m=(1.0, 0.0, 0.0))]).graph
+    way = edited.tracks.T_scene_actor[0, :, :2, 3]
+    assert torch.allclose(way, torch.tensor([[1.0, 0], [4, 1]]), atol=1e-6)
+    assert torch.equal(scene().tracks.T_scene_actor[1], edited.tracks.T_scene_actor[1])
+
+
+def test_removing_takes_the_gaussians_along() -> None:
+    edited = apply_edits(scene(), [Remove(7)]).graph
+    assert edited.tracks.track_id.tolist() == [11]
+    assert edited.actor.tolist() == [STATIC, 0]
+    assert place(edited, 0.0).source.tolist() == [0]
+
+
+def test_a_copy_is_another_actor() -> None:
+    edited = apply_edits(scene(), [Duplicate(7, copy=8, offset_m=(0.0, 3.0, 0.0)), Remove(7)]).graph
+    assert edited.tracks.track_id.tolist() == [11, 8]
+    placed = place(edited, 0.0).gaussians
+    assert torch.allclose(placed.mean_m[-1], torch.tensor([1.0, 3, 1]))
+
+
+def test_an_inserted_actor_stands_on_the_same_ground() -> None:
+    edits = [Insert("other", actor=11, copy=20, follows=7, yaw_rad=math.pi)]
+    edited = apply_edits(scene(), edits, lambda run: scene()).graph
+    pose = edited.tracks.T_scene_actor[2, 0]
+    assert torch.allclose(pose[:3, 3], torch.tensor([0.0, 0, 1]))  # both are 2 m high
+    assert torch.allclose(pose[:2, :2], -torch.eye(2), atol=1e-6)
+    assert edited.tracks.category[2] == scene().tracks.category[1]
+
+
+def test_the_ego_vehicle_is_shifted_in_its_own_frame() -> None:
+    edits = [ShiftEgo((0.0, 2.0, 0.0)), ShiftEgo((1.0, 0.0, 0.0), yaw_rad=0.1)]
+    T = apply_edits(scene(), edits).T_ego_shifted
+    assert torch.allclose(T[:3, 3], torch.tensor([1.0, 2, 0]))
+
+
+def test_edits_from_a_file_do_the_same(tmp_path: Path) -> None:
+    edits: list[Edit] = [Move(7, (1.0, 2.0, 0.0), 0.3), Duplicate(11, 12, (0.0, 1.0, 0.0)), Remove(11)]
+    save_edits(edits, tmp_path / "edits.json")
+    again = load_edits(tmp_path / "edits.json")
+    assert again == edits
+    first, second = apply_edits(scene(), edits).graph, apply_edits(scene(), again).graph
+    assert torch.equal(first.tracks.T_scene_actor, second.tracks.T_scene_actor)
+    assert torch.equal(first.gaussians.mean_m, second.gaussians.mean_m)
+
+
+@pytest.mark.parametrize(
+    ("edit", "told"),
+    [
+        (Remove(3), r"no actor 3; there are: 7, 11"),
+        (Move(3), r"no actor 3"),
+        (Duplicate(7, copy=11), r"there is an actor 11 already"),
+        (Insert("other", 7, 8, 7), r"no run can be opened"),
+    ],
+)
+def test_what_cannot_be_done_is_told(edit: Edit, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        apply_edits(scene(), [edit])
+
+
+def test_a_file_of_something_else_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "edits.json"
+    file.write_text('[{"kind": "remove", "actor": "red"}]')
+    with pytest.raises(InputError, match=r"not a list of edits: 0\.remove\.actor"):
+        load_edits(file)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_edits(tmp_path / "nothing.json")

@@ -1,0 +1,115 @@
+"""A scene before learning, from a log whose geometry is known."""
+
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+import torch
+
+from foredrive.data import find_logs
+from foredrive.data.drives import read_drive
+from foredrive.errors import InputError
+from foredrive.rendering.initial import InitialSize, initial_scene
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.rendering.tracks import read_tracks, states_at
+from foredrive.rendering.views import camera_views, sweep_views
+from foredrive.scene import Clip
+
+SIZE = InitialSize(lidar_points=4000, pixel_points=200, near_points=100, actor_points=60, features=2)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Clip:
+    (log,) = find_logs(world.write(tmp_path_factory.mktemp("initial"), frames=11))
+    return read_drive(log, (48, 96))
+
+
+@pytest.fixture(scope="module")
+def graph(drive: Clip) -> SceneGraph:
+    origin = drive.T_world_ego[0]
+    return initial_scene(
+        [view for views in camera_views(drive, origin) for view in views],
+        sweep_views(drive, origin),
+        read_tracks(drive, origin),
+        SIZE,
+        torch.Generator().manual_seed(0),
+    )
+
+
+def test_a_drive_has_every_frame(drive: Clip) -> None:
+    assert len(drive.t_s) == 11
+    assert drive.now == 0
+    assert bool(drive.misses_known.all())
+    assert drive.images.shape == (11, 2, 3, 48, 96)
+    assert drive.rig.exposed_dt_s is not None
+    assert float(drive.rig.exposed_dt_s.abs().max()) < 1e-5
+
+
+def test_a_camera_the_log_lacks_is_told(drive: Clip, tmp_path: Path) -> None:
+    (log,) = find_logs(world.write(tmp_path, frames=2))
+    with pytest.raises(InputError, match="no camera 'behind'; there are: ahead, left"):
+        read_drive(log, (48, 96), ("behind",))
+
+
+def test_tracks_are_where_the_boxes_are(drive: Clip) -> None:
+    tracks = read_tracks(drive.frames([0, 2, 4, 6, 8, 10]), drive.T_world_ego[0])
+    states = states_at(tracks, 0.5)  # between frames that were read
+    moving = tracks.index_of(11)
+    expected = torch.tensor(world.MOVING["centre"]).float() + torch.tensor([1.5, 0, 0])
+    assert torch.allclose(states.T_scene_actor[moving, :3, 3], expected, atol=1e-4)
+    assert states.velocity_mps[moving].tolist() == pytest.approx([3, 0, 0], abs=1e-3)
+
+
+def test_the_static_part_has_no_actors_in_it(graph: SceneGraph) -> None:
+    own = graph.gaussians[graph.actor == STATIC]
+    lidar = own.mean_m[: SIZE.lidar_points]
+    assert float(lidar[:, 2].abs().max()) < 0.02  # all of it is ground
+    seen = own.feature[: SIZE.lidar_points, :3]
+    grey = torch.tensor(world.GROUND_RGB) / 255
+    known = (seen - 0.5).abs().amax(-1) > 1e-6
+    assert float(known.float().mean()) > 0.2
+    # at the rims of boxes a pixel shows another thing than the beam met
+    assert float(((seen[known] - grey).abs().amax(-1) < 0.02).float().mean()) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("track_id", "box", "rgb"), [(7, world.PARKED, world.PARKED_RGB), (11, world.MOVING, world.MOVING_RGB)]
+)
+def test_actors_have_their_own_points(graph: SceneGraph, track_id: int, box: dict, rgb: tuple) -> None:
+    own = graph.of_actor(graph.tracks.index_of(track_id))
+    assert len(own.opacity_logit) >= SIZE.actor_points
+    half_m = torch.tensor(box["size"]).float() / 2
+    assert bool((own.mean_m.abs() <= half_m + 0.15).all())
+    # lidar meets surfaces: most points lie on one of the sides
+    on_side = ((own.mean_m.abs() - half_m).abs().amin(-1) < 0.05).float().mean()
+    assert float(on_side) > 0.7
+    coloured = (own.feature[:, :3] - 0.5).abs().amax(-1) > 0.05
+    near = (own.feature[coloured, :3] - torch.tensor(rgb) / 255).abs().amax(-1) < 0.1
+    assert float(near.float().mean()) > 0.6
+
+
+def test_pixels_are_as_far_as_the_beams_beside_them(graph: SceneGraph) -> None:
+    """Those of the ground lie on the ground, those of the sky far away; those of actors are left out."""
+    own = graph.gaussians[graph.actor == STATIC]
+    along = own[slice(SIZE.lidar_points, -SIZE.near_points)]
+    assert 0.5 * SIZE.pixel_points < len(along.opacity_logit) < SIZE.pixel_points
+    rgb = along.feature[:, :3] * 255
+    sky = (rgb - torch.tensor(world.SKY_RGB)).abs().amax(-1) < 4
+    ground = (rgb - torch.tensor(world.GROUND_RGB)).abs().amax(-1) < 4
+    assert bool((along.mean_m[sky, 2] > 0).all())
+    assert float((along.mean_m[sky].norm(dim=-1) > 50).float().mean()) > 0.9
+    assert float((along.mean_m[ground, 2].abs() < 0.3).float().mean()) > 0.8
+    assert int(sky.sum()) > 20
+    assert int(ground.sum()) > 20
+
+
+def test_the_same_seed_gives_the_same_scene(drive: Clip, graph: SceneGraph) -> None:
+    origin = drive.T_world_ego[0]
+    again = initial_scene(
+        [view for views in camera_views(drive, origin) for view in views],
+        sweep_views(drive, origin),
+        read_tracks(drive, origin),
+        SIZE,
+        torch.Generator().manual_seed(0),
+    )
+    assert torch.equal(again.gaussians.mean_m, graph.gaussians.mean_m)

@@ -1,0 +1,120 @@
+"""Actors and their Gaussians at any moment, by hand."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, mirrored, place
+from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.scene import Category
+
+
+def two_actors() -> Tracks:
+    """A car that turns left by 90° over 2 s and goes from (0, 0) to (4, 0), and a person who comes late."""
+    turning = matrix_from_yaw(torch.tensor([0.0, math.pi / 2]), torch.tensor([[0.0, 0, 1], [4.0, 0, 1]]))
+    late = matrix_from_yaw(torch.zeros(2), torch.tensor([[0.0, 9, 0], [0.0, 9, 0]]))
+    return Tracks(
+        track_id=torch.tensor([7, 11]),
+        category=torch.tensor([Category.CAR, Category.PEDESTRIAN]),
+        size_lwh=torch.tensor([[4.0, 2, 2], [1, 1, 2]]),
+        t_s=torch.tensor([0.0, 2.0]),
+        T_scene_actor=torch.stack([turning, late]),
+        present=torch.tensor([[True, True], [False, True]]),
+    )
+
+
+def graph_of(mean_m: list[list[float]], actor: list[int], tracks: Tracks) -> SceneGraph:
+    count = len(actor)
+    gaussians = Gaussians(
+        mean_m=torch.tensor(mean_m),
+        quaternion=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scale=torch.tensor([[1.0, 0.1, 0.2]]).log().repeat(count, 1),
+        opacity_logit=torch.zeros(count),
+        feature=torch.arange(count * 3.0).reshape(count, 3),
+    )
+    return SceneGraph(gaussians, torch.tensor(actor), tracks)
+
+
+def covariance(gaussians: Gaussians) -> torch.Tensor:
+    M = gaussians.factor().permute(2, 0, 1)
+    return M @ M.transpose(-1, -2)
+
+
+def test_halfway_an_actor_has_gone_and_turned_half() -> None:
+    states = states_at(two_actors(), 1.0)
+    assert torch.allclose(states.T_scene_actor[0, :3, 3], torch.tensor([2.0, 0, 1]))
+    c = math.sqrt(0.5)
+    assert torch.allclose(states.T_scene_actor[0, :2, :2], torch.tensor([[c, -c], [c, c]]), atol=1e-6)
+    assert torch.allclose(states.velocity_mps[0], torch.tensor([2.0, 0, 0]))
+    assert torch.allclose(states.turn_radps[0], torch.tensor([0, 0, math.pi / 4]), atol=1e-6)
+    assert states.present.tolist() == [True, False]
+
+
+def test_an_actor_goes_on_for_one_step_and_no_longer() -> None:
+    states = states_at(two_actors(), 3.0)
+    assert torch.allclose(states.T_scene_actor[0, :3, 3], torch.tensor([6.0, 0, 1]), atol=1e-6)
+    assert bool(states.present[0])
+    assert not bool(states_at(two_actors(), 4.5).present[0])
+
+
+def test_time_and_poses_have_gradients() -> None:
+    offset = torch.zeros(2, 2, 6, requires_grad=True)
+    t_s = torch.tensor(1.0, requires_grad=True)
+    x = states_at(two_actors().moved(offset), t_s).T_scene_actor[0, 0, 3]
+    x.backward()
+    assert t_s.grad is not None
+    assert float(t_s.grad) == pytest.approx(2.0)
+    assert offset.grad is not None
+    # the second key pose looks along y: what is to its right is further along x
+    assert torch.allclose(offset.grad[0, :, :2], torch.tensor([[0.5, 0], [0, -0.5]]), atol=1e-6)
+
+
+def test_gaussians_turn_and_move_with_their_actor() -> None:
+    graph = graph_of([[5.0, 5, 5], [2.0, 0, 0], [0.0, 0, 0]], [STATIC, 0, 1], two_actors())
+    placed = place(graph, 2.0)
+    assert placed.source.tolist() == [0, 1]  # the late one is not there between the key times
+    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[5.0, 5, 5], [4, 2, 1]]), atol=1e-6)
+    turned = torch.diag(torch.tensor([0.1, 1.0, 0.2]) ** 2)
+    assert torch.allclose(covariance(placed.gaussians)[1], turned, atol=1e-6)
+    # 2 m in front of the middle, which turns by π/4 a second: at its left, which is -x now
+    expected = torch.tensor([[0.0, 0, 0], [2 - math.pi / 2, 0, 0]])
+    assert torch.allclose(placed.velocity_mps, expected, atol=1e-5)
+
+
+def test_velocities_are_those_of_the_poses() -> None:
+    graph = graph_of([[1.0, 0.5, 0.2]], [0], two_actors())
+    before, after = place(graph, 0.999), place(graph, 1.001)
+    measured = (after.gaussians.mean_m - before.gaussians.mean_m) / 0.002
+    assert torch.allclose(place(graph, 1.0).velocity_mps, measured, atol=2e-3)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.1))
+def test_mirroring_is_a_reflection_of_place_and_shape(q: list[float]) -> None:
+    graph = graph_of([[1.0, 0.5, 0.2]], [0], two_actors())
+    gaussians = dataclasses.replace(graph.gaussians, quaternion=torch.tensor([q]))
+    M = torch.diag(torch.tensor([1.0, -1, 1]))
+    other = mirrored(gaussians)
+    assert torch.allclose(other.mean_m, gaussians.mean_m @ M)
+    assert torch.allclose(covariance(other), M @ covariance(gaussians) @ M, atol=1e-5)
+
+
+def test_only_the_actors_that_are_named_are_mirrored() -> None:
+    graph = graph_of([[0.0, 1, 0], [0.0, 1, 0]], [0, STATIC], two_actors())
+    placed = place(graph, 0.0, mirror=torch.tensor([True, False]))
+    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[0.0, 1, 0], [0, -1, 1]]))
+
+
+def test_vehicles_look_alike_from_both_sides_and_people_do_not() -> None:
+    assert two_actors().mirrored.tolist() == [True, False]
+
+
+def test_an_unknown_actor_is_told_with_those_there_are() -> None:
+    with pytest.raises(InputError, match=r"no actor 3; there are: 7, 11"):
+        two_actors().index_of(3)
