@@ -31,7 +31,7 @@ class RebuildRecipe:
 
 def gaussians_tiny() -> RebuildRecipe:
     """Some minutes on two cores, images of 480×270."""
-    steps = 800
+    steps = 500
     return RebuildRecipe(
         name="gaussians_tiny",
         image_hw=(270, 480),
@@ -46,8 +46,8 @@ def gaussians_tiny() -> RebuildRecipe:
         schedule=RebuildSchedule(
             steps=steps,
             most_gaussians=260_000,
-            rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=2e-3),
-            images_per_sweep=3,
+            rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=3e-3),
+            images_per_sweep=2,
             beam_stride=4,
             shrink_steps=(steps // 10,),
             grow_from=steps // 10,
