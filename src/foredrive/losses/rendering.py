@@ -23,10 +23,11 @@ def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Floa
     """Structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
     offset = torch.arange(_SSIM_WINDOW_PX, device=a.device) - _SSIM_WINDOW_PX // 2
     window = torch.softmax(-0.5 * (offset / _SSIM_SIGMA_PX) ** 2, dim=0).to(a)
-    stack = torch.cat([a, b, a * a, b * b, a * b]).flatten(0, 1)[:, None]  # [15 1 H W]
+    stack = torch.cat([a, b, a * a, b * b, a * b], dim=1)  # [1 15 H W]
     stack = F.pad(stack, (_SSIM_WINDOW_PX // 2,) * 4, mode="reflect")
-    stack = F.conv2d(F.conv2d(stack, window[None, None, None]), window[None, None, :, None])
-    mean_a, mean_b, aa, bb, ab = stack[:, 0].unflatten(0, (5, 3)).unbind(0)
+    for kernel in (window[None], window[:, None]):
+        stack = F.conv2d(stack, kernel.expand(15, 1, -1, -1), groups=15)
+    mean_a, mean_b, aa, bb, ab = stack[0].unflatten(0, (5, 3)).unbind(0)
     var_a, var_b, cov = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
     likeness = (2 * mean_a * mean_b + _SSIM_C1) * (2 * cov + _SSIM_C2)
     return (likeness / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (var_a + var_b + _SSIM_C2))).mean()

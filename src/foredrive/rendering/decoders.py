@@ -8,6 +8,8 @@ ALBEDO = 3
 """Leading features that are colour already."""
 _LAST_LAYER_GAIN = 1e-2
 """At first an image is little else than its albedo."""
+_FAINT, _SENT_BACK = -2.0, 2.0
+"""Logits before anything is learned: most returns are faint, and most beams return."""
 _LEAST_CHANCE = 1e-4
 """That a beam returns, or does not."""
 
@@ -25,13 +27,16 @@ class CameraDecoder(nn.Module):
         with torch.no_grad():
             last.weight *= _LAST_LAYER_GAIN
             last.bias.zero_()  # type: ignore[union-attr]
-        self.net = nn.Sequential(
+        self.net: nn.Module = nn.Sequential(
             nn.Conv2d(features + appearance + 3, width, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(width, width, 3, padding=1),
             nn.ReLU(),
             last,
         )
+        for parameter in self.net.parameters():
+            if parameter.dim() == 4:  # laid out as composited features are
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
     def forward(
         self, feature: Float[Tensor, "H W D"], direction: Float[Tensor, "H W 3"], camera: int
@@ -57,12 +62,15 @@ class LidarDecoder(nn.Module):
         """A decoder for `features` features beside albedo."""
         super().__init__()
         self.appearance = nn.Parameter(0.1 * torch.randn(appearance))
+        last = nn.Linear(width, 2)
+        with torch.no_grad():
+            last.bias.add_(torch.tensor([_FAINT, _SENT_BACK]))
         self.net = nn.Sequential(
             nn.Linear(features + appearance + 3, width),
             nn.ReLU(),
             nn.Linear(width, width),
             nn.ReLU(),
-            nn.Linear(width, 2),
+            last,
         )
 
     def forward(

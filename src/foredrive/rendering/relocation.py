@@ -15,6 +15,8 @@ MIN_OPACITY = 0.005
 """Gaussians that are less opaque are dead."""
 MOST_COPIES = 51
 _STEEPNESS = 100.0
+_STAYS = 0.15
+"""Opacity from which on the walk is less than a millionth of what it would be."""
 
 
 def shared_among(
@@ -46,10 +48,15 @@ def random_walk_m(gaussians: Gaussians, step_m: float, generator: torch.Generato
         step_m: λ_noise times the centres' learning rate.
         generator: on the CPU, so that a run is the same on any device.
     """
-    noise = torch.randn(len(gaussians.mean_m), 3, generator=generator).to(gaussians.mean_m)
-    free = torch.sigmoid(-_STEEPNESS * (gaussians.opacity_logit.sigmoid() - MIN_OPACITY))
-    scaled = gaussians.log_scale.exp() ** 2 * _turned(gaussians.quaternion, noise, inverse=True)
-    return step_m * free[:, None] * _turned(gaussians.quaternion, scaled)
+    opacity = gaussians.opacity_logit.sigmoid()
+    walking = (opacity < _STAYS).nonzero()[:, 0]
+    them = gaussians[walking]
+    noise = torch.randn(len(walking), 3, generator=generator).to(them.mean_m)
+    free = torch.sigmoid(-_STEEPNESS * (opacity[walking] - MIN_OPACITY))
+    scaled = them.log_scale.exp() ** 2 * _turned(them.quaternion, noise, inverse=True)
+    way = torch.zeros_like(gaussians.mean_m)
+    way[walking] = step_m * free[:, None] * _turned(them.quaternion, scaled)
+    return way
 
 
 def _turned(
