@@ -16,6 +16,8 @@ from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
 from foredrive.recipes.reconstruct import begin, memory_needed_gib, read_material, reconstruct
 from foredrive.rendering.initial import InitialSize
+from foredrive.rendering.ply import read_ply
+from foredrive.rendering.scene_graph import STATIC
 from foredrive.training import rebuilding
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
@@ -106,6 +108,13 @@ def test_an_interrupted_run_comes_to_the_same(
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
     assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+
+
+def test_what_stands_is_there_for_other_viewers(run: Path) -> None:
+    weights = load_file(run / "model.safetensors")
+    static = weights["actor"] == STATIC
+    assert 0 < int(static.sum()) < len(static)
+    assert torch.equal(read_ply(run / "static.ply").mean_m, weights["mean_m"][static])
 
 
 def test_a_folder_with_another_run_is_refused(run: Path, log: LogPath, tmp_path: Path) -> None:

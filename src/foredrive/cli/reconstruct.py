@@ -18,7 +18,9 @@ def reconstruct(
 ) -> None:
     """Rebuild a log as a scene to render cameras and lidars from, or go on with an interrupted run.
 
-    Every second frame is held out, and the scene is judged on those.
+    Every second frame is held out, and the scene is judged on those. The run's folder holds the scene, its
+    figures (summary.json), pictures of frames that were held out (held_out.png) and what stands as a PLY file
+    that viewers of 3-D Gaussians read (static.ply).
 
     Args:
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
@@ -34,6 +36,7 @@ def reconstruct(
     from foredrive.errors import InputError
     from foredrive.recipes.gaussians import find_rebuild_recipe
     from foredrive.recipes.reconstruct import reconstruct as rebuild_log
+    from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
     logs = find_logs(log)
     if len(logs) > 1:
@@ -42,6 +45,9 @@ def reconstruct(
     if cameras:
         chosen = dataclasses.replace(chosen, cameras=cameras)
     run = rebuild_log(chosen, logs[0], out, cache)
+    if run.held_out.cameras:
+        title = f"{logs[0].name}, frames that were held out"
+        write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
     print(f"rebuilt {logs[0].name} by {method}: {out}")
     for name in (
         *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),

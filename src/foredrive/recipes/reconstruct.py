@@ -20,7 +20,9 @@ from foredrive.files import atomic_path
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.rendering.initial import initial_scene
+from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import STATIC
 from foredrive.rendering.tracks import Tracks, read_tracks
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.scene import Clip
@@ -29,6 +31,8 @@ from foredrive.training.loop import read_metrics
 from foredrive.training.rebuilding import Seen, rebuild
 
 CONFIG, LOG, WEIGHTS, SUMMARY = "config.yaml", "log.json", "model.safetensors", "summary.json"
+GAUSSIANS = "static.ply"
+"""What stands, for viewers of 3-D Gaussians."""
 _log = logging.getLogger(__name__)
 
 _COPIES = 14
@@ -52,12 +56,14 @@ class Material:
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """A run on disk."""
+    """A run on disk, and its scene."""
 
     folder: Path
     recipe: RebuildRecipe
-    log: LogPath
     summary: dict[str, float | int | str | None]
+    scene: RebuiltScene
+    held_out: Seen
+    """What the scene was judged on."""
 
 
 def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None) -> Rebuilt:
@@ -93,7 +99,9 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
     load_weights(scene, weights)
     if not (folder / SUMMARY).is_file():
         write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, material))
-    return Rebuilt(folder, recipe, path, read_summary(folder / SUMMARY))
+    if not (folder / GAUSSIANS).is_file():
+        write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
+    return Rebuilt(folder, recipe, read_summary(folder / SUMMARY), scene, material.held_out)
 
 
 def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:

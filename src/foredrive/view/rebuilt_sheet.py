@@ -1,0 +1,64 @@
+"""A rebuilt scene beside what its cameras saw."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from foredrive.files import atomic_path
+from foredrive.metrics import psnr_db
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.views import CameraView
+from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
+
+ROWS = 4
+WIDTH_IN = 4.0
+"""Of one picture."""
+
+
+@torch.no_grad()
+def write_rebuilt_sheet(path: Path, scene: RebuiltScene, views: Sequence[CameraView], title: str) -> None:
+    """Write some views as a PNG: as seen, as rendered, the difference, and how far things are.
+
+    Args:
+        path: of the picture.
+        scene: that is shown.
+        views: with images; some of them, spread over the drive, are shown.
+        title: of the picture.
+    """
+    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(ROWS, len(views))).round().astype(int)]
+    height = WIDTH_IN * max(view.size_hw[0] / view.size_hw[1] for view in chosen) + 0.3
+    figure = Figure(figsize=(4 * WIDTH_IN, len(chosen) * height + 0.4), layout="constrained")
+    axes = figure.subplots(len(chosen), 4, squeeze=False)
+    figure.suptitle(title)
+    for row, view in zip(axes, chosen, strict=True):
+        assert view.image is not None
+        picture = scene(scene.graph, view.to(scene.actor.device))
+        real, rgb = view.image.float() / 255, picture.rgb.clamp(0, 1).cpu()
+        known = torch.ones(1, *view.size_hw, dtype=torch.bool)
+        quality = float(psnr_db(rgb[None], real[None], known))
+        shown = {
+            f"seen at {view.t_s:.1f} s": _bytes(real),
+            f"rendered, {quality:.1f} dB": _bytes(rgb),
+            "difference": _bytes((rgb - real).abs()),
+            f"range, {NEAREST_M:g} m bright to {FARTHEST_M:g} m dark": _ranges(picture.range_m.cpu()),
+        }
+        for axis, (name, image) in zip(row, shown.items(), strict=True):
+            axis.imshow(image)
+            axis.set_title(name, fontsize=9)
+            axis.set_axis_off()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    return (image * 255).round().byte().permute(1, 2, 0).numpy()
+
+
+def _ranges(range_m: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    flat = range_m.flatten().numpy()
+    return range_colours(flat).reshape(*range_m.shape, 3)
