@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import shutil
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,14 @@ def test_an_interrupted_run_comes_to_the_same(
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
     assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+
+
+def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
+    folder = tmp_path / "damaged"
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("cache"))
+    (folder / "model.safetensors").write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match="weights of a scene cannot be read"):
+        reconstruct(recipe(), log, folder)
 
 
 def test_what_stands_is_there_for_other_viewers(run: Path) -> None:

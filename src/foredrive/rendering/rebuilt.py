@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors, sensor_twist
 from foredrive.ops.splat_points import TiledPoints, pixel_points
@@ -131,9 +132,16 @@ class RebuiltScene(nn.Module):
         return SceneGraph(self.gaussians, self.actor, self.tracks)
 
     def resize(self, file: Path) -> None:
-        """Make room for the weights in a file, which may hold another number of Gaussians."""
-        with safe_open(file, "pt") as saved:
-            count = saved.get_slice("actor").get_shape()[0]
+        """Make room for the weights in a file, which may hold another number of Gaussians.
+
+        Raises:
+            InputError: on a file that cannot be read, or holds none.
+        """
+        try:
+            with safe_open(file, "pt") as saved:
+                count = saved.get_slice("actor").get_shape()[0]
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"{file}: weights of a scene cannot be read: {error}") from error
         self.actor = self.actor.new_zeros(count)
         for name in OF_GAUSSIANS:
             old = getattr(self, name)
