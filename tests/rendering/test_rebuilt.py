@@ -1,0 +1,139 @@
+"""Sensors that move while they look, and corrections of them, on scenes of a few Gaussians."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from foredrive.geometry.se3 import exp_se3, transform_points
+from foredrive.recipes.reconstruct import tracks_without_actors
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene import LidarSweep
+
+FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Camera (x right, y down, z forward) in a frame with x forward and z up."""
+
+
+def scene_of(mean_m: torch.Tensor, tracks: Tracks, *, rolling: bool = True) -> RebuiltScene:
+    """Small, hard, white Gaussians."""
+    count = len(mean_m)
+    gaussians = Gaussians(
+        mean_m=mean_m,
+        quaternion=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scale=torch.full((count, 3), 0.08).log(),
+        opacity_logit=torch.full((count,), 8.0),
+        feature=torch.tensor([[1.0, 1, 1, 0, 0]]).repeat(count, 1),
+    )
+    torch.manual_seed(0)
+    return RebuiltScene(SceneGraph(gaussians, torch.full((count,), STATIC), tracks), 1, rolling)
+
+
+@pytest.fixture
+def nobody() -> Tracks:
+    one = Tracks(
+        torch.tensor([1]),
+        torch.tensor([0]),
+        torch.ones(1, 3),
+        torch.tensor([0.0, 1.0]),
+        torch.eye(4).repeat(1, 2, 1, 1),
+        torch.ones(1, 2, dtype=torch.bool),
+    )
+    return tracks_without_actors(one)
+
+
+def view(twist_cam: list[float], readout_s: float) -> CameraView:
+    return CameraView(
+        K=torch.tensor([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]]),
+        dist=torch.zeros(5),
+        T_scene_cam=FORWARD,
+        twist_cam=torch.tensor(twist_cam),
+        t_s=0.5,
+        readout_s=readout_s,
+        size_hw=(64, 96),
+        sensor=0,
+    )
+
+
+@torch.no_grad()
+def centre_px(scene: RebuiltScene, camera: CameraView, rows: slice) -> float:
+    """Where along u the light of some rows lies."""
+    alpha = scene(scene.graph, camera).alpha[rows]
+    return float((alpha.sum(0) * (torch.arange(96) + 0.5)).sum() / alpha.sum())
+
+
+def test_a_pole_leans_when_the_camera_passes_it(nobody: Tracks) -> None:
+    """To the right at 10 m/s, 40 ms from the first row to the last: at 6 m a row is off by 10·dt·60/6 px."""
+    pole = torch.tensor([[6.0, 0.0, z / 20] for z in range(-60, 61)])
+    camera = view([10.0, 0, 0, 0, 0, 0], readout_s=0.04)
+    top, bottom = (centre_px(scene_of(pole, nobody), camera, rows) for rows in (slice(4, 12), slice(52, 60)))
+    assert top - bottom == pytest.approx(10 * 0.04 * 48 / 64 * 60 / 6, abs=0.05)
+    still = scene_of(pole, nobody, rolling=False)
+    assert centre_px(still, camera, slice(4, 12)) == pytest.approx(48.0, abs=0.05)
+
+
+def test_turning_shows_as_well(nobody: Tracks) -> None:
+    """About the camera's y axis, to its right, 1 rad/s: what is straight ahead goes left by 60 px/rad."""
+    pole = torch.tensor([[6.0, 0.0, z / 20] for z in range(-60, 61)])
+    camera = view([0.0, 0, 0, 0, 1.0, 0], readout_s=0.04)
+    scene = scene_of(pole, nobody)
+    lean = centre_px(scene, camera, slice(4, 12)) - centre_px(scene, camera, slice(52, 60))
+    assert lean == pytest.approx(60 * 0.04 * 48 / 64, abs=0.05)
+
+
+@torch.no_grad()
+def test_exposing_later_is_being_further(nobody: Tracks) -> None:
+    scene = scene_of(torch.tensor([[6.0, 0.3, 0.2], [9.0, -1, 0]]), nobody)
+    camera = view([1.0, 0.5, 8.0, 0.1, 0.3, 0], readout_s=0.02)
+    scene.camera_late_s[0] = 0.05
+    late = scene(scene.graph, camera).alpha
+    scene.camera_late_s[0] = 0.0
+    further = dataclasses.replace(camera, T_scene_cam=FORWARD @ exp_se3(0.05 * camera.twist_cam), t_s=0.55)
+    assert torch.allclose(late, scene(scene.graph, further).alpha, atol=1e-4)
+    assert float((late - scene(scene.graph, camera).alpha).abs().max()) > 0.1
+
+
+def test_corrections_of_cameras_are_learned(nobody: Tracks) -> None:
+    scene = scene_of(torch.tensor([[6.0, 0.3, 0.2]]), nobody)
+    camera = view([1.0, 0, 8.0, 0, 0, 0], readout_s=0.04)
+    scene(scene.graph, camera).rgb[:, :, :48].sum().backward()
+    for parameter in (scene.camera_offset, scene.camera_twist, scene.camera_late_s):
+        assert parameter.grad is not None
+        assert float(parameter.grad.abs().max()) > 0
+
+
+@torch.no_grad()
+def test_a_moving_lidar_measures_from_where_each_beam_left(nobody: Tracks) -> None:
+    """At 8 m/s in a curve; the beams' origins and directions are those that the vehicle's motion gives."""
+    targets = torch.tensor([[12.0, 0, 1], [0.0, 9, 2], [-15.0, 1, 0], [3.0, -8, 1.5]])
+    dt_s = torch.tensor([0.0, -0.025, -0.05, -0.075])
+    twist = torch.tensor([8.0, 0, 0, 0, 0, 0.4])
+    T_scene_ego = exp_se3(torch.tensor([3.0, -1, 0.1, 0, 0, 0.7]))
+    mounted = torch.tensor([[1.0, 0.2, 1.8]])
+    origin = transform_points(exp_se3(dt_s[:, None] * twist), mounted[:, None].expand(4, 1, 3))[:, 0]
+    along = targets - origin
+    beams = LidarSweep(
+        origin_ego=origin,
+        dir_ego=along / along.norm(dim=-1, keepdim=True),
+        range_m=along.norm(dim=-1),
+        returned=torch.ones(4, dtype=torch.bool),
+        intensity=torch.zeros(4),
+        dt_s=dt_s,
+        beam=torch.zeros(4, dtype=torch.int64),
+        valid=torch.ones(4, dtype=torch.bool),
+    )
+    sweep = SweepView(beams, False, T_scene_ego, twist, t_s=0.5)
+    scene = scene_of(transform_points(T_scene_ego, targets), nobody)
+    points = scene.prepare_sweep(sweep)
+    seen = scene.sweep(scene.graph, points, 0.5, hit_range_m=along.norm(dim=-1) - 0.5)
+    assert float(seen.alpha.min()) > 0.5
+    # splats move in straight lines: what they miss of the motion is of second order
+    assert torch.allclose(seen.range_m, along.norm(dim=-1), atol=0.05)
+    assert seen.alpha_before_hit is not None
+    assert float(seen.alpha_before_hit.max()) < 1e-3
+    one_moment = scene_of(transform_points(T_scene_ego, targets), nobody, rolling=False)
+    missed = one_moment.sweep(one_moment.graph, one_moment.prepare_sweep(sweep), 0.5)
+    assert float(missed.alpha[[1, 3]].max()) < 0.2  # those abeam
