@@ -10,6 +10,7 @@ from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.convert import convert
+from foredrive.data.drives import read_drive
 from foredrive.data.labels import make_labels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
@@ -74,6 +75,19 @@ def test_pandaset_sweeps_are_compensated(pandaset: LogPath) -> None:
     duration_s = float(sweep.dt_s.max() - sweep.dt_s.min())
     assert span[0] == pytest.approx(log.speed_mps[MOVING_FRAME] * duration_s, rel=0.1)
     assert 0.3 < span[0] < 0.6
+
+
+def test_pandaset_is_read_as_a_whole(pandaset: LogPath) -> None:
+    """Every frame; the Pandar64 fires 1800 times a channel, and about one beam in ten is lost."""
+    drive = read_drive(pandaset, (27, 48), ("front_camera",))
+    assert len(drive.t_s) == 56
+    assert bool(drive.misses_known.all())
+    assert drive.rig.exposed_dt_s is not None
+    assert float(drive.rig.exposed_dt_s.mean()) == pytest.approx(-0.01, abs=1e-3)
+    beams = drive.sweeps[MOVING_FRAME]
+    per_channel = torch.bincount(beams.beam[beams.valid], minlength=64)
+    assert float((per_channel - 1800).abs().float().median()) < 60
+    assert 0.85 < float(beams.returned.sum() / beams.valid.sum()) < 0.95
 
 
 def test_pandaset_points_lie_in_their_cuboids_and_their_pixels(pandaset: LogPath) -> None:
