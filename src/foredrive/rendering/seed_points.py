@@ -90,7 +90,7 @@ def points_along_pixels(
         tracks: the actors.
         count: how many pixels, over all images.
         scale: standard deviation in units of the distance between pixels drawn of a camera.
-        far_m: where points lie, even in 1/m, that no beam is near.
+        far_m: where points lie, even in 1/m, that look upwards where no beam is near.
         generator: of which pixels are taken.
     """
     found = [no_points()]
@@ -109,7 +109,8 @@ def points_along_pixels(
         else:
             apart_px, index = cKDTree(uv_beam[inside].numpy()).query(uv.numpy())
             nearest = torch.from_numpy(np.asarray(index))
-            met = torch.from_numpy(np.asarray(apart_px)) < NEAR_IN_IMAGE * view.size_hw[0]
+            beside = torch.from_numpy(np.asarray(apart_px)) < NEAR_IN_IMAGE * view.size_hw[0]
+            met = beside | (direction[:, 2] < 0)  # the ground right before the vehicle is below all beams
             beam_m = (xyz[inside] - view.T_scene_cam[:3, 3]).norm(dim=-1)[nearest]
             range_m, kept = torch.where(met, beam_m, away_m), standing[inside][nearest] | ~met
         drawn = count * sum(other.sensor == view.sensor for other in cameras) / len(cameras)
