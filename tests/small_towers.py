@@ -34,7 +34,7 @@ class PlainTowers:
 
 def save_clip(folder: Path) -> Path:
     """Write a CLIP with its tokenizer, the same every time."""
-    _save_tokenizer(folder)
+    save_tokenizer(folder)
     torch.manual_seed(0)
     text = {**SMALL, "vocab_size": len(WORDS), "eos_token_id": 3, "bos_token_id": 2, "pad_token_id": 0}
     CLIPModel(CLIPConfig(text_config=text, vision_config=VISION, projection_dim=12)).save_pretrained(folder)
@@ -43,14 +43,15 @@ def save_clip(folder: Path) -> Path:
 
 def save_siglip(folder: Path) -> Path:
     """Write a SigLIP with its tokenizer, the same every time."""
-    _save_tokenizer(folder)
+    save_tokenizer(folder)
     torch.manual_seed(0)
     text = {**SMALL, "vocab_size": len(WORDS), "max_position_embeddings": 16, "pad_token_id": 0}
     SiglipModel(SiglipConfig(text_config=text, vision_config=VISION)).save_pretrained(folder)
     return folder
 
 
-def _save_tokenizer(folder: Path) -> None:
+def save_tokenizer(folder: Path) -> None:
+    """Write a BERT tokenizer of `WORDS`."""
     folder.mkdir()
     (folder / "vocab.txt").write_text("\n".join(WORDS))
     BertTokenizerFast(str(folder / "vocab.txt")).save_pretrained(folder)

@@ -8,7 +8,7 @@ import torch
 from transformers import BertConfig, BertModel, BertTokenizerFast, CLIPConfig, CLIPModel
 
 from foredrive.errors import InputError
-from foredrive.models.text_encoder import IN_A_PACKAGE, encode_texts
+from foredrive.models.text_encoder import IN_A_PACKAGE, TextEncoder
 
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "the", "car", "stops", "at", "night", "rain"]
 SMALL = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
@@ -26,7 +26,7 @@ def test_a_bert_is_averaged_over_its_tokens(tmp_path: Path) -> None:
     torch.manual_seed(0)
     bert = BertModel(BertConfig(vocab_size=len(WORDS), **SMALL)).eval()
     bert.save_pretrained(folder)
-    encoded = encode_texts(["the car stops", "rain"], str(folder))
+    encoded = TextEncoder(str(folder))(["the car stops", "rain"])
     assert encoded.shape == (2, 16)
     torch.testing.assert_close(encoded.norm(dim=-1), torch.ones(2))
     tokens = torch.tensor([[WORDS.index(word) for word in ("[CLS]", "rain", "[SEP]")]])
@@ -43,17 +43,17 @@ def test_a_clip_says_itself_what_a_sentence_is(tmp_path: Path) -> None:
     vision = {**SMALL, "image_size": 16, "patch_size": 8}
     model = CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=8)).eval()
     model.save_pretrained(folder)
-    encoded = encode_texts(["the car stops", "rain"], str(folder))
+    encoded = TextEncoder(str(folder))(["the car stops", "rain"])
     assert encoded.shape == (2, 8)
     assert not torch.allclose(encoded[0], encoded[1])
 
 
 def test_what_cannot_be_had_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be loaded"):
-        encode_texts(["rain"], str(tmp_path))
+        TextEncoder(str(tmp_path))(["rain"])
 
 
 @pytest.mark.skipif(find_spec(IN_A_PACKAGE.replace("-", "_")) is None, reason="the extra `text` is not here")
 def test_the_packaged_one_knows_what_sentences_mean() -> None:
-    rain, wet, car = encode_texts(["It is raining.", "The weather is wet.", "A red car."], IN_A_PACKAGE)
+    rain, wet, car = TextEncoder(IN_A_PACKAGE)(["It is raining.", "The weather is wet.", "A red car."])
     assert float(rain @ wet) > 0.5 > float(rain @ car)

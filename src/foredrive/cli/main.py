@@ -21,7 +21,7 @@ from foredrive.cli.imagine import imagine
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
 from foredrive.cli.score import score
-from foredrive.cli.search import search, search_index, search_page
+from foredrive.cli.search import search, search_index, search_page, search_train
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
@@ -38,6 +38,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search": search,
     "search-index": search_index,
     "search-page": search_page,
+    "search-train": search_train,
     "reconstruct": reconstruct,
     "imagine": imagine,
     "export": export,

@@ -1,4 +1,4 @@
-"""`foredrive search`, `search index` and `search page`."""
+"""`foredrive search`, `search index`, `search page` and `search train`."""
 
 import os
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, SomePaths
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,7 +137,8 @@ def search_index(
     Args:
         logs: 123D logs, splits, data roots or lists of clips.
         index: Where the index lies: a folder, or a place on object storage such as s3://bucket/index.
-        towers: A CLIP or SigLIP model: its name on Hugging Face's hub, or its folder.
+        towers: A CLIP or SigLIP model: its name on Hugging Face's hub, or its folder; or a folder that
+            `foredrive search train` made.
         stride: Time between the moments of a log that are indexed.
         workers: How many parts of logs are embedded at a time; 0 is one for each core.
         ray: Embed on Ray: on the cluster at RAY_ADDRESS, or on one started here.
@@ -174,6 +175,39 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
         page.serve()
     finally:
         page.close()
+
+
+def search_train(
+    logs: SomePaths,
+    out: Path,
+    cache: OptionalPath = None,
+    beside: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None,
+    loss: Literal["mse", "cosine"] = "mse",
+    image_steps: int | None = None,
+    lidar_steps: int | None = None,
+    seed: int = 0,
+) -> None:
+    """Train towers for search, or go on with a run that was interrupted.
+
+    An image tower learns beside a sentence encoder from what is known of each camera's view, then a lidar
+    tower from the image tower. Beside CLIP or SigLIP only a lidar tower is trained, from images alone.
+
+    Args:
+        logs: 123D logs, splits or data roots with cameras and lidar; image towers need boxes or captions.
+        out: Folder of the run; the towers lie in its folder "towers".
+        cache: Folder for views; by default "cache" in the run's folder.
+        beside: A CLIP or SigLIP model whose images teach the lidar tower.
+        loss: What the lidar tower is trained by: mean squared error, or 1 - cosine.
+        image_steps: Steps of the image tower; by default 20 epochs.
+        lidar_steps: Steps of the lidar tower; by default 10 epochs.
+        seed: Of weights and of the order of data.
+    """
+    from foredrive.recipes import find_all_logs
+    from foredrive.recipes.tower_training import embedded_recipe, train_towers
+
+    recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
+    towers = train_towers(recipe, find_all_logs(logs), out, cache, beside)
+    print(f"next: foredrive search index LOGS --towers {towers}")
 
 
 def _saved(index: str, name: str) -> "Query":

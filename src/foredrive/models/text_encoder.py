@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,9 +18,12 @@ WITH_IMAGES = ("clip", "siglip", "siglip2")
 """Kinds of models that have a tower for texts, which says itself what a sentence is."""
 
 
-@torch.no_grad()
-def encode_texts(texts: Sequence[str], model: str) -> Float[Tensor, "N E"]:
-    """Sentences as vectors of length 1.
+AT_ONCE = 256
+"""Texts encoded together, those of about one length beside each other."""
+
+
+class TextEncoder:
+    """A frozen text encoder, loaded once.
 
     CLIP and SigLIP say by their text towers what a sentence is; of BERT-like models the last layer is
     averaged over the tokens, as sentence transformers do.
@@ -30,22 +34,37 @@ def encode_texts(texts: Sequence[str], model: str) -> Float[Tensor, "N E"]:
     Raises:
         InputError: there is no such model here, and it cannot be had.
     """
-    from transformers import AutoModel, AutoTokenizer  # takes seconds, and most only need its name
 
-    where = str(_in_package()) if model == IN_A_PACKAGE else model
-    try:
-        tokenizer, encoder = AutoTokenizer.from_pretrained(where), AutoModel.from_pretrained(where).eval()
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"the text encoder {model!r} cannot be loaded: {reason}") from error
-    tokens = tokenizer(list(texts), padding=True, truncation=True, return_tensors="pt")
-    if encoder.config.model_type in WITH_IMAGES:
-        found = encoder.get_text_features(**tokens)
-        encoded = found if isinstance(found, Tensor) else found.pooler_output
-    else:
-        hidden, mask = encoder(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
-        encoded = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
-    return F.normalize(encoded.float(), dim=-1)
+    def __init__(self, model: str) -> None:
+        from transformers import AutoModel, AutoTokenizer  # takes seconds, and most only need its name
+
+        where = str(_in_package()) if model == IN_A_PACKAGE else model
+        try:
+            self._tokenizer: Any = AutoTokenizer.from_pretrained(where)
+            self._encoder: Any = AutoModel.from_pretrained(where).eval()
+        except (OSError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"the text encoder {model!r} cannot be loaded: {reason}") from error
+
+    @torch.no_grad()
+    def __call__(self, texts: Sequence[str]) -> Float[Tensor, "N E"]:
+        """Sentences as vectors of length 1."""
+        order = sorted(range(len(texts)), key=lambda n: len(texts[n]))
+        parts = [
+            self._encode([texts[n] for n in order[start : start + AT_ONCE]])
+            for start in range(0, len(order), AT_ONCE)
+        ]
+        return torch.cat(parts)[torch.tensor(order).argsort()]
+
+    def _encode(self, texts: list[str]) -> Float[Tensor, "N E"]:
+        tokens = self._tokenizer(texts, padding=True, truncation=True, return_tensors="pt")
+        if self._encoder.config.model_type in WITH_IMAGES:
+            found = self._encoder.get_text_features(**tokens)
+            encoded = found if isinstance(found, Tensor) else found.pooler_output
+        else:
+            hidden, mask = self._encoder(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
+            encoded = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
+        return F.normalize(encoded.float(), dim=-1)
 
 
 def _in_package() -> Path:

@@ -12,7 +12,7 @@ from foredrive.models.driveworld.task_prompt import PROMPTS, TaskPrompt
 from foredrive.models.lift_splat import LiftSplatEncoder
 from foredrive.models.lifting import LiftingEncoder
 from foredrive.models.pooled_lifting import PooledLiftingEncoder
-from foredrive.models.text_encoder import encode_texts
+from foredrive.models.text_encoder import TextEncoder
 from foredrive.recipes.config import DriveWorldSize, LiftSplatSize, PromptSize
 from foredrive.scene import VoxelSpec
 
@@ -78,7 +78,7 @@ def _build_encoder(model: DriveWorldSize, spec: VoxelSpec) -> LiftSplatEncoder |
 
 def _build_prompt(size: PromptSize, size_yx: tuple[int, int], *, fetch: bool) -> TaskPrompt:
     if fetch:
-        encoded = encode_texts(list(PROMPTS.values()), size.text_encoder)
+        encoded = TextEncoder(size.text_encoder)(list(PROMPTS.values()))
         if encoded.shape[1] != size.encoding:
             raise InputError(
                 f"the text encoder {size.text_encoder!r} makes {encoded.shape[1]} numbers of a sentence, the "

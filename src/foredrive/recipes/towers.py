@@ -3,6 +3,7 @@
 import functools
 from pathlib import Path
 
+from foredrive.search.embedded import CARD, load_towers
 from foredrive.search.pretrained import PretrainedTowers
 from foredrive.search.towers import Towers
 
@@ -12,9 +13,13 @@ def find_towers(name: str) -> Towers:
     """Towers, kept for the next call.
 
     Args:
-        name: of a CLIP or SigLIP model on Hugging Face's hub, or its folder.
+        name: of a CLIP or SigLIP model on Hugging Face's hub, or its folder, or a folder of towers that were
+            trained here.
 
     Raises:
         InputError: there are none, or they cannot be loaded.
     """
-    return PretrainedTowers(str(Path(name).absolute()) if Path(name).is_dir() else name)
+    folder = Path(name).absolute()
+    if (folder / CARD).is_file():
+        return load_towers(folder)
+    return PretrainedTowers(str(folder) if folder.is_dir() else name)

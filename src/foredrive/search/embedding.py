@@ -130,7 +130,7 @@ def _vector_column(vectors: Float[np.ndarray, "n D"]) -> pa.FixedSizeListArray:
 
 def _facts(log: Log, frame: int) -> dict[str, object]:
     caption = read_caption(log, frame)
-    setting = Setting(None, None) if caption is None else read_setting(caption)
+    setting = Setting(None, None, None) if caption is None else read_setting(caption)
     speed = float(log.speed_mps[frame])
     return {
         "key": f"{log.path.name}@{log.t_us[frame]}",

@@ -1,6 +1,5 @@
 """CLIP (Radford et al. 2021) and SigLIP (Zhai et al. 2023) as towers, through transformers."""
 
-import hashlib
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,10 +8,11 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
-from torch import Tensor, nn
+from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep
+from foredrive.search.towers import weights_digest
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
@@ -44,7 +44,7 @@ class PretrainedTowers:
         self.is_clip = config.model_type == "clip"
         self.image_side_px = int(config.vision_config.image_size)
         self.dim = int(config.projection_dim if self.is_clip else config.vision_config.hidden_size)
-        self.fingerprint = f"{config.model_type}-{_digest(self.model)}"
+        self.fingerprint = f"{config.model_type}-{weights_digest(self.model.state_dict())}"
         mean, std = (CLIP_MEAN, CLIP_STD) if self.is_clip else (SIGLIP_MEAN, SIGLIP_STD)
         self._mean, self._std = (torch.tensor(values).view(3, 1, 1) for values in (mean, std))
 
@@ -110,12 +110,3 @@ def _load(model: str) -> tuple[Any, Any]:
         return AutoModel.from_pretrained(model, use_safetensors=True).eval(), tokenizer
     except (OSError, ValueError) as error:
         raise InputError(f"the towers {model!r} cannot be loaded: {str(error).splitlines()[0]}") from error
-
-
-def _digest(model: nn.Module) -> str:
-    """Of every weight, by name."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()[:16]

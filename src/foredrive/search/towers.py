@@ -1,8 +1,10 @@
 """What an index asks of the towers that embed images, sweeps and texts into one space."""
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -73,3 +75,12 @@ def embed_prompt(towers: Towers, text: str, templates: Sequence[str] = PROMPTS) 
         raise InputError("an empty text finds nothing; say what to look for")
     worded = [template.format(text.strip()) for template in templates]
     return unit(unit(towers.embed_text(worded)).mean(0))
+
+
+def weights_digest(weights: Mapping[str, Tensor]) -> str:
+    """Of every weight, by name: what a fingerprint is made of."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(weights.items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -16,12 +16,24 @@ from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, naming
-from foredrive.scene import Example
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import hold_interrupts, start_fork_server
 
 if TYPE_CHECKING:  # it takes seconds, and schedules and metrics are read without it
     from lightning_fabric import Fabric
+
+
+@runtime_checkable
+class Batch(Protocol):
+    """What an objective is given; records move to devices as they are."""
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Names its items in errors."""
+        ...
+
+
+B = TypeVar("B", bound=Batch)
 
 
 @dataclass(frozen=True)
@@ -72,8 +84,8 @@ def batch_order(items: int, batch_size: int, seed: int) -> Iterator[list[int]]:
 
 def train(
     objective: nn.Module,
-    dataset: Dataset[Example],
-    collate: Callable[[list[Example]], Example],
+    dataset: Dataset[B],
+    collate: Callable[[list[B]], B],
     schedule: Schedule,
     folder: Path,
     fabric: "Fabric",
@@ -90,7 +102,7 @@ def train(
     """
     items = len(dataset)  # type: ignore[arg-type]
     if items == 0:
-        raise InputError("there is nothing to train on: the data set has no clips")
+        raise InputError("there is nothing to train on: the data set is empty")
     total = schedule.total_steps(items)
     optimizer = torch.optim.AdamW(
         [p for p in objective.parameters() if p.requires_grad],
@@ -104,7 +116,7 @@ def train(
     if done >= total:
         return
     log = MetricsLog(folder / "metrics.jsonl", done) if fabric.is_global_zero else None
-    loader = fabric.setup_dataloaders(
+    loader: Any = fabric.setup_dataloaders(
         _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
     )
     model.train()
@@ -112,7 +124,6 @@ def train(
     with hold_interrupts() as interrupted, _progress(fabric) as progress:
         task = progress.add_task(folder.name, total=total, completed=done, note="")
         for example in loader:
-            assert isinstance(example, Example)
             losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
             step += 1
             if log is not None:
@@ -126,13 +137,13 @@ def train(
 
 
 def _loader(
-    dataset: Dataset[Example],
-    collate: Callable[[list[Example]], Example],
+    dataset: Dataset[B],
+    collate: Callable[[list[B]], B],
     schedule: Schedule,
     done: int,
     total: int,
     fabric: "Fabric",
-) -> DataLoader[Example]:
+) -> DataLoader[B]:
     """Batches from step `done` on; each rank takes its share of every global batch."""
     items = len(dataset)  # type: ignore[arg-type]
     batches = itertools.islice(
@@ -160,7 +171,7 @@ def _share(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
 def _one_step(
     model: nn.Module,
     optimizer: Any,
-    example: Example,
+    example: Batch,
     step: int,
     total: int,
     schedule: Schedule,

@@ -1,4 +1,4 @@
-"""Time of day and weather, read back out of a caption of `towns.labels.captions`."""
+"""Time of day, weather and kind of place, read back out of a caption of `towns.labels.captions`."""
 
 from typing import NamedTuple
 
@@ -13,16 +13,32 @@ WEATHERS = {
 """What weather is called, and the words of captions that tell it; what comes first counts."""
 
 
+PLACES = {
+    "junction": ("junction", "intersection"),
+    "roundabout": ("roundabout",),
+    "underpass": ("under a bridge", "underpass"),
+    "bridge": ("bridge", "overpass"),
+    "highway": ("highway", "motorway"),
+    "street": ("street", "on the road"),
+}
+"""Likewise of kinds of places."""
+
+
 class Setting(NamedTuple):
-    """What a caption says of when and in what weather; None where it does not."""
+    """What a caption says of when, in what weather and at what kind of place; None where it does not."""
 
     time_of_day: str | None
     weather: str | None
+    place: str | None
 
 
 def read_setting(caption: str) -> Setting:
     """The setting of a caption: it stands in the first sentence."""
     first = caption.split(".")[0].lower()
     time = next((word for word in TIMES_OF_DAY if word in first), None)
-    weather = next((name for name, words in WEATHERS.items() if any(word in first for word in words)), None)
-    return Setting("midday" if time == "noon" else time, weather)
+    weather, place = _named(first, WEATHERS), _named(first.rsplit(", ", 1)[-1], PLACES)
+    return Setting("midday" if time == "noon" else time, weather, place)
+
+
+def _named(text: str, names: dict[str, tuple[str, ...]]) -> str | None:
+    return next((name for name, words in names.items() if any(word in text for word in words)), None)

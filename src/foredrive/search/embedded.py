@@ -1,0 +1,211 @@
+"""Towers that were trained here: images beside a sentence encoder, lidar beside any images."""
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from pydantic import TypeAdapter, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.models.image_tower import ImageTower
+from foredrive.models.lidar_clip import LidarEncoder, PillarGrid, PointCloud
+from foredrive.models.text_encoder import TextEncoder
+from foredrive.scene import LidarSweep
+from foredrive.search.pretrained import PretrainedTowers
+from foredrive.search.towers import Towers, weights_digest
+
+CARD, IMAGE, LIDAR = "towers.json", "image.safetensors", "lidar.safetensors"
+TEXT_MEAN = "text_mean"
+AT_ONCE = 8
+"""Sectors embedded together: more no longer fit into a core's cache."""
+
+
+@dataclass(frozen=True)
+class ImageSize:
+    """See `models.image_tower.ImageTower`."""
+
+    widths: tuple[int, ...]
+    depths: tuple[int, ...]
+    heads: int
+    side_px: int
+    """Of the images that it was trained on, the shorter one."""
+
+
+@dataclass(frozen=True)
+class LidarSize:
+    """See `models.lidar_clip.LidarEncoder`."""
+
+    width: int = 128
+    heads: int = 8
+    hidden: int = 256
+    blocks: int = 4
+    window: int = 12
+
+
+@dataclass(frozen=True)
+class TowerCard:
+    """What a folder of towers says of itself."""
+
+    dim: int
+    text: str
+    """The sentence encoder, or the CLIP or SigLIP model that the lidar tower stands beside."""
+    image: ImageSize | None
+    """None: the image tower is that model's, too."""
+    base_fingerprint: str
+    """Of the towers that the lidar tower was trained beside."""
+    lidar: LidarSize | None
+    trained: dict[str, object]
+    """On what, for how long, and how well: for people to read."""
+
+
+class SentenceTowers:
+    """An image tower that was trained beside a frozen sentence encoder; see `Towers`.
+
+    What all captions of the training set have in common, their mean, is taken off every text: what is left
+    tells them apart.
+    """
+
+    has_lidar = False
+
+    def __init__(
+        self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], side_px: int, text: str
+    ) -> None:
+        self.name, self.tower, self.text_mean = name, tower.eval(), text_mean
+        self.dim, self.image_side_px, self._text = len(text_mean), side_px, text
+        self.fingerprint = f"sentence-{weights_digest({TEXT_MEAN: text_mean, **tower.state_dict()})}"
+
+    @torch.no_grad()
+    def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        return torch.cat(
+            [self.tower(images[start : start + AT_ONCE]) for start in range(0, len(images), AT_ONCE)]
+        )
+
+    def embed_sweeps(self, sweeps: LidarSweep) -> None:
+        """See `Towers`."""
+        return
+
+    def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        return self._encoder(texts) - self.text_mean
+
+    @functools.cached_property
+    def _encoder(self) -> TextEncoder:
+        """Loaded when it is first asked: to make an index takes no text."""
+        return TextEncoder(self._text)
+
+
+class LidarTowers:
+    """Any towers and, beside them, one for lidar that learned from their images alone; see `Towers`."""
+
+    has_lidar = True
+
+    def __init__(self, name: str, base: Towers, encoder: LidarEncoder) -> None:
+        self.name, self.base, self.encoder = name, base, encoder.eval()
+        self.dim, self.image_side_px = base.dim, base.image_side_px
+        self.fingerprint = f"{base.fingerprint}-lidar-{weights_digest(encoder.state_dict())}"
+
+    def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        return self.base.embed_images(images)
+
+    @torch.no_grad()
+    def embed_sweeps(self, sweeps: LidarSweep) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        rows = len(sweeps.valid)
+        parts = [sweeps[start : start + AT_ONCE] for start in range(0, rows, AT_ONCE)]
+        return torch.cat([self.encoder(PointCloud.of_sweeps(part), len(part.valid)) for part in parts])
+
+    def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
+        """See `Towers`."""
+        return self.base.embed_text(texts)
+
+
+def build_image_tower(size: ImageSize, dim: int) -> ImageTower:
+    """An untrained one."""
+    return ImageTower(widths=size.widths, depths=size.depths, heads=size.heads, dim=dim)
+
+
+def build_lidar_tower(size: LidarSize, dim: int) -> LidarEncoder:
+    """An untrained one."""
+    return LidarEncoder(PillarGrid(), dim=dim, **asdict(size))
+
+
+def save_towers(
+    folder: Path,
+    card: TowerCard,
+    image: tuple[ImageTower, Float[Tensor, "D"]] | None,
+    lidar: LidarEncoder | None,
+) -> None:
+    """Write towers as a folder, weights in half precision.
+
+    Args:
+        image: the image tower and the mean of the texts, unless it is a model's of `card.text`.
+    """
+    with atomic_path(folder) as temporary:
+        temporary.mkdir()
+        if image is not None:
+            state = _halved(image[0])
+            save_file({**state, TEXT_MEAN: image[1]}, temporary / IMAGE)
+        if lidar is not None:
+            save_file(_halved(lidar), temporary / LIDAR)
+        (temporary / CARD).write_text(json.dumps(asdict(card), indent=1))
+
+
+def load_towers(folder: Path) -> Towers:
+    """The towers of a folder that `save_towers` wrote.
+
+    Raises:
+        InputError: it holds none, they are damaged, or what they stand beside has other weights now.
+    """
+    try:
+        card = TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
+    except (OSError, ValidationError) as error:
+        raise InputError(
+            f"{folder / CARD}: does not describe towers: {str(error).splitlines()[0]}"
+        ) from error
+    base = _load_base(folder, card)
+    if card.lidar is None:
+        return base
+    if base.fingerprint != card.base_fingerprint:
+        raise InputError(f"{folder}: the lidar tower was trained beside other weights of {card.text}")
+    encoder = build_lidar_tower(card.lidar, card.dim)
+    _load_weights(encoder, folder / LIDAR)
+    return LidarTowers(str(folder), base, encoder)
+
+
+def _load_base(folder: Path, card: TowerCard) -> Towers:
+    if card.image is None:
+        return PretrainedTowers(card.text)
+    tower = build_image_tower(card.image, card.dim)
+    text_mean = _load_weights(tower, folder / IMAGE).get(TEXT_MEAN)
+    if text_mean is None:
+        raise InputError(f"{folder / IMAGE}: no {TEXT_MEAN} in it")
+    return SentenceTowers(str(folder), tower, text_mean, card.image.side_px, card.text)
+
+
+def _halved(model: nn.Module) -> dict[str, Tensor]:
+    state = model.state_dict()
+    return {
+        name: (value.half() if value.is_floating_point() else value).contiguous()
+        for name, value in state.items()
+    }
+
+
+def _load_weights(model: nn.Module, file: Path) -> dict[str, Tensor]:
+    """Load weights into a model; returns what else the file holds."""
+    try:
+        state = load_file(file)
+        rest = {name: state.pop(name) for name in state.keys() - model.state_dict().keys()}
+        model.load_state_dict(state)
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise InputError(f"{file}: not the weights of these towers: {str(error).splitlines()[0]}") from error
+    return rest

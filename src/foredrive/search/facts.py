@@ -1,0 +1,141 @@
+"""What is true of a view: who is in it, where and how they move; when, in what weather, at what place."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.data.boxes import read_boxes
+from foredrive.data.logs import Log
+from foredrive.data.recorded import read_caption, read_visibility
+from foredrive.scene import Boxes, Category
+from foredrive.search.sectors import Sector
+from foredrive.towns.labels.captions import (
+    ACROSS_COS,
+    AHEAD_M,
+    MOVING_MPS,
+    ONCOMING_COS,
+    SEEN,
+    WALKING_MPS,
+)
+from foredrive.towns.labels.setting import Setting, read_setting
+
+NEAR_M, FAR_M = 12.0, 25.0
+IN_FOG_M = 25.0
+"""How far things are worth a word in fog."""
+ROAD_HALF_M = 8.0
+"""Who moves across the way this close to it crosses the road."""
+NOUNS = {
+    Category.CAR: "car",
+    Category.TRUCK: "truck",
+    Category.BUS: "bus",
+    Category.TRAILER: "trailer",
+    Category.CONSTRUCTION_VEHICLE: "construction vehicle",
+    Category.MOTORCYCLE: "motorcycle",
+    Category.BICYCLE: "cyclist",
+    Category.PEDESTRIAN: "pedestrian",
+    Category.ANIMAL: "animal",
+    Category.TRAFFIC_CONE: "traffic cone",
+    Category.BARRIER: "barrier",
+}
+COUNTS = {1: "one", 2: "two", 3: "three"}
+MANY = "many"
+DAY = ("morning", "midday", "afternoon")
+EMPTY = "nobody"
+"""The fact that there is nothing of `NOUNS` to be seen."""
+
+
+class Thing(NamedTuple):
+    """One annotated object that can be seen."""
+
+    noun: str
+    manners: tuple[str, ...]
+    """Of near, far, oncoming, crossing, moving, standing: those that it has."""
+
+
+class ViewFacts(NamedTuple):
+    """What is true of one view; None is what the log does not tell."""
+
+    time_of_day: str | None
+    weather: str | None
+    place: str | None
+    things: tuple[Thing, ...] | None
+
+    @property
+    def facts(self) -> frozenset[str]:
+        """All of it as single words: "night", "two car", "crossing pedestrian", "nobody"."""
+        found = {fact for fact in self[:3] if fact is not None}
+        if self.time_of_day in DAY:
+            found.add("day")
+        if self.things is not None:
+            found |= {EMPTY} if not self.things else set(_counted(self.things))
+        return frozenset(found)
+
+
+def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
+    for noun in {thing.noun for thing in things}:
+        manners = [thing.manners for thing in things if thing.noun == noun]
+        for manner in {"", *(manner for those in manners for manner in those)}:
+            count = len(manners) if not manner else sum(manner in those for those in manners)
+            what = f"{manner} {noun}".strip()
+            yield what
+            yield f"{COUNTS.get(count, MANY)} {what}"
+
+
+def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, ViewFacts]:
+    """The facts of each sector of a moment, by its name.
+
+    Time, weather and place are read out of the moment's caption, where there is one. Things are boxes whose
+    centre lies in the sector, near enough and not hidden, where the log knows that.
+
+    Raises:
+        InputError: on data that cannot be read.
+    """
+    caption = read_caption(log, frame)
+    setting = Setting(None, None, None) if caption is None else read_setting(caption)
+    boxes, visibility = read_boxes(log, frame), read_visibility(log, frame)
+    if boxes is None:
+        return {name: ViewFacts(*setting, None) for name in sectors}
+    reach_m = IN_FOG_M if setting.weather == "fog" else AHEAD_M
+    seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
+    if visibility is not None:
+        seen = seen & (visibility >= SEEN)
+    return {
+        name: ViewFacts(*setting, tuple(_things(boxes[seen & sector.contains(boxes.centre)])))
+        for name, sector in sectors.items()
+    }
+
+
+def _things(boxes: Boxes) -> Iterator[Thing]:
+    rows = zip(boxes.centre, boxes.velocity, boxes.yaw, boxes.category.tolist(), strict=True)
+    for centre, velocity, yaw, kind in rows:
+        category = Category(kind)
+        if category in NOUNS:
+            yield Thing(NOUNS[category], tuple(_manners(centre, velocity, yaw, category)))
+
+
+def _manners(
+    centre: Float[Tensor, "3"], velocity: Float[Tensor, "2"], yaw: Float[Tensor, ""], category: Category
+) -> Iterator[str]:
+    range_m = float(centre[:2].norm())
+    if range_m < NEAR_M:
+        yield "near"
+    elif range_m > FAR_M:
+        yield "far"
+    if not bool(velocity.isfinite().all()):
+        return
+    on_foot = category is Category.PEDESTRIAN
+    if float(velocity.norm()) <= (WALKING_MPS if on_foot else MOVING_MPS):
+        yield "standing"
+        return
+    yield "moving"
+    (x, y), (forward, across) = centre[:2].tolist(), velocity.tolist()
+    if x <= 0 or abs(y) > ROAD_HALF_M:
+        return
+    heading = float(torch.cos(yaw))
+    if abs(across) > abs(forward) and (on_foot or abs(heading) < ACROSS_COS):
+        yield "crossing"
+    elif not on_foot and heading < ONCOMING_COS:
+        yield "oncoming"

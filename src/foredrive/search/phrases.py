@@ -1,0 +1,126 @@
+"""Short English texts that are true of a view, and which of its facts each of them says."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from foredrive.search.facts import COUNTS, EMPTY, MANY, ViewFacts
+from foredrive.search.towers import PROMPTS
+
+SETTINGS = {
+    "night": ("at night", "in the dark", "by night"),
+    "dawn": ("at dawn", "at sunrise"),
+    "dusk": ("at dusk", "at sunset"),
+    "morning": ("in the morning", "by day"),
+    "midday": ("at noon", "by day"),
+    "afternoon": ("in the afternoon", "by day"),
+    "rain": ("in the rain", "in rainy weather", "on a wet road in the rain"),
+    "fog": ("in fog", "in foggy weather", "in the mist"),
+    "overcast": ("under a grey sky", "in overcast weather"),
+    "cloudy": ("under a cloudy sky", "in cloudy weather"),
+    "clear": ("in clear weather", "under a clear sky"),
+    "street": ("on a street", "on the road"),
+    "junction": ("at a junction", "at an intersection"),
+    "roundabout": ("in a roundabout", "at a roundabout"),
+    "bridge": ("on a bridge", "on an overpass"),
+    "underpass": ("under a bridge", "in an underpass"),
+    "highway": ("on a highway", "on a motorway"),
+}
+NAMES = {
+    "truck": ("truck", "lorry"),
+    "motorcycle": ("motorcycle", "motorbike"),
+    "cyclist": ("cyclist", "bicycle"),
+    "pedestrian": ("pedestrian", "person"),
+}
+"""Of what has more names than one."""
+PLURALS = {"person": "people", "bus": "buses", "lorry": "lorries"}
+MANNERS = {
+    "": ("{}",),
+    "near": ("{} close by", "{} nearby"),
+    "far": ("{} in the distance", "{} far away"),
+    "oncoming": ("{} coming towards us", "oncoming {}"),
+    "crossing": ("{} crossing the road", "{} crossing"),
+    "moving": ("moving {}", "{} in motion"),
+    "standing": ("stationary {}", "{} standing still"),
+}
+ON_FOOT = {"moving": ("{} walking", "walking {}"), "standing": ("{} standing", "standing {}")}
+"""What of `MANNERS` is said otherwise of pedestrians."""
+NOBODY = ("an empty road", "nobody around", "no other traffic")
+ALONE = ("{}", "a drive {}", "driving {}", "a scene {}")
+"""What is said of a setting by itself."""
+_WORDED, _ALL, _SUBJECT = 0.3, 0.3, 0.75
+"""How often a text is worded as a prompt, names everyone, names anyone."""
+
+
+class Phrase(NamedTuple):
+    """A text, and the facts that a view must have for it to be true."""
+
+    text: str
+    facts: frozenset[str]
+
+
+def phrases(view: ViewFacts, seed: int, count: int) -> list[Phrase]:
+    """Texts that are true of a view: single facts and several together, as people ask and as captions tell.
+
+    The seed chooses what is said and how, never what is true. None for a view of which nothing is known.
+    """
+    if not view.facts:
+        return []
+    rng = np.random.default_rng(seed)
+    return [_phrase(view, rng) for _ in range(count)]
+
+
+def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:
+    settings = [fact for fact in view[:3] if fact is not None]
+    kept = [fact for fact in settings if rng.random() < 0.5]
+    if view.things is None or (settings and rng.random() >= _SUBJECT):
+        kept = kept or [settings[int(rng.integers(len(settings)))]]
+        subject, facts = "", set[str]()
+    else:
+        subject, facts = _subject(view, rng)
+    spoken = [_setting(fact, rng) for fact in kept]
+    said = " ".join(words for words, _ in spoken)
+    text = f"{subject} {said}".strip() if subject else _pick(ALONE, rng).format(said)
+    if rng.random() < _WORDED:
+        text = _pick(PROMPTS, rng).format(text)
+    return Phrase(text, frozenset(facts.union(*(means for _, means in spoken))))
+
+
+def _setting(fact: str, rng: np.random.Generator) -> tuple[str, set[str]]:
+    words = _pick(SETTINGS[fact], rng)
+    return words, {"day"} if words == "by day" else {fact}
+
+
+def _subject(view: ViewFacts, rng: np.random.Generator) -> tuple[str, set[str]]:
+    assert view.things is not None
+    if not view.things:
+        return _pick(NOBODY, rng), {EMPTY}
+    nouns = sorted({thing.noun for thing in view.things})
+    if rng.random() >= _ALL:
+        nouns = [nouns[int(rng.integers(len(nouns)))]]
+    parts = [_group(view, noun, rng) for noun in nouns]
+    texts = [text for text, _ in parts]
+    listed = texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
+    return listed, {fact for _, fact in parts}
+
+
+def _group(view: ViewFacts, noun: str, rng: np.random.Generator) -> tuple[str, str]:
+    """Those of one noun that have something in common, counted or "a": a text and its fact."""
+    assert view.things is not None
+    manners = [thing.manners for thing in view.things if thing.noun == noun]
+    shared = ["", *sorted({manner for those in manners for manner in those})]
+    manner = shared[int(rng.integers(len(shared)))]
+    count = len(manners) if not manner else sum(manner in those for those in manners)
+    ways = ON_FOOT.get(manner, MANNERS[manner]) if noun == "pedestrian" else MANNERS[manner]
+    name, how = _pick(NAMES.get(noun, (noun,)), rng), _pick(ways, rng)
+    fact = f"{manner} {noun}".strip()
+    if count == 1 or rng.random() < 0.5:
+        words = how.format(name)
+        return f"{'an' if words[0] in 'aeio' else 'a'} {words}", fact
+    number = COUNTS.get(count, MANY)
+    return f"{number} {how.format(PLURALS.get(name, f'{name}s'))}", f"{number} {fact}"
+
+
+def _pick(ways: Sequence[str], rng: np.random.Generator) -> str:
+    return ways[int(rng.integers(len(ways)))]

@@ -1,0 +1,119 @@
+"""Teaching towers to meet in one space: images and texts by contrast, sweeps by what an image tower says."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor, nn
+
+from foredrive.models.image_tower import ImageTower
+from foredrive.models.lidar_clip import LidarEncoder, PointCloud
+from foredrive.scene.record import Record
+
+FIRST_TEMPERATURE, SHARPEST = 0.07, 100.0
+"""CLIP's (Radford et al. 2021, section 2.4)."""
+CROP_SHARE = 0.1
+"""Of height and width that a training image may lose."""
+
+
+@dataclass(frozen=True)
+class CaptionedImages(Record):
+    """Views, T texts that are true of each, and what each text says out of a vocabulary of V facts."""
+
+    images: UInt8[Tensor, "n 3 H W"]
+    texts: Float[Tensor, "n T D"]
+    """Embeddings; the mean of all texts has been taken off them."""
+    said: Bool[Tensor, "n T V"]
+    holds: Bool[Tensor, "n V"]
+    """What is true of the view."""
+    key: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ImagedSweeps(Record):
+    """Sectors of sweeps, and what an image tower says of the same moments and sectors; nothing of texts."""
+
+    cloud: PointCloud
+    targets: Float[Tensor, "n 2 D"]
+    """Of the images, as they are and mirrored; of any length."""
+    key: tuple[str, ...]
+
+
+class ContrastObjective(nn.Module):
+    """InfoNCE both ways (Radford et al. 2021, figure 3) between images and frozen embeddings of texts.
+
+    A text that is true of another image of the batch, be it the same text or not, is no negative of it.
+    """
+
+    def __init__(self, tower: ImageTower) -> None:
+        super().__init__()
+        self.tower = tower
+        self.log_scale = nn.Parameter(torch.tensor(-math.log(FIRST_TEMPERATURE)))
+
+    def forward(self, batch: CaptionedImages, generator: torch.Generator) -> dict[str, Tensor]:
+        """One text of each view, drawn anew; views mirrored and cropped, which changes no fact."""
+        rows = torch.arange(len(batch.images), device=batch.images.device)
+        drawn = torch.randint(batch.texts.shape[1], (len(rows),), generator=generator).to(rows.device)
+        found = F.normalize(self.tower(_jittered(batch.images, generator)), dim=-1)
+        texts = F.normalize(batch.texts[rows, drawn], dim=-1)
+        logits = self.log_scale.exp().clamp(max=SHARPEST) * found @ texts.T
+        loss, share = contrast(logits, true_of(batch.said[rows, drawn], batch.holds))
+        return {"loss": loss, "hits": share}
+
+
+class DistilObjective(nn.Module):
+    """What LidarCLIP learns by (Hess et al. 2024, section 3): the image's embedding of the same moment.
+
+    Args:
+        kind: mean squared error on features of any length, or 1 - cosine.
+    """
+
+    def __init__(self, encoder: LidarEncoder, kind: Literal["mse", "cosine"]) -> None:
+        super().__init__()
+        self.encoder, self.kind = encoder, kind
+
+    def forward(self, batch: ImagedSweeps, generator: torch.Generator) -> dict[str, Tensor]:
+        """Half of the sweeps are mirrored, and compared with mirrored images."""
+        rows = torch.arange(len(batch.targets), device=batch.targets.device)
+        mirrored = (torch.rand(len(rows), generator=generator) < 0.5).to(rows.device)
+        y = torch.where(mirrored[batch.cloud.item], -1.0, 1.0)
+        points = torch.stack([torch.ones_like(y), y, torch.ones_like(y), torch.ones_like(y)], dim=-1)
+        found = self.encoder(PointCloud(batch.cloud.points * points, batch.cloud.item), len(rows))
+        target = batch.targets[rows, mirrored.long()]
+        cosine = F.cosine_similarity(found, target, dim=-1).mean()
+        loss = F.mse_loss(found, target) if self.kind == "mse" else 1 - cosine
+        return {"loss": loss, "cosine": cosine}
+
+
+def true_of(said: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Tensor, "i t"]:
+    """Of which images which texts are true: those that say nothing that does not hold."""
+    return (~holds).float() @ said.float().T == 0
+
+
+def contrast(
+    logits: Float[Tensor, "n n"], true: Bool[Tensor, "n n"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """InfoNCE over rows and columns whose pairs lie on the diagonal; other pairs that are true are left out.
+
+    Returns:
+        The mean loss, and the share of rows whose own text comes first.
+    """
+    own = torch.arange(len(logits), device=logits.device)
+    others = true & ~torch.eye(len(logits), dtype=torch.bool, device=logits.device)
+    logits = logits.masked_fill(others, -torch.inf)
+    loss = (F.cross_entropy(logits, own) + F.cross_entropy(logits.T, own)) / 2
+    return loss, (logits.argmax(dim=1) == own).float().mean()
+
+
+def _jittered(images: UInt8[Tensor, "n 3 H W"], generator: torch.Generator) -> UInt8[Tensor, "n 3 h w"]:
+    """One crop for the batch, and every other image mirrored."""
+    height, width = images.shape[-2:]
+    kept_h, kept_w = height - round(CROP_SHARE * height), width - round(CROP_SHARE * width)
+    top = int(torch.randint(height - kept_h + 1, (1,), generator=generator))
+    left = int(torch.randint(width - kept_w + 1, (1,), generator=generator))
+    images = images[..., top : top + kept_h, left : left + kept_w]
+    mirrored = (torch.rand(len(images), generator=generator) < 0.5).to(images.device)
+    return torch.where(mirrored[:, None, None, None], images.flip(-1), images)

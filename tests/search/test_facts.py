@@ -1,0 +1,134 @@
+"""What is true of a view, and texts that say it."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from foredrive.data import LogPath
+from foredrive.data.logs import Log
+from foredrive.scene import Boxes, Category
+from foredrive.search.embedding import read_views
+from foredrive.search.facts import NOUNS, Thing, ViewFacts, _things, view_facts
+from foredrive.search.phrases import phrases
+
+MANNERS = ("near", "far", "oncoming", "crossing", "moving", "standing")
+
+
+def boxes(*rows: tuple[Category, tuple[float, float], tuple[float, float], float]) -> Boxes:
+    """Category, place, velocity, yaw."""
+    count = len(rows)
+    return Boxes(
+        centre=torch.tensor([[*xy, 0.8] for _, xy, _, _ in rows]),
+        size_lwh=torch.ones(count, 3),
+        yaw=torch.tensor([yaw for *_, yaw in rows]),
+        velocity=torch.tensor([velocity for _, _, velocity, _ in rows]),
+        track_id=torch.arange(count),
+        category=torch.tensor([int(category) for category, *_ in rows]),
+        valid=torch.ones(count, dtype=torch.bool),
+    )
+
+
+def test_where_things_are_and_how_they_move() -> None:
+    found = _things(
+        boxes(
+            (Category.CAR, (8.0, 2.0), (0.0, 0.0), 0.0),
+            (Category.CAR, (30.0, 3.0), (-8.0, 0.0), 3.1),
+            (Category.BUS, (15.0, 0.0), (0.0, 5.0), 1.57),
+            (Category.PEDESTRIAN, (14.0, -3.0), (0.1, 1.2), 0.0),
+            (Category.PEDESTRIAN, (14.0, -12.0), (0.1, 1.2), 0.0),
+            (Category.BICYCLE, (-20.0, 1.0), (5.0, 0.0), 0.0),
+            (Category.CAR, (20.0, 1.0), (torch.nan, torch.nan), 0.0),
+            (Category.OTHER, (20.0, 1.0), (0.0, 0.0), 0.0),
+        )
+    )
+    assert list(found) == [
+        Thing("car", ("near", "standing")),
+        Thing("car", ("far", "moving", "oncoming")),
+        Thing("bus", ("moving", "crossing")),
+        Thing("pedestrian", ("moving", "crossing")),
+        Thing("pedestrian", ("moving",)),
+        Thing("cyclist", ("moving",)),
+        Thing("car", ()),
+    ]
+
+
+def test_facts_count_and_say_what_is_more_general() -> None:
+    cars = (Thing("car", ("near", "moving")), Thing("car", ("moving",)))
+    view = ViewFacts("morning", "rain", "street", cars)
+    assert view.facts == {
+        "morning", "day", "rain", "street", "car", "two car", "near car", "one near car", "moving car",
+        "two moving car",
+    }  # fmt: skip
+    assert ViewFacts(None, None, None, ()).facts == {"nobody"}
+    assert ViewFacts(None, None, None, None).facts == frozenset()
+    many = ViewFacts(None, None, None, (Thing("car", ()),) * 5)
+    assert many.facts == {"car", "many car"}
+
+
+VIEWS = st.builds(
+    ViewFacts,
+    st.sampled_from([None, "night", "morning", "dusk"]),
+    st.sampled_from([None, "rain", "fog", "clear"]),
+    st.sampled_from([None, "street", "junction"]),
+    st.none()
+    | st.lists(
+        st.builds(
+            Thing,
+            st.sampled_from(sorted(NOUNS.values())),
+            st.lists(st.sampled_from(MANNERS), unique=True, max_size=3).map(tuple),
+        ),
+        max_size=5,
+    ).map(tuple),
+)
+
+
+@given(VIEWS, st.integers(0, 100))
+@settings(max_examples=60, deadline=None)
+def test_a_text_never_says_what_does_not_hold(view: ViewFacts, seed: int) -> None:
+    told = phrases(view, seed, 4)
+    assert len(told) == (4 if view.facts else 0)
+    assert phrases(view, seed, 4) == told
+    for text, facts in told:
+        assert facts <= view.facts
+        assert facts
+        assert text == text.strip()
+        assert "  " not in text
+        assert "{" not in text
+
+
+@pytest.mark.parametrize(
+    ("things", "expected"),
+    [
+        ((Thing("pedestrian", ("crossing",)),), {"a pedestrian crossing the road", "a person crossing"}),
+        ((Thing("bus", ()),) * 2, {"two buses", "a bus"}),
+        ((Thing("animal", ()),), {"an animal"}),
+        ((Thing("pedestrian", ("standing",)),) * 3, {"three people standing", "a standing person"}),
+        ((Thing("car", ("oncoming",)),), {"an oncoming car", "a car coming towards us"}),
+        ((), {"an empty road", "nobody around"}),
+    ],
+)
+def test_how_things_are_said(things: tuple[Thing, ...], expected: set[str]) -> None:
+    told = {
+        phrase.text for seed in range(12) for phrase in phrases(ViewFacts(None, None, None, things), seed, 12)
+    }
+    assert expected <= told
+
+
+def test_a_setting_is_said_by_itself_too() -> None:
+    told = {p.text: p.facts for p in phrases(ViewFacts("morning", "rain", None, None), 0, 40)}
+    assert {"rain"} in [told[text] for text in told if text.endswith(("in the rain", "in rainy weather"))]
+    assert {"day"} in list(told.values())
+
+
+def test_views_of_a_log_have_the_facts_of_what_lies_in_their_sector(log: LogPath) -> None:
+    opened = Log(log)
+    sectors = {name: view.sector for name, view in read_views(opened, 10, 32, with_lidar=False).items()}
+    found = view_facts(opened, 10, sectors)
+    assert set(found) == set(sectors)
+    for facts in found.values():
+        assert facts.things is not None
+        assert (facts.time_of_day, facts.weather, facts.place) == (None, None, None)
+    turned = {name: sector._replace(camera=None, azimuth_rad=3.14) for name, sector in sectors.items()}
+    behind = view_facts(opened, 10, turned)
+    assert len({facts.things for facts in behind.values()}) == 1

@@ -1,0 +1,131 @@
+"""Contrast that knows which texts are true of other images; lidar that learns from images alone."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from foredrive.models.image_tower import ImageTower
+from foredrive.models.lidar_clip import LidarEncoder, PillarGrid, PointCloud
+from foredrive.training.alignment import (
+    CaptionedImages,
+    ContrastObjective,
+    DistilObjective,
+    ImagedSweeps,
+    contrast,
+    true_of,
+)
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_a_text_is_true_of_what_holds_all_it_says() -> None:
+    said = torch.tensor([[1, 0, 0], [1, 1, 0], [0, 0, 0]]).bool()
+    holds = torch.tensor([[1, 0, 1], [1, 1, 0]]).bool()
+    assert true_of(said, holds).tolist() == [[True, False, True], [True, True, True]]
+
+
+def test_contrast_by_hand() -> None:
+    logits = torch.tensor([[2.0, 0.0, 1.0], [0.0, 1.0, 0.0], [3.0, 0.0, 2.0]])
+    plain, share = contrast(logits, torch.eye(3).bool())
+    rows = [math.log(sum(math.exp(v) for v in row)) - row[i] for i, row in enumerate(logits.tolist())]
+    columns = [math.log(sum(math.exp(v) for v in row)) - row[i] for i, row in enumerate(logits.T.tolist())]
+    assert float(plain) == pytest.approx((sum(rows) + sum(columns)) / 6, rel=1e-5)
+    assert float(share) == pytest.approx(2 / 3)
+
+
+def test_the_same_caption_twice_is_no_negative() -> None:
+    logits = torch.tensor([[2.0, 5.0, 1.0], [5.0, 1.0, 0.0], [3.0, 0.0, 2.0]])
+    true = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 0, 1]]).bool()
+    loss, share = contrast(logits, true)
+    others = logits.clone()
+    others[0, 1] = others[1, 0] = -50.0
+    assert float(loss) == pytest.approx(float(contrast(others, torch.eye(3).bool())[0]), rel=1e-5)
+    assert float(share) == pytest.approx(2 / 3)
+    logits.requires_grad_(True)
+    contrast(logits, true)[0].backward()
+    assert logits.grad is not None
+    assert logits.grad[0, 1] == logits.grad[1, 0] == 0
+
+
+def test_where_all_is_true_of_all_nothing_is_to_learn() -> None:
+    loss, _ = contrast(torch.randn(4, 4, generator=generator()), torch.ones(4, 4).bool())
+    assert float(loss) == 0
+
+
+def captioned(said: Tensor | None = None) -> CaptionedImages:
+    """Two red views and two blue ones, and a text each."""
+    colour = torch.tensor([0, 0, 2, 2])
+    images = torch.zeros(4, 3, 40, 60, dtype=torch.uint8)
+    images[torch.arange(4), colour] = 200
+    return CaptionedImages(
+        images=images,
+        texts=torch.eye(8)[colour][:, None],
+        said=torch.eye(3).bool()[colour][:, None] if said is None else said,
+        holds=torch.eye(3).bool()[colour],
+        key=("a", "b", "c", "d"),
+    )
+
+
+def test_an_image_tower_learns_what_colours_are_called() -> None:
+    torch.manual_seed(0)
+    objective = ContrastObjective(ImageTower(widths=(8, 8), depths=(1, 1), heads=2, dim=8))
+    optimizer = torch.optim.Adam(objective.parameters(), 1e-2)
+    random = generator()
+    for _ in range(15):
+        loss = objective(captioned(), random)["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss.item() < 0.1
+    assert all(p.grad is not None for p in objective.parameters())
+    images = captioned().images[[0, 2]]
+    objective.requires_grad_(False)
+    found = objective.tower.eval()(images)
+    assert found[0, 0] > found[0, 2]
+    assert found[1, 2] > found[1, 0]
+    torch.testing.assert_close(objective.tower(images[1:]), found[1:], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["mse", "cosine"])
+def test_mirrored_sweeps_are_compared_with_mirrored_images(kind: str) -> None:
+    torch.manual_seed(0)
+    encoder = LidarEncoder(PillarGrid(), dim=4, width=16, heads=2, hidden=16, blocks=1).eval()
+    points = torch.rand(8 * 20, 4, generator=generator()) * torch.tensor([30.0, 15.0, 3.0, 1.0])
+    item = torch.arange(8).repeat_interleave(20)
+    other_side = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
+    with torch.no_grad():
+        plain, mirrored = (encoder(PointCloud(those, item), 8) for those in (points, other_side))
+    assert not torch.allclose(plain, mirrored, atol=1e-3)
+    off = torch.tensor([0.0, 0.0, 0.0, 3.0]) if kind == "mse" else torch.zeros(4)
+    longer = 1.0 if kind == "mse" else 3.0
+    batch = ImagedSweeps(
+        PointCloud(points, item), torch.stack([plain, mirrored], 1) * longer + off, ("x",) * 8
+    )
+    losses = DistilObjective(encoder, kind)(batch, generator())  # type: ignore[arg-type]
+    assert losses["loss"].item() == pytest.approx(9 / 4 if kind == "mse" else 0, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["mse", "cosine"])
+def test_a_lidar_tower_learns_from_embeddings_without_a_text(kind: str) -> None:
+    assert set(ImagedSweeps.__dataclass_fields__) == {"cloud", "targets", "key"}
+    torch.manual_seed(0)
+    encoder = LidarEncoder(PillarGrid(), dim=4, width=16, heads=2, hidden=16, blocks=2)
+    objective = DistilObjective(encoder, kind)  # type: ignore[arg-type]
+    near = torch.rand(50, 4) * torch.tensor([5.0, 5.0, 2.0, 1.0])
+    cloud = PointCloud(
+        torch.cat([near, near + torch.tensor([30.0, 0.0, 0.0, 0.0])]), torch.arange(2).repeat_interleave(50)
+    )
+    targets = torch.tensor([[2.0, 0.0, 0.0, 1.0], [0.0, 2.0, 0.0, 1.0]])[:, None].repeat(1, 2, 1)
+    batch = ImagedSweeps(cloud, targets, ("a", "b"))
+    optimizer, random = torch.optim.Adam(objective.parameters(), 3e-3), generator()
+    for _ in range(40):
+        losses = objective(batch, random)
+        optimizer.zero_grad()
+        losses["loss"].backward()
+        optimizer.step()
+    assert losses["cosine"].item() > 0.97
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in encoder.parameters())
