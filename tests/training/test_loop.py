@@ -128,7 +128,7 @@ def test_nan_stops_and_names_the_batch(make_example: Callable[..., Example], tmp
 
 
 def test_no_data_is_an_error(make_example: Callable[..., Example], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no clips"):
+    with pytest.raises(InputError, match="data set is empty"):
         train(
             Prior(), Items(make_example, 0), collate, SCHEDULE, tmp_path, Fabric(accelerator="cpu", devices=1)
         )

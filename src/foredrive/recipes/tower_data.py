@@ -3,6 +3,7 @@
 import bisect
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -137,9 +138,7 @@ def _targets_of(log: LogViews, towers: Towers, folder: Path) -> Float[Tensor, "n
 def collate_captioned(items: Sequence[CaptionedImages]) -> CaptionedImages:
     """A batch of views."""
     keys = tuple(key for item in items for key in item.key)
-    bare = [CaptionedImages(item.images, item.texts, item.said, item.holds, ()) for item in items]
-    batch = stack_records(bare)
-    return CaptionedImages(batch.images, batch.texts, batch.said, batch.holds, keys)
+    return replace(stack_records([replace(item, key=()) for item in items]), key=keys)
 
 
 def collate_imaged(items: Sequence[ImagedSweeps]) -> ImagedSweeps:

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 RECIPE = "recipe.json"
 IMAGE_STAGE, LIDAR_STAGE = "image", "lidar"
 TOWERS = "towers"
-SENTENCE_DIM = 384
-"""Of `IN_A_PACKAGE`."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +57,8 @@ class TowerRecipe:
     """True of each view, of which a step takes one."""
     loss: Literal["mse", "cosine"] = "mse"
     """Of the lidar tower."""
+    text: str = IN_A_PACKAGE
+    """The sentence encoder, as `TextEncoder` knows it."""
 
 
 def embedded_recipe(
@@ -98,7 +98,7 @@ def train_towers(
         folder: of the run.
         cache_dir: for images and points of views; by default in `folder`.
         beside: CLIP or SigLIP, as `find_towers` knows them: only a lidar tower is trained, beside their image
-            tower. By default an image tower is trained first, beside the sentence encoder that is a package.
+            tower. By default an image tower is trained first, beside the recipe's sentence encoder.
 
     Returns:
         The folder of the towers.
@@ -123,13 +123,13 @@ def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabri
     """The image tower, saved as towers without lidar: the lidar tower learns from what is kept."""
     stage = folder / IMAGE_STAGE
     if not (stage / TOWERS).is_dir():
-        dataset = CaptionedViews(views, TextEncoder(IN_A_PACKAGE), recipe.texts)
+        dataset = CaptionedViews(views, TextEncoder(recipe.text), recipe.texts)
         torch.manual_seed(recipe.contrast.seed)
-        tower = build_image_tower(recipe.image, SENTENCE_DIM)
+        tower = build_image_tower(recipe.image, len(dataset.text_mean))
         train(ContrastObjective(tower), dataset, collate_captioned, recipe.contrast, stage, fabric)
         card = TowerCard(
-            dim=SENTENCE_DIM,
-            text=IN_A_PACKAGE,
+            dim=len(dataset.text_mean),
+            text=recipe.text,
             image=recipe.image,
             base_fingerprint="",
             lidar=None,
@@ -158,7 +158,7 @@ def _train_lidar(
         image = (base.tower, base.text_mean) if isinstance(base, SentenceTowers) else None
         card = TowerCard(
             dim=base.dim,
-            text=beside or IN_A_PACKAGE,
+            text=beside or recipe.text,
             image=None if image is None else recipe.image,
             base_fingerprint=base.fingerprint,
             lidar=recipe.lidar,

@@ -23,11 +23,11 @@ CROP_SHARE = 0.1
 class CaptionedImages(Record):
     """Views, T texts that are true of each, and what each text says out of a vocabulary of V facts."""
 
-    images: UInt8[Tensor, "n 3 H W"]
-    texts: Float[Tensor, "n T D"]
+    images: UInt8[Tensor, "*n 3 H W"]
+    texts: Float[Tensor, "*n T D"]
     """Embeddings; the mean of all texts has been taken off them."""
-    said: Bool[Tensor, "n T V"]
-    holds: Bool[Tensor, "n V"]
+    said: Bool[Tensor, "*n T V"]
+    holds: Bool[Tensor, "*n V"]
     """What is true of the view."""
     key: tuple[str, ...]
 
@@ -37,7 +37,7 @@ class ImagedSweeps(Record):
     """Sectors of sweeps, and what an image tower says of the same moments and sectors; nothing of texts."""
 
     cloud: PointCloud
-    targets: Float[Tensor, "n 2 D"]
+    targets: Float[Tensor, "*n 2 D"]
     """Of the images, as they are and mirrored; of any length."""
     key: tuple[str, ...]
 
