@@ -105,7 +105,7 @@ def test_a_text_never_says_what_does_not_hold(view: ViewFacts, seed: int) -> Non
         ((Thing("animal", ()),), {"an animal"}),
         ((Thing("pedestrian", ("standing",)),) * 3, {"three people standing", "a standing person"}),
         ((Thing("car", ("oncoming",)),), {"an oncoming car", "a car coming towards us"}),
-        ((), {"an empty road", "nobody around"}),
+        ((), {"no one in sight", "nobody around"}),
     ],
 )
 def test_how_things_are_said(things: tuple[Thing, ...], expected: set[str]) -> None:

@@ -1,6 +1,7 @@
 """What may be asked, and how examples and clips are written."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -119,13 +120,14 @@ def test_scores_come_by_frame(tmp_path: Path) -> None:
     ],
 )
 def test_settings_are_read_back_out_of_captions(name: str, setting: tuple[str, str]) -> None:
-    situation = Situation(CONDITIONS[name], Place.STREET, Doing.DRIVES, 8.0, ())
-    for seed in range(12):
-        assert read_setting(caption(situation, seed) + " A van at night in rain and fog.") == setting
+    for seed, place in itertools.product(range(12), Place):
+        told = caption(Situation(CONDITIONS[name], place, Doing.DRIVES, 8.0, ()), seed)
+        assert read_setting(told + " A van at night on a bridge in rain and fog.") == (*setting, place.value)
 
 
-def test_a_caption_of_somebody_elses_tells_no_setting() -> None:
-    assert read_setting("A street. Rain at night.") == (None, None)
+def test_a_caption_of_somebody_elses_tells_what_its_first_sentence_does() -> None:
+    assert read_setting("A street. Rain at night.") == (None, None, "street")
+    assert read_setting("Two dogs. Rain at night.") == (None, None, None)
 
 
 def test_a_run_remembers_which_parts_of_its_logs_it_learned_from(log: LogPath, tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ MANNERS = {
 }
 ON_FOOT = {"moving": ("{} walking", "walking {}"), "standing": ("{} standing", "standing {}")}
 """What of `MANNERS` is said otherwise of pedestrians."""
-NOBODY = ("an empty road", "nobody around", "no other traffic")
+NOBODY = ("nobody around", "no one in sight", "no other traffic")
 ALONE = ("{}", "a drive {}", "driving {}", "a scene {}")
 """What is said of a setting by itself."""
 _WORDED, _ALL, _SUBJECT = 0.3, 0.3, 0.75

@@ -1,0 +1,31 @@
+"""Naming what views show by texts alone, untrained for it (Radford et al. 2021, section 3.1)."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from foredrive.search.towers import Towers, embed_prompt, unit
+
+
+def class_vectors(towers: Towers, classes: Mapping[str, Sequence[str]]) -> Float[Tensor, "C D"]:
+    """A unit vector for each class: the mean direction of its texts, each worded in several ways.
+
+    Args:
+        classes: texts by name, such as {"night": ("at night", "in the dark"), "day": ("by day",)}.
+
+    Raises:
+        InputError: a text is empty.
+    """
+    return torch.stack(
+        [
+            unit(torch.stack([embed_prompt(towers, text) for text in texts]).mean(0))
+            for texts in classes.values()
+        ]
+    )
+
+
+def classify(embeddings: Float[Tensor, "n D"], classes: Float[Tensor, "C D"]) -> Int[Tensor, "n"]:
+    """The class whose direction is nearest to each embedding's, of images and sweeps alike."""
+    return (unit(embeddings) @ classes.T).argmax(-1)
