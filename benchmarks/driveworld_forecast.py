@@ -5,17 +5,21 @@ cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretrain
 """
 
 import dataclasses
-import os
 from collections.abc import Callable
 from pathlib import Path
 
-from foredrive.data import LogPath, find_logs
-from foredrive.data.convert import convert
-from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
 from foredrive.recipes import RECIPES
 from foredrive.recipes.forecast import forecasting, judge_forecast
-from foredrive.recipes.study import StudyTowns, record_study, run_arm, seeded, shortened, work_folder
+from foredrive.recipes.study import (
+    StudyTowns,
+    pandaset_log,
+    record_study,
+    run_arm,
+    seeded,
+    shortened,
+    work_folder,
+)
 from foredrive.recipes.train import train_run
 
 WORK = work_folder(Path("runs/nemo_study"))
@@ -43,7 +47,7 @@ def on_pandaset(name: str, *, pretrained: bool) -> Callable[[int], dict[str, flo
     """A recipe's world model, learned from the first frames of the real log and judged on the others."""
 
     def measure(seed: int) -> dict[str, float]:
-        log, recipe = _pandaset(), seeded(RECIPE[name], seed)
+        log, recipe = pandaset_log(WORK / "pandaset"), seeded(RECIPE[name], seed)
         start = None
         if pretrained:
             logs = record_study(TOWNS, WORK / "towns", workers=2)
@@ -58,16 +62,6 @@ def on_pandaset(name: str, *, pretrained: bool) -> Callable[[int], dict[str, flo
 
 def _folder(arm: str, seed: int) -> Path:
     return WORK / "runs" / f"{arm}_seed{seed}"
-
-
-def _pandaset() -> LogPath:
-    root = WORK / "pandaset"
-    if root.is_dir():
-        return find_logs(root)[0]
-    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
-    if not source.is_dir():
-        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
-    return convert(source, "pandaset", root)[0]
 
 
 BENCHMARK = Benchmark(

@@ -6,17 +6,13 @@ runs/rebuild/COMMIT, that goes on where it stopped.
 """
 
 import dataclasses
-import os
 from collections.abc import Callable
 from pathlib import Path
 
-from foredrive.data import LogPath, find_logs
-from foredrive.data.convert import convert
-from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
 from foredrive.recipes.reconstruct import reconstruct
-from foredrive.recipes.study import work_folder
+from foredrive.recipes.study import pandaset_log, work_folder
 
 WORK = work_folder(Path("runs/rebuild"))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))
@@ -38,20 +34,12 @@ def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
         recipe = ARMS[arm]
         recipe = dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, seed=seed))
-        summary = reconstruct(recipe, _pandaset(), WORK / f"{arm}_seed{seed}", WORK / "cache").summary
+        summary = reconstruct(
+            recipe, pandaset_log(WORK / "pandaset"), WORK / f"{arm}_seed{seed}", WORK / "cache"
+        ).summary
         return {name: float(value) for name in FIGURES if isinstance(value := summary.get(name), float | int)}
 
     return measure
-
-
-def _pandaset() -> LogPath:
-    root = WORK / "pandaset"
-    if root.is_dir():
-        return find_logs(root)[0]
-    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
-    if not source.is_dir():
-        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
-    return convert(source, "pandaset", root)[0]
 
 
 BENCHMARK = Benchmark(

@@ -6,14 +6,12 @@ head and its losses work on a real Pandar64 and real boxes, not how they general
 """
 
 import functools
-import os
 import tempfile
 from pathlib import Path
 
-from foredrive.data.convert import convert
-from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
 from foredrive.recipes.detection import DetectionSplit, compare_losses, detection_samples
+from foredrive.recipes.study import pandaset_log
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.0), voxel_m=1.0, shape_zyx=(4, 64, 64))
@@ -24,11 +22,8 @@ STEPS = {"first_steps": 250, "more_steps": 125}
 @functools.cache
 def split() -> DetectionSplit:
     """One after the other in time."""
-    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
-    if not source.is_dir():
-        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
     with tempfile.TemporaryDirectory() as folder:
-        (log,) = convert(source, "pandaset", Path(folder))
+        log = pandaset_log(Path(folder) / "pandaset")
         found = detection_samples(log, SPEC, stride_s=STRIDE_S)
     end = round(TRAIN_S / STRIDE_S)
     later = end + round(CALIBRATE_S / STRIDE_S)

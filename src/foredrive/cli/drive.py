@@ -45,8 +45,8 @@ def drive(
             the other towns training-short and training-long.
         repetitions: How often each route is driven, every time among other traffic.
         seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
-        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog; any: drawn
-            for each drive; a bright day if left out.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog;
+            any: drawn for each drive; a bright day if left out.
         sensors: Log cameras and lidar of agents that need none, too; without, drives are much faster.
         image_size: Size of the six cameras' images, px.
         vehicles: How many vehicles share the road near the ego vehicle.

@@ -1,12 +1,14 @@
 """Studies: arms that differ in one thing, trained on the same recorded towns and judged in one held out."""
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from foredrive.data import LogPath
+from foredrive.data import LogPath, find_logs
+from foredrive.data.convert import convert
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, read_summary
 from foredrive.metrics import PROTOCOLS
@@ -66,6 +68,20 @@ def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
         by_seed = sorted(recorded.logs, key=lambda plan: (plan.seed, names.index(plan.town)))
         found.append(tuple(recorded.logs[plan] for plan in by_seed))
     return StudyLogs(*found)
+
+
+def pandaset_log(root: Path) -> LogPath:
+    """The first log of the raw PandaSet in FOREDRIVE_REAL_DATA, converted into `root` if it is not there yet.
+
+    Raises:
+        InputError: there is no raw PandaSet here.
+    """
+    if root.is_dir():
+        return find_logs(root)[0]
+    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
+    if not source.is_dir():
+        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
+    return convert(source, "pandaset", root)[0]
 
 
 def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:

@@ -89,6 +89,11 @@ def _middle_square(images: UInt8[Tensor, "n 3 H W"]) -> UInt8[Tensor, "n 3 S S"]
     return images[..., top : top + side, left : left + side]
 
 
+def _not_loaded(model: str, error: Exception) -> InputError:
+    reason = str(error).splitlines()[0]
+    return InputError(f"the towers {model!r} cannot be loaded: {reason} --towers takes a local folder, too")
+
+
 def _load(model: str) -> tuple[Any, Any]:
     from transformers import AutoConfig, AutoModel, AutoTokenizer  # takes seconds
 
@@ -100,7 +105,7 @@ def _load(model: str) -> tuple[Any, Any]:
     except InputError:
         raise
     except (OSError, ValueError) as error:
-        raise InputError(f"the towers {model!r} cannot be loaded: {str(error).splitlines()[0]}") from error
+        raise _not_loaded(model, error) from error
     if Path(model).is_dir() and not any(Path(model).glob("*.safetensors")):
         warnings.warn(f"towers start from RANDOM weights: {model} has none", stacklevel=3)
         with torch.random.fork_rng():
@@ -109,4 +114,4 @@ def _load(model: str) -> tuple[Any, Any]:
     try:
         return AutoModel.from_pretrained(model, use_safetensors=True).eval(), tokenizer
     except (OSError, ValueError) as error:
-        raise InputError(f"the towers {model!r} cannot be loaded: {str(error).splitlines()[0]}") from error
+        raise _not_loaded(model, error) from error
