@@ -10,13 +10,12 @@ import torch
 from jaxtyping import Float64
 from torch.utils.data import Dataset
 
-from foredrive.data.boxes import no_boxes, read_boxes
+from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras
-from foredrive.data.collate import stack_records
 from foredrive.data.commands import command_at, target_at
 from foredrive.data.image_store import ImageStore
 from foredrive.data.labels import LabelStore, VoxelLabels
-from foredrive.data.lidar import empty_sweep, read_sweep
+from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_taught_plan
@@ -166,7 +165,7 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clips[index]
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
-        images, image_valid, rig = read_rig(
+        seen = read_rig(
             log,
             frames,
             [find_camera(self._cameras[number], name) for name in self.camera_names],
@@ -174,29 +173,16 @@ class ClipDataset(Dataset[Example]):
             self._images,
             frames if config.future_images else frames[: config.past_frames + 1],
         )
-        sweeps = [read_sweep(log, frame) if config.lidar else None for frame in frames]
-        boxes = [read_boxes(log, frame) for frame in frames]
-        speed_mps = torch.from_numpy(log.speed_mps[frames]).float()
-        command, target = self._command(log, now)[0], target_at(log, now)
-        return Clip(
-            t_s=torch.from_numpy((log.t_us[frames] - log.t_us[now]) * 1e-6).float(),
-            T_world_ego=torch.from_numpy(log.T_world_ego[frames]),
-            images=images,
-            image_valid=image_valid,
-            rig=rig,
-            sweeps=stack_records([empty_sweep() if sweep is None else sweep[0] for sweep in sweeps]),
-            sweep_valid=torch.tensor([sweep is not None for sweep in sweeps]),
-            misses_known=torch.tensor([sweep is not None and sweep[1] for sweep in sweeps]),
-            boxes=stack_records([no_boxes() if b is None else b for b in boxes]),
-            boxes_valid=torch.tensor([b is not None for b in boxes]),
-            ego_speed_mps=speed_mps.nan_to_num(),
-            ego_speed_valid=speed_mps.isfinite(),
-            command=torch.tensor(0 if command is None else int(command)),
-            command_valid=torch.tensor(command is not None),
-            target_xy=torch.zeros(2) if target is None else torch.from_numpy(target).float(),
-            target_valid=torch.tensor(target is not None),
-            future=self._future(log, now),
-            map=read_map_patch(log, now) if config.map else None,
+        return assemble_clip(
+            log,
+            frames,
+            now,
+            seen,
+            [read_sweep(log, frame) if config.lidar else None for frame in frames],
+            self._future(log, now),
+            command=self._command(log, now)[0],
+            target_xy=target_at(log, now),
+            map_patch=read_map_patch(log, now) if config.map else None,
         )
 
 

@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.data.boxes import no_boxes, read_boxes
+from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras
-from foredrive.data.collate import stack_records
 from foredrive.data.image_store import ImageStore
-from foredrive.data.lidar import empty_sweep, read_sweep
+from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
@@ -53,29 +52,9 @@ def read_drive(
         if camera is None:
             raise InputError(f"{path.folder}: no camera {name!r}; there are: {', '.join(there) or 'none'}")
     frames = list(range(len(log)))
-    images, image_valid, rig = read_rig(log, frames, chosen, names, ImageStore(cache_dir, image_hw), frames)
+    seen = read_rig(log, frames, chosen, names, ImageStore(cache_dir, image_hw), frames)
     sweeps = [_read_beams(log, frame) for frame in frames]
-    boxes = [read_boxes(log, frame) for frame in frames]
-    speed_mps = torch.from_numpy(log.speed_mps).float()
-    return Clip(
-        t_s=torch.from_numpy((log.t_us - log.t_us[0]) * 1e-6).float(),
-        T_world_ego=torch.from_numpy(log.T_world_ego),
-        images=images,
-        image_valid=image_valid,
-        rig=rig,
-        sweeps=stack_records([empty_sweep() if sweep is None else sweep[0] for sweep in sweeps]),
-        sweep_valid=torch.tensor([sweep is not None for sweep in sweeps]),
-        misses_known=torch.tensor([sweep is not None and sweep[1] for sweep in sweeps]),
-        boxes=stack_records([no_boxes() if b is None else b for b in boxes]),
-        boxes_valid=torch.tensor([b is not None for b in boxes]),
-        ego_speed_mps=speed_mps.nan_to_num(),
-        ego_speed_valid=speed_mps.isfinite(),
-        command=torch.tensor(0),
-        command_valid=torch.tensor(False),
-        target_xy=torch.zeros(2),
-        target_valid=torch.tensor(False),
-        future=log.driven_future(0, 0, log.period_s),
-    )
+    return assemble_clip(log, frames, 0, seen, sweeps, log.driven_future(0, 0, log.period_s))
 
 
 def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
