@@ -109,6 +109,8 @@ def test_what_a_log_was_trained_on_is_not_what_a_forecast_is_judged_by(
     assert len(ClipDataset([log], learned.clips, None)) == 2
     assert figures["items"] == 4
     assert {"occupancy.iou_future_1s", "occupancy.iou_future_1s.carried_copy"} <= set(figures)
+    nearer = forecasting(run.recipe, (0.0, 2.5), 0.5, future_frames=1)
+    assert len(ClipDataset([log], nearer.clips, None)) == 3
 
 
 def test_futures_are_drawn_alike_each_time_and_filmed(run: Run, log: LogPath, tmp_path: Path) -> None:

@@ -17,17 +17,25 @@ from foredrive.recipes.train import Run, load_agent
 BATCH = 4
 
 
-def forecasting(recipe: Recipe, part_s: tuple[float, float], stride_s: float) -> Recipe:
+def forecasting(
+    recipe: Recipe, part_s: tuple[float, float], stride_s: float, future_frames: int | None = None
+) -> Recipe:
     """Fine-tuning of the world model alone, by what pre-training learns from, on a part of each log.
 
     Args:
         part_s: see `ClipConfig`.
         stride_s: time between the clips' nows.
+        future_frames: how far is imagined, and judged; None: as far as the recipe imagines.
     """
     assert recipe.pretrain is not None
     stage = replace(recipe.pretrain, schedule=recipe.finetune.schedule)
     model = replace(recipe.model, planner_base="straight_on", planner_look_m=())
-    clips = replace(recipe.clips, part_s=part_s, now_stride_s=stride_s)
+    clips = replace(
+        recipe.clips,
+        part_s=part_s,
+        now_stride_s=stride_s,
+        future_frames=recipe.clips.future_frames if future_frames is None else future_frames,
+    )
     return replace(recipe, clips=clips, model=model, pretrain=None, finetune=stage, path=None)
 
 
