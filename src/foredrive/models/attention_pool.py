@@ -1,5 +1,7 @@
 """Many tokens to one vector, as CLIP's ResNets do it (Radford et al. 2021, section 2.4)."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -36,12 +38,21 @@ class AttentionPool(nn.Module):
         share = share / share.sum(1, keepdim=True)
         tokens = self.norm(tokens)
         mean = torch.einsum("nt, ntc -> nc", share, tokens)
-        query = self.to_query(mean).view(rows, 1, self.heads, -1).transpose(1, 2)
-        key, value = (
-            part.view(rows, part.shape[1], self.heads, -1).transpose(1, 2)
-            for part in self.to_key_value(tokens).chunk(2, dim=-1)
-        )
-        seen = F.scaled_dot_product_attention(
-            query, key, value, attn_mask=None if mask is None else mask[:, None, None, :]
-        )
-        return self.out(torch.cat([mean, seen.transpose(1, 2).reshape(rows, -1)], dim=-1))
+        return self.out(torch.cat([mean, self._seen(mean, tokens, mask)], dim=-1))
+
+    def _seen(
+        self, mean: Float[Tensor, "n C"], tokens: Float[Tensor, "n T C"], mask: Bool[Tensor, "n T"] | None
+    ) -> Float[Tensor, "n C"]:
+        """Attention of one query an item, without a key or a value of any token.
+
+        Keys are linear in the tokens, so the query is taken into their space instead; a key's bias adds the
+        same to all tokens. A mean of values is the value of a mean.
+        """
+        query = self.to_query(mean).unflatten(1, (self.heads, -1))
+        to_key, to_value = self.to_key_value.weight.unflatten(0, (2, self.heads, -1))
+        asked = torch.einsum("nhd, hdc -> nhc", query, to_key) / math.sqrt(query.shape[-1])
+        fit = asked @ tokens.mT
+        if mask is not None:
+            fit = fit.masked_fill(~mask[:, None], -torch.inf)
+        seen = torch.einsum("nhc, hdc -> nhd", fit.softmax(-1) @ tokens, to_value)
+        return seen.flatten(1) + self.to_key_value.bias[mean.shape[1] :]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -66,7 +67,7 @@ class PillarEncoder(nn.Module):
         self.grid = grid
         first, second = widths
         self.first = nn.Sequential(nn.Linear(POINT_CHANNELS + 4, first), nn.LayerNorm(first), nn.ReLU())
-        self.second = nn.Sequential(nn.Linear(2 * first, second), nn.LayerNorm(second), nn.ReLU())
+        self.second = nn.Sequential(nn.Linear(2 * first, second), nn.LayerNorm(second))
 
     def forward(self, cloud: PointCloud, items: int) -> Pillars:
         """The pillars of a batch of `items` sweeps, some of which may have none."""
@@ -87,11 +88,23 @@ class PillarEncoder(nn.Module):
             [place[:, :2] - cell_xy - 0.5, place - mean[pillar], place[:, 2:] / upper[2]], dim=-1
         )
         features = self.first(torch.cat([told, intensity, count[flat, None].log() / 4], dim=-1))
-        shared = pillar_max(features, pillar, len(occupied))
-        features = self.second(torch.cat([features, shared[pillar]], dim=-1))
+        features = self._second(features, pillar, len(occupied))
         cell = occupied % grid.cells**2
         cell_yx = torch.stack([cell // grid.cells, cell % grid.cells], dim=-1)
-        return Pillars(pillar_max(features, pillar, len(occupied)), cell_yx, occupied // grid.cells**2)
+        return Pillars(features, cell_yx, occupied // grid.cells**2)
+
+    def _second(
+        self, features: Float[Tensor, "P C"], pillar: Int[Tensor, "P"], pillars: int
+    ) -> Float[Tensor, "K D"]:
+        """The second layer, on each point's features beside the maximum over its pillar.
+
+        What comes of that maximum is worked out once a pillar. Rectifying after the last maximum is the same.
+        """
+        linear, norm = self.second
+        assert isinstance(linear, nn.Linear)
+        of_point, of_pillar = linear.weight.split(features.shape[1], dim=1)
+        shared = F.linear(pillar_max(features, pillar, pillars), of_pillar, linear.bias)
+        return pillar_max(norm(F.linear(features, of_point) + shared[pillar]), pillar, pillars).relu()
 
 
 def pillar_max(
