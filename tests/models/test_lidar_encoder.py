@@ -83,13 +83,12 @@ def test_windows_hold_every_pillar_once_and_no_strangers() -> None:
     cell_yx, item = cells.repeat(2, 1), torch.arange(2).repeat_interleave(len(cells))
     for shift in (0, 2):
         windows = Windows.cut(cell_yx, item, 4, shift)
-        held = torch.cat([group.pillar[group.filled] for group in windows.groups])
-        assert sorted(held.tolist()) == list(range(len(item)))
-        for group in windows.groups:
-            for pillar, filled in zip(group.pillar, group.filled, strict=True):
-                mine = pillar[filled]
-                assert len(((cell_yx[mine] + shift) // 4).unique(dim=0)) == 1
-                assert len(item[mine].unique()) == 1
+        assert sorted(windows.order.tolist()) == list(range(len(item)))
+        held = windows.order.split(windows.counts.tolist())
+        for mine in held:
+            assert len(((cell_yx[mine] + shift) // 4).unique(dim=0)) == 1
+            assert len(item[mine].unique()) == 1
+        assert len(held) == 2 * len(((cell_yx + shift) // 4).unique(dim=0))
         inside = (cell_yx + shift) % 4
         assert windows.place.tolist() == (inside[:, 0] * 4 + inside[:, 1]).tolist()
 
@@ -113,6 +112,15 @@ def test_windows_of_unequal_size_attend_as_a_dense_mask_says(attention: WindowAt
         expected = expected + block.merge((weights @ value).transpose(0, 1).flatten(1))
         expected = expected + block.feed(expected)
     torch.testing.assert_close(attention(features, cell_yx, item), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_a_sweep_is_embedded_alike_while_nothing_learns() -> None:
+    torch.manual_seed(0)
+    encoder = LidarEncoder(GRID, dim=6, width=32, heads=2, hidden=16, blocks=2, window=12).eval()
+    made = cloud(9, count=2000, items=2)
+    learning = encoder(made, 2)
+    with torch.no_grad():
+        torch.testing.assert_close(encoder(made, 2), learning, atol=1e-5, rtol=1e-4)
 
 
 def test_a_scene_moved_by_a_whole_window_is_attended_to_alike(attention: WindowAttention) -> None:

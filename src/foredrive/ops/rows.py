@@ -173,6 +173,30 @@ def lowest_bit(typing_context, bits):
     return types.intp(types.uint32), codegen
 
 
+def _halving(pair: Callable[[ir.IRBuilder, ir.Value, ir.Value], ir.Value]) -> Any:
+    """An intrinsic that makes one float32 of a row, halves at a time."""
+
+    @intrinsic
+    @no_type_check
+    def apply(typing_context, row):
+        def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+            (value,) = args
+            for half in (8, 4, 2, 1):
+                other = [(lane + half) % ROW for lane in range(ROW)]
+                value = pair(builder, value, builder.shuffle_vector(value, value, ir.Constant(_WHOLE, other)))
+            return builder.extract_element(value, ir.Constant(cgutils.int32_t, 0))
+
+        return types.float32(a_row), codegen
+
+    return apply
+
+
+total_of = _halving(lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+"""The sum of a row's numbers."""
+greatest_in = _halving(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+"""The greatest of a row's numbers."""
+
+
 @intrinsic
 @no_type_check
 def totals(typing_context, array, index):

@@ -3,26 +3,19 @@
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-BUCKETS = (8, 16, 32, 64)
-"""Windows with at most as many pillars are padded to one length and attend together."""
-
-
-class Group(NamedTuple):
-    """Windows of about as many pillars, padded to L."""
-
-    pillar: Int[Tensor, "w L"]
-    """Which they hold; a padded place has the window's first."""
-    filled: Bool[Tensor, "w L"]
+from foredrive.ops.set_attention import attend_within
 
 
 class Windows(NamedTuple):
     """Which pillars attend to each other, and where each lies in its window."""
 
-    groups: tuple[Group, ...]
+    order: Int[Tensor, "K"]
+    """Pillars, window by window."""
+    counts: Int[Tensor, "W"]
+    """How many each window holds."""
     place: Int[Tensor, "K"]
     """Row by row within a window."""
 
@@ -35,20 +28,7 @@ class Windows(NamedTuple):
         window = (item * across + window_yx[:, 0]) * across + window_yx[:, 1]
         order = window.argsort(stable=True)
         _, counts = torch.unique_consecutive(window[order], return_counts=True)
-        return cls(tuple(_groups(order, counts, side)), inside[:, 0] * side + inside[:, 1])
-
-
-def _groups(order: Int[Tensor, "K"], counts: Int[Tensor, "W"], side: int) -> list[Group]:
-    starts, groups, least = counts.cumsum(0) - counts, [], 0
-    for length in (*(bucket for bucket in BUCKETS if bucket < side**2), side**2):
-        chosen = (counts > least) & (counts <= length)
-        least = length
-        if bool(chosen.any()):
-            count = counts[chosen, None]
-            steps = torch.arange(int(count.max()), device=order.device)
-            filled = steps < count
-            groups.append(Group(order[starts[chosen, None] + torch.where(filled, steps, 0)], filled))
-    return groups
+        return cls(order, counts, inside[:, 0] * side + inside[:, 1])
 
 
 class WindowBlock(nn.Module):
@@ -75,22 +55,11 @@ class WindowBlock(nn.Module):
         """Pillars after they have attended to those in their window."""
         normed = self.norm(features)
         query_key = self.to_query_key(normed + self.place[windows.place])
-        split = torch.cat([query_key, self.to_value(normed)], dim=-1)
-        parts = [self._attend(split, group) for group in windows.groups]
-        kept = torch.cat([group.pillar[group.filled] for group in windows.groups])
-        attended = torch.empty_like(features).index_copy_(0, kept, torch.cat(parts))
-        features = features + self.merge(attended)
-        return features + self.feed(features)
-
-    def _attend(self, split: Float[Tensor, "K three_D"], group: Group) -> Float[Tensor, "F D"]:
-        rows, length = group.pillar.shape
-        query, key, value = (
-            part.view(rows, length, self.heads, -1).transpose(1, 2)
-            for part in split[group.pillar].chunk(3, -1)
+        value = self.to_value(normed)
+        features = features + self.merge(
+            attend_within(query_key, value, windows.order, windows.counts, self.heads)
         )
-        mask = group.filled[:, None, None, :]
-        out = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
-        return out.transpose(1, 2).reshape(rows, length, -1)[group.filled]
+        return features + self.feed(features)
 
 
 class WindowAttention(nn.Module):

@@ -1,0 +1,93 @@
+"""Attention within sets of tokens of any sizes, none of which are padded by those who ask."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.ops.precision import numba_can
+from foredrive.ops.rows import ROW
+from foredrive.ops.set_attention_kernels import attend_sets
+from foredrive.ops.threads import in_parallel
+
+MIN_SETS = 8
+"""Fewer are not worth a thread of their own."""
+BUCKETS = (8, 16, 32, 64)
+"""The reference pads sets of at most as many tokens to one length, and lets them attend together."""
+
+
+def attend_within(
+    query_key: Float[Tensor, "K C2"],
+    value: Float[Tensor, "K C"],
+    order: Int[Tensor, "K"],
+    counts: Int[Tensor, "S"],
+    heads: int,
+) -> Float[Tensor, "K C"]:
+    """What each token gathers from its set, softmax(q kᵀ / √d) v by head (Vaswani et al. 2017, equation 1).
+
+    The kernel is for float32 on the CPU, heads of 16 channels, and where nobody asks for gradients.
+
+    Args:
+        query_key: queries, and behind them keys: C2 = 2 C.
+        order: tokens set by set.
+        counts: how many each set holds, one at least.
+    """
+    given = (query_key, value)
+    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in given)
+    single = all(t.dtype == torch.float32 for t in given)
+    if wanted or not single or value.shape[1] != heads * ROW or not numba_can(*given, order):
+        return attend_within_reference(query_key, value, order, counts, heads)
+    out = torch.empty_like(value, memory_format=torch.contiguous_format)
+    ends = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    arrays = [t.detach().contiguous().numpy() for t in (query_key, value, order, ends)]
+
+    def job(start: int, stop: int) -> None:
+        attend_sets(start, stop, *arrays, int(counts.max()), out.numpy())
+
+    in_parallel(job, len(counts), grain=MIN_SETS)
+    return out
+
+
+def attend_within_reference(
+    query_key: Float[Tensor, "K C2"],
+    value: Float[Tensor, "K C"],
+    order: Int[Tensor, "K"],
+    counts: Int[Tensor, "S"],
+    heads: int,
+) -> Float[Tensor, "K C"]:
+    """`attend_within` in plain PyTorch."""
+    groups = _groups(order, counts)
+    split = torch.cat([query_key, value], dim=-1)
+    parts = [_attend(split[group.token], group.filled, heads) for group in groups]
+    kept = torch.cat([group.token[group.filled] for group in groups])
+    return torch.empty_like(value).index_copy_(0, kept, torch.cat(parts))
+
+
+class _Group(NamedTuple):
+    """Sets of about as many tokens, padded to L."""
+
+    token: Int[Tensor, "s L"]
+    """Which they hold; a padded place has the set's first."""
+    filled: Bool[Tensor, "s L"]
+
+
+def _groups(order: Int[Tensor, "K"], counts: Int[Tensor, "S"]) -> list[_Group]:
+    starts, groups, least = counts.cumsum(0) - counts, [], 0
+    largest = int(counts.max())
+    for length in (*(bucket for bucket in BUCKETS if bucket < largest), largest):
+        chosen = (counts > least) & (counts <= length)
+        least = length
+        if bool(chosen.any()):
+            count = counts[chosen, None]
+            steps = torch.arange(int(count.max()), device=order.device)
+            filled = steps < count
+            groups.append(_Group(order[starts[chosen, None] + torch.where(filled, steps, 0)], filled))
+    return groups
+
+
+def _attend(split: Float[Tensor, "s L C3"], filled: Bool[Tensor, "s L"], heads: int) -> Float[Tensor, "F C"]:
+    query, key, value = (part.unflatten(-1, (heads, -1)).transpose(1, 2) for part in split.chunk(3, -1))
+    out = F.scaled_dot_product_attention(query, key, value, attn_mask=filled[:, None, None])
+    return out.transpose(1, 2).flatten(2)[filled]
