@@ -1,11 +1,13 @@
 """CLIP and SigLIP as towers, of small random configurations; prompts in several wordings."""
 
 import shutil
+import socket
 from pathlib import Path
 
 import pytest
 import torch
 import torch.nn.functional as F
+from huggingface_hub import constants
 from transformers import BertConfig, CLIPModel, SiglipModel
 
 from foredrive.errors import InputError
@@ -82,6 +84,20 @@ def test_what_is_no_tower_is_named(tmp_path: Path) -> None:
     BertConfig().save_pretrained(tmp_path)
     with pytest.raises(InputError, match="a bert model; towers are CLIP or SigLIP"):
         PretrainedTowers(str(tmp_path))
+
+
+def test_a_hub_that_does_not_answer_is_asked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]  # nobody listens there once it is closed
+    monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{port}")
+    with pytest.raises(InputError, match=f"'nobody/nothing' cannot be .*:{port} cannot be reached"):
+        PretrainedTowers("nobody/nothing")
+
+
+def test_a_model_that_is_not_here_is_said_at_once_offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(InputError, match="HF_HUB_OFFLINE"):
+        PretrainedTowers("nobody/nothing")
 
 
 def test_an_ensemble_is_the_direction_between_its_wordings(clip_folder: Path) -> None:

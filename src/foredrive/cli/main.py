@@ -21,7 +21,8 @@ from foredrive.cli.imagine import imagine
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
 from foredrive.cli.score import score
-from foredrive.cli.search import search, search_index, search_page, search_train
+from foredrive.cli.search import search, search_page
+from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError

@@ -19,6 +19,7 @@ SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """RGB statistics that the released models were trained with."""
 SIGLIP_TOKENS = 64
 """SigLIP was trained on texts padded to this many tokens, and its text tower reads the last."""
+HUB_ANSWERS_S = 5.0
 KINDS = ("clip", "siglip", "siglip2")
 
 
@@ -90,28 +91,57 @@ def _middle_square(images: UInt8[Tensor, "n 3 H W"]) -> UInt8[Tensor, "n 3 S S"]
 
 
 def _not_loaded(model: str, error: Exception) -> InputError:
-    reason = str(error).splitlines()[0]
-    return InputError(f"the towers {model!r} cannot be loaded: {reason} --towers takes a local folder, too")
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+    return InputError(f"the towers {model!r} cannot be loaded: {reason}. --towers takes a local folder, too")
 
 
 def _load(model: str) -> tuple[Any, Any]:
-    from transformers import AutoConfig, AutoModel, AutoTokenizer  # takes seconds
-
+    """A model and its tokenizer: what lies here, else from the hub, if that answers at all."""
     try:
-        config = AutoConfig.from_pretrained(model)
-        if config.model_type not in KINDS:
-            raise InputError(f"{model}: a {config.model_type} model; towers are CLIP or SigLIP")
-        tokenizer = AutoTokenizer.from_pretrained(model)
+        return _from_files(model, local_files_only=True)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        if Path(model).is_dir():
+            raise _not_loaded(model, error) from error
+    _reach_hub(model)
+    try:
+        return _from_files(model, local_files_only=False)
     except InputError:
         raise
     except (OSError, ValueError) as error:
         raise _not_loaded(model, error) from error
+
+
+def _reach_hub(model: str) -> None:
+    """Ask the hub once: asked for files, it would be asked again and again for 20 s.
+
+    Raises:
+        InputError: it does not answer.
+    """
+    from huggingface_hub import constants
+    from huggingface_hub.utils import get_session
+
+    if constants.is_offline_mode():
+        raise _not_loaded(model, OSError("it is not here, and HF_HUB_OFFLINE forbids to look elsewhere"))
+    try:
+        get_session().head(constants.ENDPOINT, timeout=HUB_ANSWERS_S)
+    except Exception as error:  # of whatever client the hub's library uses
+        reason = f"it is not here, and {constants.ENDPOINT} cannot be reached ({error})"
+        raise _not_loaded(model, OSError(reason)) from error
+
+
+def _from_files(model: str, *, local_files_only: bool) -> tuple[Any, Any]:
+    from transformers import AutoConfig, AutoModel, AutoTokenizer  # takes seconds
+
+    config = AutoConfig.from_pretrained(model, local_files_only=local_files_only)
+    if config.model_type not in KINDS:
+        raise InputError(f"{model}: a {config.model_type} model; towers are CLIP or SigLIP")
+    tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=local_files_only)
     if Path(model).is_dir() and not any(Path(model).glob("*.safetensors")):
         warnings.warn(f"towers start from RANDOM weights: {model} has none", stacklevel=3)
         with torch.random.fork_rng():
             torch.manual_seed(0)
             return AutoModel.from_config(config).eval(), tokenizer
-    try:
-        return AutoModel.from_pretrained(model, use_safetensors=True).eval(), tokenizer
-    except (OSError, ValueError) as error:
-        raise _not_loaded(model, error) from error
+    found = AutoModel.from_pretrained(model, use_safetensors=True, local_files_only=local_files_only)
+    return found.eval(), tokenizer

@@ -1,0 +1,112 @@
+"""`foredrive search index` and `search train`."""
+
+import os
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.search import INDEX
+from foredrive.cli.search_options import Place, Seconds
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from foredrive.recipes.indexing import Indexed
+
+TOWERS = "openai/clip-vit-base-patch32"
+FAILURES_SHOWN = 5
+
+
+def search_index(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOGS [LOGS ...]")],
+    index: Place = INDEX,
+    towers: Annotated[str, tyro.conf.arg(metavar="NAME|PATH")] = TOWERS,
+    stride: Seconds = 0.5,
+    workers: int = 0,
+    ray: bool = False,
+    scores: OptionalPath = None,
+) -> None:
+    """Index logs for search, or go on with it: what is in stays, what has changed is put in anew.
+
+    Args:
+        logs: 123D logs, splits, data roots or lists of clips.
+        index: Where the index lies: a folder, or a place on object storage such as s3://bucket/index.
+        towers: A CLIP or SigLIP model: its name on Hugging Face's hub, or its folder; or a folder that
+            `foredrive search train` made.
+        stride: Time between the moments of a log that are indexed.
+        workers: How many parts of logs are embedded at a time; 0 is one for each core.
+        ray: Embed on Ray: on the cluster at RAY_ADDRESS, or on one started here.
+        scores: Per-frame scores of detections, one JSON object a line (docs/search.md); moments that are in
+            the index are given them too.
+    """
+    from foredrive.recipes import find_all_logs
+    from foredrive.recipes.indexing import index_logs
+    from foredrive.search.scores import read_scores
+
+    found = find_all_logs(logs)
+    told = None if scores is None else read_scores(scores)
+    with _progress() as tick:
+        cores = len(os.sched_getaffinity(0))
+        done = index_logs(found, index, towers, stride, workers or cores, on_ray=ray, scores=told, tick=tick)
+    _tell_indexed(done, index)
+
+
+def search_train(
+    logs: SomePaths,
+    out: Path,
+    cache: OptionalPath = None,
+    beside: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None,
+    loss: Literal["mse", "cosine"] = "mse",
+    image_steps: int | None = None,
+    lidar_steps: int | None = None,
+    seed: int = 0,
+) -> None:
+    """Train towers for search, or go on with a run that was interrupted.
+
+    An image tower learns beside a sentence encoder from what is known of each camera's view, then a lidar
+    tower from the image tower. Beside CLIP or SigLIP only a lidar tower is trained, from images alone.
+
+    Args:
+        logs: 123D logs, splits or data roots with cameras and lidar; image towers need boxes or captions.
+        out: Folder of the run; the towers lie in its folder "towers".
+        cache: Folder for views; by default "cache" in the run's folder.
+        beside: A CLIP or SigLIP model whose images teach the lidar tower.
+        loss: What the lidar tower is trained by: mean squared error, or 1 - cosine.
+        image_steps: Steps of the image tower; by default 20 epochs.
+        lidar_steps: Steps of the lidar tower; by default 10 epochs.
+        seed: Of weights and of the order of data.
+    """
+    from foredrive.recipes import find_all_logs
+    from foredrive.recipes.tower_training import embedded_recipe, train_towers
+
+    recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
+    towers = train_towers(recipe, find_all_logs(logs), out, cache, beside)
+    print(f"next: foredrive search index LOGS --towers {towers}")
+
+
+def _tell_indexed(done: "Indexed", index: str) -> None:
+    print(f"{done.logs} logs are in {index}: {done.rows} new rows, {done.there_before} parts were in already")
+    if done.scored:
+        print(f"gave {done.scored} rows their scores")
+    if done.failed:
+        told = [f"{name} ({why})" for name, why in done.failed.items()]
+        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
+        skipped = f"skipped {len(told)} logs: {', '.join(told[:FAILURES_SHOWN])}{more}"
+        if not done.logs:
+            raise InputError(skipped)
+        print(skipped)
+
+
+@contextmanager
+def _progress() -> "Iterator[Callable[[int, int], None]]":
+    """A bar over all moments; yields what moves it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress("embedding moments", *columns) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda done, total: progress.update(bar, completed=done, total=total)

@@ -1,0 +1,150 @@
+"""What `foredrive search` is asked for, and what comes of its hits, in groups of options."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath
+
+if TYPE_CHECKING:
+    from foredrive.search.find import Found
+    from foredrive.search.query import Query
+
+Place = Annotated[str, tyro.conf.arg(metavar="PATH|URL")]
+Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
+Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+Seconds = Annotated[float, tyro.conf.arg(metavar="SECONDS")]
+
+
+@dataclass(frozen=True)
+class LookFor:
+    """What to look for.
+
+    Args:
+        text: What to look for, such as "pedestrian crossing at night".
+        like: Look for what is like a moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part
+            of that (LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM in px); LOG is the name of an indexed log
+            or a log's folder.
+        modality: Compare with images, with sweeps, or with both.
+        rule: How both are joined: the sum of features, the sum of logits, or the best by image
+            ranked again by lidar.
+        image_text: Compare images with this text instead.
+        lidar_text: Compare sweeps with this text instead.
+        plain: Take texts as they are; else they are worded in several ways.
+    """
+
+    text: tyro.conf.Positional[Text] = None
+    like: Annotated[str | None, tyro.conf.arg(metavar="LOG@12.5s")] = None
+    modality: Literal["image", "lidar", "joint"] = "image"
+    rule: Literal["features", "logits", "rerank"] = "features"
+    image_text: Text = None
+    lidar_text: Text = None
+    plain: bool = False
+
+
+@dataclass(frozen=True)
+class Among:
+    """Among which moments.
+
+    Args:
+        where: A condition on the index' columns, such as "ego_speed > 5 AND weather = 'rain'";
+            docs/search.md names them.
+        tagged: Only moments that have this tag.
+        view: any, sectors, all (whole scenes) or the name of a camera.
+    """
+
+    where: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
+    tagged: Name = None
+    view: str = "any"
+
+
+@dataclass(frozen=True)
+class Choose:
+    """Which hits, and in what order.
+
+    Args:
+        top: How many hits.
+        gap: Moments of one log that are closer than this are one hit.
+        diverse: Of the best ten times as many take those that differ most (k-centre), or that stand
+            for most.
+        by: Rank by a column of numbers as well, such as score_missed; without a text by it alone.
+        mix: What that column weighs beside likeness, 0 to 1.
+    """
+
+    top: int = 20
+    gap: Seconds = 5.0
+    diverse: Literal["no", "k-centre", "facility"] = "no"
+    by: Annotated[str | None, tyro.conf.arg(metavar="COLUMN")] = None
+    mix: float = 0.5
+
+
+@dataclass(frozen=True)
+class Then:
+    """What to do with the hits.
+
+    Args:
+        out: Write a contact sheet: PNG or HTML.
+        clips: Write the hits as a list of clips, which `foredrive train --logs` and other verbs
+            take as logs.
+        before: How much of such a clip lies before its hit.
+        after: How much of it lies after.
+        tag: Give all hits this tag.
+        save: Keep this query under a name.
+    """
+
+    out: OptionalPath = None
+    clips: OptionalPath = None
+    before: Seconds = 2.0
+    after: Seconds = 4.0
+    tag: Name = None
+    save: Name = None
+
+    def check(self) -> None:
+        """Raises `InputError` for what cannot be written, before anything is looked for."""
+        from foredrive.view.search_sheet import check_sheet
+
+        if self.out is not None:
+            check_sheet(self.out)
+
+    def do(self, index: str, query: "Query", found: "Found") -> None:
+        """Keep, tag and write."""
+        from foredrive.data.clip_list import write_clip_list
+        from foredrive.recipes.searching import listed_clips
+        from foredrive.search.kept import add_tag, save_query
+        from foredrive.view.search_sheet import write_search_sheet
+
+        if self.save is not None:
+            save_query(index, self.save, query.to_json())
+        if self.tag is not None:
+            add_tag(index, self.tag, [str(hit.facts["key"]) for hit in found.hits])
+        if not found.hits:
+            return
+        if self.clips is not None:
+            write_clip_list(self.clips, listed_clips(found.hits, self.before, self.after))
+            print(f"wrote {self.clips}: foredrive train RECIPE --logs {self.clips}")
+        if self.out is not None:
+            write_search_sheet(self.out, query, found.hits)
+            print(f"look: {self.out}")
+
+
+def as_query(look_for: LookFor, among: Among, choose: Choose) -> "Query":
+    """The question that options ask. Raises `InputError` as `Query` does."""
+    from foredrive.search.query import Query
+
+    return Query(
+        text=look_for.text,
+        image_text=look_for.image_text,
+        lidar_text=look_for.lidar_text,
+        like=look_for.like,
+        modality=look_for.modality,
+        rule=look_for.rule,
+        where=among.where,
+        tag=among.tagged,
+        view=among.view,
+        top=choose.top,
+        gap_s=choose.gap,
+        diverse=None if choose.diverse == "no" else choose.diverse,
+        by=choose.by,
+        mix=choose.mix,
+    )
