@@ -24,6 +24,12 @@ _LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {"pandaset
 """What data sets drive with that keep no beam without a return: lidar -> ego to its pattern."""
 
 
+def lidar_of(dataset: str, T_ego_lidar: Float[Tensor, "4 4"]) -> SpinningLidar | None:
+    """The lidar that a data set drives with; None where that is not known here."""
+    make_lidar = _LIDARS.get(dataset)
+    return None if make_lidar is None else make_lidar(T_ego_lidar)
+
+
 def read_drive(
     path: LogPath,
     image_hw: tuple[int, int],
@@ -60,12 +66,14 @@ def read_drive(
 def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
     """`read_sweep` with the beams that did not return, if they are recorded or can be told."""
     read = read_sweep(log, frame)
-    make_lidar = _LIDARS.get(log.metadata.dataset)
-    if read is None or read[1] or make_lidar is None or not len(read[0].dt_s):
+    if read is None or read[1] or not len(read[0].dt_s):
         return read
     sweep = read[0]
     T_ego_lidar = torch.eye(4)
     T_ego_lidar[:3, 3] = sweep.origin_ego[sweep.dt_s.abs().argmin()]
+    lidar = lidar_of(log.metadata.dataset, T_ego_lidar)
+    if lidar is None:
+        return read
     around_us = log.t_us[frame] + 1e6 * np.array([sweep.dt_s.min(), sweep.dt_s.max()])
     first, last = torch.from_numpy(log.poses_at(around_us)[0])
     span_s = float(sweep.dt_s.max() - sweep.dt_s.min()) or 1.0
@@ -73,4 +81,4 @@ def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
     velocity = R_ego_world @ (last - first)[:3, 3] / span_s
     turn = log_so3(first[:3, :3].T @ last[:3, :3]) / span_s
     twist_ego = torch.cat([velocity, turn]).float()
-    return with_missed_beams(sweep, make_lidar(T_ego_lidar), twist_ego), True
+    return with_missed_beams(sweep, lidar, twist_ego), True

@@ -84,13 +84,11 @@ def judge_sweeps(scene: RebuiltScene, views: Sequence[SweepView], *, drop: bool 
         seen = scene.sweep(graph, points, view.t_s)
         took_s += time.perf_counter() - started
         beams, beams_seen = view.beams, beams_seen + len(view.beams.dt_s)
-        range_m = torch.where(seen.median_range_m.isfinite(), seen.median_range_m, seen.range_m).cpu()
-        dropped = (seen.drop_logit > 0).cpu() & drop
         scores.append(
             score_sweep(
-                range_m=range_m,
+                range_m=seen.hit_range_m.cpu(),
                 intensity=seen.intensity.cpu(),
-                dropped=dropped,
+                dropped=~seen.returned.cpu() & drop,
                 real_range_m=beams.range_m,
                 real_intensity=beams.intensity,
                 returned=beams.returned,

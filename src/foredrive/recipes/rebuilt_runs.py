@@ -1,5 +1,6 @@
-"""Scenes of finished reconstructions, opened without their logs."""
+"""Finished reconstructions, opened without their logs."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -8,17 +9,27 @@ from safetensors.torch import load_file
 from foredrive.errors import InputError
 from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe
-from foredrive.recipes.reconstruct import CONFIG, WEIGHTS
+from foredrive.recipes.reconstruct import CONFIG, VEHICLE, WEIGHTS
 from foredrive.rendering.edits import Edit, Edited, apply_edits
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.vehicle import Vehicle, load_vehicle
 from foredrive.training.checkpoints import load_weights
 
 
-def open_scene(folder: Path) -> RebuiltScene:
-    """The scene of a run, as it was learned.
+@dataclass(frozen=True)
+class OpenRun:
+    """A scene as it was learned, and the vehicle that saw it."""
+
+    folder: Path
+    scene: RebuiltScene
+    vehicle: Vehicle
+
+
+def open_rebuilt(folder: Path) -> OpenRun:
+    """Open a run.
 
     Raises:
         InputError: on a folder without a finished run.
@@ -28,33 +39,43 @@ def open_scene(folder: Path) -> RebuiltScene:
     recipe = load_values(RebuildRecipe, folder / CONFIG)
     if not (folder / WEIGHTS).is_file():
         raise InputError(f"{folder}: not finished; go on with `foredrive reconstruct`")
+    if not (folder / VEHICLE).is_file():
+        raise InputError(
+            f"{folder}: from before runs kept their sensors (no {VEHICLE}); `foredrive reconstruct` with the "
+            "same log adds them"
+        )
+    vehicle = load_vehicle(folder / VEHICLE)
     try:
-        saved = load_file(folder / WEIGHTS)
-        gaussians = Gaussians(
-            saved["mean_m"],
-            saved["quaternion"],
-            saved["log_scale"],
-            saved["opacity_logit"],
-            saved["albedo"].new_zeros(
-                len(saved["albedo"]), saved["albedo"].shape[1] + saved["feature"].shape[1]
-            ),
-        )
-        tracks = Tracks(
-            saved["track_id"],
-            saved["category"],
-            saved["size_lwh"],
-            saved["key_t_s"],
-            saved["T_scene_actor"],
-            saved["present"],
-        )
-        cameras, graph = len(saved["camera_late_s"]), SceneGraph(gaussians, saved["actor"], tracks)
+        graph, cameras = _read_graph(folder / WEIGHTS)
     except (OSError, SafetensorError, KeyError) as error:
         raise InputError(f"{folder / WEIGHTS}: not the weights of a scene: {error}") from error
-    scene = RebuiltScene(graph, cameras, recipe.rolling, recipe.decoder_width)
+    scene = RebuiltScene(graph, cameras, recipe.rolling, recipe.decoder_width, vehicle.reach_m)
     load_weights(scene, folder / WEIGHTS)
-    return scene
+    return OpenRun(folder, scene, vehicle)
 
 
 def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> Edited:
     """A scene after edits; runs that actors come from are opened."""
-    return apply_edits(scene.graph, edits, lambda run: open_scene(Path(run)).graph)
+    return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
+
+
+def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
+    """A graph of the sizes that were saved, and how many cameras there are."""
+    saved = load_file(weights)
+    features = saved["albedo"].shape[1] + saved["feature"].shape[1]
+    gaussians = Gaussians(
+        saved["mean_m"],
+        saved["quaternion"],
+        saved["log_scale"],
+        saved["opacity_logit"],
+        saved["albedo"].new_zeros(len(saved["albedo"]), features),
+    )
+    tracks = Tracks(
+        saved["track_id"],
+        saved["category"],
+        saved["size_lwh"],
+        saved["key_t_s"],
+        saved["T_scene_actor"],
+        saved["present"],
+    )
+    return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"])

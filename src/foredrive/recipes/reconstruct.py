@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import logging
+import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import torch
 
 from foredrive.data import LogPath
 from foredrive.data.cameras import pinhole_cameras
-from foredrive.data.drives import read_drive
+from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
@@ -24,13 +26,18 @@ from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.rendering.tracks import Tracks, read_tracks
+from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.scene import Clip
+from foredrive.sensors import SpinningLidar
+from foredrive.sensors.measured_lidar import measure_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
 from foredrive.training.loop import read_metrics
 from foredrive.training.rebuilding import Seen, rebuild
 
 CONFIG, LOG, WEIGHTS, SUMMARY = "config.yaml", "log.json", "model.safetensors", "summary.json"
+VEHICLE = "vehicle.json"
+"""Where the log's vehicle drove and what it carried: a scene is looked at without its log."""
 GAUSSIANS = "static.ply"
 """What stands, for viewers of 3-D Gaussians."""
 _log = logging.getLogger(__name__)
@@ -51,7 +58,7 @@ class Material:
     learned: Seen
     held_out: Seen
     tracks: Tracks
-    cameras: tuple[str, ...]
+    vehicle: Vehicle
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,7 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
         with atomic_path(folder / LOG) as temporary:
             temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))
         save_recipe(recipe, folder / CONFIG)
+    save_vehicle(material.vehicle, folder / VEHICLE)
     scene = begin(recipe, material)
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
     weights = folder / WEIGHTS
@@ -124,11 +132,13 @@ def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Mate
             _log.warning("%s: %s", path.folder, what)
     if not recipe.actors:
         tracks = tracks_without_actors(tracks)
+    learned = _seen(known, T_world_scene)
+    lidar, reach_m = _lidar(Log(path), learned.sweeps)
     return Material(
-        learned=_seen(known, T_world_scene),
+        learned=learned,
         held_out=_seen(drive.frames(frames[held].tolist()), T_world_scene),
         tracks=tracks,
-        cameras=drive.rig.names,
+        vehicle=read_vehicle(drive, T_world_scene, lidar, reach_m),
     )
 
 
@@ -143,7 +153,13 @@ def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
         generator,
     )
     torch.manual_seed(recipe.schedule.seed)  # the decoders' weights
-    return RebuiltScene(graph, len(material.cameras), recipe.rolling, recipe.decoder_width)
+    return RebuiltScene(
+        graph,
+        len(material.vehicle.rig.names),
+        recipe.rolling,
+        recipe.decoder_width,
+        material.vehicle.reach_m,
+    )
 
 
 def tracks_without_actors(tracks: Tracks) -> Tracks:
@@ -193,6 +209,23 @@ def _free_memory_gib() -> float:
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) / 1024**2
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1024**3
+
+
+def _lidar(log: Log, sweeps: Sequence[SweepView]) -> tuple[SpinningLidar | None, float]:
+    """The lidar of a log and how far it sees: as it is known to, or as far as it ever did."""
+    seen = [view for view in sweeps if bool(view.beams.returned.any())]
+    if not seen:
+        return None, math.inf
+    fullest = max(seen, key=lambda view: len(view.beams.dt_s))
+    beams = fullest.beams
+    T_ego_lidar = torch.eye(4)
+    T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
+    known = lidar_of(log.metadata.dataset, T_ego_lidar)
+    if known is not None:
+        return known, known.max_range_m
+    farthest_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
+    lidar = measure_lidar(beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m)
+    return lidar, farthest_m
 
 
 def _seen(clip: Clip, T_world_scene: torch.Tensor) -> Seen:

@@ -1,6 +1,7 @@
 """A rebuilt scene: Gaussians, tracks, sensor corrections and decoders, all of which are learned."""
 
 import functools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +54,16 @@ class SweepPicture:
     alpha: Float[Tensor, "P"]
     alpha_before_hit: Float[Tensor, "P"] | None
 
+    @property
+    def hit_range_m(self) -> Float[Tensor, "P"]:
+        """Where beams end: the median, or the expected range where less than half of the light is stopped."""
+        return torch.where(self.median_range_m.isfinite(), self.median_range_m, self.range_m)
+
+    @property
+    def returned(self) -> Bool[Tensor, "P"]:
+        """Which beams are more likely to return than not."""
+        return self.drop_logit <= 0
+
 
 @dataclass(frozen=True)
 class SweepPoints:
@@ -73,6 +84,7 @@ class RebuiltScene(nn.Module):
         rolling: sensors look at different times within an image or a sweep; False takes all rows and beams
             to be of one moment.
         decoder_width: channels of the camera's decoder.
+        reach_m: how far lidars see: nothing beyond it stops a beam.
     """
 
     actor: Tensor
@@ -84,7 +96,12 @@ class RebuiltScene(nn.Module):
     T_scene_actor: Tensor
 
     def __init__(
-        self, graph: SceneGraph, cameras: int, rolling: bool = True, decoder_width: int = 32
+        self,
+        graph: SceneGraph,
+        cameras: int,
+        rolling: bool = True,
+        decoder_width: int = 32,
+        reach_m: float = math.inf,
     ) -> None:
         super().__init__()
         own = graph.gaussians
@@ -111,6 +128,7 @@ class RebuiltScene(nn.Module):
         self.camera_decoder = CameraDecoder(features, cameras, width=decoder_width)
         self.lidar_decoder = LidarDecoder(features)
         self.rolling = rolling
+        self.reach_m = reach_m
 
     @property
     def gaussians(self) -> Gaussians:
@@ -226,6 +244,7 @@ class RebuiltScene(nn.Module):
             inverse_se3(points.T_scene_lidar.to(placed.velocity_mps)),
             velocity_mps=placed.velocity_mps,
             twist_lidar=points.twist_lidar.to(placed.velocity_mps),
+            reach_m=self.reach_m,
         )
         seen = composite_splats(splats, points.tiles, hit_range_m)
         intensity, drop_logit = self.lidar_decoder(

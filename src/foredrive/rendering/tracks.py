@@ -82,27 +82,43 @@ def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
     Differentiable in the poses and in `t_s`, where it is a tensor.
     """
     now_s = float(t_s.detach()) if isinstance(t_s, Tensor) else t_s
+    T, velocity_mps, turn_radps = poses_at(tracks.t_s, tracks.T_scene_actor, t_s)
     if len(tracks.t_s) == 1:
-        near = abs(float(tracks.t_s[0]) - now_s) <= LONGEST_STAY_S
-        still = torch.zeros(len(tracks), 3).to(tracks.T_scene_actor)
-        return ActorStates(tracks.T_scene_actor[:, 0], still, still, tracks.present[:, 0] & near)
-    after = int(torch.searchsorted(tracks.t_s.contiguous(), now_s))
-    after = min(max(after, 1), len(tracks.t_s) - 1)
-    step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
-    share = (t_s - float(tracks.t_s[after - 1])) / step_s
-    T0, T1 = tracks.T_scene_actor[:, after - 1], tracks.T_scene_actor[:, after]
-    turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in the actor's axes
+        present = tracks.present[:, 0] & (abs(float(tracks.t_s[0]) - now_s) <= LONGEST_STAY_S)
+    else:
+        after = _key_after(tracks.t_s, now_s)
+        step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
+        near = -1.0 <= (now_s - float(tracks.t_s[after - 1])) / step_s <= 2.0
+        present = tracks.present[:, after - 1] & tracks.present[:, after] & near
+    return ActorStates(T, velocity_mps, turn_radps, present)
+
+
+def poses_at(
+    key_t_s: Float[Tensor, "K"], T: Float[Tensor, "A K 4 4"], t_s: float | Tensor
+) -> tuple[Float[Tensor, "A 4 4"], Float[Tensor, "A 3"], Float[Tensor, "A 3"]]:
+    """Poses at a time, with velocities (m/s) and turn rates (rad/s) in the axes that they are given in.
+
+    Positions on straight lines between key poses, rotations about one axis; before the first and after the
+    last key time they go on so. One key pose alone stands still. Differentiable in `T` and `t_s`.
+    """
+    if len(key_t_s) == 1:
+        still = torch.zeros(len(T), 3).to(T)
+        return T[:, 0], still, still
+    after = _key_after(key_t_s, float(t_s.detach()) if isinstance(t_s, Tensor) else t_s)
+    step_s = float(key_t_s[after] - key_t_s[after - 1])
+    share = (t_s - float(key_t_s[after - 1])) / step_s
+    T0, T1 = T[:, after - 1], T[:, after]
+    turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in its own axes
+    now = T0 @ exp_se3(torch.cat([torch.zeros_like(turn), share * turn], dim=-1))
+    now = torch.cat([now[..., :3], now[..., 3:] + share * (T1 - T0)[..., 3:]], dim=-1)
     way = T1[:, :3, 3] - T0[:, :3, 3]
-    T = T0 @ exp_se3(torch.cat([torch.zeros_like(turn), share * turn], dim=-1))
-    T = torch.cat([T[..., :3], T[..., 3:] + share * (T1 - T0)[..., 3:]], dim=-1)
-    return ActorStates(
-        T_scene_actor=T,
-        velocity_mps=way / step_s,
-        turn_radps=(T0[:, :3, :3] @ turn[..., None])[..., 0] / step_s,
-        present=tracks.present[:, after - 1]
-        & tracks.present[:, after]
-        & (-1.0 <= (now_s - float(tracks.t_s[after - 1])) / step_s <= 2.0),
-    )
+    return now, way / step_s, (T0[:, :3, :3] @ turn[..., None])[..., 0] / step_s
+
+
+def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
+    """The later one of the two key times that a time lies between, or beside; of two at least."""
+    after = int(torch.searchsorted(key_t_s.contiguous(), now_s))
+    return min(max(after, 1), len(key_t_s) - 1)
 
 
 def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:

@@ -26,6 +26,7 @@ def project_lidar(
     twist_lidar: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
     spread_rad2: float = SPREAD_RAD2,
+    reach_m: float = math.inf,
 ) -> Splats:
     """Splats over azimuth and elevation, for `beam_points`; those that no beam can see are left out.
 
@@ -41,13 +42,14 @@ def project_lidar(
             still. See `geometry.se3.sensor_twist`.
         compensate: take as much opacity away as ε spreads a splat.
         spread_rad2: ε.
+        reach_m: Gaussians whose centre is farther than this are not seen.
     """
     position = positions_in_sensor(gaussians, T_lidar_scene)
     with torch.no_grad():
         x, y, z = position
         level2 = x * x + y * y
         range2 = level2 + z * z
-        seen = (range2 > NEAR_M**2) & (level2 > UPRIGHT**2 * range2)
+        seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
         chosen = seen.nonzero()[:, 0]
     them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     angles, range_m, jacobian = _project(them.position_m)
