@@ -115,7 +115,7 @@ def test_what_is_no_finished_run_is_told(run: Rebuilt, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not finished"):
         open_rebuilt(tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"")
-    with pytest.raises(InputError, match=r"no vehicle\.json\); `foredrive reconstruct` with the same log"):
+    with pytest.raises(InputError, match=r"no vehicle\.json\): rebuild the log anew"):
         open_rebuilt(tmp_path)
     (tmp_path / "vehicle.json").write_text("{}")
     with pytest.raises(InputError, match="does not describe a vehicle"):

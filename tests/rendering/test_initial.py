@@ -11,6 +11,7 @@ from foredrive.data.drives import read_drive
 from foredrive.errors import InputError
 from foredrive.rendering.initial import InitialSize, initial_scene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.rendering.seed_points import SeedPoints, like_neighbours
 from foredrive.rendering.tracks import read_tracks, states_at
 from foredrive.rendering.views import camera_views, sweep_views
 from foredrive.scene import Clip
@@ -66,10 +67,21 @@ def test_the_static_part_has_no_actors_in_it(graph: SceneGraph) -> None:
     assert float(lidar[:, 2].abs().max()) < 0.02  # all of it is ground
     seen = own.feature[: SIZE.lidar_points, :3]
     grey = torch.tensor(world.GROUND_RGB) / 255
-    known = (seen - 0.5).abs().amax(-1) > 1e-6
-    assert float(known.float().mean()) > 0.2
-    # at the rims of boxes a pixel shows another thing than the beam met
-    assert float(((seen[known] - grey).abs().amax(-1) < 0.02).float().mean()) > 0.95
+    # at the rims of boxes a pixel shows another thing than the beam met; what no camera saw is like the rest
+    assert float(((seen - grey).abs().amax(-1) < 0.02).float().mean()) > 0.95
+
+
+def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:
+    points = SeedPoints(
+        xyz_m=torch.tensor([[0.0, 0, 0], [10.0, 0, 0], [10.0, 1, 0], [1.0, 0, 0], [10.0, 0.5, 0]]),
+        rgb=torch.tensor([[0.2], [0.6], [0.8], [0.5], [0.5]]).expand(5, 3),
+        seen=torch.tensor([True, True, True, False, False]),
+        scale_m=torch.ones(5),
+    )
+    # three points have colours, so that each neighbour counts for all
+    assert like_neighbours(points).rgb[:, 0].tolist() == pytest.approx([0.2, 0.6, 0.8, 1.6 / 3, 1.6 / 3])
+    assert like_neighbours(points[2:]).rgb[:, 0].tolist() == pytest.approx([0.8, 0.8, 0.8])
+    assert torch.equal(like_neighbours(points[3:]).rgb, points[3:].rgb)
 
 
 @pytest.mark.parametrize(

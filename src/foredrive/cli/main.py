@@ -20,6 +20,7 @@ from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
+from foredrive.cli.render import render
 from foredrive.cli.score import score
 from foredrive.cli.search import search, search_page
 from foredrive.cli.search_index import search_index, search_train
@@ -41,6 +42,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search-page": search_page,
     "search-train": search_train,
     "reconstruct": reconstruct,
+    "render": render,
     "imagine": imagine,
     "export": export,
     "view": view,

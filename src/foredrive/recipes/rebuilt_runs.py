@@ -40,10 +40,7 @@ def open_rebuilt(folder: Path) -> OpenRun:
     if not (folder / WEIGHTS).is_file():
         raise InputError(f"{folder}: not finished; go on with `foredrive reconstruct`")
     if not (folder / VEHICLE).is_file():
-        raise InputError(
-            f"{folder}: from before runs kept their sensors (no {VEHICLE}); `foredrive reconstruct` with the "
-            "same log adds them"
-        )
+        raise InputError(f"{folder}: of before runs kept their sensors (no {VEHICLE}): rebuild the log anew")
     vehicle = load_vehicle(folder / VEHICLE)
     try:
         graph, cameras = _read_graph(folder / WEIGHTS)

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import logging
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ from foredrive.rendering.tracks import Tracks, read_tracks
 from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.scene import Clip
-from foredrive.sensors import SpinningLidar
 from foredrive.sensors.measured_lidar import measure_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
 from foredrive.training.loop import read_metrics
@@ -133,12 +131,11 @@ def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Mate
     if not recipe.actors:
         tracks = tracks_without_actors(tracks)
     learned = _seen(known, T_world_scene)
-    lidar, reach_m = _lidar(Log(path), learned.sweeps)
     return Material(
         learned=learned,
         held_out=_seen(drive.frames(frames[held].tolist()), T_world_scene),
         tracks=tracks,
-        vehicle=read_vehicle(drive, T_world_scene, lidar, reach_m),
+        vehicle=_vehicle(Log(path), drive, learned.sweeps),
     )
 
 
@@ -211,21 +208,21 @@ def _free_memory_gib() -> float:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1024**3
 
 
-def _lidar(log: Log, sweeps: Sequence[SweepView]) -> tuple[SpinningLidar | None, float]:
-    """The lidar of a log and how far it sees: as it is known to, or as far as it ever did."""
+def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> Vehicle:
+    """The vehicle of a drive; its lidar as it is known to be, or as far as the sweeps tell."""
+    T_world_scene = drive.T_world_ego[0]
     seen = [view for view in sweeps if bool(view.beams.returned.any())]
     if not seen:
-        return None, math.inf
+        return read_vehicle(drive, T_world_scene)
     fullest = max(seen, key=lambda view: len(view.beams.dt_s))
-    beams = fullest.beams
-    T_ego_lidar = torch.eye(4)
+    beams, T_ego_lidar = fullest.beams, torch.eye(4)
     T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
-    known = lidar_of(log.metadata.dataset, T_ego_lidar)
-    if known is not None:
-        return known, known.max_range_m
     farthest_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
-    lidar = measure_lidar(beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m)
-    return lidar, farthest_m
+    lidar = lidar_of(log.metadata.dataset, T_ego_lidar) or measure_lidar(
+        beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m
+    )
+    reach_m = farthest_m if lidar is None else lidar.max_range_m
+    return read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
 
 
 def _seen(clip: Clip, T_world_scene: torch.Tensor) -> Seen:

@@ -15,6 +15,7 @@ from foredrive.rendering.seed_points import (
     GREY,
     SeedPoints,
     lidar_points,
+    like_neighbours,
     no_points,
     points_along_pixels,
     points_anywhere,
@@ -49,7 +50,8 @@ class InitialSize:
     pixel_scale: float = 0.6
     """The same of points along pixels, in units of the distance between pixels drawn of a camera."""
     near_m: float = 2.0
-    far_from_m: float = 60.0
+    far_from_m: float = 500.0
+    """What is far lies in a thin shell: a vehicle that drives elsewhere sees it stay whole."""
     far_m: float = 2000.0
 
 
@@ -62,8 +64,9 @@ def initial_scene(
 ) -> SceneGraph:
     """Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
-    Of the lidar's points most are taken from those that a camera saw. Points of mirrored actors
-    (`Tracks.mirrored`) are taken from both sides. Without sweeps points anywhere along pixels stand for all.
+    Of the lidar's points most are taken from those that a camera saw; the others are coloured like those near
+    them. Points of mirrored actors (`Tracks.mirrored`) are taken from both sides. Without sweeps points
+    anywhere along pixels stand for all.
 
     Args:
         cameras: that may be learned from, with images.
@@ -73,7 +76,7 @@ def initial_scene(
         generator: of which points are taken.
     """
     standing, of_actors = lidar_points(cameras, sweeps, tracks)
-    standing = some_points(standing, size.lidar_points, generator)
+    standing = like_neighbours(some_points(standing, size.lidar_points, generator))
     near, far = (size.near_m, size.far_m), (size.far_from_m, size.far_m)
     along, anywhere = no_points(), size.near_points
     if sweeps:
@@ -103,7 +106,7 @@ def _actor(
     generator: torch.Generator,
 ) -> Gaussians:
     """What lidar saw of an actor, from both sides if it is mirrored, and random points in its box."""
-    points = some_points(points, size.actor_points_most, generator)
+    points = like_neighbours(some_points(points, size.actor_points_most, generator))
     part = _gaussians(points, size, size.opacity, by_neighbours=True)
     if both_sides:
         part = joined([part, mirrored(part)])

@@ -17,7 +17,7 @@ from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene.record import Record
 
 GREY = 0.5
-"""Of what no camera saw."""
+"""Of what no camera saw, where no other point has a colour."""
 SEEN_SHARE = 0.75
 """Of the points that are taken, how many a camera saw."""
 BEAM_WIDTH_RAD = 0.01
@@ -25,6 +25,8 @@ BEAM_WIDTH_RAD = 0.01
 NEAR_IN_IMAGE = 0.06
 """How far from a pixel, in heights of the image, a beam says how far that pixel looks."""
 _BOX_MARGIN_M = 0.1
+_ALIKE = 4
+"""How many neighbours make the colour of a point that no camera saw."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,19 @@ def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> Se
     of_seen = max(round(SEEN_SHARE * most), most - len(unseen))
     picked = torch.cat([seen[:of_seen], unseen[: most - min(of_seen, len(seen))]])
     return points[picked]
+
+
+def like_neighbours(points: SeedPoints) -> SeedPoints:
+    """With those that no camera saw in the mean colour of the nearest that one saw, if there are any."""
+    if bool(points.seen.all()) or not bool(points.seen.any()):
+        return points
+    near = cKDTree(points.xyz_m[points.seen].numpy()).query(
+        points.xyz_m[~points.seen].numpy(), k=min(_ALIKE, int(points.seen.sum()))
+    )[1]
+    rgb = points.rgb.clone()
+    index = torch.from_numpy(np.asarray(near)).view(int((~points.seen).sum()), -1)
+    rgb[~points.seen] = points.rgb[points.seen][index].mean(1)
+    return dataclasses.replace(points, rgb=rgb)
 
 
 def no_points() -> SeedPoints:

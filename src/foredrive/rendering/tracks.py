@@ -1,6 +1,7 @@
 """Where tracked actors are at any time: key poses, offsets that can be learned, and motion between them."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import torch
@@ -8,8 +9,15 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.geometry.se3 import exp_se3, inverse_se3, log_so3, matrix_from_yaw
-from foredrive.scene import Category, Clip
+from foredrive.geometry.se3 import (
+    exp_se3,
+    inverse_se3,
+    log_so3,
+    matrix_from_yaw,
+    rotate_vectors,
+    yaw_of,
+)
+from foredrive.scene import Boxes, Category, Clip
 from foredrive.scene.record import Record
 
 MIRRORED = (
@@ -119,6 +127,26 @@ def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
     """The later one of the two key times that a time lies between, or beside; of two at least."""
     after = int(torch.searchsorted(key_t_s.contiguous(), now_s))
     return min(max(after, 1), len(key_t_s) - 1)
+
+
+def boxes_at(
+    tracks: Tracks, T_scene_ego: Float[Tensor, "4 4"], t_s: float, within_m: float = math.inf
+) -> Boxes:
+    """Boxes of the actors that are there at a time, in the ego frame, unbatched."""
+    states = states_at(tracks, t_s)
+    T_ego_scene = inverse_se3(T_scene_ego)
+    T_ego_actor = T_ego_scene @ states.T_scene_actor.to(T_scene_ego)
+    velocity = rotate_vectors(T_ego_scene, states.velocity_mps.to(T_scene_ego))
+    near = states.present & (T_ego_actor[:, :3, 3].norm(dim=-1) < within_m)
+    return Boxes(
+        centre=T_ego_actor[near, :3, 3].float(),
+        size_lwh=tracks.size_lwh[near],
+        yaw=yaw_of(T_ego_actor)[near].float(),
+        velocity=velocity[near, :2].float(),
+        track_id=tracks.track_id[near],
+        category=tracks.category[near],
+        valid=torch.ones_like(tracks.track_id[near], dtype=torch.bool),
+    )
 
 
 def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:

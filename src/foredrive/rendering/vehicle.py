@@ -60,6 +60,8 @@ class Vehicle(Record):
     time. Their order is that of `CameraView.sensor`."""
     lidar: SpinningLidar | None
     """None where its pattern is not known."""
+    T_ego_lidar: Float[Tensor, "4 4"] | None
+    """Where it is; None without one."""
     reach_m: float
     """How far its lidar sees; infinite without one."""
 
@@ -88,7 +90,11 @@ class Vehicle(Record):
 
 
 def read_vehicle(
-    drive: Clip, T_world_scene: Float64[Tensor, "4 4"], lidar: SpinningLidar | None, reach_m: float
+    drive: Clip,
+    T_world_scene: Float64[Tensor, "4 4"],
+    lidar: SpinningLidar | None = None,
+    T_ego_lidar: Float[Tensor, "4 4"] | None = None,
+    reach_m: float = math.inf,
 ) -> Vehicle:
     """The vehicle of a whole drive.
 
@@ -96,9 +102,7 @@ def read_vehicle(
 
     Args:
         drive: unbatched, all its frames.
-        T_world_scene: see `Vehicle`.
-        lidar: of the drive, if its pattern is known.
-        reach_m: how far that sees.
+        T_world_scene, lidar, T_ego_lidar, reach_m: see `Vehicle`.
     """
     T_scene_ego = (inverse_se3(T_world_scene) @ drive.T_world_ego).float()
     rig, cameras = drive.rig, len(drive.rig.names)
@@ -129,6 +133,7 @@ def read_vehicle(
             exposed_dt_s=dt_s,
         ),
         lidar=lidar,
+        T_ego_lidar=T_ego_lidar,
         reach_m=reach_m,
     )
 
@@ -148,7 +153,7 @@ def load_vehicle(path: Path) -> Vehicle:
     """
     try:
         saved = json.loads(path.read_text())
-        rig, lidar = saved["rig"], saved["lidar"]
+        rig, lidar, mounted = saved["rig"], saved["lidar"], saved["T_ego_lidar"]
         cameras = len(rig["names"])
         return Vehicle(
             t_s=torch.tensor(saved["t_s"]),
@@ -164,6 +169,7 @@ def load_vehicle(path: Path) -> Vehicle:
                 exposed_dt_s=torch.tensor(rig["exposed_dt_s"]),
             ),
             lidar=None if lidar is None else _lidar(lidar),
+            T_ego_lidar=None if mounted is None else torch.tensor(mounted),
             reach_m=math.inf if saved["reach_m"] is None else float(saved["reach_m"]),
         )
     except OSError as error:

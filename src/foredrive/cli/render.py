@@ -1,0 +1,60 @@
+"""`foredrive render`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath
+
+
+def render(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    out: Path,
+    shift_left: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0,
+    remove: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ACTOR [ACTOR ...]")] = (),
+    insert: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RUN:ACTOR@WAY [RUN:ACTOR@WAY ...]")] = (),
+    edits: OptionalPath = None,
+    save_edits: OptionalPath = None,
+    cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
+    lidar: Literal["pandar64", "hdl32e", "vlp16"] | None = None,
+    colour: Literal["intensity", "height"] = "intensity",
+    start: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 0.0,
+    seconds: float | None = None,
+    rate_hz: float | None = None,
+) -> None:
+    """Film a rebuilt log: its cameras and its lidar from above, edited beside unedited where there are edits.
+
+    The log itself is not needed any more. Numbers in the view from above are the actors' ids.
+
+    Args:
+        run: Folder of a reconstruction.
+        out: The video: .mp4, or .webp, which browsers play as a picture.
+        shift_left: Let the ego vehicle drive so far to the left of where it drove; negative is to the right.
+        remove: Ids of actors that are not there.
+        insert: Actors of other runs, each on the way of an actor of this one, which --remove makes room for.
+        edits: File of edits, applied before those of the other flags.
+        save_edits: Write all edits to this file, so that --edits applies them again.
+        cameras: Only these, in this order; by default all that were rebuilt.
+        lidar: Put this one where the log's lidar was; by default the log's own, where its pattern is known.
+        colour: What the lidar's points are coloured by.
+        start: Time since the log's start at which the film begins, s.
+        seconds: Length of the film, s; by default until the log's end.
+        rate_hz: Frames a second, shown in real time; by default as many as the log has.
+    """
+    from foredrive.recipes.rebuilt_film import edits_from_words, plan_shooting
+    from foredrive.recipes.rebuilt_runs import open_rebuilt
+    from foredrive.rendering.edits import load_edits
+    from foredrive.rendering.edits import save_edits as write_edits
+    from foredrive.view.rebuilt_video import write_rebuilt_video
+    from foredrive.view.video import check_video
+
+    check_video(out)
+    opened = open_rebuilt(run)
+    shooting = plan_shooting(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
+    known = [] if edits is None else load_edits(edits)
+    changes = [*known, *edits_from_words(opened.scene.tracks, known, shift_left, remove, insert)]
+    write_rebuilt_video(out, opened, changes, shooting, colour)
+    if save_edits is not None:
+        write_edits(changes, save_edits)
+    print(f"wrote {out}: {len(shooting.t_s)} frames")

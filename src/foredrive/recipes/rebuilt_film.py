@@ -1,0 +1,153 @@
+"""What sensors see on a drive through a rebuilt log, as it was and after edits, time by time."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.rendering.edits import Duplicate, Edit, Edited, Insert, Remove, ShiftEgo
+from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.tracks import Tracks, boxes_at
+from foredrive.rendering.vehicle import Vehicle
+from foredrive.scene import Boxes, LidarSweep
+from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
+
+LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {
+    "pandar64": pandar64,
+    "hdl32e": hdl32e,
+    "vlp16": vlp16,
+}
+"""By name, to be put where the log's lidar was."""
+_LEAST_STEP_S = 1e-3
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """What is filmed of a run, and when."""
+
+    t_s: tuple[float, ...]
+    step_s: float
+    cameras: tuple[int, ...]
+    """Of the vehicle's rig."""
+    lidar: SpinningLidar | None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is seen at one time."""
+
+    t_s: float
+    images: UInt8[Tensor, "C 3 H W"]
+    sweep: LidarSweep | None
+    """In the ego frame, beams that did not return with it."""
+    boxes: Boxes
+    """Actors, in the ego frame."""
+
+
+def plan_shooting(
+    vehicle: Vehicle,
+    cameras: Sequence[str] = (),
+    lidar: str | None = None,
+    *,
+    start_s: float = 0.0,
+    seconds: float | None = None,
+    rate_hz: float | None = None,
+) -> Shooting:
+    """Settle what is filmed.
+
+    Args:
+        vehicle: of the run.
+        cameras: by name, in this order; none: all.
+        lidar: one of `LIDARS` where the log's own was; None: that one.
+        start_s: of the film, since the log's start.
+        seconds: how long; None: until the log's end.
+        rate_hz: times a second; None: the log's own rate.
+
+    Raises:
+        InputError: on a camera or a lidar that there is not, a time outside of the log, or nothing to film.
+    """
+    chosen = tuple(vehicle.camera(name) for name in cameras) or tuple(range(len(vehicle.rig.names)))
+    beams = vehicle.lidar
+    if lidar is not None:
+        if lidar not in LIDARS:
+            raise InputError(f"no lidar {lidar!r}; there are: {', '.join(LIDARS)}")
+        if vehicle.T_ego_lidar is None:
+            raise InputError("the log had no lidar, so that nothing was learned of what one sees")
+        beams = LIDARS[lidar](vehicle.T_ego_lidar)
+    if not chosen and beams is None:
+        raise InputError("neither cameras nor a lidar to film; name a lidar with --lidar")
+    vehicle.check_time(start_s)
+    last_s = float(vehicle.t_s[-1])
+    end_s = last_s if seconds is None else start_s + seconds
+    vehicle.check_time(end_s)
+    steps_s = vehicle.t_s.diff()
+    step_s = 1 / rate_hz if rate_hz else float(steps_s.median()) if len(steps_s) else 1.0
+    if not (step_s >= _LEAST_STEP_S and end_s >= start_s):
+        raise InputError(f"{rate_hz or 0:g} times a second over {end_s - start_s:g} s cannot be filmed")
+    count = int((end_s - start_s) / step_s + _LEAST_STEP_S) + 1
+    return Shooting(tuple(min(start_s + k * step_s, last_s) for k in range(count)), step_s, chosen, beams)
+
+
+@torch.no_grad()
+def shoot(scene: RebuiltScene, vehicle: Vehicle, edited: Edited, shooting: Shooting, number: int) -> Shot:
+    """Render all sensors at one of the times.
+
+    Cameras look as much later as they did in the log; a lidar's revolution ends at the time itself.
+
+    Args:
+        scene: of a run.
+        vehicle: of the run.
+        edited: the scene's graph after edits, or before any (`apply_edits(graph, [])`).
+        shooting: from `plan_shooting`.
+        number: which of its times.
+    """
+    t_s, rig = shooting.t_s[number], vehicle.rig
+    images = torch.zeros(len(shooting.cameras), 3, *rig.size_hw, dtype=torch.uint8)
+    assert rig.exposed_dt_s is not None
+    for place, camera in enumerate(shooting.cameras):
+        moment = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
+        view = free_camera(rig, camera, moment).to(scene.actor.device)
+        rgb = scene(edited.graph, view).rgb
+        images[place] = (255 * rgb.clamp(0, 1)).round().to(torch.uint8).cpu()
+    moment, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
+    if shooting.lidar is not None:
+        beams = free_sweep(shooting.lidar, moment)
+        sweep = rendered_sweep(beams, scene.sweep(edited.graph, scene.prepare_sweep(beams), t_s))
+    return Shot(t_s, images, sweep, boxes_at(edited.graph.tracks, moment.T_scene_ego, t_s))
+
+
+def edits_from_words(
+    tracks: Tracks, known: Sequence[Edit], shift_left_m: float, remove: Sequence[int], insert: Sequence[str]
+) -> list[Edit]:
+    """Edits as the command line has them.
+
+    Args:
+        tracks: of the run that is edited.
+        known: edits that come before; ids of what is inserted are no copies' among them.
+        shift_left_m: of the ego vehicle; 0: none.
+        remove: ids of actors.
+        insert: "RUN:ACTOR@WAY": an actor of another run, on the way of one of this run's.
+
+    Raises:
+        InputError: on an entry of `insert` that is written otherwise.
+    """
+    edits: list[Edit] = []
+    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert)]
+    copy = max([*tracks.track_id.tolist(), *copies], default=0) + 1
+    for number, text in enumerate(insert):
+        source, _, rest = text.rpartition(":")
+        actor, _, way = rest.partition("@")
+        if not (source and actor.isdecimal() and way.isdecimal()):
+            raise InputError(
+                f"{text!r}: what is inserted is written RUN:ACTOR@WAY, such as runs/003:17@4: actor 17 of "
+                "runs/003 where actor 4 drives here"
+            )
+        edits.append(Insert(source, int(actor), copy + number, int(way)))
+    edits += [Remove(actor) for actor in remove]
+    if shift_left_m:
+        edits.append(ShiftEgo((0.0, shift_left_m, 0.0)))
+    return edits

@@ -1,0 +1,174 @@
+"""A drive through a rebuilt log as a film: the cameras, and below them what the lidar sees, from above."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from rich.progress import track
+
+from foredrive.geometry.boxes import box_corners
+from foredrive.recipes.rebuilt_film import Shooting, Shot, shoot
+from foredrive.recipes.rebuilt_runs import OpenRun, edited_scene
+from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, apply_edits
+from foredrive.scene import Boxes, CameraRig, LidarSweep
+from foredrive.view import palette
+from foredrive.view.bev import EGO_OUTLINE_XY
+from foredrive.view.image_drawing import resize
+from foredrive.view.log_sheet import camera_rows
+from foredrive.view.video import check_video, write_video
+
+Colour = Literal["intensity", "height"]
+ONE_CAMERA_PX, CAMERA_PX = 480, 320
+"""Width of a camera's picture where it is alone in its row, and where it is not."""
+GAP_PX, TITLE_PX = 8, 26
+ABOVE_HW = (0.5, 0.35)
+"""Height of the view from above, and where the vehicle is that drives to the right, in units of its width."""
+ABOVE_M = 100.0
+"""Width of the view from above."""
+LOW_M, HIGH_M = -0.5, 4.0
+"""Ends of the scale of heights over the ground."""
+MOST_EDITS = 3
+"""Named in a caption."""
+
+
+def write_rebuilt_video(
+    path: Path, run: OpenRun, edits: list[Edit], shooting: Shooting, colour: Colour
+) -> None:
+    """Film a run in real time, and beside it what edits make of it, where there are any.
+
+    Raises:
+        InputError: on edits that cannot be made, or a path that is not one of a video.
+    """
+    check_video(path)
+    takes = [("as it was", apply_edits(run.scene.graph, []))]
+    if edits:
+        takes.append((caption_of(edits), edited_scene(run.scene, edits)))
+    rig, chosen = run.vehicle.rig, list(shooting.cameras)
+    rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
+    frames = [
+        draw_shots(
+            [(name, shoot(run.scene, run.vehicle, edited, shooting, k)) for name, edited in takes],
+            rig,
+            run.folder.name,
+            colour,
+        )
+        for k in track(range(len(shooting.t_s)), description=f"filming {run.folder.name}")
+    ]
+    write_video(path, frames, shooting.step_s)
+
+
+def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, colour: Colour) -> Image.Image:
+    """One frame: shots of the same time side by side, each under its caption.
+
+    Args:
+        shots: with captions.
+        rig: of the cameras that were shot, [C].
+        name: of the log.
+        colour: what points of the lidar are coloured by.
+    """
+    columns = [_column(shot, rig, colour) for _, shot in shots]
+    width = sum(column.width for column in columns) + GAP_PX * (len(columns) + 1)
+    canvas = Image.new("RGB", (width, columns[0].height + 2 * TITLE_PX + GAP_PX), palette.GROUND)
+    pen = ImageDraw.Draw(canvas)
+    _write(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
+    x = GAP_PX
+    for (caption, _), column in zip(shots, columns, strict=True):
+        _write(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
+        canvas.paste(column, (x, 2 * TITLE_PX))
+        x += column.width + GAP_PX
+    return canvas
+
+
+def caption_of(edits: Sequence[Edit]) -> str:
+    """What was changed, in words."""
+    words = [_said(edit) for edit in edits[:MOST_EDITS]]
+    more = len(edits) - MOST_EDITS
+    return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
+
+
+def _said(edit: Edit) -> str:
+    if isinstance(edit, Remove):
+        return f"without {edit.actor}"
+    if isinstance(edit, Move):
+        return f"{edit.actor} moved"
+    if isinstance(edit, Duplicate):
+        return f"{edit.copy} like {edit.actor}"
+    if isinstance(edit, Insert):
+        return f"{edit.copy} inserted on the way of {edit.follows}"
+    forward_m, left_m, _ = edit.offset_m
+    aside = f"{abs(left_m):g} m to the {'left' if left_m > 0 else 'right'}" if left_m else ""
+    ahead = f"{abs(forward_m):g} m {'ahead' if forward_m > 0 else 'back'}" if forward_m else ""
+    return " ".join(part for part in (aside, ahead) if part) or "ego vehicle turned"
+
+
+def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
+    rows = camera_rows(rig) if rig.names else []
+    longest = max((len(row) for row in rows), default=1)
+    each_px = ONE_CAMERA_PX if longest == 1 else CAMERA_PX
+    width = longest * (each_px + GAP_PX) - GAP_PX
+    height = each_px * rig.size_hw[0] // rig.size_hw[1]
+    above = None if shot.sweep is None else _from_above(shot.sweep, shot.boxes, width, colour)
+    whole = len(rows) * (height + GAP_PX) + (0 if above is None else above.height)
+    canvas = Image.new("RGB", (width, whole), palette.GROUND)
+    for line, row in enumerate(rows):
+        for place, camera in enumerate(row):
+            picture = resize(shot.images[camera].permute(1, 2, 0).numpy(), (height, each_px))
+            canvas.paste(Image.fromarray(picture), (place * (each_px + GAP_PX), line * (height + GAP_PX)))
+    if above is not None:
+        canvas.paste(above, (0, len(rows) * (height + GAP_PX)))
+    return canvas
+
+
+def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
+    """Returns in the colour of what they say, low ones first, and outlines of the actors with their ids."""
+    twice = 2  # drawn larger and shrunk: PIL's lines have no smooth edges
+    height_px = round(ABOVE_HW[0] * width_px)
+    scale = twice * width_px / ABOVE_M
+    picture = np.full((twice * height_px, twice * width_px, 3), palette.rgb255(palette.GROUND), np.uint8)
+
+    def pixels(xy_ego: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        return np.array([ABOVE_HW[1] * twice * width_px, twice * height_px / 2]) + scale * xy_ego * [1, -1]
+
+    returned = sweep[sweep.returned & sweep.valid]
+    points = returned.points_ego.numpy()
+    order = points[:, 2].argsort(kind="stable")
+    colours = _colours(returned, colour)[order]
+    u, v = pixels(points[order, :2]).astype(int).T
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        x, y = u + right, v + down
+        inside = (x >= 0) & (x < picture.shape[1]) & (y >= 0) & (y < picture.shape[0])
+        picture[y[inside], x[inside]] = colours[inside]
+    image = Image.fromarray(picture)
+    pen = ImageDraw.Draw(image)
+    corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)[:, :4, :2].double().numpy()
+    for outline, category in zip(corners, boxes.category.tolist(), strict=True):
+        around = [tuple(corner) for corner in pixels(outline)]
+        pen.polygon(around, outline=palette.box_colour(category), width=twice)
+    pen.polygon([tuple(corner) for corner in pixels(EGO_OUTLINE_XY)], fill=palette.EGO)
+    image = image.resize((width_px, height_px), Image.Resampling.BOX)
+    pen = ImageDraw.Draw(image)
+    font = ImageFont.load_default(size=11)
+    for outline, track_id in zip(corners, boxes.track_id.tolist(), strict=True):
+        u_px, v_px = pixels(outline).mean(0) / twice
+        if 0 < u_px < width_px and 0 < v_px < height_px:
+            pen.text((u_px, v_px), str(track_id), fill=palette.INK, font=font, anchor="mm")
+    return image
+
+
+def _colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]:
+    if colour == "height":
+        share = (sweep.points_ego[:, 2].numpy() - LOW_M) / (HIGH_M - LOW_M)
+        mapped = palette.HEIGHT_MAP(share.clip(0, 1))
+    else:
+        faint, bright = palette.RANGE_SPAN[::-1]
+        share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # most returns are faint
+        mapped = palette.RANGE_MAP(faint + (bright - faint) * share)
+    return (mapped[:, :3] * 255).astype(np.uint8)
+
+
+def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
+    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))
