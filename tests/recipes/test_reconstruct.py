@@ -71,7 +71,7 @@ def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: L
     summary = reconstruct(recipe(), log, run).summary  # is there already
     assert summary["images"] == summary["sweeps"] == 4
     assert summary["actors"] == 2
-    assert summary["gaussians"] == 2200
+    assert summary["gaussians"] > 2200  # those that learning may make, and ground that nobody saw
     material = read_material(recipe(), log, run / "cache")
     scene = begin(recipe(), material)
     before = judge_cameras(scene, material.held_out.cameras, material.learned.cameras)

@@ -78,8 +78,8 @@ def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:
         seen=torch.tensor([True, True, True, False, False]),
         scale_m=torch.ones(5),
     )
-    # three points have colours, so that each neighbour counts for all
-    assert like_neighbours(points).rgb[:, 0].tolist() == pytest.approx([0.2, 0.6, 0.8, 1.6 / 3, 1.6 / 3])
+    # three points have colours, so that each is a neighbour of all
+    assert like_neighbours(points).rgb[:, 0].tolist() == pytest.approx([0.2, 0.6, 0.8, 0.6, 0.6])
     assert like_neighbours(points[2:]).rgb[:, 0].tolist() == pytest.approx([0.8, 0.8, 0.8])
     assert torch.equal(like_neighbours(points[3:]).rgb, points[3:].rgb)
 

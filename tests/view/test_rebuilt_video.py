@@ -75,15 +75,16 @@ def test_the_verb_films_edited_beside_unedited(
 
 
 def test_without_edits_there_is_one_picture(run: Rebuilt, tmp_path: Path) -> None:
-    """And an MP4 has all times of the log."""
+    """As an MP4, at a rate that is no whole number."""
     out = tmp_path / "film.mp4"
-    assert main(["render", str(run.folder), "--out", str(out), "--colour", "height"]) == 0
+    args = ["render", str(run.folder), "--out", str(out), "--colour", "height"]
+    assert main([*args, "--rate-hz", "7.5"]) == 0
     av = pytest.importorskip("av")
     with av.open(str(out)) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == ONE_WH
-        assert sum(1 for _ in container.decode(stream)) == FRAMES
-        assert stream.average_rate == 10
+        assert sum(1 for _ in container.decode(stream)) == 4  # 0, 0.13, 0.27 and 0.4 s
+        assert stream.average_rate == 7.5
 
 
 def test_a_recorded_time_is_filmed_as_it_was_judged(run: Rebuilt) -> None:
@@ -143,6 +144,7 @@ def test_captions_say_what_was_changed() -> None:
         (["--start", "0.2", "--seconds", "1"], "1.2 s is not in the log"),
         (["--rate-hz", "-5"], "cannot be filmed"),
         (["--edits", "{tmp}/none.json"], "{tmp}/none.json: cannot be read"),
+        (["--out", "/proc/none/film.webp"], "/proc/none: no folder can be made there"),
         (["--out", "{tmp}/film.avi"], "{tmp}/film.avi: videos end on .mp4"),
     ],
 )

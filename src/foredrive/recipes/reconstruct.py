@@ -25,6 +25,7 @@ from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.rendering.tracks import Tracks, read_tracks
+from foredrive.rendering.unseen_ground import add_unseen_ground
 from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.scene import Clip
@@ -99,6 +100,7 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
     weights = folder / WEIGHTS
     if not weights.is_file():
         rebuild(scene, material.learned, recipe.schedule, folder)
+        add_unseen_ground(scene, material.vehicle.T_scene_ego, material.learned.cameras)
         with atomic_path(weights) as temporary:
             save_weights(scene, temporary)
     scene.resize(weights)

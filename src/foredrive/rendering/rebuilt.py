@@ -17,7 +17,7 @@ from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import composite_splats
 from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
 from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
-from foredrive.rendering.scene_graph import SceneGraph, place
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, place
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.sensors import TimedRays
@@ -164,6 +164,17 @@ class RebuiltScene(nn.Module):
         for name in OF_GAUSSIANS:
             old = getattr(self, name)
             setattr(self, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
+
+    def add_standing(self, gaussians: Gaussians) -> None:
+        """Put more Gaussians into the static part."""
+        added = {
+            name: getattr(gaussians, name) for name in ("mean_m", "quaternion", "log_scale", "opacity_logit")
+        }
+        added |= {"albedo": gaussians.feature[:, :ALBEDO], "feature": gaussians.feature[:, ALBEDO:]}
+        for name in OF_GAUSSIANS:
+            setattr(self, name, nn.Parameter(torch.cat([getattr(self, name).detach(), added[name].detach()])))
+        none = self.actor.new_full((len(gaussians.opacity_logit),), STATIC)
+        self.actor = torch.cat([self.actor, none])
 
     def forward(
         self, graph: SceneGraph, view: CameraView, mirror: Bool[Tensor, "A"] | None = None

@@ -25,7 +25,7 @@ BEAM_WIDTH_RAD = 0.01
 NEAR_IN_IMAGE = 0.06
 """How far from a pixel, in heights of the image, a beam says how far that pixel looks."""
 _BOX_MARGIN_M = 0.1
-_ALIKE = 4
+_ALIKE = 5
 """How many neighbours make the colour of a point that no camera saw."""
 
 
@@ -148,7 +148,7 @@ def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> Se
 
 
 def like_neighbours(points: SeedPoints) -> SeedPoints:
-    """With those that no camera saw in the mean colour of the nearest that one saw, if there are any."""
+    """With those that no camera saw in the median colour of the nearest that one saw, if there are any."""
     if bool(points.seen.all()) or not bool(points.seen.any()):
         return points
     near = cKDTree(points.xyz_m[points.seen].numpy()).query(
@@ -156,7 +156,7 @@ def like_neighbours(points: SeedPoints) -> SeedPoints:
     )[1]
     rgb = points.rgb.clone()
     index = torch.from_numpy(np.asarray(near)).view(int((~points.seen).sum()), -1)
-    rgb[~points.seen] = points.rgb[points.seen][index].mean(1)
+    rgb[~points.seen] = points.rgb[points.seen][index].median(1).values
     return dataclasses.replace(points, rgb=rgb)
 
 

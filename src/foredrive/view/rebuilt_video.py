@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from rich.progress import track
 
+from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
 from foredrive.recipes.rebuilt_film import Shooting, Shot, shoot
 from foredrive.recipes.rebuilt_runs import OpenRun, edited_scene
@@ -47,6 +48,7 @@ def write_rebuilt_video(
     takes = [("as it was", apply_edits(run.scene.graph, []))]
     if edits:
         takes.append((caption_of(edits), edited_scene(run.scene, edits)))
+    make_folder(path.parent)
     rig, chosen = run.vehicle.rig, list(shooting.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
     frames = [

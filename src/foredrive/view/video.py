@@ -1,6 +1,7 @@
 """Moving pictures on disk."""
 
 from collections.abc import Sequence
+from fractions import Fraction
 from importlib import util
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def _write_mp4(path: Path, frames: Sequence[Image.Image], frame_s: float) -> Non
 
     width, height = (n - n % 2 for n in frames[0].size)  # as H.264 has it
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=round(1 / frame_s))
+        stream = container.add_stream("libx264", rate=Fraction(1 / frame_s).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for frame in frames:
             picture = av.VideoFrame.from_ndarray(np.asarray(frame)[:height, :width].copy(), format="rgb24")
