@@ -10,7 +10,7 @@ from foredrive.data.logs import Log
 from foredrive.scene import Boxes, Category
 from foredrive.search.embedding import read_views
 from foredrive.search.facts import NOUNS, Thing, ViewFacts, _things, view_facts
-from foredrive.search.phrases import phrases
+from foredrive.search.phrases import phrases, whole_caption
 
 MANNERS = ("near", "far", "oncoming", "crossing", "moving", "standing")
 
@@ -132,3 +132,17 @@ def test_views_of_a_log_have_the_facts_of_what_lies_in_their_sector(log: LogPath
     turned = {name: sector._replace(camera=None, azimuth_rad=3.14) for name, sector in sectors.items()}
     behind = view_facts(opened, 10, turned)
     assert len({facts.things for facts in behind.values()}) == 1
+
+
+def test_a_caption_tells_all_of_a_view_in_one_way() -> None:
+    cars = (Thing("car", ("near", "moving")), Thing("car", ("near", "standing")))
+    walker = Thing("pedestrian", ("near", "moving", "crossing"))
+    view = ViewFacts("night", "rain", "junction", (*cars, walker))
+    assert whole_caption(view) == (
+        "two cars close by and one pedestrian crossing the road at a junction at night in the rain"
+    )
+    apart = ViewFacts(None, None, None, (*cars, Thing("car", ("far",)), Thing("bus", ())))
+    assert whole_caption(apart) == "one bus and three cars"  # not all of the cars are near
+    assert whole_caption(ViewFacts("dawn", None, None, ())) == "nobody around at dawn"
+    assert whole_caption(ViewFacts("dawn", "fog", None, None)) == "a scene at dawn in fog"
+    assert whole_caption(ViewFacts(None, None, None, None)) is None

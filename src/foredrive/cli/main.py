@@ -23,6 +23,7 @@ from foredrive.cli.record import record
 from foredrive.cli.render import render
 from foredrive.cli.score import score
 from foredrive.cli.search import search, search_page
+from foredrive.cli.search_caption import search_caption, search_train_captions
 from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.train import train
 from foredrive.cli.view import view
@@ -41,6 +42,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search-index": search_index,
     "search-page": search_page,
     "search-train": search_train,
+    "search-caption": search_caption,
+    "search-train-captions": search_train_captions,
     "reconstruct": reconstruct,
     "render": render,
     "imagine": imagine,

@@ -49,6 +49,8 @@ ON_FOOT = {"moving": ("{} walking", "walking {}"), "standing": ("{} standing", "
 NOBODY = ("nobody around", "no one in sight", "no other traffic")
 ALONE = ("{}", "a drive {}", "driving {}", "a scene {}")
 """What is said of a setting by itself."""
+TOLD = ("crossing", "oncoming", "near")
+"""What a caption tells of all of a noun, the first that holds."""
 _WORDED, _ALL, _SUBJECT = 0.3, 0.3, 0.75
 """How often a text is worded as a prompt, names everyone, names anyone."""
 
@@ -69,6 +71,26 @@ def phrases(view: ViewFacts, seed: int, count: int) -> list[Phrase]:
         return []
     rng = np.random.default_rng(seed)
     return [_phrase(view, rng) for _ in range(count)]
+
+
+def whole_caption(view: ViewFacts) -> str | None:
+    """One sentence of all that is known of a view, always in the same words; None where nothing is."""
+    settings = [
+        SETTINGS[fact][0] for fact in (view.place, view.time_of_day, view.weather) if fact is not None
+    ]
+    if view.things is None:
+        return f"a scene {' '.join(settings)}" if settings else None
+    nouns = sorted({thing.noun for thing in view.things})
+    parts = [_counted([thing.manners for thing in view.things if thing.noun == noun], noun) for noun in nouns]
+    return " ".join([" and ".join(parts) or NOBODY[0], *settings])
+
+
+def _counted(manners: Sequence[Sequence[str]], noun: str) -> str:
+    """How many of a noun, and what of `TOLD` is true of all of them."""
+    number = COUNTS.get(len(manners), MANY)
+    name = noun if len(manners) == 1 else PLURALS.get(noun, f"{noun}s")
+    told = [manner for manner in TOLD if all(manner in those for those in manners)]
+    return MANNERS[told[0]][0].format(f"{number} {name}") if told else f"{number} {name}"
 
 
 def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:

@@ -51,11 +51,32 @@ def text_target(query: Query, towers: Towers, *, ensemble: bool = True) -> Targe
     return Target(by_image, by_image if same else embed_prompt(towers, lidar_text, templates).numpy())
 
 
+class ExampleViews(NamedTuple):
+    """An example, read."""
+
+    views: dict[str, View]
+    """By name: one view, or all of a moment."""
+    moment: tuple[str, int]
+    """Log, and time in µs."""
+
+
 def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
     """Of a moment, a view or a crop of a log, which need not be in the index.
 
     Raises:
         InputError: there is no such log, moment or view, or it cannot be read.
+    """
+    views, moment = example_views(index, like, towers)
+    each = [embed_views(towers, [view]) for view in views.values()]
+    image, lidar = mean_direction(np.concatenate(each))
+    return Target(None if np.isnan(image).any() else image, None if np.isnan(lidar).any() else lidar, moment)
+
+
+def example_views(index: FrameIndex | None, like: Like, towers: Towers) -> ExampleViews:
+    """What towers are shown of an example. Raises as `example_target`.
+
+    Args:
+        index: None knows logs by their folders only.
     """
     log = Log(_find_log(index, like.log))
     frame, found = log.nearest_frames(np.array([log.t_us[0] + like.t_s * 1e6]))
@@ -72,16 +93,16 @@ def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
             if name not in views:
                 raise InputError(f"{log.path.name}: no view {like.view}; there are {', '.join(views)}")
             views = {name: views[name]}
-    each = [embed_views(towers, [view]) for view in views.values()]
-    if not each:
+    if not views:
         raise InputError(f"{log.path.name}: neither cameras nor lidar at {like.t_s:g} s")
-    image, lidar = mean_direction(np.concatenate(each))
-    return Target(None if np.isnan(image).any() else image, None if np.isnan(lidar).any() else lidar, moment)
+    return ExampleViews(views, moment)
 
 
-def _find_log(index: FrameIndex, name: str) -> LogPath:
+def _find_log(index: FrameIndex | None, name: str) -> LogPath:
     if (Path(name) / "sync.arrow").is_file():
         return find_logs(Path(name))[0]
+    if index is None:
+        raise InputError(f"{name}: no folder of a log")
     ends = quoted("%/" + name.replace("%", ""))
     found = index.select(
         f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR log LIKE {ends})", ["log", "folder", "maps_dir"]

@@ -1,0 +1,67 @@
+"""`foredrive search caption` and `search train-captions`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from foredrive.cli.arguments import SomePaths
+from foredrive.cli.search import INDEX
+from foredrive.cli.search_options import Name, Place
+
+
+def search_caption(
+    moment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG@12.5s")],
+    index: Place = INDEX,
+    towers: Name = None,
+) -> None:
+    """Say what the views of a moment show: by their images, and by lidar alone.
+
+    Args:
+        moment: A moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part of that
+            (LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM in px); LOG is the name of an indexed log or a log's folder.
+        index: The index that knows the log by name, and by default the towers.
+        towers: The folder of other towers, for which captions were trained; LOG is a folder then.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from foredrive.recipes.captioning import CAPTIONS, caption_views, load_captions
+    from foredrive.recipes.towers import find_towers
+    from foredrive.search.index import FrameIndex
+    from foredrive.search.query import parse_like
+    from foredrive.search.target import example_views
+
+    like = parse_like(moment)
+    opened = FrameIndex(index) if towers is None else None
+    chosen = find_towers(towers if opened is None else opened.making.towers)
+    decoder = load_captions(Path(chosen.name) / CAPTIONS, chosen)
+    views, _ = example_views(opened, like, chosen)
+    table = Table("view", "by image", "by lidar")
+    for name, said in caption_views(views, chosen, decoder).items():
+        table.add_row(name, said.by_image or "-", said.by_lidar or "-")
+    Console().print(table)
+
+
+def search_train_captions(
+    logs: SomePaths, towers: Path, out: Path, stride: float = 0.5, epochs: int = 20, seed: int = 0
+) -> None:
+    """Teach towers to say what they see, or go on with a run that was interrupted.
+
+    A small decoder learns from embeddings of images to say what is known of their views; sweeps, whose
+    embeddings lie in the same space, are then read by it too. It is put into the towers' folder.
+
+    Args:
+        logs: 123D logs, splits or data roots with cameras, and with boxes or captions.
+        towers: A folder of towers that `foredrive search train` made.
+        out: Folder of the run.
+        stride: Time between the moments that are looked at, s.
+        epochs: How often it looks at each.
+        seed: Of weights and of the order of data.
+    """
+    from foredrive.recipes import find_all_logs
+    from foredrive.recipes.captioning import train_captions
+    from foredrive.training import Schedule
+
+    schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)
+    print(f"wrote {train_captions(find_all_logs(logs), towers, out, schedule, stride)}")
