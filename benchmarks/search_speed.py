@@ -1,11 +1,15 @@
 """How long a query takes over a million embeddings, how much it misses, and what building the index holds.
 
-LanceDB as `foredrive.search` uses it, beside comparing all in NumPy and FAISS' flat and graph indices. The
-embeddings are made: directions of falling variance about a common mean, as those of image towers are, in
-kinds of scenes, drives of a kind, and moments along a drive that follow one another. Half of the queries are
-moments that are not in the index; the other half lie off to one side of all of them, as texts do.
+LanceDB as `foredrive.search` uses it, beside comparing all in NumPy and in FAISS, and FAISS' partitions of
+vectors kept to 8 bits, as LanceDB's are. And how many sweeps of a recorded town the lidar tower embeds a
+second, by the clock and by what a core computes.
 
-Needs 2 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
+The embeddings of queries are made: directions of falling variance about a common mean, as those of image
+towers are, in kinds of scenes, drives of a kind, and moments along a drive that follow one another. Half of
+the queries are moments that are not in the index; the other half lie off to one side of all of them, as texts
+do.
+
+Needs 2.5 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
 """
 
 import os
@@ -13,19 +17,27 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from pathlib import Path
 from statistics import median
 
 import numpy as np
 import pyarrow as pa
+import torch
 
-from foredrive.evaluation import Benchmark
-from foredrive.evaluation.measuring import held_mib
+from foredrive.data.collate import stack_records
+from foredrive.data.logs import Log
+from foredrive.evaluation import Benchmark, peak_rss_gib
+from foredrive.evaluation.measuring import held_mib, measure
+from foredrive.models.lidar_clip import PointCloud
 from foredrive.recipes.indexing import IndexWriter
+from foredrive.search.embedded import LidarSize, build_lidar_tower
+from foredrive.search.embedding import read_views
 from foredrive.search.find import find
-from foredrive.search.index import FrameIndex, Making, Part
+from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, Making, Part
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.target import Target
+from foredrive.towns.recorder import record
 
 ROWS = int(os.environ.get("SEARCH_SPEED_ROWS", "1000000"))
 DIM, KINDS, DRIVE = 384, 300, 400
@@ -34,6 +46,8 @@ MEAN, KIND, ALONG, NOISE = 0.6, 0.55, 0.3, 0.25
 """Lengths of what a direction is made of: two random moments have a cosine of about 0.4."""
 ASIDE = 0.8
 QUERIES, TOP = 60, 20
+SWEEPS = 8
+"""Embedded together, sector by sector, as an index does it."""
 
 
 def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -44,11 +58,10 @@ def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
     )
 
 
-def drives(seed: int) -> Iterator[np.ndarray]:
-    """Unit vectors of one drive after the other, [DRIVE DIM], always the same for a seed."""
+def drives(seed: int, number: int = 0) -> Iterator[np.ndarray]:
+    """Unit vectors of drives from a number on, [DRIVE DIM] each, always the same for a seed."""
     shared = np.random.default_rng(seed)
     mean, kinds = MEAN * spectrum(shared, 1), KIND * spectrum(shared, KINDS)
-    number = 0
     while True:
         rng = np.random.default_rng((seed, number))
         start, end = spectrum(rng, 1), spectrum(rng, 1)
@@ -67,9 +80,7 @@ def embeddings(seed: int) -> np.ndarray:
 
 def queries(seed: int) -> np.ndarray:
     """Unit vectors that are asked for, [QUERIES DIM]."""
-    made = drives(seed)
-    for _ in range(-(-ROWS // DRIVE)):
-        next(made)
+    made = drives(seed, -(-ROWS // DRIVE))
     rng = np.random.default_rng((seed, 1 << 40))
     asked = np.stack([next(made)[rng.integers(DRIVE)] for _ in range(QUERIES)])
     asked[QUERIES // 2 :] += ASIDE * spectrum(rng, 1)
@@ -109,20 +120,21 @@ def with_numpy(seed: int) -> dict[str, float]:
     return asked(lambda query: nearest(vectors, query), seed, truth)
 
 
-def with_faiss(seed: int, *, graph: bool) -> dict[str, float]:
+def with_faiss(seed: int, *, partitions: bool) -> dict[str, float]:
     if find_spec("faiss") is None:
         return {"installed": 0.0}
     import faiss
 
     vectors = embeddings(seed)
     truth = np.stack([nearest(vectors, query) for query in queries(seed)])
-    metric = faiss.METRIC_INNER_PRODUCT
-    index = faiss.IndexHNSWFlat(DIM, 20, metric) if graph else faiss.IndexFlatIP(DIM)
-    if graph:
-        index.hnsw.efConstruction, index.hnsw.efSearch = 300, 100
+    kind = f"IVF{max(1, ROWS // PARTITION_ROWS)},SQ8,RFlat" if partitions else "Flat"
+    index = faiss.index_factory(DIM, kind, faiss.METRIC_INNER_PRODUCT)
     started = time.perf_counter()
+    index.train(vectors)
     index.add(vectors)
     build_s = time.perf_counter() - started
+    if partitions:
+        faiss.ParameterSpace().set_index_parameters(index, f"nprobe={PROBES},k_factor_rf={REFINEMENT}")
     found = asked(lambda query: index.search(query[None], TOP)[1][0], seed, truth)
     return {"installed": 1.0, "build_s": build_s, **found}
 
@@ -166,6 +178,7 @@ def with_lancedb(seed: int) -> dict[str, float]:
         written_s = time.perf_counter() - started
         index.optimise()
         built_s = time.perf_counter() - started - written_s
+        peak_gib = peak_rss_gib()
         vectors = embeddings(seed)
         truth = np.stack([nearest(vectors, query) for query in queries(seed)])
         del vectors
@@ -184,12 +197,34 @@ def with_lancedb(seed: int) -> dict[str, float]:
         return {
             "rows": float(index.count()),
             "write_s": written_s,
-            "graph_s": built_s,
+            "partition_s": built_s,
             "held_mib_at_tenth": held[len(held) // 10],
             "held_mib_at_end": held[-1],
+            "peak_rss_gib": peak_gib,
             "collapsed_query_ms": 1e3 * float(np.median(np.diff(whole))),
             **figures,
         }
+
+
+def lidar_tower(seed: int) -> dict[str, float]:
+    """Whole sweeps, cut into the sectors of six cameras, by an untrained tower: weights change no speed."""
+    torch.manual_seed(seed)
+    tower = build_lidar_tower(LidarSize(), DIM).eval()
+    with tempfile.TemporaryDirectory() as folder:
+        log = Log(record("Town05", SWEEPS / 2, seed, Path(folder), rate_hz=2.0))
+        frames = range(len(log.t_us))
+        read = [read_views(log, frame, 128, with_lidar=True) for frame in frames]
+    sectors = [[views[name].sweep for views in read] for name in read[0]]
+    clouds = [PointCloud.of_sweeps(stack_records(those)) for those in sectors]
+    with torch.inference_mode():
+        took = measure(lambda: [tower(cloud, len(read)) for cloud in clouds], 5, "cpu")
+    return {
+        "sweeps_per_s": len(read) / took.wall_s,
+        "sweeps_per_core_s": len(read) / took.cpu_s,
+        "threads": float(torch.get_num_threads()),
+        "sectors": float(len(sectors)),
+        "points_per_sector": float(np.mean([len(cloud.points) for cloud in clouds])) / len(read),
+    }
 
 
 BENCHMARK = Benchmark(
@@ -197,8 +232,9 @@ BENCHMARK = Benchmark(
     arms={
         "lancedb": with_lancedb,
         "numpy": with_numpy,
-        "faiss_flat": lambda seed: with_faiss(seed, graph=False),
-        "faiss_graph": lambda seed: with_faiss(seed, graph=True),
+        "faiss_flat": lambda seed: with_faiss(seed, partitions=False),
+        "faiss_partitions": lambda seed: with_faiss(seed, partitions=True),
+        "lidar_tower": lidar_tower,
     },
     seeds=(0,),
     config={"rows": ROWS, "dim": DIM, "drive": DRIVE, "kinds": KINDS, "queries": QUERIES, "top": TOP},

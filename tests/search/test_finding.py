@@ -89,6 +89,24 @@ def test_looking_up_finds_what_comparing_all_does(
     assert [hit.score for hit in looked_up.hits] == pytest.approx([hit.score for hit in exact.hits], abs=1e-5)
 
 
+def test_partitions_find_what_comparing_all_does_and_grow_with_the_rows(
+    index: FrameIndex, target: Target, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("foredrive.search.index.PARTITION_ROWS", 40)
+    index.optimise(exact_up_to=100)
+    names = {made.name for made in index._frames.list_indices()}
+    assert names == {"image_6", "lidar_4", "joint_6"}  # of 240 rows 160 have lidar
+    query = Query(text="x", gap_s=0.0, top=5)
+    expected = [hit.facts for hit in find(index, query, target).hits]
+    assert [hit.facts for hit in find(index, query, target, exact_up_to=0).hits] == expected
+    index.optimise(exact_up_to=100)
+    assert {made.name for made in index._frames.list_indices()} == names
+    monkeypatch.setattr("foredrive.search.index.PARTITION_ROWS", 20)  # as if there were twice the rows
+    index.optimise(exact_up_to=100)
+    assert {made.name for made in index._frames.list_indices()} == {"image_12", "lidar_8", "joint_12"}
+    assert [hit.facts for hit in find(index, query, target, exact_up_to=0).hits] == expected
+
+
 def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
     by_rule = {
         rule: find(index, Query(text="x", modality="joint", rule=rule, top=3), target).hits

@@ -91,5 +91,5 @@ def _tell(index: "FrameIndex", found: "Found") -> None:
         print(f"nothing found among {rows} rows of {index.uri}")
         return
     Console().print(hits_table(found.hits))
-    how = "all compared" if found.exact else f"{found.compared} compared, the others passed over by a graph"
+    how = "all compared" if found.exact else f"{found.compared} compared, the others lie farther off"
     print(f"{len(found.hits)} hits among {rows} rows of {index.uri}; {how}")

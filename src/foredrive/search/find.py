@@ -55,7 +55,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
 
     Args:
         target: what rows are compared with; None where the query compares with nothing.
-        exact_up_to: so many rows are all compared; of more those that a graph finds near.
+        exact_up_to: so many rows are all compared; of more those that are looked up.
 
     Raises:
         InputError: the condition does not parse; the query asks for what neither towers nor logs have.

@@ -15,11 +15,14 @@ from foredrive.search.rows import EMBEDDINGS, FACTS, SCORES, row_schema
 from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list, understanding
 
 EXACT_UP_TO = 100_000
-"""So many rows are compared one by one; more are looked up in a graph and then compared."""
+"""So many rows are compared one by one; of more, those near a query are looked up and then compared."""
 KEPT_VERSIONS = datetime.timedelta(hours=1)
 """Whoever reads meanwhile has so long to finish."""
-REFINEMENT = 3
-"""The graph knows vectors to 8 bits: so many times as many as are wanted are compared in full."""
+PARTITION_ROWS, GROWN = 4096, 2
+"""Rows that lie together around a centre; centres are chosen anew once rows are so many times as many."""
+PROBES, REFINEMENT = 32, 3
+"""Partitions that are looked through, and how many times as many rows as are wanted are then compared in
+full: partitions know vectors to 8 bits."""
 FRAMES, PARTS = "frames", "parts"
 _REMEMBERED = b"foredrive"
 _PART_SCHEMA = pa.schema(
@@ -125,17 +128,30 @@ class FrameIndex:
             table.delete(f"log = {quoted(log)}")
         self._frames.delete(f"log = {quoted(log)}")
 
-    def optimise(self) -> None:
-        """Merge small files and drop old versions; bring the graphs that are looked up in up to date."""
-        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
-        if self.count() <= EXACT_UP_TO:
-            return
-        from lancedb.index import HnswSq
+    def optimise(self, *, exact_up_to: int = EXACT_UP_TO) -> None:
+        """Merge small files and drop old versions; bring what embeddings are looked up in up to date.
 
-        there = {column for index in self._frames.list_indices() for column in index.columns}
-        for name in EMBEDDINGS:
-            if name not in there and self.count(f"{name} IS NOT NULL") > EXACT_UP_TO:
-                self._frames.create_index(name, config=HnswSq(distance_type="cosine"))
+        Args:
+            exact_up_to: so many rows need none of that.
+        """
+        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
+        if self.count() > exact_up_to:
+            for name in EMBEDDINGS:
+                rows = self.count(f"{name} IS NOT NULL")
+                if rows > exact_up_to:
+                    self._partition(name, max(1, rows // PARTITION_ROWS))
+
+    def _partition(self, column: str, partitions: int) -> None:
+        """Partition the rows by an embedding, unless they are: how many there were then is in its name."""
+        from lancedb.index import IvfSq
+
+        there = [index.name for index in self._frames.list_indices() if column in index.columns]
+        if any(partitions < GROWN * int(name.removeprefix(f"{column}_")) for name in there):
+            return
+        config = IvfSq(distance_type="cosine", num_partitions=partitions)
+        self._frames.create_index(column, config=config, name=f"{column}_{partitions}")
+        for name in there:
+            self._frames.drop_index(name)
 
     def count(self, where: str | None = None) -> int:
         """Rows for which a condition in SQL holds.
@@ -160,7 +176,9 @@ class FrameIndex:
         Raises `InputError` as `count`.
         """
         query = self._frames.search(vector, vector_column_name=to).distance_type("cosine")
-        query = query.select([*columns, "_distance"]).limit(limit).refine_factor(REFINEMENT)
+        query = query.select([*columns, "_distance"]).limit(limit)
+        query = query.minimum_nprobes(PROBES).maximum_nprobes(0)  # more, if conditions leave too few
+        query = query.refine_factor(REFINEMENT)
         with understanding(where):
             found = (query if where is None else query.where(where, prefilter=True)).to_arrow()
         return found.select(list(columns))
