@@ -10,7 +10,8 @@ from pathlib import Path
 
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
-from foredrive.recipes.driving import DriveSuite, drive_suite, summarise
+from foredrive.recipes.driving import DriveSuite, drive_suite
+from foredrive.recipes.kept_drives import summarise
 from foredrive.recipes.study import work_folder
 
 WORK = work_folder(Path("runs/drive_expert"))

@@ -14,8 +14,9 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark, read_summary
 from foredrive.recipes import find_recipe
-from foredrive.recipes.driving import Driven, DriveSuite, drive_suite, summarise
+from foredrive.recipes.driving import Driven, DriveSuite, drive_suite
 from foredrive.recipes.evaluate import SUMMARY, evaluate_run
+from foredrive.recipes.kept_drives import summarise
 from foredrive.recipes.recording import record_drives
 from foredrive.recipes.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
 from foredrive.recipes.train import find_all_logs, train_run

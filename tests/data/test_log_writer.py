@@ -59,6 +59,17 @@ def test_a_rolling_shutter_is_noted(tmp_path: Path) -> None:
     np.testing.assert_allclose(frames["ahead"].T_ego_cam, specs[0].T_ego_cam, atol=1e-6)
 
 
+def test_distortion_comes_back(tmp_path: Path) -> None:
+    dist = np.array([-0.3, 0.1, 1e-3, -2e-3, 0.05])
+    ahead, left = world.cameras()
+    folder = world.write(tmp_path, frames=1, specs=[dataclasses.replace(ahead, dist=dist), left])
+    log = Log(find_logs(folder)[0])
+    cameras = pinhole_cameras(log)
+    read = [read_camera(log, 0, cameras[name], (48, 96), with_image=False).dist for name in ("ahead", "left")]
+    assert np.allclose(read[0], dist, atol=1e-6)
+    assert not read[1].any()
+
+
 def test_the_sweep_comes_back_with_its_misses(tmp_path: Path) -> None:
     folder = world.write(tmp_path, frames=1)
     scene = ArrowSceneAPI(folder)

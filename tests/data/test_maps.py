@@ -11,7 +11,7 @@ from py123d.geometry import Polyline3D
 from foredrive.data import ClipConfig, ClipDataset, find_logs
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
-from foredrive.data.maps import RADIUS_M, VERTICES, read_map_patch, write_map
+from foredrive.data.maps import RADIUS_M, VERTICES, read_lane_outlines, read_map_patch, write_map
 from foredrive.scene import MapKind, MapPatch, VoxelSpec
 
 
@@ -74,6 +74,16 @@ def test_polylines_are_cut_without_gaps_and_end_near_the_radius(tmp_path: Path) 
     assert RADIUS_M <= centre.max() <= RADIUS_M + VERTICES
     assert (patch.kind == MapKind.LANE_CENTRE).sum() > 3
     assert patch.valid.any(-1).all()
+
+
+def test_outlines_of_lanes_are_those_near_the_way_driven(tmp_path: Path) -> None:
+    outlines = read_lane_outlines(write_with_map(tmp_path))
+    assert outlines is not None
+    (lane,) = outlines
+    low, high = world.WORLD_OFFSET[:2] + np.array([[-100.0, -1.75], [100.0, 1.75]])
+    np.testing.assert_allclose(lane.min(axis=0), low, atol=1e-3)
+    np.testing.assert_allclose(lane.max(axis=0), high, atol=1e-3)
+    assert read_lane_outlines(Log(find_logs(world.write(tmp_path / "bare", frames=2))[0])) is None
 
 
 def test_clips_carry_the_map_and_batches_pad_it(tmp_path: Path) -> None:

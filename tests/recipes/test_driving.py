@@ -20,10 +20,9 @@ from foredrive.recipes.driving import (
     DriveSuite,
     claim,
     drive_suite,
-    read_drive,
     scenario_of,
-    score_of,
 )
+from foredrive.recipes.kept_drives import read_drive, score_of
 from foredrive.scene import VoxelSpec
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route

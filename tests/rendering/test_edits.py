@@ -14,6 +14,7 @@ from foredrive.rendering.edits import (
     Insert,
     Move,
     Remove,
+    Send,
     ShiftEgo,
     apply_edits,
     load_edits,
@@ -56,6 +57,23 @@ def test_an_inserted_actor_stands_on_the_same_ground() -> None:
     assert edited.tracks.category[2] == scene().tracks.category[1]
 
 
+def test_a_sent_copy_goes_straight_on_all_the_time() -> None:
+    """At 2 m/s to the left through a point at 1 s, wherever its original is then."""
+    sent = Send(7, copy=9, at_m=(10.0, 4.0, 1.0), at_s=1.0, velocity_mps=(0.0, 2.0, 0.0), yaw_rad=math.pi / 2)
+    edited = apply_edits(scene(), [sent]).graph
+    tracks = edited.tracks
+    assert tracks.track_id.tolist() == [7, 11, 9]
+    assert bool(tracks.present[2].all())
+    since_s = tracks.t_s - 1.0
+    assert torch.allclose(tracks.T_scene_actor[2, :, 1, 3], 4.0 + 2.0 * since_s)
+    assert torch.allclose(tracks.T_scene_actor[2, :, :2, 0], torch.tensor([0.0, 1.0]), atol=1e-6)
+    assert torch.equal(tracks.T_scene_actor[:2], scene().tracks.T_scene_actor)
+    placed = place(edited, float(tracks.t_s[0])).gaussians.mean_m[-1]
+    ahead_m = 1.0  # of its middle its Gaussian is
+    at_first = torch.tensor([10.0, 4.0 + 2.0 * float(since_s[0]) + ahead_m, 1.0])
+    assert torch.allclose(placed, at_first, atol=1e-5)
+
+
 def test_the_ego_vehicle_is_shifted_in_its_own_frame() -> None:
     edits = [ShiftEgo((0.0, 2.0, 0.0)), ShiftEgo((1.0, 0.0, 0.0), yaw_rad=0.1)]
     T = apply_edits(scene(), edits).T_ego_shifted
@@ -64,6 +82,7 @@ def test_the_ego_vehicle_is_shifted_in_its_own_frame() -> None:
 
 def test_edits_from_a_file_do_the_same(tmp_path: Path) -> None:
     edits: list[Edit] = [Move(7, (1.0, 2.0, 0.0), 0.3), Duplicate(11, 12, (0.0, 1.0, 0.0)), Remove(11)]
+    edits.append(Send(7, 13, (5.0, 0.0, 1.0), 0.5, (-1.0, 0.0, 0.0)))
     save_edits(edits, tmp_path / "edits.json")
     again = load_edits(tmp_path / "edits.json")
     assert again == edits

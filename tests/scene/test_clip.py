@@ -1,5 +1,6 @@
 """Clips: what an agent may see."""
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -20,6 +21,17 @@ def test_observed_ends_at_now_and_hides_the_driven_future(make_example: Callable
     assert not seen.future.valid.any()
     assert not seen.future.xy.any()
     assert clip.future.valid.all()  # the original is as it was
+
+
+def test_a_clip_through_some_cameras_has_theirs_in_that_order(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, past=1).clip
+    first = clip.rig.K.new_tensor([1.0, 2.0])[:, None, None]
+    clip = dataclasses.replace(clip, rig=dataclasses.replace(clip.rig, K=first * clip.rig.K))
+    turned = clip.through([1, 0])
+    assert turned.rig.names == ("camera_1", "camera_0")
+    assert torch.equal(turned.rig.K, clip.rig.K.flip(2))
+    assert torch.equal(turned.images, clip.images.flip(2))
+    assert clip.through([1]).image_valid.shape[2] == 1
 
 
 def test_a_batch_must_agree_on_where_now_is(make_example: Callable[..., Example]) -> None:

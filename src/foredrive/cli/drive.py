@@ -2,20 +2,22 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from foredrive.cli.arguments import OptionalPath
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
     from foredrive.recipes.driving import DriveJob, Driven, DriveSuite
+    from foredrive.recipes.rebuilt_driving import RebuiltSuite
 
 FAILURES_SHOWN = 3
 
 
 def drive(
-    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|…")],
+    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|log|…")],
     out: Path,
     routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short",
     repetitions: int = 1,
@@ -30,10 +32,16 @@ def drive(
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1,
     workers: int = 0,
     ray: bool = False,
+    rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None,
+    start: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = (),
+    threat: tuple[Literal["stationary", "frontal", "side"], ...] = (),
+    edits: OptionalPath = None,
 ) -> None:
     """Drive routes in closed loop and score them as CARLA's leaderboards 1.0 and 2.1 do.
 
     Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
+    With --in a log that was rebuilt is driven in instead of towns, along the way it drove itself: of the
+    options only agent, out, sensors, period, latency and those below --in count there.
 
     Args:
         agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or ego-mlp:RUN, the
@@ -56,11 +64,35 @@ def drive(
         latency: How much later than what it saw a plan takes effect.
         workers: How many drives run at a time; 0 is one for each core.
         ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
+        rebuilt: Folder of a reconstruction to drive in. Its actors replay; agent "log" goes on as the log was
+            driven.
+        start: Times of the log at which drives begin; as early as possible if left out.
+        threat: Put a car in the way: one that stands, comes head-on or crosses.
+        edits: File of edits to the rebuilt scene.
     """
+    driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    if rebuilt is not None:
+        from foredrive.recipes.rebuilt_driving import RebuiltSuite
+        from foredrive.simulation.threats import Threat
+
+        in_log = RebuiltSuite(
+            driver=driver,
+            run=str(rebuilt.absolute()),
+            starts_s=start,
+            threats=tuple(map(Threat, threat)),
+            edits=None if edits is None else str(edits.absolute()),
+            sensors=sensors,
+            period_s=period,
+            latency_s=latency,
+        )
+        _drive_rebuilt(in_log, out)
+        return
+    if start or threat or edits is not None:
+        raise InputError("--start, --threat and --edits are for drives in rebuilt logs (--in RUN)")
     from foredrive.recipes.driving import DriveSuite
 
     suite = DriveSuite(
-        driver=str(Path(agent).absolute()) if Path(agent).is_dir() else agent,
+        driver=driver,
         routes=routes,
         repetitions=repetitions,
         seed=seed,
@@ -87,6 +119,22 @@ def _drive(suite: "DriveSuite", out: Path, workers: int, on_ray: bool) -> None:
     print(f"look: {write_drive_report(out)}")
 
 
+def _drive_rebuilt(suite: "RebuiltSuite", out: Path) -> None:
+    from rich.console import Console
+    from rich.status import Status
+
+    from foredrive.recipes.kept_drives import summarise
+    from foredrive.recipes.rebuilt_driving import drive_rebuilt
+    from foredrive.view.drive_report import score_table, write_drive_report
+
+    with Status("driving") as status:
+        drives = drive_rebuilt(suite, out, lambda job: status.update(f"driving; last driven: {job.route}"))
+    Console().print(score_table(summarise(drives)))
+    for met in (drive["threat"] for drive in drives if "threat" in drive):
+        print(f"{met['kind']} threat: {met['score']:.1f} of 5")
+    print(f"look: {write_drive_report(out)}")
+
+
 def _tell(driven: "Driven") -> None:
     """The scores.
 
@@ -95,7 +143,7 @@ def _tell(driven: "Driven") -> None:
     """
     from rich.console import Console
 
-    from foredrive.recipes.driving import summarise
+    from foredrive.recipes.kept_drives import summarise
     from foredrive.view.drive_report import score_table
 
     if driven.broken:

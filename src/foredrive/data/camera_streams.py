@@ -11,6 +11,7 @@ from py123d.datatypes import (
     DefaultCameraSegmentationLabel,
     DepthCameraMetadata,
     PinholeCameraMetadata,
+    PinholeDistortion,
     PinholeIntrinsics,
     SegmentationCameraMetadata,
 )
@@ -30,7 +31,7 @@ _AHEAD_RAD = np.deg2rad(22.5)
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole camera without distortion, fixed to the vehicle."""
+    """A pinhole camera, fixed to the vehicle."""
 
     name: str
     K: Float[np.ndarray, "3 3"]
@@ -40,6 +41,8 @@ class CameraSpec:
     readout_s: float = 0.0
     """From the first row's exposure to the last's, the middle one's being at the frame's time; 0: global
     shutter."""
+    dist: Float[np.ndarray, "5"] | None = None
+    """OpenCV's k1 k2 p1 p2 k3; None: an ideal pinhole."""
 
 
 class RollingCameraMetadata(PinholeCameraMetadata):
@@ -70,11 +73,11 @@ def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetad
         camera_name=spec.name,
         camera_id=camera_id,
         intrinsics=PinholeIntrinsics.from_camera_matrix(spec.K.astype(np.float64)),
-        distortion=None,
+        distortion=None if spec.dist is None else PinholeDistortion.from_array(spec.dist.astype(np.float64)),
         width=spec.size_hw[1],
         height=spec.size_hw[0],
         camera_to_imu_se3=PoseSE3.from_transformation_matrix(spec.T_ego_cam.astype(np.float64)),
-        is_undistorted=True,
+        is_undistorted=spec.dist is None,
     )
 
 

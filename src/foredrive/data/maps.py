@@ -66,6 +66,25 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
     return MapPatch(vertices=vertices, valid=valid, kind=kinds)
 
 
+def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "V 2"]] | None:
+    """Outlines of the lanes within RADIUS_M of where the ego vehicle drove, world frame; None without a map.
+
+    Raises:
+        InputError: on a map that cannot be read.
+    """
+    driven = log.T_world_ego[:, :2, 3]
+    middle = 0.5 * (driven.min(axis=0) + driven.max(axis=0))
+    reach_m = float(np.hypot(*(driven - middle).T).max()) + RADIUS_M
+    with reading(log.path.folder, "its map"):
+        api = log.scene.get_map_api()
+        if api is None:
+            return None
+        near = api.get_map_objects_in_radius(Point2D(*middle), reach_m, [MapLayer.LANE])
+        lanes = [lane for lane in near[MapLayer.LANE] if isinstance(lane, Lane)]
+        sides = [(_points(lane.left_boundary)[:, :2], _points(lane.right_boundary)[:, :2]) for lane in lanes]
+    return [np.concatenate([left, right[::-1]]) for left, right in sides]
+
+
 def write_map(objects: Iterable[BaseMapObject], location: str, root: Path) -> Path:
     """Write a map that all logs of `location` in the data root share, once; it has heights.
 

@@ -34,6 +34,8 @@ class Needs:
     lidar: bool
     """Learned agents go on from a halt only where lidar sees nobody (`Restarting`)."""
     past_frames: int
+    camera_names: tuple[str, ...] | None = None
+    """Which cameras; None: all there are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,8 @@ def needs_of(driver: str) -> Needs:
     clips = open_run(_run_folder(driver)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    return Needs(not driver.startswith(EGO_MLP), lidar=True, past_frames=clips.past_frames)
+    seeing = not driver.startswith(EGO_MLP)
+    return Needs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
 def make_driver(
@@ -96,7 +99,7 @@ def make_driver(
 
 def _expert(town: TownSimulator | None) -> TownExpert:
     if town is None:
-        raise InputError("the expert knows a town's traffic from inside: it cannot drive in CARLA")
+        raise InputError("the expert knows a town's traffic from inside: it cannot drive anywhere else")
     return TownExpert(town)
 
 

@@ -8,11 +8,9 @@ import contextlib
 import dataclasses
 import functools
 import json
-import statistics
 import time
 import zlib
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,37 +18,24 @@ from typing import Any
 import torch
 
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance
 from foredrive.evaluation.summary import write_json, write_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.drivers import make_driver, needs_of
 from foredrive.recipes.fan_out import fan_out, reason
-from foredrive.simulation.drive import Drive, Pace, drive_route
+from foredrive.recipes.kept_drives import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
+from foredrive.simulation.drive import Pace, drive_route
 from foredrive.simulation.drive_log import drive_log, key_frame
 from foredrive.simulation.lessons import Alternating, Disturbed
 from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
-from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scenarios.places import scenarios_on
-from foredrive.simulation.scores import (
-    Ending,
-    Infraction,
-    InfractionKind,
-    RouteScore,
-    score_suite,
-    timeout_s,
-)
-from foredrive.simulation.time_to_collision import LEAST_S
+from foredrive.simulation.scores import timeout_s
 from foredrive.simulation.town import TownScenario, TownSimulator, grow
 from foredrive.towns.campaign import ANY_CONDITIONS
 from foredrive.towns.conditions import CONDITIONS, find_conditions
 from foredrive.towns.recorder import Crowd
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-
-SUITE, DRIVES, SUMMARY = "suite.json", "drives", "summary.json"
-TRACK_EVERY = 5
-"""Of the states of a drive one in this many is kept: four a second."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +163,10 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict
             pace=Pace(suite.period_s, suite.latency_s),
             on_frame=write_frame,
         )
-    kept = _kept(drive, route, time.perf_counter() - began) | {"log": str(log.folder.relative_to(out))}
+    wall_s = time.perf_counter() - began
+    kept = kept_of(drive, route.xyz, route.length_m, route.town, wall_s) | {
+        "log": str(log.folder.relative_to(out))
+    }
     write_json(_file(out, job), kept)
     return read_drive(_file(out, job))
 
@@ -209,82 +197,6 @@ def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownSc
 def _lot(seed: int, route: str) -> int:
     """A number drawn for a drive, always the same."""
     return zlib.crc32(f"{seed} {route}".encode())
-
-
-def read_drive(path: Path) -> dict[str, Any]:
-    """What was kept of a drive.
-
-    Raises:
-        InputError: the file is no drive.
-    """
-    try:
-        drive: dict[str, Any] = json.loads(path.read_text())
-        score_of(drive)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not what is kept of a drive ({error}); delete it to drive again") from None
-    return drive
-
-
-def score_of(drive: dict[str, Any]) -> RouteScore:
-    """The score of what was kept of a drive."""
-    fields = drive["score"]
-    infractions = tuple(
-        Infraction(**{**each, "kind": InfractionKind(each["kind"]), "xy_world": tuple(each["xy_world"])})
-        for each in fields["infractions"]
-    )
-    return RouteScore(**{**fields, "ending": Ending(fields["ending"]), "infractions": infractions})
-
-
-def summarise(drives: Sequence[dict[str, Any]]) -> dict[str, float | int | str | None]:
-    """The figures of a suite, flat; a driver who failed by his own fault is scored by what he drove."""
-    suite = score_suite([score_of(drive) for drive in drives])
-    out: dict[str, float | int | str | None] = {
-        "routes": suite.routes,
-        "repetitions": suite.repetitions,
-        "drives": len(drives),
-        "failed": suite.failed,
-    }
-    for name in ("driving_score_1_0", "driving_score_2_1", "completion"):
-        value = getattr(suite, name)
-        out |= {name: value.mean, f"{name}.spread": value.spread}
-    out |= {f"endings.{ending}": count for ending, count in suite.endings.items()}
-    out |= {f"infractions.{kind}": count for kind, count in suite.infractions.items()}
-    out |= {f"infractions_per_km.{kind}": each for kind, each in suite.infractions_per_km.items()}
-    begun = Counter(e["what"] for drive in drives for e in drive["events"] if e["kind"] == "scenario")
-    out |= {f"scenarios.{kind}": begun[kind] for kind in ScenarioKind}
-    comfortable = [drive["comfort"]["comfortable_share"] for drive in drives if drive["comfort"]]
-    near = [seconds is not None and seconds < LEAST_S for drive in drives for seconds in drive["nearest_s"]]
-    plan_ms = [1000 * seconds for drive in drives for seconds in drive["act_s"]]
-    out["comfortable_share"] = statistics.fmean(comfortable) if comfortable else None
-    out["near_collision_share"] = statistics.fmean(near) if near else None
-    out["plan_ms"] = statistics.median(plan_ms) if plan_ms else None
-    out["driven_s"] = sum(drive["score"]["duration_s"] for drive in drives)
-    out["wall_s"] = sum(drive["wall_s"] for drive in drives)
-    return out | collect_provenance()
-
-
-def _kept(drive: Drive, route: DriveRoute, wall_s: float) -> dict[str, Any]:
-    states = drive.states[::TRACK_EVERY]
-    return {
-        "town": route.town,
-        "length_m": route.length_m,
-        "score": dataclasses.asdict(drive.score),
-        "driving_score_1_0": drive.score.driving_score_1_0,
-        "driving_score_2_1": drive.score.driving_score_2_1,
-        "error": drive.error,
-        "events": [dataclasses.asdict(event) for event in drive.events],
-        "comfort": None if drive.comfort is None else dataclasses.asdict(drive.comfort),
-        "nearest_s": drive.nearest_s,
-        "act_s": drive.act_s,
-        "route_xy": route.xyz[:, :2].round(2).tolist(),
-        "track": {
-            "t_s": [round(0.05 * TRACK_EVERY * k, 2) for k in range(len(states))],
-            "xy": [(round(s.x_m, 2), round(s.y_m, 2)) for s in states],
-            "yaw_rad": [round(s.yaw_rad, 4) for s in states],
-            "speed_mps": [round(s.speed_mps, 3) for s in states],
-        },
-        "wall_s": wall_s,
-    }
 
 
 def claim(suite: DriveSuite, out: Path) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.edits import Duplicate, Edit, Edited, Insert, Remove, ShiftEgo
+from foredrive.rendering.edits import Duplicate, Edit, Edited, Insert, Remove, Send, ShiftEgo
 from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.tracks import Tracks, boxes_at
@@ -136,7 +136,7 @@ def edits_from_words(
         InputError: on an entry of `insert` that is written otherwise.
     """
     edits: list[Edit] = []
-    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert)]
+    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert | Send)]
     copy = max([*tracks.track_id.tolist(), *copies], default=0) + 1
     for number, text in enumerate(insert):
         source, _, rest = text.rpartition(":")

@@ -1,15 +1,18 @@
 """Finished reconstructions, opened without their logs."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
+from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe
-from foredrive.recipes.reconstruct import CONFIG, VEHICLE, WEIGHTS
+from foredrive.recipes.reconstruct import CONFIG, LOG, VEHICLE, WEIGHTS
 from foredrive.rendering.edits import Edit, Edited, apply_edits
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
@@ -76,3 +79,32 @@ def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
         saved["present"],
     )
     return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"])
+
+
+def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
+    """How a run was made, and the log it was made of.
+
+    Raises:
+        InputError: on a folder without a run, or if its log is gone.
+    """
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
+    try:
+        named = json.loads((folder / LOG).read_text())
+        path = LogPath(Path(named["folder"]), Path(named["maps_dir"]))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+    if not path.folder.is_dir():
+        raise InputError(f"{folder}: the log it was made of is gone: {path.folder}")
+    return load_values(RebuildRecipe, folder / CONFIG), path
+
+
+def rebuilt_cameras(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Which of the rebuilt cameras each of those is that an agent looks through.
+
+    Raises:
+        InputError: naming the cameras that were not rebuilt.
+    """
+    if missing := [name for name in wanted if name not in there]:
+        raise InputError(f"not rebuilt: {', '.join(missing)}; there are: {', '.join(there) or 'no cameras'}")
+    return [there.index(name) for name in wanted]

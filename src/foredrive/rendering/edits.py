@@ -70,6 +70,23 @@ class Insert:
 
 
 @dataclass(frozen=True)
+class Send:
+    """Let there be another one like an actor, all the time, straight on at one velocity."""
+
+    actor: int
+    copy: int
+    """Its id; no other actor's."""
+    at_m: Offset
+    """Where its middle is at `at_s`, in the scene's frame."""
+    at_s: float
+    velocity_mps: Offset = (0.0, 0.0, 0.0)
+    """In the scene's axes."""
+    yaw_rad: float = 0.0
+    """Its heading about the scene's z."""
+    kind: Literal["send"] = "send"
+
+
+@dataclass(frozen=True)
 class ShiftEgo:
     """Let the ego vehicle, and its sensors, be elsewhere all the time: by an offset in its own frame."""
 
@@ -78,7 +95,7 @@ class ShiftEgo:
     kind: Literal["shift_ego"] = "shift_ego"
 
 
-Edit = Annotated[Move | Remove | Duplicate | Insert | ShiftEgo, Discriminator("kind")]
+Edit = Annotated[Move | Remove | Duplicate | Insert | Send | ShiftEgo, Discriminator("kind")]
 
 
 @dataclass(frozen=True)
@@ -114,6 +131,8 @@ def apply_edits(
             graph = dataclasses.replace(graph, tracks=_moved(graph.tracks, row, edit.offset_m, edit.yaw_rad))
         elif isinstance(edit, Duplicate):
             graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, edit.offset_m, edit.yaw_rad)
+        elif isinstance(edit, Send):
+            graph = _with_sent(graph, edit)
         else:
             if open_run is None:
                 raise InputError(
@@ -209,4 +228,18 @@ def _with_copy(
             T_scene_actor=torch.cat([tracks.T_scene_actor, pose[None]]),
             present=torch.cat([tracks.present, tracks.present[way : way + 1]]),
         ),
+    )
+
+
+def _with_sent(graph: SceneGraph, edit: Send) -> SceneGraph:
+    """With a copy of an actor on a straight way."""
+    graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, (0.0, 0.0, 0.0), 0.0)
+    tracks, row = graph.tracks, len(graph.tracks) - 1
+    since_s = (tracks.t_s - edit.at_s)[:, None]
+    way = tracks.t_s.new_tensor(edit.at_m) + since_s * tracks.t_s.new_tensor(edit.velocity_mps)
+    poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()
+    poses[row] = matrix_from_yaw(torch.full_like(tracks.t_s, edit.yaw_rad), way)
+    present[row] = True
+    return dataclasses.replace(
+        graph, tracks=dataclasses.replace(tracks, T_scene_actor=poses, present=present)
     )

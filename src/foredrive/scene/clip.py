@@ -86,6 +86,14 @@ class Clip(Record):
         )
         return dataclasses.replace(self, **{name: getattr(self, name)[where] for name in per_frame.split()})
 
+    def through(self, cameras: list[int]) -> "Clip":
+        """The clip with some of its cameras only, in this order."""
+        where = (slice(None),) * self.t_s.dim() + (cameras,)
+        rig = dataclasses.replace(self.rig[where], names=tuple(self.rig.names[k] for k in cameras))
+        return dataclasses.replace(
+            self, images=self.images[where], image_valid=self.image_valid[where], rig=rig
+        )
+
     def observed(self) -> "Clip":
         """What an agent may see: frames up to now, the future masked."""
         past = self.frames(slice(0, self.now + 1))

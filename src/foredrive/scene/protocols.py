@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from foredrive.scene.clip import Clip
 from foredrive.scene.record import Record
+from foredrive.scene.rig import CameraRig
+from foredrive.scene.sweep import LidarSweep
 from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelSpec
 
@@ -123,19 +125,31 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True)
 class Rendered(Record):
-    """What a sensor would have seen; R rays."""
+    """What the sensors of a vehicle see at one time, unbatched."""
 
-    rgb: Float[Tensor, "*R 3"]
-    range_m: Float[Tensor, "*R"]
-    intensity: Float[Tensor, "*R"]
-    drop: Float[Tensor, "*R"]
-    """Probability that a lidar ray does not return."""
-    alpha: Float[Tensor, "*R"]
+    images: UInt8[Tensor, "C 3 H W"]
+    """RGB, in the order of the renderer's rig."""
+    sweep: LidarSweep | None
+    """One revolution in the ego frame, beams that do not return included; None: there is no lidar."""
 
 
+@runtime_checkable
 class Renderer(Protocol):
-    """Something that turns a scene into sensor data."""
+    """A scene as the sensors of a vehicle see it that may be anywhere in it: a rebuilt log."""
 
-    def render(self, scene: Any, sensor: Any, pose: Float64[Tensor, "4 4"], t_s: float) -> Rendered:
-        """Render one sensor at one pose and time."""
+    @property
+    def rig(self) -> CameraRig:
+        """The cameras, without leading dimensions, all exposed at the time that is asked for."""
+        ...
+
+    def render(
+        self, T_world_ego: Float64[Tensor, "4 4"], twist_ego: Float[Tensor, "6"], t_s: float
+    ) -> Rendered:
+        """What is seen from a pose at a time of the scene.
+
+        Args:
+            T_world_ego: where the vehicle is.
+            twist_ego: its velocity (m/s), then turn rate (rad/s), over ground in its own axes.
+            t_s: since the scene's first moment.
+        """
         ...

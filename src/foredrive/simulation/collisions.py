@@ -54,18 +54,7 @@ class CollisionSense:
     ) -> tuple[list[Event], Contacts, bool]:
         """New collisions, what is known of contacts from now on, and whether something stops the vehicle."""
         box = ego_box(T_world_ego, ego)
-        hit = np.flatnonzero(touched(box, users))
-        velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
-        known, events = dict(contacts.users), []
-        for i in hit.tolist():
-            track, category = int(users.track_id[i]), Category(int(users.category[i]))
-            if t_s - known.get(track, -np.inf) > SAME_S:
-                kind = "pedestrian" if category is Category.PEDESTRIAN else "vehicle"
-                impact_mps = float(np.hypot(*(velocity - users.velocity_mps[i])))
-                where = (float(users.foot_m[i, 0]), float(users.foot_m[i, 1]))
-                text = f"{category.name.lower()} {track} at {impact_mps:.1f} m/s"
-                events.append(Event(f"collision_{kind}", t_s, where, text, category.name.lower(), impact_mps))
-            known[track] = t_s
+        events, recent = collide(box, ego, users, contacts.users, t_s)
         stands_in_front, struck = self._standing(T_world_ego)
         standing_xy = contacts.standing_xy
         if struck is not None:
@@ -75,16 +64,8 @@ class CollisionSense:
                 text = f"{what} at {ego.speed_mps:.1f} m/s"
                 events.append(Event("collision_static", t_s, xy, text, what, ego.speed_mps))
                 standing_xy = xy
-        recent = tuple((track, at_s) for track, at_s in known.items() if t_s - at_s <= SAME_S)
-        stopped = stands_in_front or self._runs_into(box, users)
+        stopped = stands_in_front or blocked(box, users)
         return events, Contacts(recent, standing_xy), stopped
-
-    def _runs_into(self, box: Box, users: RoadUsers) -> bool:
-        """Whether there is a vehicle right before the bumper."""
-        forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
-        half = np.array([0.5 * BUMPER_M, box.half_lw[1] - FLANK_M])
-        bumper = Box(box.foot_m + (box.half_lw[0] - half[0]) * forward, box.yaw_rad, half)
-        return bool((touched(bumper, users) & (users.category != Category.PEDESTRIAN)).any())
 
     def _standing(
         self, T_world_ego: Float64[np.ndarray, "4 4"]
@@ -105,6 +86,36 @@ class CollisionSense:
         first = int(np.argmin(np.where(inside, part, np.inf)))
         xy = start[first, :2] + part[first] * way[first, :2]
         return bool(at_front.any()), ((float(xy[0]), float(xy[1])), Surface(int(surface[first])))
+
+
+def collide(
+    box: Box, ego: BicycleState, users: RoadUsers, met: tuple[tuple[int, float], ...], t_s: float
+) -> tuple[list[Event], tuple[tuple[int, float], ...]]:
+    """New collisions of the ego vehicle's box with road users, and who has been met when from now on.
+
+    Args:
+        met: as `Contacts.users`.
+    """
+    velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
+    known, events = dict(met), []
+    for i in np.flatnonzero(touched(box, users)).tolist():
+        track, category = int(users.track_id[i]), Category(int(users.category[i]))
+        if t_s - known.get(track, -np.inf) > SAME_S:
+            kind = "pedestrian" if category is Category.PEDESTRIAN else "vehicle"
+            impact_mps = float(np.hypot(*(velocity - users.velocity_mps[i])))
+            where = (float(users.foot_m[i, 0]), float(users.foot_m[i, 1]))
+            text = f"{category.name.lower()} {track} at {impact_mps:.1f} m/s"
+            events.append(Event(f"collision_{kind}", t_s, where, text, category.name.lower(), impact_mps))
+        known[track] = t_s
+    return events, tuple((track, at_s) for track, at_s in known.items() if t_s - at_s <= SAME_S)
+
+
+def blocked(box: Box, users: RoadUsers) -> bool:
+    """Whether there is a vehicle right before the bumper."""
+    forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
+    half = np.array([0.5 * BUMPER_M, box.half_lw[1] - FLANK_M])
+    bumper = Box(box.foot_m + (box.half_lw[0] - half[0]) * forward, box.yaw_rad, half)
+    return bool((touched(bumper, users) & (users.category != Category.PEDESTRIAN)).any())
 
 
 def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState) -> Box:

@@ -1,12 +1,16 @@
-"""Drives in towns as 123D logs, like those that `record` writes, at the key frames that the agent saw."""
+"""Drives in towns and in rebuilt logs as 123D logs, at the key frames that the agent saw."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from foredrive.data.log_writer import Frame, LogWriter
-from foredrive.scene import Trajectory
-from foredrive.simulation.dynamics import yaw_rate_radps
+from foredrive.scene import CameraRig, Trajectory
+from foredrive.simulation.dynamics import BicycleState, yaw_rate_radps
+from foredrive.simulation.observation import KeyFrame
+from foredrive.simulation.rebuilt import RebuiltSimulator
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import (
@@ -17,6 +21,8 @@ from foredrive.towns.recorder import (
     write_town_map,
 )
 
+REBUILT_SPLIT = "rebuilt_test"
+
 
 def drive_log(scenario: TownScenario, out: Path, name: str) -> LogWriter:
     """The writer of a drive's log, at out/logs/SPLIT/NAME; without sensors it has poses, boxes and lights."""
@@ -26,17 +32,40 @@ def drive_log(scenario: TownScenario, out: Path, name: str) -> LogWriter:
     return LogWriter(out, split, name, cameras, maps, scenario.town, scenario.route_xyz)
 
 
+def rebuilt_drive_log(
+    rig: CameraRig | None, route_xyz: Float64[np.ndarray, "M 3"], out: Path, name: str
+) -> LogWriter:
+    """The writer of the log of a drive in a rebuilt log, at out/logs/SPLIT/NAME; without a rig nothing is
+    seen.
+    """
+    cameras = [] if rig is None else camera_specs(rig)
+    return LogWriter(out, REBUILT_SPLIT, name, cameras, None, None, route_xyz)
+
+
 def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Frame:
     """What is logged of a simulator's latest key frame, if that is now.
 
     Args:
         taught: what a teacher would do from here, a batch of one.
     """
-    frame, ego = simulator.state.frames[-1], simulator.state.ego
     names = () if simulator.scenario.sensors is None else simulator.scenario.sensors.rig.names
+    lights = simulator.traffic.zone_lights(simulator.state.decided.time_s)
+    return dataclasses.replace(
+        _frame(simulator.state.frames[-1], simulator.state.ego, names),
+        taught=None if taught is None else taught[0],
+        traffic_lights=lights_of_lanes(load_town_map(simulator.scenario.town), lights),
+    )
+
+
+def rebuilt_key_frame(simulator: RebuiltSimulator) -> Frame:
+    """The same of a drive in a rebuilt log."""
+    names = simulator.renderer.rig.names if simulator.scenario.sensors else ()
+    return _frame(simulator.state.frames[-1], simulator.state.ego, names)
+
+
+def _frame(frame: KeyFrame, ego: BicycleState, names: tuple[str, ...]) -> Frame:
     images = frame.images.permute(0, 2, 3, 1).numpy()
     aside_mps2 = ego.speed_mps * yaw_rate_radps(ego)
-    lights = simulator.traffic.zone_lights(simulator.state.decided.time_s)
     return Frame(
         t_us=FIRST_TIME_US + round(frame.t_s * 1e6),
         T_world_ego=frame.T_world_ego,
@@ -45,6 +74,4 @@ def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Fra
         images=dict(zip(names, images, strict=True)),
         sweep=frame.sweep,
         boxes=frame.boxes,
-        taught=None if taught is None else taught[0],
-        traffic_lights=lights_of_lanes(load_town_map(simulator.scenario.town), lights),
     )

@@ -295,6 +295,13 @@ def _distance_m(actor: ActorState, moment: Moment) -> float:
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:
     """The cameras of a rig as a log declares them."""
     return [
-        CameraSpec(name, rig.K[i].numpy(), rig.T_ego_cam[i].numpy(), rig.size_hw, float(rig.readout_s[i]))
+        CameraSpec(
+            name,
+            rig.K[i].numpy(),
+            rig.T_ego_cam[i].numpy(),
+            rig.size_hw,
+            float(rig.readout_s[i]),
+            rig.dist[i].numpy() if rig.dist[i].any() else None,
+        )
         for i, name in enumerate(rig.names)
     ]

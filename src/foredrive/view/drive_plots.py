@@ -37,8 +37,8 @@ LETTERS = {
 
 
 def draw_way(drive: Mapping[str, Any]) -> Figure:
-    """The route over the town's lanes, the way driven coloured by speed; north is up. Infractions and
-    scenarios are marked."""
+    """The route over the town's lanes, if there is a town, the way driven coloured by speed; north is up.
+    Infractions and scenarios are marked."""
     figure = Figure(figsize=(4.6, 4.6))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     route, track = np.array(drive["route_xy"]), np.array(drive["track"]["xy"])
@@ -50,7 +50,8 @@ def draw_way(drive: Mapping[str, Any]) -> Figure:
     ax.set_aspect("equal")
     ax.set_xticks([])
     ax.set_yticks([])
-    _draw_lanes(ax, drive["town"], centre, half)
+    if drive["town"] is not None:
+        _draw_lanes(ax, drive["town"], centre, half)
     ax.plot(*route.T, color=palette.FAINT, linewidth=6.0, alpha=0.5, solid_capstyle="round", zorder=2)
     ax.plot(*route[-1], "o", color=palette.EXPERT, markersize=9, markerfacecolor="none", zorder=4)
     if len(track) > 1:

@@ -12,7 +12,7 @@ from foredrive.data.logs import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.recipes.driving import DRIVES, SUITE, SUMMARY, read_drive, score_of
+from foredrive.recipes.kept_drives import DRIVES, SUITE, SUMMARY, read_drive, score_of
 from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, InfractionKind
 from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events
@@ -20,7 +20,7 @@ from foredrive.view.drive_video import write_drive_video
 from foredrive.view.inline_svg import inline_svg
 from foredrive.view.report_style import CSS
 from foredrive.view.run_report import machine_line
-from foredrive.view.summary_tables import full_table, number
+from foredrive.view.summary_tables import MISSING, full_table, number
 
 REPORT, VIDEOS = "report.html", "videos"
 Summary = Mapping[str, float | int | str | None]
@@ -180,12 +180,14 @@ def _drive_table(drives: Mapping[str, Mapping[str, Any]]) -> str:
 def _drive_row(name: str, drive: Mapping[str, Any]) -> str:
     score = score_of(dict(drive))
     wrong = ", ".join(_words(infraction.kind) for infraction in score.infractions)
+    known = drive.get("lanes_known", True)
+    outside = number(100 * score.outside_lanes, 1) if known else MISSING
     mark = "good" if score.ending is Ending.COMPLETED else "bad"
     return (
         f'<tr><th scope="row"><a href="#{name}">{escape(name)}</a></th>'
         f"<td>{number(drive['length_m'], 0)}</td>"
         f"<td>{number(score.driving_score_1_0, 1)}</td><td>{number(score.driving_score_2_1, 1)}</td>"
-        f"<td>{number(100 * score.completion, 0)}</td><td>{number(100 * score.outside_lanes, 1)}</td>"
+        f"<td>{number(100 * score.completion, 0)}</td><td>{outside}</td>"
         f'<td>{number(score.duration_s, 0)}</td><td class="text {mark}">{_words(score.ending)}</td>'
         f'<td class="text">{wrong}</td></tr>'
     )
@@ -206,6 +208,8 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
         for place, event in enumerate(scenario_events(drive), start=1)
     ]
     told = "".join(f"<li>{t_s:.1f} s: {text}</li>" for t_s, text in sorted(lines))
+    if "threat" in drive:
+        told += f"<li>{_threat(drive['threat'])}</li>"
     return (
         f'<h3 id="{name}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'
         f"{error}"
@@ -214,6 +218,13 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
         f'<figure class="film"><img loading="lazy" src="{VIDEOS}/{name}.webp" alt="film of the drive">'
         "</figure></div>"
     )
+
+
+def _threat(met: Mapping[str, Any]) -> str:
+    """What came of a threat, in a line."""
+    hit = "not hit" if met["impact_mps"] is None else f"hit at {met['impact_mps']:.1f} m/s"
+    by_the_log = f"{met['reference_mps']:.1f} m/s by who goes on as the log did"
+    return f"<b>{_words(met['kind'])} threat</b>: {hit} ({by_the_log}), score {met['score']:.1f} of 5"
 
 
 def _words(name: str) -> str:

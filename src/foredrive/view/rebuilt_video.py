@@ -14,7 +14,7 @@ from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
 from foredrive.recipes.rebuilt_film import Shooting, Shot, shoot
 from foredrive.recipes.rebuilt_runs import OpenRun, edited_scene
-from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, apply_edits
+from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, Send, apply_edits
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
@@ -97,7 +97,7 @@ def _said(edit: Edit) -> str:
         return f"without {edit.actor}"
     if isinstance(edit, Move):
         return f"{edit.actor} moved"
-    if isinstance(edit, Duplicate):
+    if isinstance(edit, Duplicate | Send):
         return f"{edit.copy} like {edit.actor}"
     if isinstance(edit, Insert):
         return f"{edit.copy} inserted on the way of {edit.follows}"

@@ -1,0 +1,106 @@
+"""How a log was driven, as a way for others to follow: poses at any time, and the ground along them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.rendering.vehicle import Vehicle
+from foredrive.simulation.dynamics import EGO, BicycleState
+
+SPEED_OVER_S = 0.2
+"""Speeds are those over twice as long: logged poses tremble."""
+SPACING_M = 0.5
+"""Points of a route are so far apart."""
+STEERS_FROM_MPS = 1.0
+"""How a slower vehicle's wheels stand cannot be told from where it goes."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedDrive:
+    """The ego vehicle of a rebuilt log, or one that keeps its place beside it.
+
+    Raises:
+        InputError: there are fewer than two poses.
+    """
+
+    vehicle: Vehicle
+    T_ego_shifted: Float[Tensor, "4 4"]
+    """`Edited.T_ego_shifted`."""
+
+    def __post_init__(self) -> None:
+        if len(self.vehicle.t_s) < 2:
+            raise InputError("a log to drive in needs two ego poses or more")
+
+    @property
+    def first_s(self) -> float:
+        """The first time, since the log's start."""
+        return float(self.vehicle.t_s[0])
+
+    @property
+    def end_s(self) -> float:
+        """The last time."""
+        return float(self.vehicle.t_s[-1])
+
+    def pose_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
+        """`T_world_ego` at a time; before and after the log it goes on as it moved."""
+        T_scene_ego = self.vehicle.at(t_s).shifted(self.T_ego_shifted).T_scene_ego.double()
+        T_world_ego: np.ndarray = (self.vehicle.T_world_scene @ T_scene_ego).numpy()
+        return T_world_ego
+
+    def state_at(self, t_s: float) -> BicycleState:
+        """The vehicle at a time, steering as it turned."""
+        from_s, to_s = max(t_s - SPEED_OVER_S, self.first_s), min(t_s + SPEED_OVER_S, self.end_s)
+        before, now, after = (self.pose_at(at) for at in (from_s, t_s, to_s))
+        speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
+        turned = np.remainder(_yaw(after) - _yaw(before) + np.pi, 2 * np.pi) - np.pi
+        curvature = turned / (to_s - from_s) / speed if speed > STEERS_FROM_MPS else 0.0
+        most = EGO.max_steering_rad
+        steering = np.clip(np.arctan(EGO.wheelbase_m * curvature), -most, most)
+        return BicycleState(float(now[0, 3]), float(now[1, 3]), _yaw(now), speed, float(steering))
+
+    def route_from(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
+        """The way from where the vehicle was at a time to where the log ends, world frame.
+
+        Raises:
+            InputError: it is shorter than the vehicle.
+        """
+        if (left_m := self.way_left_m(t_s)) < EGO.length_m:
+            raise InputError(f"from {t_s:.1f} s on the log drives {left_m:.1f} m: nothing to follow")
+        return self._way(t_s)
+
+    def way_left_m(self, t_s: float) -> float:
+        """How far it is from where the vehicle was at a time to where the log ends, seen from above."""
+        return float(np.hypot(*np.diff(self._way(t_s)[:, :2], axis=0).T).sum())
+
+    def _way(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
+        points = [self.pose_at(t_s)[:3, 3]]
+        for point in self._poses[self.vehicle.t_s.numpy() > t_s, :3, 3]:
+            if np.hypot(*(point - points[-1])[:2]) >= SPACING_M:
+                points.append(point)
+        return np.stack(points)
+
+    def on_ground(self, ego: BicycleState) -> Float64[np.ndarray, "4 4"]:
+        """`T_world_ego` of a vehicle beside the way driven: on the plane the log stood on nearest to it."""
+        away_m = np.hypot(*(self._poses[:, :2, 3] - [ego.x_m, ego.y_m]).T)
+        near = self._poses[int(np.argmin(away_m))]
+        up = near[:3, 2]
+        aside_m = np.array([ego.x_m, ego.y_m]) - near[:2, 3]
+        forward = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad), 0.0])
+        forward[2] = -(forward[:2] @ up[:2]) / up[2]
+        forward /= np.linalg.norm(forward)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
+        T[:3, 3] = ego.x_m, ego.y_m, near[2, 3] - (aside_m @ up[:2]) / up[2]
+        return T
+
+    @cached_property
+    def _poses(self) -> Float64[np.ndarray, "K 4 4"]:
+        return np.stack([self.pose_at(t_s) for t_s in self.vehicle.t_s.tolist()])
+
+
+def _yaw(T: Float64[np.ndarray, "4 4"]) -> float:
+    return float(np.arctan2(T[1, 0], T[0, 0]))

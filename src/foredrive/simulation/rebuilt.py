@@ -1,0 +1,206 @@
+"""A rebuilt log as a simulator: the ego vehicle drives at 20 Hz, the others replay, sensors are rendered."""
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3
+from foredrive.rendering.tracks import Tracks, boxes_at
+from foredrive.scene import Clip, Control, Event, Renderer, Step
+from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
+from foredrive.simulation.drive import Standing
+from foredrive.simulation.dynamics import STEP_S, BicycleState, step, yaw_rate_radps
+from foredrive.simulation.logged_drive import LoggedDrive
+from foredrive.simulation.logged_lanes import LoggedLanes
+from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.replayed import comes_from_behind, users_at
+from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.towns.recorder import BOXES_WITHIN_M
+
+FRAME_STEPS = round(FRAME_DT_S / STEP_S)
+REACH_M = 6.0
+"""Who is further beside the way driven sees little but what nobody has looked at: the drive ends."""
+STRUCK = "struck"
+"""Kind of the event that a replaying actor drives into the ego vehicle from behind: it cannot brake, and that
+is nobody's fault here."""
+
+
+@dataclass(frozen=True, eq=False)
+class RebuiltScenario:
+    """When a drive begins, with the speed and the steering that the log has then."""
+
+    start_s: float
+    """Since the log's first moment."""
+    sensors: bool = True
+    """False: key frames have boxes alone."""
+    past_frames: int = 1
+    """Key frames before now in an observation, rendered on the log's way."""
+
+
+@dataclass(frozen=True, eq=False)
+class RebuiltState:
+    """A drive at one time: with the scenario, all that its future depends on."""
+
+    step_index: int
+    ego: BicycleState
+    frames: tuple[KeyFrame, ...]
+    contacts: Contacts = field(default_factory=Contacts)
+    progress: Progress = field(default_factory=Progress)
+    driven_m: float = 0.0
+    outside_m: float = 0.0
+    """Of it outside of all lanes."""
+    ended: str | None = None
+    """Why the drive is over, if it is."""
+
+    @property
+    def t_s(self) -> float:
+        """Since the drive began."""
+        return self.step_index * STEP_S
+
+
+class RebuiltSimulator:
+    """A `Simulator` over a rebuilt log: equal scenarios and controls give equal drives.
+
+    Others replay their tracks and react to nobody. What stands without a box is no obstacle.
+
+    Args:
+        renderer: of the scene.
+        tracks: of its actors, edits included, in the scene's frame.
+        drive: how the log was driven in it.
+        lanes: of the log's map; without them nothing is said of leaving lanes.
+    """
+
+    state: RebuiltState
+
+    def __init__(
+        self, renderer: Renderer, tracks: Tracks, drive: LoggedDrive, lanes: LoggedLanes | None = None
+    ) -> None:
+        self.renderer, self.drive, self._lanes = renderer, drive, lanes
+        self._tracks = tracks.map_tensors(lambda tensor: tensor.detach().cpu())
+        self._T_world_scene = drive.vehicle.T_world_scene
+
+    def reset(self, scenario: RebuiltScenario) -> Clip:
+        """Start a drive.
+
+        Raises:
+            InputError: the log does not reach from the frames before the start to some way after it.
+        """
+        before_s = scenario.past_frames * FRAME_DT_S
+        first_s = self.drive.first_s + before_s
+        if not first_s - 1e-6 <= scenario.start_s < self.drive.end_s:
+            raise InputError(
+                f"a drive can begin at {first_s:.1f} to {self.drive.end_s:.1f} s of this log, "
+                f"not at {scenario.start_s:g} s"
+            )
+        self._scenario = scenario
+        self._route = RouteLine(self.drive.route_from(scenario.start_s))
+        frames: tuple[KeyFrame, ...] = ()
+        for number in range(-scenario.past_frames, 1):
+            t_s = number * FRAME_DT_S
+            at_s = scenario.start_s + t_s
+            frames = self._with_frame(frames, self.drive.state_at(at_s), self.drive.pose_at(at_s), t_s)
+        self.state = RebuiltState(0, self.drive.state_at(scenario.start_s), frames)
+        self._clip = self._make_clip()
+        return self._clip
+
+    def step(self, control: Control) -> Step:
+        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+
+        Raises:
+            InputError: the drive is over, or the control is not finite.
+        """
+        state = self.state
+        if state.ended is not None:
+            raise InputError(f"the drive is over ({state.ended}): reset the simulator")
+        state, events = self._drive(state, step(state.ego, control))
+        self.state = state
+        if state.step_index % FRAME_STEPS == 0:
+            T = self.drive.on_ground(state.ego)
+            self.state = dataclasses.replace(
+                state, frames=self._with_frame(state.frames, state.ego, T, state.t_s)
+            )
+            self._clip = self._make_clip()
+        return Step(self._clip, events, state.ended is not None)
+
+    def ego(self) -> BicycleState:
+        """The ego vehicle now."""
+        return self.state.ego
+
+    def standing(self) -> Standing:
+        """How far the drive has come; without lanes none is outside of them."""
+        state = self.state
+        completion = min(1.0, state.progress.done_m / self._route.length_m)
+        outside = state.outside_m / state.driven_m if state.driven_m > 0 else 0.0
+        return Standing(completion, outside, state.driven_m)
+
+    @property
+    def scenario(self) -> RebuiltScenario:
+        """What is driven."""
+        return self._scenario
+
+    @property
+    def length_m(self) -> float:
+        """Of the route."""
+        return self._route.length_m
+
+    def _drive(self, state: RebuiltState, moved: BicycleState) -> tuple[RebuiltState, list[Event]]:
+        """Move the ego vehicle unless something stops it, and see what comes of that."""
+        index = state.step_index + 1
+        t_s = index * STEP_S
+        users = users_at(self._tracks, self._T_world_scene, self._scenario.start_s + t_s)
+        box = ego_box(self.drive.on_ground(moved), moved)
+        behind = comes_from_behind(box, users)
+        before = users.without(users.track_id[behind])
+        events, met = collide(box, moved, before, state.contacts.users, t_s)
+        struck, met = collide(box, moved, users.without(users.track_id[~behind]), met, t_s)
+        events += [dataclasses.replace(event, kind=STRUCK) for event in struck]
+        if blocked(box, before):
+            moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
+        xy = np.array([moved.x_m, moved.y_m])
+        progress = self._route.advance(state.progress, xy, moved.speed_mps, t_s)
+        ended = self._end_of(progress, t_s)
+        if ended is not None:
+            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
+            events.append(Event(ended, t_s, (moved.x_m, moved.y_m), text))
+        way_m = float(np.hypot(moved.x_m - state.ego.x_m, moved.y_m - state.ego.y_m))
+        outside = self._lanes is not None and self._lanes.outside(box.foot_m[:2])
+        return dataclasses.replace(
+            state,
+            step_index=index,
+            ego=moved,
+            contacts=Contacts(met),
+            progress=progress,
+            driven_m=state.driven_m + way_m,
+            outside_m=state.outside_m + way_m * outside,
+            ended=ended,
+        ), events
+
+    def _end_of(self, progress: Progress, t_s: float) -> str | None:
+        """Why the drive is over: also by leaving what the log has seen, in space or in time."""
+        ended = self._route.end_of(progress, t_s, self.drive.end_s - self._scenario.start_s - 0.5 * STEP_S)
+        return "deviation" if ended is None and progress.beside_m > REACH_M else ended
+
+    def _with_frame(
+        self, frames: tuple[KeyFrame, ...], ego: BicycleState, T: Float64[np.ndarray, "4 4"], t_s: float
+    ) -> tuple[KeyFrame, ...]:
+        """The key frames with one more, as many as an observation has."""
+        at_s = self._scenario.start_s + t_s
+        images, sweep = no_images(), None
+        T_world_ego = torch.from_numpy(T)
+        if self._scenario.sensors:
+            twist = torch.tensor([ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(ego)])
+            seen = self.renderer.render(T_world_ego, twist, at_s)
+            images, sweep = seen.images, seen.sweep
+        boxes = boxes_at(self._tracks, inverse_se3(self._T_world_scene) @ T_world_ego, at_s, BOXES_WITHIN_M)
+        frame = KeyFrame(t_s, T, ego.speed_mps, images, sweep, boxes)
+        return (*frames, frame)[-1 - self._scenario.past_frames :]
+
+    def _make_clip(self) -> Clip:
+        state, route = self.state, self._route
+        rig = self.renderer.rig if self._scenario.sensors else None
+        target_xy = route.target_xy(state.progress, state.frames[-1].T_world_ego)
+        return make_clip(state.frames, rig, route.command(state.progress), target_xy)

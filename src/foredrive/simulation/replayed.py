@@ -1,0 +1,32 @@
+"""Actors of a rebuilt log, who go where their tracks lead them whatever the ego vehicle does."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from foredrive.geometry.se3 import rotate_vectors, yaw_of
+from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.simulation.road_users import Box, RoadUsers
+
+
+def users_at(tracks: Tracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:
+    """All actors at a time, a slot for each; those who are not there have no track id."""
+    states = states_at(tracks, t_s)
+    T_world_actor = T_world_scene @ states.T_scene_actor.double()
+    half_height = 0.5 * tracks.size_lwh[:, 2:].double()
+    return RoadUsers(
+        track_id=torch.where(states.present, tracks.track_id, -1).numpy(),
+        category=tracks.category.numpy(),
+        foot_m=(T_world_actor[:, :3, 3] - half_height * T_world_actor[:, :3, 2]).numpy(),
+        yaw=yaw_of(T_world_actor).numpy(),
+        half_lw=(0.5 * tracks.size_lwh[:, :2]).double().numpy(),
+        velocity_mps=rotate_vectors(T_world_scene, states.velocity_mps.double())[:, :2].numpy(),
+    )
+
+
+def comes_from_behind(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
+    """Whose middle lies behind a vehicle's rear: if they touch it, they drove into it."""
+    forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad)])
+    ahead_m = (users.foot_m - box.foot_m)[:, :2] @ forward
+    return np.asarray(ahead_m < -box.half_lw[0])
