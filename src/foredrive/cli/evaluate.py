@@ -14,8 +14,12 @@ def evaluate(
     out: OptionalPath = None,
     examples: int = 4,
     batch_size: int = 4,
+    rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="REBUILT")] = None,
 ) -> None:
     """Judge a trained run against its baselines; write summary.json and report.html.
+
+    With --in the gap between real and rendered images is measured instead, at the moments that a rebuilt log
+    has held out: how far the run's occupancy and plans agree, beside how well each fits the truth.
 
     Args:
         run: Folder of a trained run.
@@ -24,7 +28,11 @@ def evaluate(
         out: Folder for summary.json and report.html; the run's own by default.
         examples: How many examples the report shows in pictures.
         batch_size: Clips judged at once.
+        rebuilt: Folder of a reconstruction whose log is still there; writes gap.json.
     """
+    if rebuilt is not None:
+        _evaluate_gap(run, rebuilt, out or run)
+        return
     from rich.console import Console
 
     from foredrive.evaluation import print_summary, read_summary
@@ -42,3 +50,20 @@ def evaluate(
     report = report_on_run(trained, chosen, summary, inspections, result.failures)
     write_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
+
+
+def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from foredrive.recipes import open_run
+    from foredrive.recipes.rebuild_gap import GAP, measure_gap
+    from foredrive.view.gap_table import gap_table
+
+    with Progress() as progress:
+        bar = progress.add_task("real and rendered")
+        figures = measure_gap(
+            open_run(run), rebuilt, out, lambda done, of: progress.update(bar, completed=done, total=of)
+        )
+    Console().print(gap_table(figures))
+    print(f"wrote {out / GAP}")

@@ -14,6 +14,7 @@ def reconstruct(
     method: Literal["gaussians"] = "gaussians",
     recipe: str = "gaussians_tiny",
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
+    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None,
     cache: OptionalPath = None,
 ) -> None:
     """Rebuild a log as a scene to render cameras and lidars from, or go on with an interrupted run.
@@ -28,6 +29,7 @@ def reconstruct(
         method: What the scene is made of.
         recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_base (a GPU).
         cameras: Only these, by their own names or 123D's, such as pcam_f0; by default the recipe's.
+        image_size: Images are shrunk to this, px; by default the recipe's, 270 480 or 1080 1920.
         cache: Folder for shrunk images; by default "cache" in the run's folder.
     """
     import dataclasses
@@ -44,6 +46,8 @@ def reconstruct(
     chosen = find_rebuild_recipe(recipe)
     if cameras:
         chosen = dataclasses.replace(chosen, cameras=cameras)
+    if image_size is not None:
+        chosen = dataclasses.replace(chosen, image_hw=image_size)
     run = rebuild_log(chosen, logs[0], out, cache)
     if run.held_out.cameras:
         title = f"{logs[0].name}, frames that were held out"
