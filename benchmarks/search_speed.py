@@ -9,7 +9,7 @@ towers are, in kinds of scenes, drives of a kind, and moments along a drive that
 the queries are moments that are not in the index; the other half lie off to one side of all of them, as texts
 do.
 
-Needs 2.5 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
+Needs 4 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
 """
 
 import os

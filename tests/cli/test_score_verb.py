@@ -1,6 +1,7 @@
 """`foredrive score`: what it writes, and what a user is told whose files do not fit."""
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import pytest
 from evaluation.detections.files_of_detections import box, write_nuscenes
 
 from foredrive.cli.main import main
+from foredrive.search.rows import SCORES
+from foredrive.search.scores import read_scores
 
 
 @pytest.fixture
@@ -42,6 +45,27 @@ def test_figures_and_a_report_that_loads_nothing(files: dict[str, Path], tmp_pat
     assert not re.search(r'(src|href)="(?!data:|#)', page)
     assert "ap.&lt;car&gt;" in page
     assert "ap.<car>" not in page
+
+
+def test_an_index_takes_the_frames_scores(files: dict[str, Path], tmp_path: Path) -> None:
+    names = ("town/drive@1000000", "town/drive@1500000")
+    truth = write_nuscenes(tmp_path / "truth.json", {name: [box(5.0, 0.0, "car")] for name in names})
+    boxes = {names[0]: [box(5.0, 0.0, "car", detection_score=0.9)], names[1]: []}
+    results = write_nuscenes(tmp_path / "results.json", boxes)
+    assert main(["score", str(results), "--truth", str(truth), "--out", str(tmp_path / "out")]) == 0
+    found = read_scores(tmp_path / "out" / "frames.jsonl")
+    assert set(found) == set(names)
+    for scores in found.values():
+        assert set(scores) == set(SCORES)
+        assert sum(value for name, value in scores.items() if name != "nll") < scores["nll"] + 1.0
+    assert found[names[1]]["missed"] > found[names[0]]["missed"] + 3.0  # an object far from any detection
+
+
+def test_scores_that_are_not_finite_are_kept(tmp_path: Path) -> None:
+    line = {"frame": "town/drive@5", "nll": "inf", "missed": "inf", "false": 0.5}
+    (tmp_path / "frames.jsonl").write_text(json.dumps(line))
+    scores = read_scores(tmp_path / "frames.jsonl")["town/drive@5"]
+    assert scores == {"nll": math.inf, "missed": math.inf, "false": 0.5}
 
 
 def test_wrong_files_are_one_line(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:

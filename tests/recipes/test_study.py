@@ -7,8 +7,9 @@ import pytest
 from miniature import miniature
 
 from foredrive.data import LogPath
+from foredrive.errors import InputError
 from foredrive.recipes import Run
-from foredrive.recipes.study import StudyLogs, occupancy_alone, run_arm, seeded, share_of
+from foredrive.recipes.study import StudyLogs, occupancy_alone, pandaset_log, run_arm, seeded, share_of
 from foredrive.training import read_metrics
 
 LOGS = tuple(LogPath(Path(f"log{i}"), Path("maps")) for i in range(7))
@@ -35,6 +36,19 @@ def test_occupancy_alone_is_one_stage_as_long_as_pretraining() -> None:
     assert not recipe.finetune.imagine
     weights = recipe.finetune.weights
     assert (weights.wpts, weights.recon, weights.occ) == (0.0, 0.0, full.pretrain.weights.occ)
+
+
+def test_a_conversion_that_fails_leaves_nothing_that_looks_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FOREDRIVE_REAL_DATA", str(tmp_path))
+    broken = tmp_path / "pandaset" / "001" / "meta"
+    broken.mkdir(parents=True)
+    (broken / "gps.json").write_text("[]")
+    for _ in range(2):  # the second time it is not taken for converted
+        with pytest.raises(InputError, match="pandaset"):
+            pandaset_log(tmp_path / "converted")
+        assert not (tmp_path / "converted").exists()
 
 
 def test_an_arm_is_trained_and_judged_once(trained: Run, tmp_path: Path) -> None:

@@ -48,7 +48,9 @@ def test_a_drive_has_every_frame(drive: Clip) -> None:
 
 def test_a_camera_the_log_lacks_is_told(drive: Clip, tmp_path: Path) -> None:
     (log,) = find_logs(world.write(tmp_path, frames=2))
-    with pytest.raises(InputError, match="no camera 'behind'; there are: ahead, left"):
+    with pytest.raises(
+        InputError, match=r"no camera 'behind'; there are: ahead \(pcam_f0\), left \(pcam_l\d\)"
+    ):
         read_drive(log, (48, 96), ("behind",))
 
 

@@ -21,14 +21,15 @@ def score(
     k: int = 25,
     worst: int = 6,
 ) -> None:
-    """Score detections as a random finite set; write summary.json and report.html.
+    """Score detections as a random finite set; write summary.json, report.html and frames.jsonl.
 
     Args:
         results: nuScenes or COCO results (JSON), or a folder of KITTI's text; docs/sets.md says how such
             files state their uncertainty.
         truth: The truth in the same format; for COCO its instances.
         against: Other results on the same frames, to compare with.
-        out: Folder for summary.json and report.html.
+        out: Folder for summary.json, report.html and frames.jsonl: every frame's scores, which
+            `foredrive search index --scores` takes.
         family: What box densities are taken to be.
         k: Best associations that are listed where there are too many to be summed.
         worst: How many of the frames that lost most likelihood the report draws.
@@ -38,7 +39,12 @@ def score(
     from rich.console import Console
 
     from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
-    from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
+    from foredrive.evaluation.detections import (
+        compare_scores,
+        read_detections,
+        summarise_scores,
+        write_frame_scores,
+    )
     from foredrive.view.score_report import print_scores, write_score_report
 
     if worst < 0:
@@ -65,11 +71,12 @@ def score(
     figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
     figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
     write_summary(out / "summary.json", figures)
+    write_frame_scores(out / "frames.jsonl", scores)
     write_score_report(
         out / "report.html", f"{results.name} and the truth, {truth.name}", read, scores, result, worst
     )
     print_scores(figures, Console())
-    print(f"wrote {out / 'summary.json'} and {out / 'report.html'}")
+    print(f"wrote {out / 'summary.json'}, {out / 'report.html'} and {out / 'frames.jsonl'}")
 
 
 def _scored(read: "DetectionSet", k: int, path: Path) -> "list[FrameScore]":

@@ -3,6 +3,7 @@
 import functools
 import io
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +63,13 @@ def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> Pinhole
     """A camera by its own name ("CAM_FRONT") or by 123D's ("pcam_f0"), which all data sets share."""
     by_id = {metadata.camera_id.serialize(): metadata for metadata in cameras.values()}
     return cameras.get(name) or by_id.get(name)
+
+
+def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:
+    """Cameras as errors list them: by both names that `find_camera` knows."""
+    names = dict.fromkeys((metadata.camera_name, metadata.camera_id.serialize()) for metadata in cameras)
+    told = [own if own == shared else f"{own} ({shared})" for own, shared in names]
+    return ", ".join(told) or "none"
 
 
 def read_camera(

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch.utils.data import Dataset
 
 from foredrive.data.assemble import assemble_clip
-from foredrive.data.cameras import find_camera, pinhole_cameras
+from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.commands import command_at, target_at
 from foredrive.data.image_store import ImageStore
 from foredrive.data.labels import LabelStore, VoxelLabels
@@ -141,8 +141,8 @@ class ClipDataset(Dataset[Example]):
             return tuple(dict.fromkeys(name for cameras in self._cameras for name in cameras))
         for name in self.config.cameras:
             if not any(find_camera(cameras, name) for cameras in self._cameras):
-                there = sorted({name for cameras in self._cameras for name in cameras})
-                raise InputError(f"no log has a camera {name!r}; there are: {', '.join(there) or 'none'}")
+                there = told_cameras(camera for cameras in self._cameras for camera in cameras.values())
+                raise InputError(f"no log has a camera {name!r}; there are: {there}")
         return self.config.cameras
 
     def _command(self, log: Log, now: int) -> tuple[int | None, str]:

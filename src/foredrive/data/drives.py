@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data.assemble import assemble_clip
-from foredrive.data.cameras import find_camera, pinhole_cameras
+from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.image_store import ImageStore
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log, LogPath
@@ -56,7 +56,7 @@ def read_drive(
     chosen = [find_camera(there, name) for name in names]
     for name, camera in zip(names, chosen, strict=True):
         if camera is None:
-            raise InputError(f"{path.folder}: no camera {name!r}; there are: {', '.join(there) or 'none'}")
+            raise InputError(f"{path.folder}: no camera {name!r}; there are: {told_cameras(there.values())}")
     frames = list(range(len(log)))
     seen = read_rig(log, frames, chosen, names, ImageStore(cache_dir, image_hw), frames)
     sweeps = [_read_beams(log, frame) for frame in frames]

@@ -24,8 +24,8 @@ PART_FRAMES = 64
 """Embedded by one worker in one go: what memory holds does not grow with the length of logs."""
 FLUSH_ROWS, FLUSH_S = 20_000, 60.0
 """Rows are written in large batches, but no work of more than a minute is lost when a machine stops."""
-OPTIMISE_ROWS, OPTIMISE_WRITES = 100_000, 20
-"""What is added between two optimisations, as LanceDB advises."""
+COMPACT_WRITES = 100
+"""Writes before small files are merged: the disk holds all rows twice then, until old versions are dropped."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _one_by_one(
 
 
 class IndexWriter:
-    """Puts finished parts into an index, many at a time, and optimises it now and then.
+    """Puts finished parts into an index, many at a time, and compacts it now and then.
 
     A context: whatever waits at its end is put in, after an interruption as well.
     """
@@ -135,7 +135,7 @@ class IndexWriter:
         self._index = index
         self._waiting: list[tuple[Part, pa.Table]] = []
         self._flushed_s = time.monotonic()
-        self._since_rows = self._since_writes = 0
+        self._since_writes = 0
 
     def __enter__(self) -> "IndexWriter":
         return self
@@ -155,13 +155,12 @@ class IndexWriter:
         """Put in whatever still waits."""
         if self._waiting:
             self._index.add(self._waiting)
-            added = sum(len(rows) for _, rows in self._waiting)
-            self.rows += added
-            self._since_rows, self._since_writes = self._since_rows + added, self._since_writes + 1
+            self.rows += sum(len(rows) for _, rows in self._waiting)
+            self._since_writes += 1
             self._waiting = []
-        if self._since_rows >= OPTIMISE_ROWS or self._since_writes >= OPTIMISE_WRITES:
-            self._index.optimise()
-            self._since_rows = self._since_writes = 0
+        if self._since_writes >= COMPACT_WRITES:
+            self._index.compact()
+            self._since_writes = 0
         self._flushed_s = time.monotonic()
 
 

@@ -11,6 +11,7 @@ from foredrive.data import LogPath, find_logs
 from foredrive.data.convert import convert
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, read_summary
+from foredrive.files import atomic_path
 from foredrive.metrics import PROTOCOLS
 from foredrive.recipes.config import Recipe, Stage, rescheduled
 from foredrive.recipes.evaluate import SUMMARY, evaluate_run
@@ -76,12 +77,17 @@ def pandaset_log(root: Path) -> LogPath:
     Raises:
         InputError: there is no raw PandaSet here.
     """
-    if root.is_dir():
-        return find_logs(root)[0]
+    if not root.is_dir():
+        with atomic_path(root) as temporary:
+            convert(_raw_pandaset(), "pandaset", temporary)
+    return find_logs(root)[0]
+
+
+def _raw_pandaset() -> Path:
     source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
     if not source.is_dir():
         raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
-    return convert(source, "pandaset", root)[0]
+    return source
 
 
 def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:

@@ -128,13 +128,17 @@ class FrameIndex:
             table.delete(f"log = {quoted(log)}")
         self._frames.delete(f"log = {quoted(log)}")
 
+    def compact(self) -> None:
+        """Merge small files and drop old versions; put new rows into partitions that there are."""
+        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
+
     def optimise(self, *, exact_up_to: int = EXACT_UP_TO) -> None:
-        """Merge small files and drop old versions; bring what embeddings are looked up in up to date.
+        """Compact, and partition the rows of which there are many by what they are looked up by.
 
         Args:
-            exact_up_to: so many rows need none of that.
+            exact_up_to: so many rows need no partitions.
         """
-        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
+        self.compact()
         if self.count() > exact_up_to:
             for name in EMBEDDINGS:
                 rows = self.count(f"{name} IS NOT NULL")

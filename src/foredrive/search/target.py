@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from foredrive.data.cameras import CameraFrame, find_camera, pinhole_cameras, read_camera
+from foredrive.data.cameras import CameraFrame, find_camera, pinhole_cameras, read_camera, told_cameras
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log, LogPath, find_logs
 from foredrive.errors import InputError
@@ -121,9 +121,8 @@ def _cropped(log: Log, frame: int, like: Like, *, with_lidar: bool) -> View:
     """A part of an image as a view of its own: a camera with another middle."""
     metadata = find_camera(pinhole_cameras(log), like.view)
     if metadata is None:
-        raise InputError(
-            f"{log.path.name}: no camera {like.view}; there are {', '.join(pinhole_cameras(log))}"
-        )
+        there = told_cameras(pinhole_cameras(log).values())
+        raise InputError(f"{log.path.name}: no camera {like.view}; there are: {there}")
     camera = read_camera(log, frame, metadata, (metadata.height, metadata.width), with_image=True)
     assert like.crop_px is not None
     left, top, right, bottom = like.crop_px

@@ -1,6 +1,7 @@
 """Files of detections beside truth: read, scored as random finite sets and by the usual metrics, compared."""
 
 from foredrive.evaluation.detections.files import read_detections
+from foredrive.evaluation.detections.frame_file import write_frame_scores
 from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.evaluation.detections.score import FrameScore, predicted_set, score_frames
 from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
@@ -15,4 +16,5 @@ __all__ = [
     "read_detections",
     "score_frames",
     "summarise_scores",
+    "write_frame_scores",
 ]
