@@ -1,11 +1,13 @@
 """What a user sees when a verb cannot go on: one line and an exit code."""
 
+import dataclasses
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -154,11 +156,20 @@ def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str])
     said = capsys.readouterr().out
     function = program.VERBS[verb]
     assert (function.__doc__ or "").split("\n")[0] in " ".join(said.split())
-    for name in function.__annotations__:
-        if name != "return":
-            sentence = function.__doc__.partition(f"        {name}: ")[2].split()[:3]
-            assert len(sentence) == 3, f"{verb}: no sentence about {name}"
-            assert " ".join(sentence) in " ".join(said.replace("│", " ").split())
+    for explained, name in flags_of(function):
+        sentence = (explained.__doc__ or "").partition(f"        {name}: ")[2].split()[:3]
+        assert len(sentence) == 3, f"{verb}: no sentence about {name}"
+        assert " ".join(sentence) in " ".join(said.replace("│", " ").split())
+
+
+def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
+    """A verb's flags, those of its groups too, and whose docstring explains each."""
+    for name, kind in verb.__annotations__.items():
+        group = get_args(kind)[0] if get_args(kind) else kind
+        if dataclasses.is_dataclass(group):
+            yield from flags_of(group)
+        elif name != "return":
+            yield verb, name
 
 
 @pytest.mark.parametrize(

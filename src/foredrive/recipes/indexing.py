@@ -25,7 +25,7 @@ PART_FRAMES = 64
 FLUSH_ROWS, FLUSH_S = 20_000, 60.0
 """Rows are written in large batches, but no work of more than a minute is lost when a machine stops."""
 COMPACT_WRITES = 100
-"""Writes before small files are merged: the disk holds all rows twice then, until old versions are dropped."""
+"""Writes before files are merged; until old versions are dropped, the disk then holds all rows twice."""
 
 
 @dataclass(frozen=True)
