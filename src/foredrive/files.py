@@ -14,7 +14,7 @@ WHILE_WRITING = "while writing "
 
 
 @contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
+def naming(path: Path | str) -> Iterator[None]:
     """Note on errors of the block (a full disk) what it writes: they may name a scratch file, or nothing."""
     try:
         yield

@@ -1,6 +1,8 @@
 """`foredrive search` from logs to lists of clips, and what it says where it cannot go on."""
 
+import os
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,27 @@ def test_a_text_finds_pictures_and_clips(
     assert main(["search", "--untag", "few", *index]) == 0
     assert main(["search", "--tagged", "few", *index]) == 0
     assert "nothing found among 9 rows" in capsys.readouterr().out
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = f"search index {find_logs(root)[0].folder} --towers {root / 'clip'} --workers 1 --index /sys/index"
+    assert main(shlex.split(line)) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told in [
+        f"foredrive: /sys/index: {why}" for why in ("permission denied", "nothing can be written there")
+    ]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_an_index_that_may_only_be_read_is_one_line(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    index = shutil.copytree(root / "index", tmp_path / "index")
+    for path in (index, *index.rglob("*")):
+        path.chmod(path.stat().st_mode & ~0o222)
+    assert main(["search", "rain", "--index", str(index)]) == 0
+    assert main(["search", "rain", "--index", str(index), "--tag", "wet"]) == 2
+    assert capsys.readouterr().err == f"foredrive: {index}: permission denied\n"
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,7 @@ DISK_ERRORS = {
     errno.EFBIG: "larger than files may be here",
     errno.EROFS: "the disk is read-only",
     errno.EACCES: "permission denied",
+    errno.EPERM: "nothing can be written there",
     errno.EEXIST: "there is a file of that name",
     errno.ENOTDIR: "a part of this path is a file",
     errno.EISDIR: "there is a folder of that name",

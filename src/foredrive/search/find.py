@@ -63,8 +63,6 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     _check(query, target)
     where = _conditions(index, query, target)
     total = index.count(where)
-    if not total and query.modality == "lidar" and not index.count("lidar IS NOT NULL"):
-        raise InputError(f"{index.uri}: no lidar embeddings; the towers {index.making.towers} made none")
     exact = target is None or total <= exact_up_to
     wanted = query.top * (POOL_PER_HIT if query.diverse else 1)
     limit = wanted * CANDIDATES_PER_HIT
@@ -77,6 +75,8 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
         if exact or reranked or len(order) >= wanted or limit >= total:
             break
         limit *= MORE
+    if not order and query.modality == "lidar" and not index.count("lidar IS NOT NULL"):
+        raise InputError(f"{index.uri}: no lidar embeddings; the towers {index.making.towers} made none")
     if query.diverse is not None:
         order = [order[n] for n in _diverse(rows, order, score, query)]
     kept = rows.take(pa.array(order, pa.int64()))
@@ -117,8 +117,6 @@ def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str |
         conditions.append(query.where_view)
     if query.tag is not None:
         conditions.append(where_tagged(index.uri, query.tag))
-    if target is not None:
-        conditions.append(f"{query.modality} IS NOT NULL")
     if target is not None and target.moment is not None:
         log, t_us = target.moment
         gap_us = max(round(query.gap_s * 1e6), 1)

@@ -11,6 +11,7 @@ import pyarrow as pa
 from jaxtyping import Float
 
 from foredrive.errors import InputError
+from foredrive.files import naming
 from foredrive.search.rows import EMBEDDINGS, FACTS, SCORES, row_schema
 from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list, understanding
 
@@ -116,10 +117,11 @@ class FrameIndex:
     def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
         """Put parts in; rows of the same moments, which an interrupted call has left, give way."""
         rows = pa.concat_tables([rows for _, rows in parts])
-        self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
-        self._put(rows)
         told = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
-        make_table(self.uri, PARTS, _PART_SCHEMA).add(told)
+        with naming(self.uri):
+            self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
+            self._put(rows)
+            make_table(self.uri, PARTS, _PART_SCHEMA).add(told)
 
     def drop(self, log: str) -> None:
         """Take a log out: it has changed."""
@@ -130,7 +132,8 @@ class FrameIndex:
 
     def compact(self) -> None:
         """Merge small files and drop old versions; put new rows into partitions that there are."""
-        self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
+        with naming(self.uri):
+            self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
 
     def optimise(self, *, exact_up_to: int = EXACT_UP_TO) -> None:
         """Compact, and partition the rows of which there are many by what they are looked up by.

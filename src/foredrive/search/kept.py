@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import pyarrow as pa
 
+from foredrive.files import naming
 from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list
 
 _TAGS = pa.schema([("tag", pa.string()), ("key", pa.string())])
@@ -17,14 +18,16 @@ def add_tag(uri: str, tag: str, keys: Iterable[str]) -> None:
     """Give moments of the index at `uri`, by their keys, a tag; those that have it keep it."""
     rows = [{"tag": tag, "key": key} for key in sorted({*keys} - {*tagged(uri, tag)})]
     if rows:
-        make_table(uri, "tags", _TAGS).add(pa.Table.from_pylist(rows, schema=_TAGS))
+        with naming(uri):
+            make_table(uri, "tags", _TAGS).add(pa.Table.from_pylist(rows, schema=_TAGS))
 
 
 def remove_tag(uri: str, tag: str) -> None:
     """Take a tag away from all that have it."""
     table = find_table(uri, "tags")
     if table is not None:
-        table.delete(f"tag = {quoted(tag)}")
+        with naming(uri):
+            table.delete(f"tag = {quoted(tag)}")
 
 
 def tagged(uri: str, tag: str) -> list[str]:
@@ -40,9 +43,10 @@ def where_tagged(uri: str, tag: str) -> str:
 
 def save_query(uri: str, name: str, query: str) -> None:
     """Keep a query, in place of one of the same name."""
-    table = make_table(uri, "queries", _QUERIES)
-    table.delete(f"name = {quoted(name)}")
-    table.add(pa.Table.from_pylist([{"name": name, "query": query}], schema=_QUERIES))
+    with naming(uri):
+        table = make_table(uri, "queries", _QUERIES)
+        table.delete(f"name = {quoted(name)}")
+        table.add(pa.Table.from_pylist([{"name": name, "query": query}], schema=_QUERIES))
 
 
 def saved_queries(uri: str) -> dict[str, str]:
