@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from statistics import fmean
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.metrics import psnr_db, ssim
 from foredrive.metrics.lidar_rendering import SweepScores, score_sweep
 from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
 
 MOVING_MPS = 0.5
@@ -21,7 +22,11 @@ MOVING_MPS = 0.5
 
 @torch.no_grad()
 def judge_cameras(
-    scene: RebuiltScene, views: Sequence[CameraView], learned: Sequence[CameraView]
+    scene: RebuiltScene,
+    views: Sequence[CameraView],
+    learned: Sequence[CameraView],
+    graph: SceneGraph | None = None,
+    where: Sequence[Bool[Tensor, "H W"]] | None = None,
 ) -> dict[str, float]:
     """PSNR and SSIM, mean over images; beside them those of the nearest image that was learned from.
 
@@ -32,18 +37,20 @@ def judge_cameras(
         scene: that is judged.
         views: with images, that it has not seen.
         learned: what it has seen; the nearest in time of the same camera is the rival.
+        graph: the scene after edits; None: as it was learned.
+        where: pixels that count, of each view; None: all.
     """
     if not views:
         return {}
     found: dict[str, list[float]] = defaultdict(list)
-    graph, took_s, pixels = scene.graph, 0.0, 0
-    for view in views:
+    graph, took_s, pixels = graph or scene.graph, 0.0, 0
+    for number, view in enumerate(views):
         started = time.perf_counter()
         rgb = scene(graph, view.to(scene.actor.device)).rgb.clamp(0, 1)[None].cpu()
         took_s += time.perf_counter() - started
         pixels += view.size_hw[0] * view.size_hw[1]
         real = _image(view)
-        known = torch.ones_like(real[:, 0], dtype=torch.bool)
+        known = torch.ones_like(real[:, 0], dtype=torch.bool) if where is None else where[number][None]
         rivals = [other for other in learned if other.sensor == view.sensor]
         shown = {"": rgb}
         if rivals:
@@ -66,29 +73,40 @@ def _image(view: CameraView) -> Float[Tensor, "1 3 H W"]:
 
 
 @torch.no_grad()
-def judge_sweeps(scene: RebuiltScene, views: Sequence[SweepView], *, drop: bool = True) -> dict[str, float]:
+def judge_sweeps(
+    scene: RebuiltScene,
+    views: Sequence[SweepView],
+    *,
+    drop: bool = True,
+    graph: SceneGraph | None = None,
+    where: Sequence[Bool[Tensor, "P"]] | None = None,
+) -> dict[str, float]:
     """The figures of `SweepScores`, mean over sweeps.
 
     Args:
         scene: that is judged.
         views: that it has not seen.
         drop: beams that are more likely to be lost than not are taken as such; False: all return.
+        graph: the scene after edits; None: as it was learned.
+        where: beams that count, of each view; None: all.
     """
     if not views:
         return {}
     scores: list[SweepScores] = []
-    graph, took_s, beams_seen = scene.graph, 0.0, 0
-    for view in views:
+    graph, took_s, beams_seen = graph or scene.graph, 0.0, 0
+    for number, view in enumerate(views):
         points = scene.prepare_sweep(view)
         started = time.perf_counter()
         seen = scene.sweep(graph, points, view.t_s)
         took_s += time.perf_counter() - started
-        beams, beams_seen = view.beams, beams_seen + len(view.beams.dt_s)
+        beams_seen += len(view.beams.dt_s)
+        some = slice(None) if where is None else where[number]
+        beams = view.beams[some]
         scores.append(
             score_sweep(
-                range_m=seen.hit_range_m.cpu(),
-                intensity=seen.intensity.cpu(),
-                dropped=~seen.returned.cpu() & drop,
+                range_m=seen.hit_range_m.cpu()[some],
+                intensity=seen.intensity.cpu()[some],
+                dropped=~seen.returned.cpu()[some] & drop,
                 real_range_m=beams.range_m,
                 real_intensity=beams.intensity,
                 returned=beams.returned,

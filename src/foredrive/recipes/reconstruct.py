@@ -18,6 +18,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
 from foredrive.files import atomic_path
+from foredrive.recipes.calibration_doubts import calibration_doubts
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.rendering.initial import initial_scene
@@ -68,6 +69,7 @@ class Rebuilt:
     recipe: RebuildRecipe
     summary: dict[str, float | int | str | None]
     scene: RebuiltScene
+    learned: Seen
     held_out: Seen
     """What the scene was judged on."""
 
@@ -99,6 +101,9 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
     weights = folder / WEIGHTS
     if not weights.is_file():
+        seen, names = material.learned, material.vehicle.rig.names
+        for doubt in calibration_doubts(names, seen.cameras, seen.sweeps, material.tracks):
+            _log.warning("%s: is the calibration right? %s", path.folder, doubt)
         rebuild(scene, material.learned, recipe.schedule, folder)
         add_unseen_ground(scene, material.vehicle.T_scene_ego, material.learned.cameras)
         with atomic_path(weights) as temporary:
@@ -109,7 +114,7 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
         write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, material))
     if not (folder / GAUSSIANS).is_file():
         write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
-    return Rebuilt(folder, recipe, read_summary(folder / SUMMARY), scene, material.held_out)
+    return Rebuilt(folder, recipe, read_summary(folder / SUMMARY), scene, material.learned, material.held_out)
 
 
 def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:

@@ -52,7 +52,7 @@ def lidar_points(
         returned = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, returned.points_ego)
         states = states_at(tracks, sweep.t_s)
-        owner = _owners(xyz, returned.dt_s, states, tracks)
+        owner = owners(xyz, returned.dt_s, states, tracks)
         velocity = torch.cat([states.velocity_mps, torch.zeros(1, 3)])[owner]
         points = SeedPoints(
             xyz,
@@ -102,7 +102,7 @@ def points_along_pixels(
         sweep = sweeps[int((moments_s - view.t_s).abs().argmin())]
         beams = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, beams.points_ego)
-        standing = _owners(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
+        standing = owners(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
         T_cam_scene = inverse_se3(view.T_scene_cam)
         uv_beam, _, inside = project(transform_points(T_cam_scene, xyz), view.K, view.dist, view.size_hw)
         away_m = _even_in_inverse(share, far_m, generator)
@@ -171,7 +171,7 @@ def all_points(parts: list[SeedPoints]) -> SeedPoints:
     return SeedPoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
-def _owners(
+def owners(
     xyz: Float[Tensor, "N 3"], dt_s: Float[Tensor, "N"], states: ActorStates, tracks: Tracks
 ) -> Int[Tensor, "N"]:
     """In whose box each point lies at the time of its beam."""

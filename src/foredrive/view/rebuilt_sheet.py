@@ -12,6 +12,7 @@ from torch import Tensor
 from foredrive.files import atomic_path
 from foredrive.metrics import psnr_db
 from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView
 from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
 
@@ -21,7 +22,13 @@ WIDTH_IN = 4.0
 
 
 @torch.no_grad()
-def write_rebuilt_sheet(path: Path, scene: RebuiltScene, views: Sequence[CameraView], title: str) -> None:
+def write_rebuilt_sheet(
+    path: Path,
+    scene: RebuiltScene,
+    views: Sequence[CameraView],
+    title: str,
+    graph: SceneGraph | None = None,
+) -> None:
     """Write some views as a PNG: as seen, as rendered, the difference, and how far things are.
 
     Args:
@@ -29,6 +36,7 @@ def write_rebuilt_sheet(path: Path, scene: RebuiltScene, views: Sequence[CameraV
         scene: that is shown.
         views: with images; some of them, spread over the drive, are shown.
         title: of the picture.
+        graph: the scene after edits; None: as it was learned.
     """
     chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(ROWS, len(views))).round().astype(int)]
     height = WIDTH_IN * max(view.size_hw[0] / view.size_hw[1] for view in chosen) + 0.3
@@ -37,7 +45,7 @@ def write_rebuilt_sheet(path: Path, scene: RebuiltScene, views: Sequence[CameraV
     figure.suptitle(title)
     for row, view in zip(axes, chosen, strict=True):
         assert view.image is not None
-        picture = scene(scene.graph, view.to(scene.actor.device))
+        picture = scene(graph or scene.graph, view.to(scene.actor.device))
         real, rgb = view.image.float() / 255, picture.rgb.clamp(0, 1).cpu()
         known = torch.ones(1, *view.size_hw, dtype=torch.bool)
         quality = float(psnr_db(rgb[None], real[None], known))

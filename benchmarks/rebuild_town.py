@@ -1,0 +1,135 @@
+"""A drive of a town rebuilt, and judged where the truth is known: off the driven lane, and after edits.
+
+`foredrive bench rebuild-town`. The front camera and the lidar of a drive are learned from every second frame.
+The scene is then looked at from the poses that were held out, from beside them, and with a road user removed
+or moved; beside each view stands what the town's own sensors see there. Each arm is a run, kept in
+runs/rebuild_town/COMMIT, that goes on where it stopped.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from foredrive.evaluation import Benchmark
+from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
+from foredrive.recipes.rebuilt_towns import TownDrive, TownTruth, TrueViews
+from foredrive.recipes.reconstruct import Rebuilt, reconstruct
+from foredrive.recipes.study import work_folder
+from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
+
+WORK = work_folder(Path("runs/rebuild_town"))
+DRIVE = TownDrive("Town10HD", seed=3)
+PASSED = 18
+"""A car in the lane to the right, which is overtaken."""
+EDITS: dict[str, tuple[Edit, ...]] = {
+    "held_out": (),
+    "left_2m": (ShiftEgo((0.0, 2.0, 0.0)),),
+    "left_3m": (ShiftEgo((0.0, 3.0, 0.0)),),
+    "right_2m": (ShiftEgo((0.0, -2.0, 0.0)),),
+    "right_3m": (ShiftEgo((0.0, -3.0, 0.0)),),
+    "removed": (Remove(PASSED),),
+    "moved": (Move(PASSED, offset_m=(3.0, 2.0, 0.0)),),
+}
+JUDGED_EVERY = 8
+"""Of the frames, from the second on: a quarter of those that are held out."""
+CHANGED, CHANGED_M = 4, 0.1
+"""What an edit really changes: pixels by more than this (of 255), and beams whose range is another."""
+FEWEST = 20
+"""Pixels or beams that must have changed for a view to count."""
+OF_IMAGES = ("psnr_db", "ssim", "nearest.psnr_db", "nearest.ssim")
+OF_SWEEPS = ("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2")
+RECIPE = dataclasses.replace(gaussians_tiny(), cameras=DRIVE.cameras)
+ARMS: dict[str, RebuildRecipe] = {
+    "gaussians": RECIPE,
+    "static_only": dataclasses.replace(RECIPE, actors=False),
+}
+
+
+@functools.cache
+def truth() -> TownTruth:
+    """The town that is driven in."""
+    return TownTruth(DRIVE)
+
+
+@functools.cache
+def true_views(name: str) -> list[TrueViews]:
+    """What is really seen after the edits of a name."""
+    return [truth().seen(frame, EDITS[name]) for frame in range(1, DRIVE.frames, JUDGED_EVERY)]
+
+
+def rebuilt(arm: str, seed: int) -> dict[str, float]:
+    """Figures of one run: "VIEWS.FIGURE", and "VIEWS.changed.FIGURE" of what an edit really changes."""
+    recipe = dataclasses.replace(ARMS[arm], schedule=dataclasses.replace(ARMS[arm].schedule, seed=seed))
+    run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
+    figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
+    for name, edits in EDITS.items():
+        edited = any(isinstance(edit, Move | Remove) for edit in edits)
+        if edited and not recipe.actors:
+            continue
+        graph = apply_edits(run.scene.graph, edits).graph
+        views, title = true_views(name), f"{name}, beside what the town's camera sees there"
+        figures |= named(f"{name}.", judge(run, views, graph))
+        if edited:
+            figures |= judge_changed(run, name, graph)
+        cameras = [camera for view in views for camera in view.cameras]
+        write_rebuilt_sheet(run.folder / f"{name}.png", run.scene, cameras, title, graph)
+    return figures
+
+
+def judge(run: Rebuilt, views: Sequence[TrueViews], graph: SceneGraph) -> dict[str, float]:
+    """All figures of views, over all they show."""
+    cameras = [camera for view in views for camera in view.cameras]
+    found = judge_cameras(run.scene, cameras, run.learned.cameras, graph)
+    found |= judge_sweeps(run.scene, [view.sweep for view in views], graph=graph)
+    return {name: found[name] for name in OF_IMAGES + OF_SWEEPS}
+
+
+def judge_changed(run: Rebuilt, name: str, graph: SceneGraph) -> dict[str, float]:
+    """The same of what an edit really changes alone, and of the scene without that edit."""
+    pixels, beams = [], []
+    for before, after in zip(true_views("held_out"), true_views(name), strict=True):
+        pixels += list(zip(after.cameras, map(changed_pixels, before.cameras, after.cameras), strict=True))
+        beams.append((after.sweep, changed_beams(before.sweep, after.sweep)))
+    pixels, beams = ([seen for seen in some if int(seen[1].sum()) >= FEWEST] for some in (pixels, beams))
+    found = {}
+    for prefix, shown in (("changed.", graph), ("unedited.changed.", run.scene.graph)):
+        cameras, where = zip(*pixels, strict=True)
+        figures = judge_cameras(run.scene, cameras, run.learned.cameras, shown, where)
+        sweeps, which = zip(*beams, strict=True)
+        figures |= judge_sweeps(run.scene, sweeps, graph=shown, where=which)
+        found |= named(f"{name}.{prefix}", {key: figures[key] for key in OF_IMAGES + OF_SWEEPS})
+    return found
+
+
+def changed_pixels(before: CameraView, after: CameraView) -> Bool[Tensor, "H W"]:
+    assert before.image is not None
+    assert after.image is not None
+    return (before.image.int() - after.image.int()).abs().amax(0) > CHANGED
+
+
+def changed_beams(before: SweepView, after: SweepView) -> Bool[Tensor, "P"]:
+    one, other = before.beams, after.beams
+    return (one.returned != other.returned) | ((one.range_m - other.range_m).abs() > CHANGED_M)
+
+
+def named(prefix: str, figures: Mapping[str, float]) -> dict[str, float]:
+    return {prefix + name: value for name, value in figures.items()}
+
+
+BENCHMARK = Benchmark(
+    question="How true is a rebuilt town off the driven lane, and with a road user removed or moved?",
+    arms={arm: functools.partial(rebuilt, arm) for arm in ARMS},
+    config={
+        "drive": dataclasses.asdict(DRIVE),
+        "edits": {name: [dataclasses.asdict(edit) for edit in edits] for name, edits in EDITS.items()},
+        "arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()},
+    },
+)

@@ -1,0 +1,150 @@
+"""Drives of towns to be rebuilt, and what their sensors would really see of the scene after edits."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, sensor_twist
+from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo
+from foredrive.rendering.free_views import free_camera
+from foredrive.rendering.vehicle import EgoMoment
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.towns.actors import ActorState
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, find_lidar
+from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.world import World
+
+
+@dataclass(frozen=True)
+class TownDrive:
+    """A drive that comes out the same each time: as a log, and as the town it was recorded in."""
+
+    town: str
+    seed: int
+    seconds: float = 8.0
+    rate_hz: float = 10.0
+    crowd: Crowd = dataclasses.field(default_factory=lambda: Crowd(vehicles=60, people=20))
+    cameras: tuple[str, ...] = ("PCAM_F0",)
+    image_hw: tuple[int, int] = (270, 480)
+    readout_s: float = 0.03
+    lidar: str = "pandar64"
+
+    @cached_property
+    def sensors(self) -> SensorSuite:
+        """What the vehicle carries."""
+        rig = camera_rig(self.image_hw, self.readout_s)
+        rows = [rig.names.index(name) for name in self.cameras]
+        return SensorSuite(dataclasses.replace(rig[rows], names=self.cameras), find_lidar(self.lidar))
+
+    @property
+    def frames(self) -> int:
+        """Length of the log."""
+        return max(1, round(self.seconds * self.rate_hz))
+
+    def recorded(self, out: Path) -> LogPath:
+        """The log in a 123D data root, recorded if it is not there yet: without labels but boxes."""
+        name = f"{self.town}_seed{self.seed}"
+        path = LogPath(out / "logs" / split_of(self.town) / name, out / "maps")
+        if path.folder.is_dir():
+            return path
+        labels = LabelKinds(occupancy=None, visibility=False, captions=False)
+        return record(
+            self.town,
+            self.seconds,
+            self.seed,
+            out,
+            self.rate_hz,
+            self.sensors,
+            self.crowd,
+            labels,
+            log_name=name,
+        )
+
+
+@dataclass(frozen=True)
+class TrueViews:
+    """What all sensors see at one time."""
+
+    cameras: list[CameraView]
+    """With images."""
+    sweep: SweepView
+
+
+class TownTruth:
+    """The town of a drive, as its sensors see it from anywhere, with road users moved or not there."""
+
+    def __init__(self, drive: TownDrive) -> None:
+        self.drive = drive
+        town = load_town_map(drive.town)
+        self._world = World(town, drive.seed)
+        traffic = Traffic(town, drive.seed, drive.crowd.vehicles + 1, drive.crowd.people)
+        moments = Drive(traffic, drive.seconds).moments(drive.frames, 1 / drive.rate_hz)
+        self.moments: list[Moment] = list(moments)
+
+    def seen(self, frame: int, edits: Sequence[Edit] = ()) -> TrueViews:
+        """What the sensors see at a frame's time after edits, in the frame of the first ego pose.
+
+        Args:
+            frame: of the log.
+            edits: `Move` and `Remove` of road users that are not parked, and `ShiftEgo`.
+
+        Raises:
+            InputError: on another kind of edit.
+        """
+        moment, sensors = self.moments[frame], self.drive.sensors
+        actors, T_ego_shifted = _edited(moment.actors, edits)
+        T_world_ego = moment.T_world_ego @ T_ego_shifted.numpy()
+        twist_ego = sensor_twist(T_ego_shifted, torch.from_numpy(moment.twist_ego))
+        picture = self._world.render(
+            actors, sensors, T_world_ego, twist_ego.numpy(), noise_seed=frame, lights=moment.lights
+        )
+        T_world_scene = torch.from_numpy(self.moments[0].T_world_ego)
+        T_scene_ego = (inverse_se3(T_world_scene) @ torch.from_numpy(T_world_ego)).float()
+        seen_from = EgoMoment(T_scene_ego, twist_ego.float(), moment.t_s)
+        cameras = [
+            dataclasses.replace(
+                free_camera(sensors.rig, number, seen_from), image=torch.from_numpy(image).permute(2, 0, 1)
+            )
+            for number, image in enumerate(picture.images.values())
+        ]
+        sweep = SweepView(picture.sweep, True, T_scene_ego, seen_from.twist_ego, moment.t_s)
+        return TrueViews(cameras, sweep)
+
+
+def _edited(
+    actors: list[ActorState], edits: Sequence[Edit]
+) -> tuple[list[ActorState], Float64[Tensor, "4 4"]]:
+    """Road users after edits, and where the ego vehicle is in the frame it was driven in."""
+    T_ego_shifted = torch.eye(4, dtype=torch.float64)
+    for edit in edits:
+        if isinstance(edit, Remove):
+            actors = [actor for actor in actors if actor.track_id != edit.actor]
+        elif isinstance(edit, Move):
+            actors = [_moved(actor, edit) if actor.track_id == edit.actor else actor for actor in actors]
+        elif isinstance(edit, ShiftEgo):
+            yaw, offset_m = (torch.tensor(x, dtype=torch.float64) for x in (edit.yaw_rad, edit.offset_m))
+            T_ego_shifted = T_ego_shifted @ matrix_from_yaw(yaw, offset_m)
+        else:
+            raise InputError(f"road users of a town can be moved and removed, not: {edit.kind}")
+    return actors, T_ego_shifted
+
+
+def _moved(actor: ActorState, edit: Move) -> ActorState:
+    """An actor elsewhere, by an offset and a turn in its own frame; over ground it moves as it did."""
+    cos, sin = np.cos(actor.yaw), np.sin(actor.yaw)
+    forward_m, left_m, up_m = edit.offset_m
+    shift = np.array([cos * forward_m - sin * left_m, sin * forward_m + cos * left_m, up_m])
+    return dataclasses.replace(actor, centre_m=actor.centre_m + shift, yaw=actor.yaw + edit.yaw_rad)
