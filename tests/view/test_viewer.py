@@ -18,7 +18,8 @@ from foredrive.recipes.vision import Vision
 from foredrive.scene import Trajectory, VoxelSpec
 from foredrive.view.log_times import LogTimes
 from foredrive.view.model_panel import pinhole
-from foredrive.view.viewer import Viewer, free_port
+from foredrive.view.page import free_port
+from foredrive.view.viewer import Viewer
 from foredrive.view.volume_nodes import arrows, shown_voxels
 from foredrive.view.voxel_drawing import pca_colours
 
@@ -54,7 +55,7 @@ def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
     viewer.close()
     for _ in range(100):
         try:
-            socket.create_connection(("localhost", viewer.port), 5).close()
+            socket.create_connection(("localhost", viewer.server.get_port()), 5).close()
         except ConnectionRefusedError:
             return
         time.sleep(0.1)

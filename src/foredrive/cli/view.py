@@ -10,24 +10,33 @@ from foredrive.cli.arguments import OptionalPath
 if TYPE_CHECKING:
     from foredrive.recipes import Run
 
+EDITS = "edits.json"
+RUN_CONFIG = "config.yaml"
+"""What folders of runs have, and those of logs do not."""
+
 
 def view(
     log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
     run: OptionalPath = None,
+    edits: OptionalPath = None,
     save: OptionalPath = None,
     t: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None,
     reach: Annotated[float, tyro.conf.arg(metavar="METRES")] = 50.0,
     host: str = "localhost",
     port: int = 8080,
 ) -> None:
-    """Look at a log: in 3-D and over time on a page in the browser, or one time of it as a picture.
+    """Look at a log, or at one that was rebuilt: in 3-D and over time on a page in the browser. Of a log one
+    time can be had as a picture, too; in a rebuilt one actors can be dragged, removed and added.
 
     Args:
-        log: Folder of a 123D log, or of a split or data root with exactly one log in it.
+        log: Folder of a 123D log, or of a split or data root with exactly one log in it; or that of a
+            reconstruction.
         run: Folder of a trained run: the page shows what its model sees, imagines and plans, too.
+        edits: Of a reconstruction: file of edits to begin with, where the page saves them, too; by default it
+            saves them as "edits.json" in the run's folder, and begins without any.
         save: Write a picture (PNG) and serve no page: every camera with lidar and boxes, and the scene from
             above with the map.
-        t: Time since the log's start, s; by default the middle of the log.
+        t: Time since the log's start, s; by default the middle of the log, of a reconstruction the start.
         reach: How far the picture's view from above looks in each direction, m.
         host: Where the page is served; other machines see it at 0.0.0.0.
         port: The page's port; the next free one if it is taken.
@@ -37,6 +46,13 @@ def view(
     from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
     from foredrive.view.log_times import LogTimes
 
+    if (log / RUN_CONFIG).is_file():
+        if run is not None or save is not None:
+            raise InputError(f"{log}: --run and --save are for logs; `foredrive render` films rebuilt ones")
+        _serve_rebuilt(log, edits, t, host, port)
+        return
+    if edits is not None:
+        raise InputError(f"{log}: --edits are for the folder of a reconstruction")
     logs = find_logs(log)
     if len(logs) > 1:
         raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
@@ -64,3 +80,23 @@ def _opened(run: Path) -> "Run":
     from foredrive.recipes import open_run  # only now: a log alone needs none of it
 
     return open_run(run)
+
+
+def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
+    from foredrive.recipes.rebuilt_runs import edited_scene, open_rebuilt
+    from foredrive.rendering.edits import load_edits
+    from foredrive.view.rebuilt_viewer import RebuiltViewer
+
+    run = open_rebuilt(folder)
+    if t_s is not None:
+        run.vehicle.check_time(t_s)
+    known = [] if edits is None else load_edits(edits)
+    edited_scene(run.scene, known)
+    viewer = RebuiltViewer(run, known, edits or folder / EDITS, host, port)
+    try:
+        if t_s is not None:
+            viewer.show(t_s)
+        print(f"{folder.name} is at {viewer.url} until you press Ctrl-C")
+        viewer.play()
+    finally:
+        viewer.close()

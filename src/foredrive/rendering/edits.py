@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.rendering.scene_graph import SceneGraph, joined
 from foredrive.rendering.tracks import Tracks
 
@@ -145,8 +146,28 @@ def apply_edits(
     return Edited(graph, T_ego_shifted)
 
 
+def move_between(
+    actor: int, T_scene_before: Float[Tensor, "4 4"], T_scene_after: Float[Tensor, "4 4"]
+) -> Move:
+    """The edit that takes an actor from one pose to another of the same moment; of its turn the yaw alone."""
+    change = (inverse_se3(T_scene_before) @ T_scene_after).tolist()
+    forward_m, left_m, up_m = (row[3] for row in change[:3])
+    return Move(actor, (forward_m, left_m, up_m), math.atan2(change[1][0], change[0][0]))
+
+
+def free_id(graph: SceneGraph) -> int:
+    """An id that no actor has, for a copy."""
+    return max(graph.tracks.track_id.tolist(), default=0) + 1
+
+
 def save_edits(edits: Sequence[Edit], path: Path) -> None:
-    """Write edits as JSON."""
+    """Write edits as JSON.
+
+    Raises:
+        InputError: if there is a file of something else, which is left as it is.
+    """
+    if path.exists():
+        load_edits(path)
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps([dataclasses.asdict(edit) for edit in edits], indent=1) + "\n")
 

@@ -87,12 +87,13 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
 
 def caption_of(edits: Sequence[Edit]) -> str:
     """What was changed, in words."""
-    words = [_said(edit) for edit in edits[:MOST_EDITS]]
+    words = [words_of(edit) for edit in edits[:MOST_EDITS]]
     more = len(edits) - MOST_EDITS
     return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
 
 
-def _said(edit: Edit) -> str:
+def words_of(edit: Edit) -> str:
+    """What an edit changes."""
     if isinstance(edit, Remove):
         return f"without {edit.actor}"
     if isinstance(edit, Move):
@@ -138,7 +139,7 @@ def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) 
     returned = sweep[sweep.returned & sweep.valid]
     points = returned.points_ego.numpy()
     order = points[:, 2].argsort(kind="stable")
-    colours = _colours(returned, colour)[order]
+    colours = sweep_colours(returned, colour)[order]
     u, v = pixels(points[order, :2]).astype(int).T
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
         x, y = u + right, v + down
@@ -161,7 +162,8 @@ def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) 
     return image
 
 
-def _colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]:
+def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]:
+    """Colours of returns by their height over the ground, or by how bright they are."""
     if colour == "height":
         share = (sweep.points_ego[:, 2].numpy() - LOW_M) / (HIGH_M - LOW_M)
         mapped = palette.HEIGHT_MAP(share.clip(0, 1))

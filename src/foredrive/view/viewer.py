@@ -1,44 +1,16 @@
 """A log in the browser, in 3-D and over time, and what a run makes of it."""
 
-import contextlib
-import errno
-import io
-import socket
 import threading
 import time
 
-import viser
-
-from foredrive.errors import InputError
 from foredrive.view import palette
 from foredrive.view.log_times import LogTimes
 from foredrive.view.model_panel import ModelPanel
+from foredrive.view.page import close_page, open_page, page_url
 from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_lidar, show_map, show_path
 
 LAYERS = ("lidar", "boxes", "map", "cameras", "driven")
 PLAY_PERIOD_S = 0.1
-PORTS, PORTS_TRIED = 65536, 100
-AMBIENT_LIGHT = 0.7
-START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
-
-
-def free_port(host: str, port: int) -> int:
-    """The first port from `port` on that nobody else serves at; any one if `port` is 0.
-
-    Raises:
-        InputError: if there is no such host here, no such port, or none that this user may serve at.
-    """
-    if not 0 <= port < PORTS:
-        raise InputError(f"no port {port}: there are 0 to {PORTS - 1}")
-    candidates = range(port, min(port + PORTS_TRIED, PORTS))
-    for candidate in candidates:
-        try:
-            with socket.create_server((host, candidate)) as found:
-                return int(found.getsockname()[1])
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise InputError(f"cannot serve a page at {host}:{candidate}: {error}") from error
-    raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
 
 
 class Viewer:
@@ -58,14 +30,7 @@ class Viewer:
     def __init__(self, times: LogTimes, host: str, port: int) -> None:
         self.times = times
         self._drawing, self._drawn = threading.Lock(), -1
-        self.port = free_port(host, port)  # viser would wait for a host that does not exist
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
-            self.server = viser.ViserServer(host=host, port=self.port, label=times.name, verbose=False)
-        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self.server.scene.configure_environment_map(hdri=None)  # lights that nobody has to download
-        self.server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
-        self.server.initial_camera.position = START_EYE_M
-        self.server.initial_camera.look_at = START_TARGET_M
+        self.server = open_page(times.name, host, port)
         show_ego(self.server.scene)
         self._add_controls()
         self.model = None if times.observer is None else ModelPanel(self.server, times)
@@ -74,7 +39,7 @@ class Viewer:
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{self.server.get_host()}:{self.port}"
+        return page_url(self.server)
 
     def show(self, index: int) -> None:
         """Go to a frame of the log."""
@@ -90,8 +55,7 @@ class Viewer:
 
     def close(self) -> None:
         """Stop serving."""
-        with contextlib.suppress(RuntimeError):  # its thread may be done before it has been told everything
-            self.server.stop()
+        close_page(self.server)
 
     def _add_controls(self) -> None:
         gui, count = self.server.gui, len(self.times)

@@ -1,0 +1,70 @@
+"""What a page does beside: slow work in a thread of its own, of many wishes the newest alone."""
+
+import logging
+import threading
+from collections.abc import Callable
+
+from foredrive.errors import InputError
+
+_log = logging.getLogger(__name__)
+
+
+class Background:
+    """One thread that does named jobs. A job that has not begun gives way to a newer one of its name.
+
+    Of several names the one comes first that has waited longest for its turn, so that none starves while
+    wishes come faster than they can be met. A job that fails is told, and the next one is done.
+
+    Args:
+        tell: is given the message of a job that failed.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._changed = threading.Condition()
+        self._wanted: dict[str, Callable[[], None]] = {}
+        self._last_turn: dict[str, int] = {}
+        self._turns, self._busy, self._closed = 0, False, False
+        self._thread = threading.Thread(target=self._work, name="foredrive-page", daemon=True)
+        self._thread.start()
+
+    def ask(self, name: str, job: Callable[[], None]) -> None:
+        """Have a job done, instead of an older one of this name that has not begun."""
+        with self._changed:
+            self._wanted[name] = job
+            self._changed.notify_all()
+
+    def wait(self) -> None:
+        """Return once nothing is left to do."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._wanted and not self._busy)
+
+    def close(self) -> None:
+        """Forget what is wanted, and return once the job under way is done."""
+        with self._changed:
+            self._wanted.clear()
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (job := self._next()) is not None:
+            try:
+                job()
+            except InputError as error:
+                self._tell(str(error))
+            except Exception as error:  # a mistake in the program, but the page lives on
+                _log.exception("while drawing")
+                self._tell(f"{type(error).__name__}: {error}")
+
+    def _next(self) -> Callable[[], None] | None:
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._wanted or self._closed)
+            if self._closed:
+                return None
+            self._turns, self._busy = self._turns + 1, True
+            name = min(self._wanted, key=lambda name: self._last_turn.get(name, 0))
+            self._last_turn[name] = self._turns
+            return self._wanted.pop(name)

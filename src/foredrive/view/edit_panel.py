@@ -1,0 +1,213 @@
+"""The part of the page that changes a rebuilt scene: a list of edits that can be made, undone and kept."""
+
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import viser
+from viser.transforms import SO3
+
+from foredrive.errors import InputError
+from foredrive.recipes.rebuilt_runs import open_rebuilt
+from foredrive.rendering.edits import (
+    Duplicate,
+    Edit,
+    Edited,
+    Insert,
+    Remove,
+    ShiftEgo,
+    apply_edits,
+    free_id,
+    load_edits,
+    move_between,
+    save_edits,
+)
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import states_at
+from foredrive.view.rebuilt_nodes import ROOT, RebuiltNodes
+from foredrive.view.rebuilt_video import words_of
+
+NOBODY = "none"
+BESIDE_M = (0.0, 3.0, 0.0)
+"""Where a copy appears: a lane to the left of what it is like."""
+GIZMO_M = 5.0
+RUNS_KEPT = 4
+
+
+class EditPanel:
+    """Controls of edits, and the gizmo that drags an actor.
+
+    An edit that cannot be made is told, and leaves everything as it was.
+
+    Args:
+        server: of the page.
+        graph: the scene as it was learned; it is never changed.
+        nodes: of the scene; the chosen actor stands out, and goes along with the gizmo.
+        file: where edits are saved, unless the page says otherwise.
+        tell: is given what went wrong, or well.
+        on_change: is called after the scene has changed.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        graph: SceneGraph,
+        nodes: RebuiltNodes,
+        file: Path,
+        tell: Callable[[str], None],
+        on_change: Callable[[], None],
+    ) -> None:
+        self._graph, self._nodes, self._tell, self._on_change = graph, nodes, tell, on_change
+        self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_rebuilt(Path(run)).scene.graph)
+        self._changing = threading.RLock()
+        self.edits: list[Edit] = []
+        self.edited: Edited = apply_edits(graph, [])
+        self._t_s = 0.0
+        self._add_controls(server.gui, file)
+        self.gizmo = server.scene.add_transform_controls(
+            f"{ROOT}/gizmo",
+            scale=GIZMO_M,
+            active_axes=(True, True, False),  # along the ground, and turns about the vertical
+            depth_test=False,
+            visible=False,
+        )
+        self.gizmo.on_update(lambda _: self._drag())
+        self.gizmo.on_drag_end(lambda _: self.drop())
+
+    @property
+    def chosen(self) -> int | None:
+        """Id of the actor that is edited."""
+        return None if self.actor.value == NOBODY else int(self.actor.value)
+
+    def choose(self, track_id: int | None) -> None:
+        """Choose an actor, or none."""
+        self.actor.value = NOBODY if track_id is None else str(track_id)
+        self._show_chosen()
+
+    def show(self, t_s: float) -> None:
+        """Go to a time."""
+        self._t_s = t_s
+        self._show_chosen()
+
+    def replace(self, edits: Sequence[Edit]) -> bool:
+        """Have other edits; returns whether they can be made."""
+        with self._changing:
+            try:
+                edited = apply_edits(self._graph, edits, self._open)
+            except InputError as error:
+                self._tell(str(error))
+                return False
+            self.edits, self.edited = list(edits), edited
+            ids = sorted(edited.graph.tracks.track_id.tolist())
+            kept = self.actor.value
+            self.actor.options = (NOBODY, *map(str, ids))
+            self.actor.value = kept if kept in self.actor.options else NOBODY
+            self._list.content = "\n".join(f"1. {words_of(edit)}" for edit in self.edits) or "*no edits*"
+            self.undo.disabled = not self.edits
+        self._on_change()
+        return True
+
+    def add(self, edit: Edit) -> bool:
+        """Make one more edit; returns whether it can be made."""
+        with self._changing:
+            return self.replace([*self.edits, edit])
+
+    def drop(self) -> None:
+        """Leave the chosen actor where the gizmo is."""
+        with self._changing:
+            if self.chosen is None:
+                return
+            tracks = self.edited.graph.tracks
+            before = states_at(tracks, self._t_s).T_scene_actor[tracks.index_of(self.chosen)].detach().cpu()
+            after = torch.eye(4)
+            after[:3, :3] = torch.from_numpy(SO3(self.gizmo.wxyz).as_matrix()).float()
+            after[:3, 3] = torch.from_numpy(np.asarray(self.gizmo.position)).float()
+            self.add(move_between(self.chosen, before, after))
+
+    def save(self) -> None:
+        """Write the edits to the file that the page names."""
+        path = Path(self.file.value)
+        try:
+            save_edits(self.edits, path)
+        except InputError as error:
+            self._tell(str(error))
+        except OSError as error:
+            self._tell(f"{path}: cannot be written: {error.strerror}")
+        else:
+            self._tell(f"{len(self.edits)} edits saved to {path}")
+
+    def load(self) -> None:
+        """Read edits instead of those there are."""
+        try:
+            edits = load_edits(Path(self.file.value))
+        except InputError as error:
+            self._tell(str(error))
+        else:
+            self.replace(edits)
+
+    def _add_controls(self, gui: viser.GuiApi, file: Path) -> None:
+        ids = sorted(self._graph.tracks.track_id.tolist())
+        with gui.add_folder("Edits"):
+            self.actor = gui.add_dropdown(
+                "actor", (NOBODY, *map(str, ids)), hint="or click at one; then drag it by its arrows"
+            )
+            self.change = gui.add_button_group("change it", ("remove", "duplicate"))
+            self.shift_m = gui.add_number("ego to the left, m", 2.0, step=0.5)
+            self.shift = gui.add_button("Shift ego")
+            with gui.add_folder("From another run", expand_by_default=False):
+                self.source = gui.add_text("run's folder", "")
+                self.source_id = gui.add_number("actor there", 0, min=0, step=1)
+                self.insert = gui.add_button("Insert", hint="it drives beside the actor that is chosen here")
+            self._list = gui.add_markdown("*no edits*")
+            self.undo = gui.add_button("Undo", disabled=True)
+            self.file = gui.add_text("file", str(file))
+            self.keep = gui.add_button_group("edits", ("save", "load"))
+        self.actor.on_update(lambda _: self._show_chosen())
+        self.change.on_click(lambda _: self._change(self.change.value))
+        self.shift.on_click(lambda _: self._shift())
+        self.insert.on_click(lambda _: self._insert())
+        self.undo.on_click(lambda _: self._take_back())
+        self.keep.on_click(lambda _: self.save() if self.keep.value == "save" else self.load())
+
+    def _shift(self) -> None:
+        self.add(ShiftEgo((0.0, float(self.shift_m.value), 0.0)))
+
+    def _take_back(self) -> None:
+        self.replace(self.edits[:-1])
+
+    def _change(self, how: str) -> None:
+        if self.chosen is None:
+            self._tell("choose an actor first: click at one, or take it from the list")
+        elif how == "remove":
+            self.add(Remove(self.chosen))
+        else:
+            self._copied(Duplicate(self.chosen, free_id(self.edited.graph), BESIDE_M))
+
+    def _insert(self) -> None:
+        if self.chosen is None:
+            self._tell("choose the actor beside which the new one is to drive first")
+            return
+        copy, actor = free_id(self.edited.graph), int(self.source_id.value)
+        self._copied(Insert(self.source.value, actor, copy, follows=self.chosen, offset_m=BESIDE_M))
+
+    def _copied(self, edit: Duplicate | Insert) -> None:
+        if self.add(edit):
+            self.choose(edit.copy)
+
+    def _show_chosen(self) -> None:
+        with self._changing:
+            chosen, tracks = self.chosen, self.edited.graph.tracks
+            self._nodes.choose(chosen)
+            states = states_at(tracks, self._t_s)
+            row = None if chosen is None else tracks.index_of(chosen)
+            self.gizmo.visible = row is not None and bool(states.present[row])
+            if row is not None:
+                pose = states.T_scene_actor[row].detach().double().cpu().numpy()
+                self.gizmo.wxyz, self.gizmo.position = SO3.from_matrix(pose[:3, :3]).wxyz, pose[:3, 3]
+
+    def _drag(self) -> None:
+        if self.chosen is not None:
+            self._nodes.move(self.chosen, self.gizmo.wxyz, self.gizmo.position)

@@ -1,0 +1,65 @@
+"""A page in the browser: where it is served, and how it looks before anything is on it."""
+
+import contextlib
+import errno
+import io
+import socket
+
+import viser
+
+from foredrive.errors import InputError
+
+PORTS, PORTS_TRIED = 65536, 100
+AMBIENT_LIGHT = 0.7
+START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
+
+
+def free_port(host: str, port: int) -> int:
+    """The first port from `port` on that nobody else serves at; any one if `port` is 0.
+
+    Raises:
+        InputError: if there is no such host here, no such port, or none that this user may serve at.
+    """
+    if not 0 <= port < PORTS:
+        raise InputError(f"no port {port}: there are 0 to {PORTS - 1}")
+    candidates = range(port, min(port + PORTS_TRIED, PORTS))
+    for candidate in candidates:
+        try:
+            with socket.create_server((host, candidate)) as found:
+                return int(found.getsockname()[1])
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise InputError(f"cannot serve a page at {host}:{candidate}: {error}") from error
+    raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
+
+
+def open_page(label: str, host: str, port: int) -> viser.ViserServer:
+    """Serve an empty page, dark, seen from behind and above the ego vehicle; in threads of its own.
+
+    Args:
+        label: of the page.
+        host, port: where it is served; at the next free port if this one is taken.
+
+    Raises:
+        InputError: as `free_port`.
+    """
+    port = free_port(host, port)  # viser would wait for a host that does not exist
+    with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.scene.configure_environment_map(hdri=None)  # lights that nobody has to download
+    server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
+    server.initial_camera.position = START_EYE_M
+    server.initial_camera.look_at = START_TARGET_M
+    return server
+
+
+def page_url(server: viser.ViserServer) -> str:
+    """Where a page is."""
+    return f"http://{server.get_host()}:{server.get_port()}"
+
+
+def close_page(server: viser.ViserServer) -> None:
+    """Stop serving."""
+    with contextlib.suppress(RuntimeError):  # its thread may be done before it has been told everything
+        server.stop()

@@ -1,0 +1,162 @@
+"""A rebuilt scene as nodes that the browser draws by itself: what stands, and actors in frames that move."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+from torch import Tensor
+from viser.transforms import SO3
+
+from foredrive.geometry.boxes import EDGES, box_corners
+from foredrive.geometry.se3 import inverse_se3
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.rendering.tracks import states_at
+from foredrive.view import palette
+from foredrive.view.splat_nodes import show_splats, thinned
+
+ROOT = "/scene"
+"""The scene's frame; all beside it are in the ego frame at the time shown."""
+MOST_SPLATS = 400_000
+"""More are thinned out: at 32 bytes each these are 13 MB that a browser has to fetch and to sort."""
+AWAY_M = (0.0, 0.0, -1e6)
+"""Where is put what is not to be seen: the browser draws splats of nodes that are invisible all the same."""
+HERE_M = (0.0, 0.0, 0.0)
+FACE_OPACITY, CHOSEN_OPACITY = 0.06, 0.35
+PLACES = 16
+"""Along the vehicle's way, to tell what is near."""
+EDGE_WIDTH, LABEL_SCALE, NUDGE_M = 2.0, 0.8, 1e-3
+
+
+@dataclass(frozen=True)
+class _ActorNode:
+    frame: viser.FrameHandle
+    splats: viser.GaussianSplatHandle | None
+    face: viser.BoxHandle
+    edges: viser.LineSegmentsHandle
+    label: viser.LabelHandle
+    own: Gaussians
+    """What its splats show, before it was thinned out."""
+
+
+class RebuiltNodes:
+    """The nodes of a scene.
+
+    Args:
+        scene: of the page.
+        graph: to begin with.
+        way_m: where the ego vehicle was, in the scene's frame.
+        on_click: is given the id of an actor that was clicked at.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        graph: SceneGraph,
+        way_m: Float[Tensor, "K 3"],
+        on_click: Callable[[int], None],
+    ) -> None:
+        self._scene, self._on_click = scene, on_click
+        self.share = min(1.0, MOST_SPLATS / max(len(graph.actor), 1))
+        """Of the Gaussians that are drawn."""
+        self.layers = {"splats": True, "boxes": True, "ids": True}
+        self._root = scene.add_frame(ROOT, show_axes=False)
+        standing = thinned(graph.of_actor(STATIC), self.share, way_m[:: -(-len(way_m) // PLACES)])
+        self._standing = show_splats(scene, f"{ROOT}/static", standing) if len(standing.mean_m) else None
+        self._actors: dict[int, _ActorNode] = {}
+        self._chosen: int | None = None
+
+    def show(self, graph: SceneGraph, T_scene_ego: Float[Tensor, "4 4"], t_s: float) -> None:
+        """Draw the scene as it is at a time, seen from the ego vehicle; what is a node already only moves."""
+        _place(self._root, inverse_se3(T_scene_ego))
+        ids = graph.tracks.track_id.tolist()
+        for gone in self._actors.keys() - set(ids):
+            self._actors.pop(gone).frame.remove()
+        states = states_at(graph.tracks, t_s)
+        for row, track_id in enumerate(ids):
+            there, own = bool(states.present[row]), graph.of_actor(row)
+            node = self._actors.get(track_id)
+            if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another one of this id
+                self._actors.pop(track_id).frame.remove()
+                node = None
+            if node is None and there:
+                node = self._actors[track_id] = self._added(graph, row, own)
+            if node is not None:
+                _place(node.frame, states.T_scene_actor[row])
+                node.frame.visible = there
+                if not there:
+                    node.frame.position = AWAY_M
+        self.show_layers()
+
+    def choose(self, track_id: int | None) -> None:
+        """Make one actor stand out."""
+        self._chosen = track_id
+        self.show_layers()
+
+    def move(self, track_id: int, wxyz: np.ndarray, position: np.ndarray) -> None:
+        """Put an actor elsewhere in the scene, until it is shown again."""
+        if track_id in self._actors:
+            frame = self._actors[track_id].frame
+            frame.wxyz, frame.position = wxyz, position
+
+    def show_layers(self) -> None:
+        """Show what `layers` says."""
+        splats_at = HERE_M if self.layers["splats"] else AWAY_M
+        if self._standing is not None:
+            self._standing.position = splats_at
+        for track_id, node in self._actors.items():
+            chosen = track_id == self._chosen
+            if node.splats is not None:
+                node.splats.position = splats_at
+            node.face.visible = node.edges.visible = self.layers["boxes"] or chosen
+            node.face.opacity = CHOSEN_OPACITY if chosen else FACE_OPACITY
+            node.label.visible = self.layers["ids"] or chosen
+
+    def nudge(self) -> None:
+        """Have browsers sort splats anew, by a movement that nobody sees: of several nodes that come at once
+        they show the first alone, until something moves.
+        """
+        self._root.position = self._root.position + np.array([0.0, 0.0, NUDGE_M])
+
+    def _added(self, graph: SceneGraph, row: int, own: Gaussians) -> _ActorNode:
+        track_id, size = int(graph.tracks.track_id[row]), graph.tracks.size_lwh[row].cpu()
+        name, colour = f"{ROOT}/actors/{track_id}", palette.box_colour(int(graph.tracks.category[row]))
+        rgb = palette.rgb255(colour)
+        scene, shown = self._scene, thinned(own, self.share, own.mean_m.new_zeros(1, 3))
+        frame = scene.add_frame(name, show_axes=False)
+        corners = box_corners(torch.zeros(3), size, torch.tensor(0.0))
+        edges = corners[torch.tensor([*EDGES, (0, 5), (1, 4)])]  # corners 0, 1, 5, 4 are the front
+        face = scene.add_box(
+            f"{name}/face",
+            rgb,
+            tuple(size.tolist()),
+            opacity=FACE_OPACITY,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        face.on_click(lambda _: self._on_click(track_id))
+        return _ActorNode(
+            frame=frame,
+            splats=show_splats(scene, f"{name}/splats", shown) if len(shown.mean_m) else None,
+            face=face,
+            edges=scene.add_line_segments(
+                f"{name}/edges", edges.numpy(), np.array(rgb), line_width=EDGE_WIDTH
+            ),
+            label=scene.add_label(
+                f"{name}/id",
+                str(track_id),
+                position=(0.0, 0.0, 0.5 * float(size[2]) + 0.2),
+                anchor="bottom-center",
+                font_screen_scale=LABEL_SCALE,
+            ),
+            own=own,
+        )
+
+
+def _place(node: viser.SceneNodeHandle, T: Float[Tensor, "4 4"]) -> None:
+    pose = T.detach().double().cpu().numpy()
+    node.wxyz, node.position = SO3.from_matrix(pose[:3, :3]).wxyz, pose[:3, 3]

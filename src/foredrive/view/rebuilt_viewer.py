@@ -1,0 +1,155 @@
+"""A rebuilt log in the browser: over time, from anywhere, and changed."""
+
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import viser
+
+from foredrive.recipes.rebuilt_runs import OpenRun
+from foredrive.rendering.edits import Edit
+from foredrive.view.background import Background
+from foredrive.view.edit_panel import EditPanel
+from foredrive.view.page import close_page, open_page, page_url
+from foredrive.view.rebuilt_nodes import RebuiltNodes
+from foredrive.view.rebuilt_pictures import RebuiltPictures
+from foredrive.view.scene_nodes import show_ego
+
+STEP_S = 0.1
+"""Of the slider, and of playing, which is in real time."""
+FAR_M = 5000.0
+"""What is farther is not drawn by the browser: the sky is some two kilometres away."""
+NUDGES_S = (2.0, 6.0)
+"""How long after the last step splats are sorted anew for someone who has come."""
+NOTE_S = 8.0
+
+
+class RebuiltViewer:
+    """A page with a slider for time, sensors rendered at that time, and edits.
+
+    The browser draws the Gaussians' albedo by itself; what sensors see is rendered in the background, the
+    newest time first, so that the slider never waits. All is in the ego frame at the time shown. The server
+    runs in threads of its own until `close`.
+
+    Args:
+        run: that is looked at.
+        edits: to begin with.
+        file: where edits are saved, unless the page says otherwise.
+        host, port: where the page is served; at the next free port if this one is taken.
+
+    Raises:
+        InputError: if it cannot be served there.
+    """
+
+    def __init__(self, run: OpenRun, edits: Sequence[Edit], file: Path, host: str, port: int) -> None:
+        self.run = run
+        self.server = open_page(run.folder.name, host, port)
+        self.server.initial_camera.far = FAR_M
+        self._showing = threading.RLock()
+        self.background = Background(self.tell)
+        show_ego(self.server.scene)
+        graph = run.scene.graph.map_tensors(lambda tensor: tensor.detach())
+        way_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
+        self.nodes = RebuiltNodes(
+            self.server.scene, graph, way_m, lambda track_id: self.edits.choose(track_id)
+        )
+        self._add_controls()
+        self.edits = EditPanel(self.server, graph, self.nodes, file, self.tell, self.show_now)
+        self.pictures = RebuiltPictures(self.server, run, self.background)
+        self.server.on_client_connect(self._welcome)
+        if not self.edits.replace(edits):
+            self.show_now()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return page_url(self.server)
+
+    def show(self, t_s: float) -> None:
+        """Go to a time since the log's start."""
+        self.time_s.value = t_s  # calls `show_now`, unless it is there already
+
+    def show_now(self) -> None:
+        """Draw the scene as it is now; what sensors see follows."""
+        with self._showing, self.server.atomic():
+            t_s, edited = float(self.time_s.value), self.edits.edited
+            ego = self.run.vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu())
+            self.nodes.show(edited.graph, ego.T_scene_ego, t_s)
+            self.edits.show(t_s)
+            self.pictures.show(edited, t_s)
+            self._show_own_views()
+
+    def play(self) -> None:
+        """Go through the log in real time while "play" is ticked on the page; does not return."""
+        first_s, last_s = float(self.run.vehicle.t_s[0]), float(self.run.vehicle.t_s[-1])
+        while True:
+            began_s = time.monotonic()
+            if self._play.value:
+                later_s = self.time_s.value + STEP_S
+                self.show(later_s if later_s <= last_s else first_s)
+            time.sleep(max(STEP_S - (time.monotonic() - began_s), 0.01))
+
+    def tell(self, message: str) -> None:
+        """Show a message to everybody who looks."""
+        for client in self.server.get_clients().values():
+            client.add_notification("", message, auto_close_seconds=NOTE_S)
+
+    def close(self) -> None:
+        """Stop rendering and serving."""
+        self.background.close()
+        close_page(self.server)
+
+    def _add_controls(self) -> None:
+        gui, vehicle = self.server.gui, self.run.vehicle
+        first_s, last_s = float(vehicle.t_s[0]), float(vehicle.t_s[-1])
+        with gui.add_folder("Time"):
+            self.time_s = gui.add_slider("time, s", first_s, max(last_s, first_s + STEP_S), STEP_S, first_s)
+            self._play = gui.add_checkbox("play", False)
+        with gui.add_folder("Scene"):
+            self._note = gui.add_markdown(self._count())
+            self.own = gui.add_checkbox(
+                "render my view",
+                False,
+                disabled=not vehicle.rig.names,
+                hint="by the renderer that cameras use, in the place of splats that the browser draws",
+            )
+            self.layers = {
+                name: gui.add_checkbox(name, True) for name in ("splats", "boxes", "ids", "lidar", "cameras")
+            }
+        self.time_s.on_update(lambda _: self.show_now())
+        self.own.on_update(lambda _: self._toggle_own())
+        for box in self.layers.values():
+            box.on_update(lambda _: self._show_layers())
+
+    def _count(self) -> str:
+        count, share = len(self.run.scene.actor), self.nodes.share
+        drawn = "" if share == 1 else f"; the browser draws {share:.0%} of them, those that cover most"
+        return f"{count:,} Gaussians, {len(self.run.scene.track_id)} actors{drawn}"
+
+    def _show_layers(self) -> None:
+        for name in self.nodes.layers:
+            self.nodes.layers[name] = self.layers[name].value
+        self.nodes.layers["splats"] &= not self.own.value
+        for name in self.pictures.layers:
+            self.pictures.layers[name] = self.layers[name].value
+        self.nodes.show_layers()
+        self.pictures.show_layers()
+
+    def _toggle_own(self) -> None:
+        self._show_layers()
+        self._show_own_views()
+        if not self.own.value:
+            for client in self.server.get_clients().values():
+                client.scene.set_background_image(None)
+
+    def _show_own_views(self) -> None:
+        if self.own.value:
+            for client in self.server.get_clients().values():
+                self.pictures.ask_own_view(client)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self.pictures.ask_own_view(client) if self.own.value else None)
+        for pause_s in NUDGES_S:
+            time.sleep(pause_s)
+            self.nodes.nudge()

@@ -1,0 +1,54 @@
+"""Gaussians as nodes of a 3-D scene that the browser draws by itself: their albedo, without the decoders."""
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.rendering.gaussians import Gaussians
+
+LARGEST_M = 200.0
+"""Standard deviations are held below: the browser keeps variances in half precision, which ends at 65504."""
+FAINTEST = 1 / 255
+"""What is less opaque at its centre is never seen."""
+NEAREST_M = 5.0
+"""What is nearer to where it is looked at from does not count more."""
+
+
+def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -> Gaussians:
+    """A share of Gaussians: those that cover most, by opacity and largest section, and can be seen at all.
+
+    Args:
+        gaussians: in any frame.
+        share: how much of them is left at most.
+        from_m: places they are looked at from, in their frame: what is as large but farther covers less.
+    """
+    opacity = gaussians.opacity_logit.sigmoid()
+    seen = (opacity >= FAINTEST).nonzero()[:, 0]
+    most = round(share * len(opacity))
+    if len(seen) > most:
+        scale_m = gaussians.log_scale.exp().sort(dim=-1).values
+        range_m = torch.cdist(gaussians.mean_m, from_m).amin(-1).clamp_min(NEAREST_M)
+        covers = opacity * scale_m[:, 1] * scale_m[:, 2] / range_m**2
+        seen = seen[covers[seen].topk(most).indices].sort().values
+    return gaussians[seen]
+
+
+@torch.no_grad()
+def show_splats(scene: viser.SceneApi, name: str, gaussians: Gaussians) -> viser.GaussianSplatHandle:
+    """Draw Gaussians in the frame of the node above them."""
+    factor = gaussians.factor().permute(2, 0, 1)
+    held = (LARGEST_M / gaussians.log_scale.exp().amax(-1)).clamp_max(1.0)
+    factor = factor * held[:, None, None]
+    return scene.add_gaussian_splats(
+        name,
+        centers=_array(gaussians.mean_m),
+        covariances=_array(factor @ factor.transpose(-1, -2)),
+        rgbs=_array(gaussians.feature[:, :3].clamp(0, 1)),
+        opacities=_array(gaussians.opacity_logit.sigmoid()[:, None]),
+    )
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy()
