@@ -75,7 +75,7 @@ def test_an_image_tower_learns_what_colours_are_called() -> None:
     objective = ContrastObjective(ImageTower(widths=(8, 8), depths=(1, 1), heads=2, dim=8))
     optimizer = torch.optim.Adam(objective.parameters(), 1e-2)
     random = generator()
-    for _ in range(15):
+    for _ in range(30):  # running means of batches need some time
         loss = objective(captioned(), random)["loss"]
         optimizer.zero_grad()
         loss.backward()

@@ -41,7 +41,7 @@ def judge_towers(views: Sequence[LogViews], towers: Towers) -> dict[str, float]:
         InputError: no fact is true of some of the views and not of others.
     """
     rows = [row for log in views for row in log.rows]
-    vectors = _embedded(views, towers)
+    vectors = embed_all(views, towers)
     truths = {fact: np.array([fact in row.facts.facts for row in rows]) for fact in QUERIES}
     asked = {fact: true for fact, true in truths.items() if LEAST_SHARE <= true.mean() <= MOST_SHARE}
     if not asked:
@@ -77,7 +77,7 @@ def _named(rows: Sequence[Row], found: Float[np.ndarray, "n D"], towers: Towers)
     return out
 
 
-def _embedded(views: Sequence[LogViews], towers: Towers) -> dict[str, Float[np.ndarray, "n D"]]:
+def embed_all(views: Sequence[LogViews], towers: Towers) -> dict[str, Float[np.ndarray, "n D"]]:
     """Unit vectors by modality."""
     images = []
     for log in views:

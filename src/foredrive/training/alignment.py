@@ -57,7 +57,10 @@ class ContrastObjective(nn.Module):
         """One text of each view, drawn anew; views mirrored and cropped, which changes no fact."""
         rows = torch.arange(len(batch.images), device=batch.images.device)
         drawn = torch.randint(batch.texts.shape[1], (len(rows),), generator=generator).to(rows.device)
-        found = F.normalize(self.tower(_jittered(batch.images, generator)), dim=-1)
+        # a third of the time of full precision, on CPUs that know it
+        with torch.autocast(batch.images.device.type, torch.bfloat16):
+            found = self.tower(_jittered(batch.images, generator))
+        found = F.normalize(found.float(), dim=-1)
         texts = F.normalize(batch.texts[rows, drawn], dim=-1)
         logits = self.log_scale.exp().clamp(max=SHARPEST) * found @ texts.T
         loss, share = contrast(logits, true_of(batch.said[rows, drawn], batch.holds))

@@ -1,0 +1,65 @@
+"""What do the embedded towers find in a town that they have never seen? `foredrive bench search-retrieval`.
+
+Drives of the held-out town under four kinds of weather, each with the same routes and traffic. Everything
+that is known of a view is asked for (recipes/retrieval_quality.py); P@K counts moments of one drive that are
+closer than 5 s once, and its 95 % interval is over drives. Seed 0 are the towers that come with the package.
+SEARCH_RETRIEVAL_TOWERS names a folder of others, to try them.
+"""
+
+import functools
+import os
+from pathlib import Path
+
+from foredrive.data import LogPath
+from foredrive.evaluation import Benchmark
+from foredrive.recipes.recording import record_drives
+from foredrive.recipes.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
+from foredrive.recipes.sector_views import gather_views
+from foredrive.recipes.towers import EMBEDDED, find_towers
+from foredrive.towns.campaign import Campaign, plan_drives
+
+TOWERS = os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED)
+WORK = Path("runs/search_retrieval")
+TOWN, SEEDS, WEATHERS = "Town05", (201, 202), ("clear", "night", "rain", "fog")
+SECONDS, RATE_HZ, IMAGE_HW, CROWD = 40.0, 0.5, (144, 256), (40, 40)
+
+
+def drives() -> list[LogPath]:
+    """Recorded if they do not lie there yet."""
+    campaign = Campaign((TOWN,), SEEDS, WEATHERS, CROWD, CROWD, SECONDS, RATE_HZ)
+    plans = plan_drives(campaign)
+    done = record_drives(plans, WORK / "towns", IMAGE_HW, workers=os.cpu_count() or 1)
+    assert not done.failed, done.failed
+    return [done.logs[plan] for plan in plans]
+
+
+@functools.cache
+def judged() -> dict[str, dict[str, float]]:
+    """Figures by modality."""
+    towers = find_towers(TOWERS)
+    logs = drives()
+    views = gather_views(logs, 1 / RATE_HZ, towers.image_side_px, WORK)
+    seen = Judged.of_logs(logs, views, towers)
+    figures = judge_retrieval(seen, towers)
+    for modality, named in judge_naming(seen, towers).items():
+        figures[modality] |= named
+    return figures
+
+
+def of_modality(modality: str, seed: int) -> dict[str, float]:
+    return judged()[modality]
+
+
+BENCHMARK = Benchmark(
+    question="What share of the first 1, 10 and 100 hits is what was asked for, by modality and weather?",
+    arms={modality: functools.partial(of_modality, modality) for modality in MODALITIES},
+    seeds=(0,),
+    config={
+        "towers": TOWERS,
+        "town": TOWN,
+        "drives": [SEEDS, WEATHERS],
+        "seconds": SECONDS,
+        "rate_hz": RATE_HZ,
+        "gap_s": GAP_S,
+    },
+)

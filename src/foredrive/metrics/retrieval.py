@@ -1,0 +1,47 @@
+"""How much of what is found is what was asked for, with neighbours counted once, and how sure that is."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+class Ranking(NamedTuple):
+    """The hits that S sequences have for one question, those close to a better one left out.
+
+    Rows are padded to the H hits of the longest with a score of -inf.
+    """
+
+    score: Float[np.ndarray, "S H"]
+    true: Bool[np.ndarray, "S H"]
+    """Whether the hit is what was asked for."""
+    could: Int[np.ndarray, "S"]
+    """How many hits of a sequence could be true at most."""
+
+
+def precision_at(
+    ranking: Ranking, drawn: Int[np.ndarray, "B S"], ranks: Sequence[int]
+) -> Float[np.ndarray, "B K"]:
+    """P@K = true hits among the best K / min(K, hits that could be true), of each draw of sequences.
+
+    A sequence that is drawn twice counts as two. NaN where nothing could be true.
+    """
+    score, true = (of[drawn].reshape(len(drawn), -1) for of in (ranking.score, ranking.true))
+    order = np.argsort(-score, axis=1, kind="stable")[:, : max(ranks)]
+    hits = np.take_along_axis(true, order, axis=1).cumsum(axis=1)
+    could = ranking.could[drawn].sum(axis=1)
+    found = [hits[:, min(rank, hits.shape[1]) - 1] / np.minimum(rank, could).clip(min=1) for rank in ranks]
+    return np.where((could > 0)[:, None], np.stack(found, axis=1), np.nan)
+
+
+def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:
+    """All sequences first, as they are, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
+    drawn = np.random.default_rng(seed).integers(sequences, size=(draws, sequences))
+    return np.concatenate([np.arange(sequences)[None], drawn])
+
+
+def with_interval(values: Float[np.ndarray, "B"]) -> tuple[float, float, float]:
+    """The value of all sequences, and the 2.5 and 97.5 % quantiles over draws of them (`draw_sequences`)."""
+    low, high = np.nanquantile(values[1:], (0.025, 0.975))
+    return float(values[0]), float(low), float(high)

@@ -1,0 +1,42 @@
+"""P@K over sequences, by hand and drawn again."""
+
+import numpy as np
+import pytest
+
+from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
+
+OUT = -np.inf
+RANKING = Ranking(
+    score=np.array([[0.9, 0.1, OUT], [0.8, 0.7, 0.2]]),
+    true=np.array([[True, True, False], [False, True, False]]),
+    could=np.array([2, 1]),
+)
+"""In order: true, false, true, false, true; three could be."""
+
+
+def test_precision_by_hand() -> None:
+    drawn = np.array([[0, 1], [0, 0], [1, 1]])
+    found = precision_at(RANKING, drawn, (1, 2, 10))
+    np.testing.assert_allclose(found[0], [1, 1 / 2, 3 / 3])
+    np.testing.assert_allclose(found[1], [1, 1, 4 / 4])  # the first drive twice: four hits, all true
+    np.testing.assert_allclose(found[2], [0, 0, 2 / 2])  # false and false, then both true ones
+
+
+def test_what_nothing_answers_has_no_precision() -> None:
+    nothing = Ranking(RANKING.score, np.zeros((2, 3), dtype=bool), np.zeros(2, dtype=int))
+    assert np.isnan(precision_at(nothing, np.array([[0, 1]]), (1, 10))).all()
+
+
+def test_draws_begin_with_all_sequences_and_bounds_hold_what_varies() -> None:
+    drawn = draw_sequences(8, 500, seed=0)
+    assert drawn.shape == (501, 8)
+    assert drawn[0].tolist() == list(range(8))
+    assert set(drawn[1:].ravel()) == set(range(8))
+    share = np.array([1.0, 1, 1, 1, 0, 0, 0, 0])
+    value, low, high = with_interval(share[drawn].mean(axis=1))
+    assert value == 0.5
+    # the standard error of a mean of 8 is 0.18
+    assert low == pytest.approx(0.125, abs=0.07)
+    assert high == pytest.approx(0.875, abs=0.07)
+    alike = np.full(8, 0.25)[drawn].mean(axis=1)
+    assert with_interval(alike) == (0.25, 0.25, 0.25)
