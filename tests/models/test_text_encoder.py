@@ -1,6 +1,5 @@
 """Text encoders: by local folder, whatever their kind, and the one that comes as a package."""
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -53,7 +52,6 @@ def test_what_cannot_be_had_is_named(tmp_path: Path) -> None:
         TextEncoder(str(tmp_path))(["rain"])
 
 
-@pytest.mark.skipif(find_spec(IN_A_PACKAGE.replace("-", "_")) is None, reason="the extra `text` is not here")
 def test_the_packaged_one_knows_what_sentences_mean() -> None:
     rain, wet, car = TextEncoder(IN_A_PACKAGE)(["It is raining.", "The weather is wet.", "A red car."])
     assert float(rain @ wet) > 0.5 > float(rain @ car)

