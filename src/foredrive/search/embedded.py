@@ -160,11 +160,8 @@ def save_towers(
         (temporary / CARD).write_text(json.dumps(asdict(card), indent=1))
 
 
-def load_towers(folder: Path, name: str | None = None) -> Towers:
+def load_towers(folder: Path) -> Towers:
     """The towers of a folder that `save_towers` wrote.
-
-    Args:
-        name: what they are called by; by default the folder.
 
     Raises:
         InputError: it holds none, they are damaged, or what they stand beside has other weights now.
@@ -175,25 +172,24 @@ def load_towers(folder: Path, name: str | None = None) -> Towers:
         raise InputError(
             f"{folder / CARD}: does not describe towers: {str(error).splitlines()[0]}"
         ) from error
-    name = name or str(folder)
-    base = _load_base(folder, name, card)
+    base = _load_base(folder, card)
     if card.lidar is None:
         return base
     if base.fingerprint != card.base_fingerprint:
         raise InputError(f"{folder}: the lidar tower was trained beside other weights of {card.text}")
     encoder = build_lidar_tower(card.lidar, card.dim)
     _load_weights(encoder, folder / LIDAR)
-    return LidarTowers(name, base, encoder)
+    return LidarTowers(str(folder), base, encoder)
 
 
-def _load_base(folder: Path, name: str, card: TowerCard) -> Towers:
+def _load_base(folder: Path, card: TowerCard) -> Towers:
     if card.image is None:
         return PretrainedTowers(card.text)
     tower = build_image_tower(card.image, card.dim)
     text_mean = _load_weights(tower, folder / IMAGE).get(TEXT_MEAN)
     if text_mean is None:
         raise InputError(f"{folder / IMAGE}: no {TEXT_MEAN} in it")
-    return SentenceTowers(name, tower, text_mean, card.image.side_px, card.text)
+    return SentenceTowers(str(folder), tower, text_mean, card.image.side_px, card.text)
 
 
 def _halved(model: nn.Module) -> dict[str, Tensor]:
