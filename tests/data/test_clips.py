@@ -89,7 +89,7 @@ def test_cameras_are_chosen_by_either_name_and_in_order(flat_root: Path) -> None
     assert own.rig.names == ("left", "ahead")
     assert shared.rig.names == ("pcam_l0", "pcam_f0")
     assert torch.equal(own.images, shared.images)
-    with pytest.raises(InputError, match="'behind'; there are: ahead, left"):
+    with pytest.raises(InputError, match=r"'behind'; there are: ahead \(pcam_f0\), left \(pcam_l0\)"):
         ClipDataset(logs, config(cameras=("behind",)), None)
 
 
