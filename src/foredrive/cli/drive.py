@@ -2,11 +2,11 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,29 +19,14 @@ FAILURES_SHOWN = 3
 def drive(
     agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|log|…")],
     out: Path,
-    routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short",
-    repetitions: int = 1,
-    seed: int = 0,
-    conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
-    sensors: bool = True,
-    image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256),
-    vehicles: int = 30,
-    people: int = 20,
-    scenarios: bool = True,
-    period: Annotated[float, tyro.conf.arg(metavar="S")] = 0.5,
-    latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1,
-    workers: int = 0,
-    ray: bool = False,
-    rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None,
-    start: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = (),
-    threat: tuple[Literal["stationary", "frontal", "side"], ...] = (),
-    edits: OptionalPath = None,
+    planning: tyro.conf.OmitArgPrefixes[Planning],
+    towns: tyro.conf.OmitArgPrefixes[InTowns],
+    rebuilt: tyro.conf.OmitArgPrefixes[InRebuilt],
 ) -> None:
     """Drive routes in closed loop and score them as CARLA's leaderboards 1.0 and 2.1 do.
 
     Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
-    With --in a log that was rebuilt is driven in instead of towns, along the way it drove itself: of the
-    options only agent, out, sensors, period, latency and those below --in count there.
+    With --in a log that was rebuilt is driven in instead of towns, along the way it drove itself.
 
     Args:
         agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or ego-mlp:RUN, the
@@ -49,63 +34,13 @@ def drive(
             the expert would do at each key frame: disturbed, the expert steered aside and slowed, or
             pupil:RUN, a run and the expert by turns.
         out: Folder of the suite: summary.json, report.html, drives, logs.
-        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for lessons in
-            the other towns training-short and training-long.
-        repetitions: How often each route is driven, every time among other traffic.
-        seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
-        conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog;
-            any: drawn for each drive; a bright day if left out.
-        sensors: Log cameras and lidar of agents that need none, too; without, drives are much faster.
-        image_size: Size of the six cameras' images, px.
-        vehicles: How many vehicles share the road near the ego vehicle.
-        people: How many pedestrians do.
-        scenarios: Let others brake, cut in, run lights and step out on the way, in CARLA's manner.
-        period: Time between plans.
-        latency: How much later than what it saw a plan takes effect.
-        workers: How many drives run at a time; 0 is one for each core.
-        ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
-        rebuilt: Folder of a reconstruction to drive in. Its actors replay; agent "log" goes on as the log was
-            driven.
-        start: Times of the log at which drives begin; as early as possible if left out.
-        threat: Put a car in the way: one that stands, comes head-on or crosses.
-        edits: File of edits to the rebuilt scene.
     """
     driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    if rebuilt is not None:
-        from foredrive.recipes.rebuilt_driving import RebuiltSuite
-        from foredrive.simulation.threats import Threat
-
-        in_log = RebuiltSuite(
-            driver=driver,
-            run=str(rebuilt.absolute()),
-            starts_s=start,
-            threats=tuple(map(Threat, threat)),
-            edits=None if edits is None else str(edits.absolute()),
-            sensors=sensors,
-            period_s=period,
-            latency_s=latency,
-        )
+    in_log = rebuilt.suite(driver, planning)
+    if in_log is not None:
         _drive_rebuilt(in_log, out)
-        return
-    if start or threat or edits is not None:
-        raise InputError("--start, --threat and --edits are for drives in rebuilt logs (--in RUN)")
-    from foredrive.recipes.driving import DriveSuite
-
-    suite = DriveSuite(
-        driver=driver,
-        routes=routes,
-        repetitions=repetitions,
-        seed=seed,
-        conditions=conditions,
-        sensors=sensors,
-        image_hw=image_size,
-        vehicles=vehicles,
-        people=people,
-        scenarios=scenarios,
-        period_s=period,
-        latency_s=latency,
-    )
-    _drive(suite, out, workers or len(os.sched_getaffinity(0)), ray)
+    else:
+        _drive(towns.suite(driver, planning), out, towns.workers or len(os.sched_getaffinity(0)), towns.ray)
 
 
 def _drive(suite: "DriveSuite", out: Path, workers: int, on_ray: bool) -> None:

@@ -1,11 +1,9 @@
 """The program `foredrive`: its verbs, and what a user sees when one of them cannot go on."""
 
-import _thread
 import errno
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -29,6 +27,7 @@ from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
+from foredrive.interrupts import LastingInterrupt
 
 VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
@@ -80,38 +79,33 @@ def main(args: Sequence[str] | None = None) -> int:
     traceback is shown, because it is a mistake in the program. What the command line itself gets wrong ends
     in SystemExit(2), `--help` in SystemExit(0).
     """
-    hook, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     args = sys.argv[1:] if args is None else list(args)
     if "-".join(args[:2]) in VERBS:  # such as `search index`
         args = ["-".join(args[:2]), *args[2:]]
+    interrupt = LastingInterrupt()
     try:
-        tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
+        with interrupt:
+            tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
         return _give_up(_last_words(error))
     except BrokenPipeError:  # whoever reads our output has seen enough, such as `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE
     except KeyboardInterrupt:
-        _give_up("interrupted")
-        return EXIT_INTERRUPTED
+        return _end_interrupted()
     except Exception as error:
+        if interrupt.pressed:  # code that it hit has made another error of it
+            return _end_interrupted()
         reason = _disk_reason(error)
         if reason is None:
             raise
         return _give_up(reason)
-    finally:
-        sys.unraisablehook = hook
     return 0
 
 
-def _interrupt_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Ctrl-C that hits where Python ignores exceptions, such as in a destructor, is not lost."""
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        again = threading.Timer(0.01, _thread.interrupt_main)  # at once it would hit this very function
-        again.daemon = True
-        again.start()
-    else:
-        sys.__unraisablehook__(unraisable)
+def _end_interrupted() -> int:
+    _give_up("interrupted")
+    return EXIT_INTERRUPTED
 
 
 def _give_up(reason: str) -> int:

@@ -1,7 +1,7 @@
 """`foredrive score`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -11,13 +11,15 @@ from foredrive.errors import InputError
 if TYPE_CHECKING:
     from foredrive.evaluation.detections import DetectionSet, FrameScore
 
+Family = Literal["gaussian", "laplace"]
+
 
 def score(
     results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS")],
     truth: Path,
     against: OptionalPath = None,
     out: Path = Path("runs/score"),
-    family: Literal["gaussian", "laplace"] = "gaussian",
+    family: Family = "gaussian",
     k: int = 25,
     worst: int = 6,
 ) -> None:
@@ -39,12 +41,7 @@ def score(
     from rich.console import Console
 
     from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
-    from foredrive.evaluation.detections import (
-        compare_scores,
-        read_detections,
-        summarise_scores,
-        write_frame_scores,
-    )
+    from foredrive.evaluation.detections import read_detections, summarise_scores, write_frame_scores
     from foredrive.view.score_report import print_scores, write_score_report
 
     if worst < 0:
@@ -55,19 +52,7 @@ def score(
     result = summarise_scores(read, scores)
     figures = result.figures
     if against is not None:
-        other = read_detections(against, truth, family)
-        others = _scored(other, k, against)
-        compared, uncompared = compare_scores(scores, others)
-        theirs = summarise_scores(other, others).figures
-        figures |= {f"against.{key}": value for key, value in theirs.items()}
-        figures |= {
-            "against": str(against),
-            "against.difference": compared.mean,
-            "against.difference_low_95": compared.low,
-            "against.difference_high_95": compared.high,
-            "against.p_value": compared.p_value,
-            "against.frames_not_compared": uncompared,
-        }
+        figures |= _compared(scores, against, truth, family, k)
     figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
     figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
     write_summary(out / "summary.json", figures)
@@ -77,6 +62,26 @@ def score(
     )
     print_scores(figures, Console())
     print(f"wrote {out / 'summary.json'}, {out / 'report.html'} and {out / 'frames.jsonl'}")
+
+
+def _compared(
+    scores: "list[FrameScore]", against: Path, truth: Path, family: Family, k: int
+) -> dict[str, Any]:
+    """The others' figures, and the difference to them."""
+    from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
+
+    other = read_detections(against, truth, family)
+    others = _scored(other, k, against)
+    compared, uncompared = compare_scores(scores, others)
+    theirs = summarise_scores(other, others).figures
+    return {f"against.{key}": value for key, value in theirs.items()} | {
+        "against": str(against),
+        "against.difference": compared.mean,
+        "against.difference_low_95": compared.low,
+        "against.difference_high_95": compared.high,
+        "against.p_value": compared.p_value,
+        "against.frames_not_compared": uncompared,
+    }
 
 
 def _scored(read: "DetectionSet", k: int, path: Path) -> "list[FrameScore]":

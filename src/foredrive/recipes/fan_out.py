@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import rich
 
 from foredrive.errors import InputError
+from foredrive.interrupts import LastingInterrupt
 from foredrive.training.interrupts import start_fork_server
 
 LAST_WORDS_S = 60.0
@@ -101,29 +102,23 @@ class _Worker:
     """What a worker process knows of itself."""
 
     is_busy = False
-    has_to_stop = False
+    interrupt = LastingInterrupt(lambda: _Worker.is_busy)
 
 
 def _start_worker(stop: Connection) -> None:
     """Stop when the parent closes its end of a pipe, not by Ctrl-C; clear away what is half-written."""
     rich.get_console().quiet = True  # the parent shows how far it is
 
-    def interrupt(signum: int, frame: object) -> None:
-        if not _Worker.has_to_stop:
-            _Worker.has_to_stop = True
-            if _Worker.is_busy:
-                raise KeyboardInterrupt
-
     def watch() -> None:
         stop.poll(None)
         _thread.interrupt_main()
 
-    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGINT, _Worker.interrupt)
     threading.Thread(target=watch, daemon=True).start()
 
 
 def _unless_stopped(work: Callable[[J], R], job: J) -> R:
-    if _Worker.has_to_stop:
+    if _Worker.interrupt.pressed:
         raise KeyboardInterrupt
     _Worker.is_busy = True
     try:

@@ -57,8 +57,8 @@ class ContrastObjective(nn.Module):
         """One text of each view, drawn anew; views mirrored and cropped, which changes no fact."""
         rows = torch.arange(len(batch.images), device=batch.images.device)
         drawn = torch.randint(batch.texts.shape[1], (len(rows),), generator=generator).to(rows.device)
-        # a third of the time of full precision, on CPUs that know it
-        with torch.autocast(batch.images.device.type, torch.bfloat16):
+        device = batch.images.device.type
+        with torch.autocast(device, torch.bfloat16, enabled=computes_bfloat16(device)):
             found = self.tower(_jittered(batch.images, generator))
         found = F.normalize(found.float(), dim=-1)
         texts = F.normalize(batch.texts[rows, drawn], dim=-1)
@@ -89,6 +89,15 @@ class DistilObjective(nn.Module):
         cosine = F.cosine_similarity(found, target, dim=-1).mean()
         loss = F.mse_loss(found, target) if self.kind == "mse" else 1 - cosine
         return {"loss": loss, "cosine": cosine}
+
+
+def computes_bfloat16(device: str) -> bool:
+    """Whether bfloat16 saves time: on CPUs that know it a step takes a third of that in full precision, on
+    others twenty times as long."""
+    if device != "cpu":
+        return True
+    known = torch.cpu.get_capabilities()
+    return bool(known.get("amx_bf16") or known.get("avx512_bf16"))
 
 
 def true_of(said: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Tensor, "i t"]:

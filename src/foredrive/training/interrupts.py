@@ -3,9 +3,10 @@
 import contextlib
 import multiprocessing
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
+
+from foredrive.interrupts import raises_interrupts
 
 
 @contextlib.contextmanager
@@ -19,11 +20,10 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
     Yields:
         a function that tells whether Ctrl-C was pressed, so that the block can come to its end.
     """
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not raises_interrupts():
         yield lambda: False
         return
-    pressed = False
+    before, pressed = signal.getsignal(signal.SIGINT), False
 
     def note(signum: int, frame: object) -> None:
         nonlocal pressed
@@ -35,7 +35,7 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
     if pressed:
         raise KeyboardInterrupt
 
