@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath
@@ -12,22 +13,12 @@ from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
 from foredrive.recipes import Run
-from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.recipes.rebuild_gap import Comparison, measure_gap, rendered_images
 from foredrive.recipes.rebuilt_runs import open_rebuilt, rebuilt_cameras
 from foredrive.recipes.reconstruct import read_material, reconstruct
-from foredrive.rendering.initial import InitialSize
 from foredrive.scene import Clip, Trajectory
-from foredrive.training.rebuilding import RebuildSchedule
 
-RECIPE = RebuildRecipe(
-    name="smallest",
-    image_hw=(24, 48),
-    initial=InitialSize(lidar_points=1500, pixel_points=1000, near_points=0, actor_points=80, features=2),
-    schedule=RebuildSchedule(steps=2, most_gaussians=3000, beam_stride=4),
-    hold_out_every=4,
-    decoder_width=8,
-)
+RECIPE = dataclasses.replace(SMALLEST, hold_out_every=4)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import synthetic_log as world
 import torch
+from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
@@ -13,26 +14,16 @@ from foredrive.data.drives import read_drive as read_log
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.recipes import Run, evaluate_run
-from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.recipes.kept_drives import score_of
 from foredrive.recipes.rebuilt_driving import REPLAY, RebuiltSuite, drive_rebuilt
 from foredrive.recipes.rebuilt_runs import open_rebuilt
 from foredrive.recipes.reconstruct import reconstruct
-from foredrive.rendering.initial import InitialSize
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.scene import Renderer, VoxelSpec
 from foredrive.simulation.threats import Threat
-from foredrive.training.rebuilding import RebuildSchedule
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
-SMALLEST = RebuildRecipe(
-    name="smallest",
-    image_hw=(24, 48),
-    initial=InitialSize(lidar_points=1500, pixel_points=1000, near_points=0, actor_points=80, features=2),
-    schedule=RebuildSchedule(steps=2, most_gaussians=3000, beam_stride=4),
-    decoder_width=8,
-)
 
 
 @pytest.fixture(scope="module")

@@ -1,38 +1,30 @@
 """Runs opened again without their logs, and actors that go from one to another."""
 
+import dataclasses
 import math
 from pathlib import Path
 
 import pytest
 import synthetic_log as world
 import torch
+from small_rebuild import SMALLEST
 
 from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.recipes.rebuilt_runs import edited_scene, open_rebuilt
 from foredrive.recipes.reconstruct import Rebuilt, reconstruct
 from foredrive.rendering.edits import Insert, Remove
 from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
-from foredrive.rendering.initial import InitialSize
-from foredrive.training.rebuilding import RebuildSchedule
 
-SMALLEST = RebuildRecipe(
-    name="smallest",
-    image_hw=(24, 48),
-    initial=InitialSize(lidar_points=1500, pixel_points=1000, near_points=0, actor_points=80, features=2),
-    schedule=RebuildSchedule(steps=2, most_gaussians=3000, beam_stride=4),
-    cameras=("ahead",),
-    decoder_width=8,
-)
+ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
     folder = tmp_path_factory.mktemp("opened")
     (log,) = find_logs(world.write(folder, frames=5))
-    return reconstruct(SMALLEST, log, folder / "run")
+    return reconstruct(ONE_CAMERA, log, folder / "run")
 
 
 @torch.no_grad()

@@ -1,5 +1,6 @@
 """Films of a rebuilt log, from the command line."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,17 +8,15 @@ import pytest
 import synthetic_log as world
 import torch
 from PIL import Image
+from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.recipes import rebuilt_film
-from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.recipes.rebuilt_film import edits_from_words, plan_shooting, shoot
 from foredrive.recipes.rebuilt_runs import edited_scene, open_rebuilt
 from foredrive.recipes.reconstruct import Rebuilt, reconstruct
 from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
-from foredrive.rendering.initial import InitialSize
-from foredrive.training.rebuilding import RebuildSchedule
 from foredrive.view import rebuilt_video, video
 
 FRAMES = 5
@@ -29,14 +28,7 @@ ONE_WH = (480 + 2 * 8, 270 - 30 + 8 + 240 + 2 * 26 + 8)
 def run(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
     folder = tmp_path_factory.mktemp("filmed")
     (log,) = find_logs(world.write(folder, frames=FRAMES))
-    recipe = RebuildRecipe(
-        name="smallest",
-        image_hw=(24, 48),
-        initial=InitialSize(lidar_points=1500, pixel_points=1000, near_points=0, actor_points=80, features=2),
-        schedule=RebuildSchedule(steps=1, most_gaussians=3000, beam_stride=4),
-        cameras=("ahead",),
-        decoder_width=8,
-    )
+    recipe = dataclasses.replace(SMALLEST, cameras=("ahead",))
     return reconstruct(recipe, log, folder / "run")
 
 

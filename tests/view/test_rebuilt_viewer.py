@@ -9,38 +9,29 @@ import numpy as np
 import pytest
 import synthetic_log as world
 import torch
+from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.errors import InputError
-from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.recipes.rebuilt_runs import OpenRun, open_rebuilt
 from foredrive.recipes.reconstruct import reconstruct
 from foredrive.rendering.edits import Move, Remove, ShiftEgo, load_edits, move_between
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.initial import InitialSize
 from foredrive.rendering.tracks import states_at
-from foredrive.training.rebuilding import RebuildSchedule
 from foredrive.view.background import Background
 from foredrive.view.rebuilt_viewer import RebuiltViewer
 from foredrive.view.splat_nodes import thinned
 
 PARKED, MOVING = 7, 11
-SMALLEST = RebuildRecipe(
-    name="smallest",
-    image_hw=(24, 48),
-    initial=InitialSize(lidar_points=1500, pixel_points=1000, near_points=0, actor_points=80, features=2),
-    schedule=RebuildSchedule(steps=2, most_gaussians=3000, beam_stride=4),
-    cameras=("ahead",),
-    decoder_width=8,
-)
+ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> OpenRun:
     folder = tmp_path_factory.mktemp("viewed")
     (log,) = find_logs(world.write(folder, frames=5))
-    return open_rebuilt(reconstruct(SMALLEST, log, folder / "run").folder)
+    return open_rebuilt(reconstruct(ONE_CAMERA, log, folder / "run").folder)
 
 
 class Page(RebuiltViewer):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from foredrive.recipes.indexing import Indexed
 
-TOWERS = "openai/clip-vit-base-patch32"
+TOWERS = "embedded"
 FAILURES_SHOWN = 5
 
 
@@ -35,8 +35,8 @@ def search_index(
     Args:
         logs: 123D logs, splits, data roots or lists of clips.
         index: Where the index lies: a folder, or a place on object storage such as s3://bucket/index.
-        towers: A CLIP or SigLIP model: its name on Hugging Face's hub, or its folder; or a folder that
-            `foredrive search train` made.
+        towers: Those that come along ("embedded"); or a CLIP or SigLIP model: its name on Hugging Face's hub,
+            or its folder; or a folder that `foredrive search train` made.
         stride: Time between the moments of a log that are indexed.
         workers: How many parts of logs are embedded at a time; 0 is one for each core.
         ray: Embed on Ray: on the cluster at RAY_ADDRESS, or on one started here.

@@ -43,7 +43,7 @@ def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> Non
         drive: what was kept of it.
     """
     opened = Log(log)
-    frames = [_frame(opened, index, drive) for index in range(len(opened))]
+    frames = (_frame(opened, index, drive) for index in range(len(opened)))
     write_video(path, frames, FRAME_DT_S / FASTER)
 
 

@@ -51,7 +51,7 @@ def write_rebuilt_video(
     make_folder(path.parent)
     rig, chosen = run.vehicle.rig, list(shooting.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
-    frames = [
+    frames = (
         draw_shots(
             [(name, shoot(run.scene, run.vehicle, edited, shooting, k)) for name, edited in takes],
             rig,
@@ -59,7 +59,7 @@ def write_rebuilt_video(
             colour,
         )
         for k in track(range(len(shooting.t_s)), description=f"filming {run.folder.name}")
-    ]
+    )
     write_video(path, frames, shooting.step_s)
 
 

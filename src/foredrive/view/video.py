@@ -1,6 +1,7 @@
 """Moving pictures on disk."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from importlib import util
 from pathlib import Path
@@ -27,8 +28,11 @@ def check_video(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs PyAV: pip install 'foredrive[video]', or write {WEBP}")
 
 
-def write_video(path: Path, frames: Sequence[Image.Image], frame_s: float) -> None:
+def write_video(path: Path, frames: Iterable[Image.Image], frame_s: float) -> None:
     """Write frames of one size, each shown for `frame_s`: MP4 (H.264) or animated WebP, by the path's suffix.
+
+    Args:
+        frames: at least one. MP4 keeps none of them in memory, WebP all.
 
     Raises:
         InputError: as `check_video`.
@@ -36,27 +40,29 @@ def write_video(path: Path, frames: Sequence[Image.Image], frame_s: float) -> No
     check_video(path)
     with atomic_path(path) as temporary:
         if path.suffix == MP4:
-            _write_mp4(temporary, frames, frame_s)
+            _write_mp4(temporary, iter(frames), frame_s)
             return
-        frames[0].save(
+        first, *others = frames
+        first.save(
             temporary,
             format="WEBP",
             save_all=True,
-            append_images=frames[1:],
+            append_images=others,
             duration=round(1000 * frame_s),
             loop=0,
             quality=WEBP_QUALITY,
         )
 
 
-def _write_mp4(path: Path, frames: Sequence[Image.Image], frame_s: float) -> None:
+def _write_mp4(path: Path, frames: Iterator[Image.Image], frame_s: float) -> None:
     import av  # an extra
 
-    width, height = (n - n % 2 for n in frames[0].size)  # as H.264 has it
+    first = next(frames)
+    width, height = (n - n % 2 for n in first.size)  # as H.264 has it
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(1 / frame_s).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for frame in frames:
+        for frame in itertools.chain([first], frames):
             picture = av.VideoFrame.from_ndarray(np.asarray(frame)[:height, :width].copy(), format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
