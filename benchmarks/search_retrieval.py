@@ -3,7 +3,7 @@
 Drives of the held-out town under four kinds of weather, each with the same routes and traffic. Everything
 that is known of a view is asked for (recipes/retrieval_quality.py); P@K counts moments of one drive that are
 closer than 5 s once, and its 95 % interval is over drives. SEARCH_RETRIEVAL_TOWERS names the towers, as
-`--towers` of `foredrive search index` does; by default they are those of docs/search.md.
+`--towers` of `foredrive search index` does; by default they are those that come along.
 """
 
 import functools
@@ -15,12 +15,12 @@ from foredrive.evaluation import Benchmark
 from foredrive.recipes.recording import record_drives
 from foredrive.recipes.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
 from foredrive.recipes.sector_views import gather_views
-from foredrive.recipes.towers import find_towers
+from foredrive.recipes.towers import EMBEDDED, find_towers
 from foredrive.towns.campaign import Campaign, plan_drives
 
-TOWERS = os.environ.get("SEARCH_RETRIEVAL_TOWERS", "runs/towers/towers")
+TOWERS = os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED)
 WORK = Path("runs/search_retrieval")
-TOWN, SEEDS, WEATHERS = "Town05", (201, 202), ("clear", "night", "rain", "fog")
+TOWN, SEEDS, WEATHERS = "Town05", tuple(range(201, 206)), ("clear", "night", "rain", "fog")
 SECONDS, RATE_HZ, IMAGE_HW, CROWD = 40.0, 0.5, (144, 256), (40, 40)
 
 
