@@ -41,3 +41,12 @@ def _plain(tensors: tuple[Tensor, ...], device: str) -> bool:
 @lru_cache
 def _has_triton() -> bool:
     return find_spec("triton") is not None
+
+
+def computes_bfloat16(device: str) -> bool:
+    """Whether bfloat16 saves time: on CPUs that know it a step takes a third of that in full precision, on
+    others more than ten times as long. A PyTorch that does not tell takes full precision."""
+    if device != "cpu":
+        return True
+    known: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(known.get("amx_bf16") or known.get("avx512_bf16"))

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from foredrive.models.image_tower import ImageTower
 from foredrive.models.lidar_clip import LidarEncoder, PointCloud
+from foredrive.ops.precision import computes_bfloat16
 from foredrive.scene.record import Record
 
 FIRST_TEMPERATURE, SHARPEST = 0.07, 100.0
@@ -89,15 +90,6 @@ class DistilObjective(nn.Module):
         cosine = F.cosine_similarity(found, target, dim=-1).mean()
         loss = F.mse_loss(found, target) if self.kind == "mse" else 1 - cosine
         return {"loss": loss, "cosine": cosine}
-
-
-def computes_bfloat16(device: str) -> bool:
-    """Whether bfloat16 saves time: on CPUs that know it a step takes a third of that in full precision, on
-    others twenty times as long."""
-    if device != "cpu":
-        return True
-    known = torch.cpu.get_capabilities()
-    return bool(known.get("amx_bf16") or known.get("avx512_bf16"))
 
 
 def true_of(said: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Tensor, "i t"]:
