@@ -8,6 +8,7 @@ runs/rebuild_town/COMMIT, that goes on where it stopped.
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -23,21 +24,14 @@ from foredrive.recipes.study import work_folder
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene import Category
 from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
 WORK = work_folder(Path("runs/rebuild_town"))
 DRIVE = TownDrive("Town10HD", seed=3)
-PASSED = 18
-"""A car in the lane to the right, which is overtaken."""
-EDITS: dict[str, tuple[Edit, ...]] = {
-    "held_out": (),
-    "left_2m": (ShiftEgo((0.0, 2.0, 0.0)),),
-    "left_3m": (ShiftEgo((0.0, 3.0, 0.0)),),
-    "right_2m": (ShiftEgo((0.0, -2.0, 0.0)),),
-    "right_3m": (ShiftEgo((0.0, -3.0, 0.0)),),
-    "removed": (Remove(PASSED),),
-    "moved": (Move(PASSED, offset_m=(3.0, 2.0, 0.0)),),
-}
+ASIDE_M, AHEAD_M = (-5.0, -2.0), (2.0, 25.0)
+"""Where the lane to the right is, and how far ahead a car in it is looked for."""
+NAMES = ("held_out", "left_2m", "left_3m", "right_2m", "right_3m", "removed", "moved")
 JUDGED_EVERY = 8
 """Of the frames, from the second on: a quarter of those that are held out."""
 CHANGED, CHANGED_M = 4, 0.1
@@ -60,9 +54,44 @@ def truth() -> TownTruth:
 
 
 @functools.cache
+def passed() -> int:
+    """The car in the lane to the right that is ahead in most of the judged frames: it is passed.
+
+    Who drives there depends on the last digits of a machine's arithmetic, so it is not known by its number.
+    """
+    ahead: Counter[int] = Counter()
+    for moment in truth().moments[1::JUDGED_EVERY]:
+        R, ego_m = moment.T_world_ego[:3, :3], moment.T_world_ego[:3, 3]
+        for actor in moment.actors:
+            x_m, y_m, _ = R.T @ (actor.centre_m - ego_m)
+            if actor.category is Category.CAR and inside(x_m, AHEAD_M) and inside(y_m, ASIDE_M):
+                ahead[actor.track_id] += 1
+    return ahead.most_common(1)[0][0]
+
+
+def inside(value: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] < value < bounds[1]
+
+
+@functools.cache
+def edits_of(name: str) -> tuple[Edit, ...]:
+    """The edits that one of `NAMES` stands for."""
+    every: dict[str, tuple[Edit, ...]] = {
+        "held_out": (),
+        "left_2m": (ShiftEgo((0.0, 2.0, 0.0)),),
+        "left_3m": (ShiftEgo((0.0, 3.0, 0.0)),),
+        "right_2m": (ShiftEgo((0.0, -2.0, 0.0)),),
+        "right_3m": (ShiftEgo((0.0, -3.0, 0.0)),),
+        "removed": (Remove(passed()),),
+        "moved": (Move(passed(), offset_m=(3.0, 2.0, 0.0)),),
+    }
+    return every[name]
+
+
+@functools.cache
 def true_views(name: str) -> list[TrueViews]:
     """What is really seen after the edits of a name."""
-    return [truth().seen(frame, EDITS[name]) for frame in range(1, DRIVE.frames, JUDGED_EVERY)]
+    return [truth().seen(frame, edits_of(name)) for frame in range(1, DRIVE.frames, JUDGED_EVERY)]
 
 
 def rebuilt(arm: str, seed: int) -> dict[str, float]:
@@ -70,7 +99,8 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
     recipe = dataclasses.replace(ARMS[arm], schedule=dataclasses.replace(ARMS[arm].schedule, seed=seed))
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
     figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
-    for name, edits in EDITS.items():
+    for name in NAMES:
+        edits = edits_of(name)
         edited = any(isinstance(edit, Move | Remove) for edit in edits)
         if edited and not recipe.actors:
             continue
@@ -129,7 +159,7 @@ BENCHMARK = Benchmark(
     arms={arm: functools.partial(rebuilt, arm) for arm in ARMS},
     config={
         "drive": dataclasses.asdict(DRIVE),
-        "edits": {name: [dataclasses.asdict(edit) for edit in edits] for name, edits in EDITS.items()},
+        "views": NAMES,
         "arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()},
     },
 )

@@ -73,6 +73,13 @@ def test_a_run_trains_both_towers_and_is_not_begun_again(
     with pytest.raises(InputError, match="holds a run with another recipe"):
         train_towers(other, [log], tmp_path / "run")
 
+    another = dataclasses.replace(recipe, distil=dataclasses.replace(recipe.distil, seed=1))
+    beside = train_towers(another, [log], tmp_path / "beside", tmp_path / "cache", beside=str(folder))
+    found = load_towers(beside)
+    assert found.fingerprint.startswith(base.fingerprint)
+    assert found.fingerprint != towers.fingerprint
+    torch.testing.assert_close(found.embed_text(["a car"]), towers.embed_text(["a car"]), rtol=0, atol=0)
+
 
 def test_a_lidar_tower_beside_clip_needs_nothing_that_could_be_said(
     recipe: TowerRecipe, log: LogPath, tmp_path: Path

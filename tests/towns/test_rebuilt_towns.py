@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -15,12 +16,14 @@ from foredrive.rendering.calibration import with_images_of
 from foredrive.rendering.edits import Duplicate, Move, Remove, ShiftEgo
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
 
 DRIVE = TownDrive(
     "Town02", seed=3, seconds=6.0, rate_hz=2.0, cameras=("PCAM_F0", "PCAM_R0"), image_hw=(120, 240)
 )
-AHEAD = 42
-"""A car that drives ahead all the time."""
+AHEAD = 1_000
+"""A car that is put ahead: whom traffic puts there depends on the last digits of the machine's arithmetic."""
 NOBODY = Tracks(
     torch.zeros(0, dtype=torch.int64),
     torch.zeros(0, dtype=torch.int64),
@@ -56,9 +59,20 @@ def test_from_beside_the_same_town_is_seen(truth: TownTruth) -> None:
     assert not torch.equal(beside.cameras[0].image, driven.cameras[0].image)
 
 
-def test_who_is_removed_or_moved_is_not_where_it_was(truth: TownTruth) -> None:
+def car_ahead(T_world_ego: np.ndarray) -> ActorState:
+    """It drives 10 m ahead on a level road."""
+    size_lwh = np.array([4.5, 1.8, 1.5])
+    centre_m = (T_world_ego @ [10.0, 0.0, 0.5 * size_lwh[2], 1.0])[:3]
+    yaw = float(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
+    velocity_mps = T_world_ego[:3, 0] * 3.0
+    return ActorState(AHEAD, Category.CAR, centre_m, yaw, 0.0, size_lwh, velocity_mps, style=1, parked=False)
+
+
+def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
+    truth = TownTruth(DRIVE)
+    actor = car_ahead(truth.moments[4].T_world_ego)
+    truth.moments[4] = dataclasses.replace(truth.moments[4], actors=[actor])
     driven = truth.seen(4).sweep
-    (actor,) = [a for a in truth.moments[4].actors if a.track_id == AHEAD]
     T_scene_world = torch.from_numpy(truth.moments[0].T_world_ego).inverse()
     centre_m = transform_points(T_scene_world, torch.from_numpy(actor.centre_m)[None]).float()[0]
     forward = (T_scene_world[:3, :3] @ torch.from_numpy(actor.velocity_mps)).float()

@@ -68,13 +68,13 @@ def search_train(
     """Train towers for search, or go on with a run that was interrupted.
 
     An image tower learns beside a sentence encoder from what is known of each camera's view, then a lidar
-    tower from the image tower. Beside CLIP or SigLIP only a lidar tower is trained, from images alone.
+    tower from the image tower. Beside other towers only a lidar tower is trained, from images alone.
 
     Args:
         logs: 123D logs, splits or data roots with cameras and lidar; image towers need boxes or captions.
         out: Folder of the run; the towers lie in its folder "towers".
         cache: Folder for views; by default "cache" in the run's folder.
-        beside: A CLIP or SigLIP model whose images teach the lidar tower.
+        beside: Towers whose images teach the lidar tower: embedded, a folder, or a CLIP or SigLIP model.
         loss: What the lidar tower is trained by: mean squared error, or 1 - cosine.
         image_steps: Steps of the image tower; by default 20 epochs.
         lidar_steps: Steps of the lidar tower; by default 10 epochs.

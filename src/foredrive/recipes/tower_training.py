@@ -24,6 +24,7 @@ from foredrive.recipes.towers import find_towers
 from foredrive.search.embedded import (
     ImageSize,
     LidarSize,
+    LidarTowers,
     SentenceTowers,
     TowerCard,
     build_image_tower,
@@ -97,8 +98,8 @@ def train_towers(
     Args:
         folder: of the run.
         cache_dir: for images and points of views; by default in `folder`.
-        beside: CLIP or SigLIP, as `find_towers` knows them: only a lidar tower is trained, beside their image
-            tower. By default an image tower is trained first, beside the recipe's sentence encoder.
+        beside: towers, as `find_towers` knows them: only a lidar tower is trained, beside their image tower.
+            By default an image tower is trained first, beside the recipe's sentence encoder.
 
     Returns:
         The folder of the towers.
@@ -112,11 +113,12 @@ def train_towers(
     cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
     if beside is None:
         views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
-        base = _train_image(recipe, views, folder, fabric)
+        base: Towers = _train_image(recipe, views, folder, fabric)
     else:
         base = find_towers(beside)
+        base = base.base if isinstance(base, LidarTowers) else base
         views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
-    return _train_lidar(recipe, views, folder, fabric, base, beside)
+    return _train_lidar(recipe, views, folder, fabric, base)
 
 
 def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabric: "Fabric") -> Towers:
@@ -145,7 +147,6 @@ def _train_lidar(
     folder: Path,
     fabric: "Fabric",
     base: Towers,
-    beside: str | None,
 ) -> Path:
     """The lidar tower, which meets no text: its views come as points and embeddings of images."""
     final = folder / TOWERS
@@ -155,15 +156,16 @@ def _train_lidar(
         encoder = build_lidar_tower(recipe.lidar, base.dim)
         objective = DistilObjective(encoder, recipe.loss)
         train(objective, dataset, collate_imaged, recipe.distil, folder / LIDAR_STAGE, fabric)
-        image = (base.tower, base.text_mean) if isinstance(base, SentenceTowers) else None
+        sentences = base if isinstance(base, SentenceTowers) else None
         card = TowerCard(
             dim=base.dim,
-            text=beside or recipe.text,
-            image=None if image is None else recipe.image,
+            text=base.name if sentences is None else sentences.text,
+            image=None if sentences is None else sentences.size,
             base_fingerprint=base.fingerprint,
             lidar=recipe.lidar,
             trained=_told(recipe, views),
         )
+        image = None if sentences is None else (sentences.tower, sentences.text_mean)
         save_towers(final, card, image, encoder)
     return final
 

@@ -76,10 +76,11 @@ class SentenceTowers:
     has_lidar = False
 
     def __init__(
-        self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], side_px: int, text: str
+        self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], size: ImageSize, text: str
     ) -> None:
         self.name, self.tower, self.text_mean = name, tower.eval(), text_mean
-        self.dim, self.image_side_px, self._text = len(text_mean), side_px, text
+        self.size, self.text = size, text
+        self.dim, self.image_side_px = len(text_mean), size.side_px
         self.fingerprint = f"sentence-{weights_digest({TEXT_MEAN: text_mean, **tower.state_dict()})}"
 
     @torch.no_grad()
@@ -100,7 +101,7 @@ class SentenceTowers:
     @functools.cached_property
     def _encoder(self) -> TextEncoder:
         """Loaded when it is first asked: to make an index takes no text."""
-        return TextEncoder(self._text)
+        return TextEncoder(self.text)
 
 
 class LidarTowers:
@@ -189,7 +190,7 @@ def _load_base(folder: Path, card: TowerCard) -> Towers:
     text_mean = _load_weights(tower, folder / IMAGE).get(TEXT_MEAN)
     if text_mean is None:
         raise InputError(f"{folder / IMAGE}: no {TEXT_MEAN} in it")
-    return SentenceTowers(str(folder), tower, text_mean, card.image.side_px, card.text)
+    return SentenceTowers(str(folder), tower, text_mean, card.image, card.text)
 
 
 def _halved(model: nn.Module) -> dict[str, Tensor]:

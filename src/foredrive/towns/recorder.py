@@ -95,7 +95,7 @@ def record(
     conditions: Conditions | None = None,
     log_name: str | None = None,
 ) -> LogPath:
-    """Record one drive; the same arguments give the same bytes.
+    """Record one drive; the same arguments give the same bytes, on the same kind of processor.
 
     The log lies at out/logs/SPLIT/NAME and replaces one of that name; the map, once for all logs of the
     town, at out/maps. Boxes are those of all road users within `BOXES_WITHIN_M`, parked cars included; the
