@@ -183,7 +183,7 @@ def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
         (["evaluate", "{tmp}"], "{tmp}: not a run folder"),
         (["imagine", "{tmp}", "{tmp}", "--out", "{tmp}/x.avi"], "{tmp}/x.avi: videos end on .mp4"),
         (["convert", "pandaset", "{tmp}/none", "--out", "{tmp}/out"], "{tmp}/none: no such folder"),
-        (["convert", "kitti", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
+        (["convert", "lyft", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
     ],
 )
 def test_each_verb_names_what_it_cannot_use(

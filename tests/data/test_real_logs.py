@@ -245,8 +245,8 @@ def test_the_nuscenes_boxes_hold_as_many_points_as_annotated(keyframe: LogPath) 
 def test_a_source_without_logs_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no pandaset log here"):
         convert(tmp_path, "pandaset", tmp_path / "out")
-    with pytest.raises(InputError, match="unknown data set 'kitti'"):
-        convert(tmp_path, "kitti", tmp_path / "out")
+    with pytest.raises(InputError, match="unknown data set 'lyft'"):
+        convert(tmp_path, "lyft", tmp_path / "out")
 
 
 def test_a_damaged_source_leaves_nothing_behind(real_data: Path, tmp_path: Path) -> None:

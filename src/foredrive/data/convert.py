@@ -14,6 +14,7 @@ from py123d.parser.pandaset.pandaset_parser import PandasetLogParser
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.av2_partial import Av2PartialParser
+from foredrive.data.kitti_object import KittiObjectParser
 from foredrive.data.logs import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.errors import InputError
@@ -106,10 +107,18 @@ def _nuscenes_keyframe(source: Path) -> LogParsers:
         yield folder, NuScenesKeyframeParser(folder, "nuscenes_val"), None
 
 
+def _kitti_object(source: Path) -> LogParsers:
+    for folder in _folders_with(source, "velodyne"):
+        split = "kitti_test" if folder.name == "testing" else "kitti_train"
+        for sweep in sorted(folder.glob("velodyne/*.bin")):
+            yield sweep, KittiObjectParser(folder, sweep.stem, split), None
+
+
 DATASETS: dict[str, Callable[[Path], LogParsers]] = {
     "pandaset": _pandaset,
     "av2": _av2,
     "nuscenes-keyframe": _nuscenes_keyframe,
+    "kitti-object": _kitti_object,
 }
 """How the raw logs of each data set are found and parsed. The whole of nuScenes, and data sets that are not
 here, are for py123d's own `py123d-conversion`."""
