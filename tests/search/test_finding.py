@@ -116,8 +116,10 @@ def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
         assert hit.score == pytest.approx(hit.scores["joint"])
     for hit in by_rule["logits"]:
         assert hit.score == pytest.approx(hit.scores["image"] + hit.scores.get("lidar", hit.scores["image"]))
+        assert hit.scores.get("joint", hit.score / 2) == pytest.approx(hit.score / 2)
     for hit in by_rule["rerank"]:
         assert hit.score == pytest.approx(hit.scores["lidar"])
+        assert "joint" not in hit.scores
 
 
 def test_what_has_no_lidar_is_not_found_by_it(index: FrameIndex, target: Target) -> None:

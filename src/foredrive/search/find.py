@@ -80,7 +80,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     if query.diverse is not None:
         order = [order[n] for n in _diverse(rows, order, score, query)]
     kept = rows.take(pa.array(order, pa.int64()))
-    facts, scores = kept.select(FACTS.names).to_pylist(), _scores(kept, target)
+    facts, scores = kept.select(FACTS.names).to_pylist(), _scores(kept, target, query)
     hits = [Hit(*each) for each in zip(facts, score[order].tolist(), scores, strict=True)]
     return Found(hits, len(rows), exact)
 
@@ -178,15 +178,22 @@ def _likeness(rows: pa.Table, query: Query, target: Target) -> Float[ndarray, "n
     return again
 
 
-def _scores(rows: pa.Table, target: Target | None) -> list[dict[str, float]]:
-    """Of each row its cosine with the target by modality; the joint one only where there are two to join."""
+def _scores(rows: pa.Table, target: Target | None, query: Query) -> list[dict[str, float]]:
+    """Of each row its cosine with the target by modality; the joint one only where there are two to join.
+
+    Joined as the query joins them: of logits the mean, and nothing where lidar ranks again.
+    """
     if target is None:
         return [{} for _ in range(len(rows))]
-    image, lidar = vectors_of(rows, "image"), vectors_of(rows, "lidar")
-    both = mean_direction(np.stack([image, lidar]))
-    both[np.isnan(image + lidar).any(-1)] = np.nan
-    of_rows = {"image": image, "lidar": lidar, "joint": both}
-    cosines = {name: of_rows[name] @ vector for name, vector in _vectors(target).items()}
+    of_rows = {name: vectors_of(rows, name) for name in ("image", "lidar")}
+    vectors = _vectors(target)
+    cosines = {name: of_rows[name] @ vectors[name] for name in of_rows if name in vectors}
+    if query.rule == "logits" and len(cosines) == 2:
+        cosines["joint"] = 0.5 * (cosines["image"] + cosines["lidar"])
+    elif query.rule == "features":
+        both = mean_direction(np.stack(list(of_rows.values())))
+        both[np.isnan(of_rows["image"] + of_rows["lidar"]).any(-1)] = np.nan
+        cosines["joint"] = both @ vectors["joint"]
     return [
         {name: float(values[n]) for name, values in cosines.items() if not np.isnan(values[n])}
         for n in range(len(rows))
