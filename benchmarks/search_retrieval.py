@@ -3,7 +3,8 @@
 Drives of the held-out town under four kinds of weather, each with the same routes and traffic. Everything
 that is known of a view is asked for (recipes/retrieval_quality.py); P@K counts moments of one drive that are
 closer than 5 s once, and its 95 % interval is over drives. SEARCH_RETRIEVAL_TOWERS names the towers, as
-`--towers` of `foredrive search index` does; by default they are those that come along.
+`--towers` of `foredrive search index` does, one for each seed with : between them; by default they are those
+that come along.
 """
 
 import functools
@@ -18,7 +19,7 @@ from foredrive.recipes.sector_views import gather_views
 from foredrive.recipes.towers import EMBEDDED, find_towers
 from foredrive.towns.campaign import Campaign, plan_drives
 
-TOWERS = os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED)
+TOWERS = tuple(os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED).split(":"))
 WORK = Path("runs/search_retrieval")
 TOWN, SEEDS, WEATHERS = "Town05", tuple(range(201, 206)), ("clear", "night", "rain", "fog")
 SECONDS, RATE_HZ, IMAGE_HW, CROWD = 40.0, 0.5, (144, 256), (40, 40)
@@ -34,9 +35,9 @@ def drives() -> list[LogPath]:
 
 
 @functools.cache
-def judged() -> dict[str, dict[str, float]]:
+def judged(seed: int) -> dict[str, dict[str, float]]:
     """Figures by modality."""
-    towers = find_towers(TOWERS)
+    towers = find_towers(TOWERS[seed])
     logs = drives()
     views = gather_views(logs, 1 / RATE_HZ, towers.image_side_px, WORK)
     seen = Judged.of_logs(logs, views, towers)
@@ -47,13 +48,13 @@ def judged() -> dict[str, dict[str, float]]:
 
 
 def of_modality(modality: str, seed: int) -> dict[str, float]:
-    return judged()[modality]
+    return judged(seed)[modality]
 
 
 BENCHMARK = Benchmark(
     question="What share of the first 1, 10 and 100 hits is what was asked for, by modality and weather?",
     arms={modality: functools.partial(of_modality, modality) for modality in MODALITIES},
-    seeds=(0,),
+    seeds=tuple(range(len(TOWERS))),
     config={
         "towers": TOWERS,
         "town": TOWN,
