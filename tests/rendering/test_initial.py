@@ -2,16 +2,19 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import synthetic_log as world
 import torch
+from scipy.spatial.transform import Rotation
 
 from foredrive.data import find_logs
 from foredrive.data.drives import read_drive
 from foredrive.errors import InputError
-from foredrive.rendering.initial import InitialSize, initial_scene
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.initial import PATCH_OPACITY, InitialSize, initial_scene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.seed_points import SeedPoints, like_neighbours
+from foredrive.rendering.seed_points import UNSEEN_M, SeedPoints, like_neighbours
 from foredrive.rendering.tracks import read_tracks, states_at
 from foredrive.rendering.views import camera_views, sweep_views
 from foredrive.scene import Clip
@@ -73,6 +76,26 @@ def test_the_static_part_has_no_actors_in_it(graph: SceneGraph) -> None:
     assert float(((seen - grey).abs().amax(-1) < 0.02).float().mean()) > 0.95
 
 
+def unseen(own: Gaussians) -> torch.Tensor:
+    """Those where no camera looks."""
+    return own.opacity_logit.isclose(torch.tensor(PATCH_OPACITY).logit())
+
+
+def test_what_no_camera_saw_lies_flat_and_evenly(graph: SceneGraph) -> None:
+    own = graph.gaussians[graph.actor == STATIC]
+    patches = own[unseen(own)]
+    assert 2000 < len(patches.opacity_logit) <= SIZE.lidar_points
+    cells = (patches.mean_m / UNSEEN_M).floor()
+    assert len(cells.unique(dim=0)) == len(cells)
+    # all of it is ground: thin along the vertical, as wide as they are apart across it
+    thinnest = patches.log_scale.argmin(-1)
+    R = Rotation.from_quat(patches.quaternion.numpy(), scalar_first=True).as_matrix()
+    assert np.median(np.abs(R[np.arange(len(R)), 2, thinnest])) > 0.99
+    widths_m = patches.log_scale.exp().sort(-1).values
+    assert float(widths_m[:, 0].median()) < 0.05
+    assert 0.5 * UNSEEN_M < float(widths_m[:, 1].median()) < float(widths_m[:, 2].median()) < 2 * UNSEEN_M
+
+
 def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:
     points = SeedPoints(
         xyz_m=torch.tensor([[0.0, 0, 0], [10.0, 0, 0], [10.0, 1, 0], [1.0, 0, 0], [10.0, 0.5, 0]]),
@@ -105,7 +128,7 @@ def test_actors_have_their_own_points(graph: SceneGraph, track_id: int, box: dic
 def test_pixels_are_as_far_as_the_beams_beside_them(graph: SceneGraph) -> None:
     """Those of the ground lie on the ground, those of the sky far away; those of actors are left out."""
     own = graph.gaussians[graph.actor == STATIC]
-    along = own[slice(SIZE.lidar_points, -SIZE.near_points)]
+    along = own[~unseen(own)][slice(SIZE.lidar_points, -SIZE.near_points)]
     assert 0.5 * SIZE.pixel_points < len(along.opacity_logit) < SIZE.pixel_points
     rgb = along.feature[:, :3] * 255
     sky = (rgb - torch.tensor(world.SKY_RGB)).abs().amax(-1) < 4

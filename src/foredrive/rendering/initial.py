@@ -1,5 +1,6 @@
 """Gaussians before anything is learned: lidar points in their colours, the far field, random points."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from foredrive.geometry.quaternions import quaternion_of
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, joined, mirrored
 from foredrive.rendering.seed_points import (
@@ -20,12 +22,17 @@ from foredrive.rendering.seed_points import (
     points_along_pixels,
     points_anywhere,
     some_points,
+    standing_points,
 )
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
 
 _NEIGHBOURS = 3
 _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
+_PATCH = 8
+"""Neighbours that tell how a Gaussian lies where no camera looks."""
+_FLATTEST_M = 0.03
+PATCH_OPACITY = 0.8
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,7 @@ class InitialSize:
     """How many Gaussians a scene begins with, and how they look."""
 
     lidar_points: int
-    """At most, over the static part."""
+    """At most, over the static part, of what a camera saw; and at most as many more of what none saw."""
     pixel_points: int
     """Along random pixels, at the range of the beam nearest in the image, or far away where none is near."""
     near_points: int
@@ -64,9 +71,9 @@ def initial_scene(
 ) -> SceneGraph:
     """Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
-    Of the lidar's points most are taken from those that a camera saw; the others are coloured like those near
-    them. Points of mirrored actors (`Tracks.mirrored`) are taken from both sides. Without sweeps points
-    anywhere along pixels stand for all.
+    Points of the lidar that no camera saw are coloured like those near them, and lie flat on what they are
+    part of: nothing but some beams will ever say how large they should be. Points of mirrored actors
+    (`Tracks.mirrored`) are taken from both sides. Without sweeps points anywhere along pixels stand for all.
 
     Args:
         cameras: that may be learned from, with images.
@@ -76,7 +83,7 @@ def initial_scene(
         generator: of which points are taken.
     """
     standing, of_actors = lidar_points(cameras, sweeps, tracks)
-    standing = like_neighbours(some_points(standing, size.lidar_points, generator))
+    standing = like_neighbours(standing_points(standing, size.lidar_points, generator))
     near, far = (size.near_m, size.far_m), (size.far_from_m, size.far_m)
     along, anywhere = no_points(), size.near_points
     if sweeps:
@@ -86,7 +93,8 @@ def initial_scene(
         anywhere += size.lidar_points + size.pixel_points
     beside = points_anywhere(cameras, anywhere, size.scale, near, generator)
     parts = [
-        _gaussians(standing, size, size.opacity, by_neighbours=True),
+        _gaussians(standing[standing.seen], size, size.opacity, by_neighbours=True),
+        _patches(standing[~standing.seen], size),
         _gaussians(along, size, size.opacity),
         _gaussians(beside, size, size.near_opacity if sweeps else size.opacity),
     ]
@@ -140,6 +148,21 @@ def _gaussians(
         opacity_logit=torch.full((count,), opacity).logit(),
         feature=F.pad(points.rgb.float(), (0, size.features)),
     )
+
+
+def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
+    """Gaussians as wide, along each of their axes, as their neighbours are spread: flat where those are."""
+    found = _gaussians(points, size, PATCH_OPACITY)
+    if len(points.xyz_m) <= _PATCH:
+        return found
+    xyz = points.xyz_m.numpy().astype(np.float64)
+    _, near = cKDTree(xyz).query(xyz, k=_PATCH + 1)
+    spread = xyz[near] - xyz[near].mean(1, keepdims=True)
+    variance, axes = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread / (_PATCH + 1))
+    axes *= np.sign(np.linalg.det(axes))[:, None, None]  # a rotation
+    scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
+    quaternion, log_scale = quaternion_of(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
+    return dataclasses.replace(found, quaternion=quaternion.float(), log_scale=log_scale.float())
 
 
 def _neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:

@@ -19,7 +19,9 @@ from foredrive.scene.record import Record
 GREY = 0.5
 """Of what no camera saw, where no other point has a colour."""
 SEEN_SHARE = 0.75
-"""Of the points that are taken, how many a camera saw."""
+"""Of an actor's points that are taken, how many a camera saw."""
+UNSEEN_M = 0.4
+"""How far apart points begin that no camera saw."""
 BEAM_WIDTH_RAD = 0.01
 """Of its range the most that a Gaussian at a lidar's point may measure (standard deviation)."""
 NEAR_IN_IMAGE = 0.06
@@ -136,6 +138,18 @@ def points_anywhere(
         scale_m = scale * away_m * _pixels_apart_rad(view, share)
         found.append(_at(view, uv, direction, away_m, scale_m))
     return all_points(found)
+
+
+def standing_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
+    """At most so many of those that a camera saw, and at most so many of the others, but evenly.
+
+    Beams meet what is near over and over. Of what no camera looks at one point in each `UNSEEN_M` is enough.
+    """
+    order = torch.randperm(len(points.seen), generator=generator)
+    seen, unseen = order[points.seen[order]][:most], order[~points.seen[order]]
+    cell = (points.xyz_m[unseen] / UNSEEN_M).floor().numpy()
+    _, first = np.unique(cell, axis=0, return_index=True)
+    return points[torch.cat([seen, unseen[torch.from_numpy(np.sort(first))][:most]])]
 
 
 def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
