@@ -14,7 +14,7 @@ from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.kept_drives import DRIVES, SUITE, SUMMARY, read_drive, score_of
 from foredrive.simulation.scenarios.kinds import ScenarioKind
-from foredrive.simulation.scores import Ending, InfractionKind
+from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.inline_svg import inline_svg
@@ -193,13 +193,19 @@ def _drive_row(name: str, drive: Mapping[str, Any]) -> str:
     )
 
 
+def _told(infraction: Infraction) -> str:
+    """What was met, and how; some details begin with what it was."""
+    what, detail = infraction.what, infraction.detail
+    return detail if detail.startswith(what) else f"{what} {detail}"
+
+
 def _drive(name: str, drive: Mapping[str, Any]) -> str:
     score = score_of(dict(drive))
     error = f'<p class="alert">{escape(drive["error"])}</p>' if drive["error"] else ""
     lines = [
         (
             infraction.t_s,
-            f"<b>{_words(infraction.kind)}</b> {escape(infraction.what)} {escape(infraction.detail)}",
+            f"<b>{_words(infraction.kind)}</b> {escape(_told(infraction))}",
         )
         for infraction in score.infractions
     ]
