@@ -20,6 +20,7 @@ from foredrive.recipes.tower_data import (
     collate_captioned,
     collate_imaged,
     image_targets,
+    text_targets,
 )
 from foredrive.recipes.tower_training import TowerRecipe, train_towers
 from foredrive.recipes.towers import find_towers
@@ -132,6 +133,17 @@ def test_views_are_read_once_and_hold_what_their_sector_does(
     rows_file.write_text("{")
     with pytest.raises(InputError, match="cannot be read"):
         gather_views([log], 0.5, 24, tmp_path)
+
+
+def test_texts_are_embedded_once(recipe: TowerRecipe, tmp_path: Path) -> None:
+    texts = ["a car", "rain", "a car in the rain"]
+    found = text_targets(texts, recipe.text, tmp_path)
+    torch.testing.assert_close(found, TextEncoder(recipe.text)(texts))
+    (file,) = tmp_path.iterdir()
+    written = file.stat().st_mtime_ns
+    assert torch.equal(text_targets(texts, recipe.text, tmp_path), found)
+    assert file.stat().st_mtime_ns == written
+    assert len(text_targets(texts[:2], recipe.text, tmp_path)) == 2
 
 
 def test_every_text_of_a_view_is_true_of_it(recipe: TowerRecipe, log: LogPath, tmp_path: Path) -> None:

@@ -1,13 +1,15 @@
 """What towers are trained on, item by item: images beside texts, sweeps beside images' embeddings."""
 
 import bisect
+import hashlib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
+from rich.progress import track
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -21,6 +23,8 @@ from foredrive.recipes.sector_views import LogViews, Row
 from foredrive.search.phrases import Phrase, phrases
 from foredrive.search.towers import Towers
 from foredrive.training.alignment import CaptionedImages, ImagedSweeps
+
+TEXTS_AT_ONCE = 4096
 
 
 class _Rows:
@@ -47,7 +51,7 @@ class CaptionedViews(Dataset[CaptionedImages]):
     """Views with T texts each; those of which nothing is known are left out.
 
     Args:
-        encoder: of sentences; it is asked once for every text.
+        embed: texts as vectors; it is asked once, for every text.
         texts: T.
 
     Raises:
@@ -57,7 +61,9 @@ class CaptionedViews(Dataset[CaptionedImages]):
     text_mean: Float[Tensor, "D"]
     """Of all texts."""
 
-    def __init__(self, views: Sequence[LogViews], encoder: TextEncoder, texts: int) -> None:
+    def __init__(
+        self, views: Sequence[LogViews], embed: Callable[[list[str]], Float[Tensor, "N D"]], texts: int
+    ) -> None:
         self._rows = _Rows(views)
         told = [phrases(row.facts, seed, texts) for seed, row in enumerate(self._rows.all())]
         self._known = [index for index, those in enumerate(told) if those]
@@ -67,7 +73,7 @@ class CaptionedViews(Dataset[CaptionedImages]):
         if len(sizes) > 1:
             raise InputError(f"images of one shape are wanted, these logs have {sorted(sizes)}")
         distinct = sorted({phrase.text for those in told for phrase in those})
-        embedded = encoder(distinct)
+        embedded = embed(distinct)
         number = {text: n for n, text in enumerate(distinct)}
         self._text_of = {index: [number[phrase.text] for phrase in told[index]] for index in self._known}
         used = torch.tensor([n for those in self._text_of.values() for n in those])
@@ -115,6 +121,19 @@ class ImagedViews(Dataset[ImagedSweeps]):
         points = log.points(row)
         cloud = PointCloud(points, torch.zeros(len(points), dtype=torch.int64))
         return ImagedSweeps(cloud, self._targets[index], (log.rows[row].name,))
+
+
+def text_targets(texts: Sequence[str], model: str, folder: Path) -> Float[Tensor, "N E"]:
+    """What a text encoder makes of texts; kept in a folder."""
+    told = hashlib.sha256("\n".join([model, *texts]).encode()).hexdigest()[:24]
+    file = folder / f"texts-{told}.safetensors"
+    if not file.is_file():
+        encoder, found = TextEncoder(model), []
+        for start in track(range(0, len(texts), TEXTS_AT_ONCE), "embedding texts"):
+            found.append(encoder(texts[start : start + TEXTS_AT_ONCE]))
+        with atomic_path(file) as temporary:
+            save_file({"texts": torch.cat(found)}, temporary)
+    return load_file(file)["texts"]
 
 
 def image_targets(views: Sequence[LogViews], towers: Towers, folder: Path) -> Float[Tensor, "n 2 D"]:

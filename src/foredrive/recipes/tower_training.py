@@ -1,5 +1,6 @@
 """Training towers: an image tower beside sentences, then a lidar tower beside the image tower."""
 
+import functools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +12,7 @@ import torch
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.text_encoder import IN_A_PACKAGE, TextEncoder
+from foredrive.models.text_encoder import IN_A_PACKAGE
 from foredrive.recipes.sector_views import LogViews, gather_views
 from foredrive.recipes.tower_data import (
     CaptionedViews,
@@ -19,6 +20,7 @@ from foredrive.recipes.tower_data import (
     collate_captioned,
     collate_imaged,
     image_targets,
+    text_targets,
 )
 from foredrive.recipes.towers import find_towers
 from foredrive.search.embedded import (
@@ -125,7 +127,8 @@ def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabri
     """The image tower, saved as towers without lidar: the lidar tower learns from what is kept."""
     stage = folder / IMAGE_STAGE
     if not (stage / TOWERS).is_dir():
-        dataset = CaptionedViews(views, TextEncoder(recipe.text), recipe.texts)
+        embed = functools.partial(text_targets, model=recipe.text, folder=stage)
+        dataset = CaptionedViews(views, embed, recipe.texts)
         torch.manual_seed(recipe.contrast.seed)
         tower = build_image_tower(recipe.image, len(dataset.text_mean))
         train(ContrastObjective(tower), dataset, collate_captioned, recipe.contrast, stage, fabric)
