@@ -14,12 +14,14 @@ from foredrive.errors import InputError
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.initial import PATCH_OPACITY, InitialSize, initial_scene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.seed_points import UNSEEN_M, SeedPoints, like_neighbours
+from foredrive.rendering.seed_points import UNSEEN_RAD, SeedPoints, like_neighbours
 from foredrive.rendering.tracks import read_tracks, states_at
 from foredrive.rendering.views import camera_views, sweep_views
 from foredrive.scene import Clip
 
-SIZE = InitialSize(lidar_points=4000, pixel_points=200, near_points=100, actor_points=60, features=2)
+SIZE = InitialSize(
+    lidar_points=4000, unseen_points=20_000, pixel_points=200, near_points=100, actor_points=60, features=2
+)
 
 
 @pytest.fixture(scope="module")
@@ -81,19 +83,25 @@ def unseen(own: Gaussians) -> torch.Tensor:
     return own.opacity_logit.isclose(torch.tensor(PATCH_OPACITY).logit())
 
 
-def test_what_no_camera_saw_lies_flat_and_evenly(graph: SceneGraph) -> None:
+def test_what_no_camera_saw_lies_flat_and_evenly(graph: SceneGraph, drive: Clip) -> None:
     own = graph.gaussians[graph.actor == STATIC]
     patches = own[unseen(own)]
-    assert 2000 < len(patches.opacity_logit) <= SIZE.lidar_points
-    cells = (patches.mean_m / UNSEEN_M).floor()
-    assert len(cells.unique(dim=0)) == len(cells)
+    assert 1000 < len(patches.opacity_logit) < SIZE.unseen_points
+    way_m = float(torch.linalg.inv(drive.T_world_ego[0])[0] @ drive.T_world_ego[-1, :, 3])  # straight on
+    x_m, y_m = patches.mean_m[:, 0], patches.mean_m[:, 1]
+    range_m = (x_m - x_m.clamp(0, way_m)).hypot(y_m)  # from which it was met at closest
+    for near_m, far_m, side_m in ((0, 8, 0.125), (9, 16, 0.25), (18, 32, 0.5)):
+        there = patches.mean_m[(range_m > near_m) & (range_m < far_m)]
+        cubes = (there / side_m).floor()
+        assert len(there) > 50
+        assert len(cubes.unique(dim=0)) == len(cubes)
     # all of it is ground: thin along the vertical, as wide as they are apart across it
     thinnest = patches.log_scale.argmin(-1)
     R = Rotation.from_quat(patches.quaternion.numpy(), scalar_first=True).as_matrix()
     assert np.median(np.abs(R[np.arange(len(R)), 2, thinnest])) > 0.99
     widths_m = patches.log_scale.exp().sort(-1).values
     assert float(widths_m[:, 0].median()) < 0.05
-    assert 0.5 * UNSEEN_M < float(widths_m[:, 1].median()) < float(widths_m[:, 2].median()) < 2 * UNSEEN_M
+    assert 0.02 < float((widths_m[:, 2] / range_m).median()) < 2 * UNSEEN_RAD
 
 
 def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:

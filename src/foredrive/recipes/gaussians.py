@@ -36,7 +36,8 @@ def gaussians_tiny() -> RebuildRecipe:
         name="gaussians_tiny",
         image_hw=(270, 480),
         initial=InitialSize(
-            lidar_points=60_000,
+            lidar_points=45_000,
+            unseen_points=30_000,
             pixel_points=100_000,
             near_points=0,
             actor_points=50,
@@ -45,7 +46,7 @@ def gaussians_tiny() -> RebuildRecipe:
         ),
         schedule=RebuildSchedule(
             steps=steps,
-            most_gaussians=260_000,
+            most_gaussians=275_000,
             rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=3e-3),
             images_per_sweep=2,
             beam_stride=4,
@@ -65,7 +66,8 @@ def gaussians_base() -> RebuildRecipe:
         name="gaussians_base",
         image_hw=(1080, 1920),
         initial=InitialSize(
-            lidar_points=2_000_000,
+            lidar_points=1_500_000,
+            unseen_points=500_000,
             pixel_points=300_000,
             near_points=300_000,
             actor_points=500,

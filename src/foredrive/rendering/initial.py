@@ -40,7 +40,9 @@ class InitialSize:
     """How many Gaussians a scene begins with, and how they look."""
 
     lidar_points: int
-    """At most, over the static part, of what a camera saw; and at most as many more of what none saw."""
+    """At most, over the static part, of what a camera saw."""
+    unseen_points: int
+    """The same of what none saw."""
     pixel_points: int
     """Along random pixels, at the range of the beam nearest in the image, or far away where none is near."""
     near_points: int
@@ -83,14 +85,14 @@ def initial_scene(
         generator: of which points are taken.
     """
     standing, of_actors = lidar_points(cameras, sweeps, tracks)
-    standing = like_neighbours(standing_points(standing, size.lidar_points, generator))
+    standing = like_neighbours(standing_points(standing, size.lidar_points, size.unseen_points, generator))
     near, far = (size.near_m, size.far_m), (size.far_from_m, size.far_m)
     along, anywhere = no_points(), size.near_points
     if sweeps:
         count, scale = size.pixel_points, size.pixel_scale
         along = points_along_pixels(cameras, sweeps, tracks, count, scale, far, generator)
     else:
-        anywhere += size.lidar_points + size.pixel_points
+        anywhere += size.lidar_points + size.unseen_points + size.pixel_points
     beside = points_anywhere(cameras, anywhere, size.scale, near, generator)
     parts = [
         _gaussians(standing[standing.seen], size, size.opacity, by_neighbours=True),

@@ -20,8 +20,8 @@ GREY = 0.5
 """Of what no camera saw, where no other point has a colour."""
 SEEN_SHARE = 0.75
 """Of an actor's points that are taken, how many a camera saw."""
-UNSEEN_M = 0.4
-"""How far apart points begin that no camera saw."""
+UNSEEN_RAD, UNSEEN_M = 0.03, (0.125, 1.0)
+"""How far apart points begin that no camera saw: a share of the range, between bounds."""
 BEAM_WIDTH_RAD = 0.01
 """Of its range the most that a Gaussian at a lidar's point may measure (standard deviation)."""
 NEAR_IN_IMAGE = 0.06
@@ -140,16 +140,29 @@ def points_anywhere(
     return all_points(found)
 
 
-def standing_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
+def standing_points(
+    points: SeedPoints, most: int, most_unseen: int, generator: torch.Generator
+) -> SeedPoints:
     """At most so many of those that a camera saw, and at most so many of the others, but evenly.
 
-    Beams meet what is near over and over. Of what no camera looks at one point in each `UNSEEN_M` is enough.
+    Beams meet what is near over and over. Where no camera looks one point is enough in each cube whose side
+    is about `UNSEEN_RAD` of the range from which the place was met at closest.
     """
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]][:most], order[~points.seen[order]]
-    cell = (points.xyz_m[unseen] / UNSEEN_M).floor().numpy()
-    _, first = np.unique(cell, axis=0, return_index=True)
-    return points[torch.cat([seen, unseen[torch.from_numpy(np.sort(first))][:most]])]
+    return points[torch.cat([seen, unseen[_one_a_cube(points[unseen])][:most_unseen]])]
+
+
+def _one_a_cube(points: SeedPoints) -> Int[Tensor, "K"]:
+    """The first point of each cube, in their order."""
+    xyz_m, range_m = points.xyz_m.double().numpy(), points.scale_m.double().numpy() / BEAM_WIDTH_RAD
+    _, block = np.unique(np.floor(xyz_m / UNSEEN_M[1]), axis=0, return_inverse=True)
+    closest_m = np.full(block.max(initial=-1) + 1, np.inf)
+    np.minimum.at(closest_m, block, range_m)
+    halvings = np.ceil(np.log2(UNSEEN_M[1] / (UNSEEN_RAD * closest_m).clip(*UNSEEN_M)))
+    side_m = (UNSEEN_M[1] / 2**halvings)[block]
+    cubes = np.column_stack([np.floor(xyz_m / side_m[:, None]), side_m])
+    return torch.from_numpy(np.sort(np.unique(cubes, axis=0, return_index=True)[1]))
 
 
 def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
