@@ -8,11 +8,14 @@ import torch
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
+from foredrive.data.logs import Log
+from foredrive.recipes.captioning import CAPTIONS, caption_views, load_captions
 from foredrive.recipes.recording import record_plan
 from foredrive.recipes.searching import ask
 from foredrive.recipes.sector_views import gather_views
 from foredrive.recipes.tower_quality import embed_all
 from foredrive.recipes.towers import EMBEDDED, SHIPPED, find_towers
+from foredrive.search.embedding import read_views
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
 from foredrive.search.zero_shot import class_vectors, classify
@@ -34,7 +37,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LogPath]:
 
 def test_they_are_small_enough_to_come_along() -> None:
     files = {file.name: file.stat().st_size for file in SHIPPED.iterdir()}
-    assert set(files) == {"towers.json", "image.safetensors", "lidar.safetensors"}
+    assert set(files) == {"towers.json", "image.safetensors", "lidar.safetensors", "captions.safetensors"}
     assert sum(files.values()) < MOST_BYTES
 
 
@@ -57,3 +60,14 @@ def test_searching_works_with_nothing_else(
         hits = ask(FrameIndex(index), Query(text="at night", modality=modality, view="sectors")).hits
         assert "night" in str(hits[0].facts["log"])
     assert main(["search", "a car close by", "--modality", "lidar", "--index", index]) == 0
+
+
+def test_they_say_whether_it_is_night(drives: dict[str, LogPath]) -> None:
+    towers = find_towers(EMBEDDED)
+    decoder = load_captions(SHIPPED / CAPTIONS, towers)
+    for light, log in drives.items():
+        said = caption_views(read_views(Log(log), 0, towers.image_side_px, with_lidar=True), towers, decoder)
+        assert len(said) == 6
+        at_night = ["at night" in str(each.by_image) for each in said.values()]
+        assert sum(at_night) >= 5 if light == "night" else sum(at_night) <= 1
+        assert all(each.by_lidar for each in said.values())
