@@ -32,7 +32,6 @@ _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
 _PATCH = 8
 """Neighbours that tell how a Gaussian lies where no camera looks."""
 _FLATTEST_M = 0.03
-PATCH_OPACITY = 0.8
 
 
 @dataclass(frozen=True)
@@ -154,7 +153,7 @@ def _gaussians(
 
 def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
     """Gaussians as wide, along each of their axes, as their neighbours are spread: flat where those are."""
-    found = _gaussians(points, size, PATCH_OPACITY)
+    found = _gaussians(points, size, size.opacity)
     if len(points.xyz_m) <= _PATCH:
         return found
     xyz = points.xyz_m.numpy().astype(np.float64)
