@@ -31,6 +31,7 @@ from foredrive.evaluation import Benchmark, peak_rss_gib
 from foredrive.evaluation.measuring import held_mib, measure
 from foredrive.models.lidar_clip import PointCloud
 from foredrive.recipes.indexing import IndexWriter
+from foredrive.recipes.recording import record_drives
 from foredrive.search.embedded import LidarSize, build_lidar_tower
 from foredrive.search.embedding import read_views
 from foredrive.search.find import find
@@ -38,7 +39,7 @@ from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameInde
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.target import Target
-from foredrive.towns.recorder import record
+from foredrive.towns.campaign import DrivePlan
 
 ROWS = int(os.environ.get("SEARCH_SPEED_ROWS", "1000000"))
 DIM, KINDS, DRIVE = 384, 300, 400
@@ -214,7 +215,8 @@ def lidar_tower(seed: int) -> dict[str, float]:
     As an index does it, side by side on every core, each with one thread.
     """
     with tempfile.TemporaryDirectory() as folder:
-        log = Log(record("Town05", SWEEPS / 2, seed, Path(folder), rate_hz=2.0))
+        plan = DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0)
+        log = Log(record_drives([plan], Path(folder), (144, 256), workers=1).logs[plan])
         frames = range(len(log.t_us))
         read = [read_views(log, frame, 128, with_lidar=True) for frame in frames]
     sectors = [[views[name].sweep for views in read] for name in read[0]]
