@@ -8,11 +8,11 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.common.study import work_folder
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
-from foredrive.recipes.driving import DriveSuite, drive_suite
-from foredrive.recipes.kept_drives import summarise
-from foredrive.recipes.study import work_folder
+from foredrive.runs.drive.records import summarise
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
 WORK = work_folder(Path("runs/drive_expert"))
 SETS = {"short": "town05-short", "long": "town05-long"}

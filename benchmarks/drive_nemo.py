@@ -10,16 +10,16 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark, read_summary
 from foredrive.recipes import find_recipe
-from foredrive.recipes.driving import Driven, DriveSuite, drive_suite
-from foredrive.recipes.evaluate import SUMMARY, evaluate_run
-from foredrive.recipes.kept_drives import summarise
-from foredrive.recipes.recording import record_drives
-from foredrive.recipes.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
-from foredrive.recipes.train import find_all_logs, train_run
+from foredrive.runs.drive.recording import record_drives
+from foredrive.runs.drive.records import summarise
+from foredrive.runs.drive.suite import Driven, DriveSuite, drive_suite
+from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
+from foredrive.runs.train.run import find_all_logs, train_run
 from foredrive.towns.campaign import Campaign, plan_drives
 
 WORK = work_folder(Path("runs/drive_nemo"))

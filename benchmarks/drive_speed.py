@@ -12,12 +12,12 @@ from itertools import cycle
 import numpy as np
 import torch
 
+from benchmarks.common.measuring import held_mib
 from foredrive.data.collate import stack_records
 from foredrive.data.resizing import shrink_images
 from foredrive.evaluation import Benchmark
-from foredrive.evaluation.measuring import held_mib
 from foredrive.recipes import find_recipe
-from foredrive.recipes.build import build_agent
+from foredrive.runs.build import build_agent
 from foredrive.scene import Clip
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S

@@ -10,9 +10,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-from foredrive.evaluation import Benchmark
-from foredrive.recipes import RECIPES
-from foredrive.recipes.study import (
+from benchmarks.common.study import (
     StudyLogs,
     StudyTowns,
     record_study,
@@ -22,6 +20,8 @@ from foredrive.recipes.study import (
     shortened,
     work_folder,
 )
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import RECIPES
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

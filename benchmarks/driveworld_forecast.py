@@ -8,10 +8,8 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-from foredrive.evaluation import Benchmark
-from foredrive.recipes import RECIPES
-from foredrive.recipes.forecast import forecasting, judge_forecast
-from foredrive.recipes.study import (
+from benchmarks.common.forecast import forecasting, judge_forecast
+from benchmarks.common.study import (
     StudyTowns,
     pandaset_log,
     record_study,
@@ -20,7 +18,9 @@ from foredrive.recipes.study import (
     shortened,
     work_folder,
 )
-from foredrive.recipes.train import train_run
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import RECIPES
+from foredrive.runs.train.run import train_run
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

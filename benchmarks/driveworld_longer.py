@@ -8,12 +8,12 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.common.forecast import forecasting, judge_forecast
+from benchmarks.common.study import StudyTowns, record_study, seeded, shortened, work_folder
 from foredrive.evaluation import Benchmark
 from foredrive.recipes import RECIPES
 from foredrive.recipes.config import Recipe
-from foredrive.recipes.forecast import forecasting, judge_forecast
-from foredrive.recipes.study import StudyTowns, record_study, seeded, shortened, work_folder
-from foredrive.recipes.train import train_run
+from foredrive.runs.train.run import train_run
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

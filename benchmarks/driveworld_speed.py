@@ -13,13 +13,13 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.measuring import Took, forget_peak, measure, peak_mib
 from foredrive.data import collate
 from foredrive.evaluation import Benchmark
-from foredrive.evaluation.measuring import Took, forget_peak, measure, peak_mib
 from foredrive.recipes import RECIPES, Recipe
-from foredrive.recipes.build import build_agent, build_objective
-from foredrive.recipes.open_clips import open_clips
-from foredrive.recipes.recording import record_drives
+from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.drive.recording import record_drives
+from foredrive.runs.open_clips import open_clips
 from foredrive.towns.campaign import Campaign, plan_drives
 from foredrive.training import make_fabric
 

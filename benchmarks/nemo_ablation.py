@@ -7,9 +7,9 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.common.study import StudyTowns, record_study, run_arm, seeded, work_folder
 from foredrive.evaluation import Benchmark
 from foredrive.recipes import RECIPES
-from foredrive.recipes.study import StudyTowns, record_study, run_arm, seeded, work_folder
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

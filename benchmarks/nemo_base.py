@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
+from benchmarks.common.measuring import forget_peak, in_a_process, measure, peak_mib
 from foredrive.evaluation import Benchmark
-from foredrive.evaluation.measuring import forget_peak, in_a_process, measure, peak_mib
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.models import lifting
 from foredrive.models.nemo import rendering
@@ -27,7 +27,7 @@ from foredrive.ops.attention3d import attend_volume_reference
 from foredrive.ops.lifting import lift_reference
 from foredrive.ops.volume import sample_volume_reference
 from foredrive.recipes import Recipe, find_recipe
-from foredrive.recipes.build import build_agent, build_objective
+from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
 from foredrive.training import make_fabric
 

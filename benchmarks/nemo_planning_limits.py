@@ -16,6 +16,7 @@ from jaxtyping import Float
 from rich.progress import track
 from torch import Tensor, nn
 
+from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.collate import stack_records
 from foredrive.evaluation import Benchmark, fit_ego_mlp, read_status
@@ -24,7 +25,6 @@ from foredrive.losses import waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, ego_motion
 from foredrive.models.planner import VolumePlanner
 from foredrive.recipes import find_recipe
-from foredrive.recipes.study import StudyTowns, record_study, work_folder
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
 
 WORK = work_folder(Path("runs/nemo_study"))

@@ -9,10 +9,7 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from foredrive.evaluation import Benchmark
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import AveragingEncoderSize, Recipe
-from foredrive.recipes.study import (
+from benchmarks.common.study import (
     StudyLogs,
     StudyTowns,
     occupancy_alone,
@@ -22,7 +19,10 @@ from foredrive.recipes.study import (
     share_of,
     work_folder,
 )
-from foredrive.recipes.train import train_run
+from foredrive.evaluation import Benchmark
+from foredrive.recipes import find_recipe
+from foredrive.recipes.config import AveragingEncoderSize, Recipe
+from foredrive.runs.train.run import train_run
 from foredrive.training import read_metrics
 
 WORK = work_folder(Path("runs/nemo_study"))

@@ -9,10 +9,10 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.evaluation import Benchmark
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
-from foredrive.recipes.reconstruct import reconstruct
-from foredrive.recipes.study import pandaset_log, work_folder
+from foredrive.runs.rebuild.reconstruct import reconstruct
 
 WORK = work_folder(Path("runs/rebuild"))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))

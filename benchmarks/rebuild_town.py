@@ -15,15 +15,15 @@ from pathlib import Path
 from jaxtyping import Bool
 from torch import Tensor
 
+from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
+from benchmarks.common.study import work_folder
 from foredrive.evaluation import Benchmark
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
-from foredrive.recipes.rebuilt_towns import TownDrive, TownTruth, TrueViews
-from foredrive.recipes.reconstruct import Rebuilt, reconstruct
-from foredrive.recipes.study import work_folder
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
 from foredrive.scene import Category
 from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 

@@ -1,7 +1,7 @@
 """What do towers find in a town that they have never seen? `foredrive bench search-retrieval`.
 
 Drives of the held-out town under four kinds of weather, each with the same routes and traffic. Everything
-that is known of a view is asked for (recipes/retrieval_quality.py); P@K counts moments of one drive that are
+that is known of a view is asked for (common/retrieval_quality.py); P@K counts moments of one drive that are
 closer than 5 s once, and its 95 % interval is over drives. SEARCH_RETRIEVAL_TOWERS names the towers, as
 `--towers` of `foredrive search index` does, one for each seed with : between them; by default they are those
 that come along.
@@ -11,12 +11,12 @@ import functools
 import os
 from pathlib import Path
 
+from benchmarks.common.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
 from foredrive.data import LogPath
 from foredrive.evaluation import Benchmark
-from foredrive.recipes.recording import record_drives
-from foredrive.recipes.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
-from foredrive.recipes.sector_views import gather_views
-from foredrive.recipes.towers import EMBEDDED, find_towers
+from foredrive.runs.drive.recording import record_drives
+from foredrive.runs.search.sector_views import gather_views
+from foredrive.runs.search.towers import EMBEDDED, find_towers
 from foredrive.towns.campaign import Campaign, plan_drives
 
 TOWERS = tuple(os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED).split(":"))

@@ -25,13 +25,13 @@ import numpy as np
 import pyarrow as pa
 import torch
 
+from benchmarks.common.measuring import held_mib, measure
 from foredrive.data.collate import stack_records
 from foredrive.data.logs import Log
 from foredrive.evaluation import Benchmark, peak_rss_gib
-from foredrive.evaluation.measuring import held_mib, measure
 from foredrive.models.lidar_clip import PointCloud
-from foredrive.recipes.indexing import IndexWriter
-from foredrive.recipes.recording import record_drives
+from foredrive.runs.drive.recording import record_drives
+from foredrive.runs.search.indexing import IndexWriter
 from foredrive.search.embedded import LidarSize, build_lidar_tower
 from foredrive.search.embedding import read_views
 from foredrive.search.find import find

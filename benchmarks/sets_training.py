@@ -9,9 +9,9 @@ import functools
 import tempfile
 from pathlib import Path
 
+from benchmarks.common.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
 from foredrive.evaluation import Benchmark
-from foredrive.recipes.demo import camera_rig, roof_lidar
-from foredrive.recipes.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
+from foredrive.runs.demo import camera_rig, roof_lidar
 from foredrive.scene import VoxelSpec
 from foredrive.towns.recorder import LabelKinds, record
 from foredrive.towns.sensing.capture import SensorSuite

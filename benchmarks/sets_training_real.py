@@ -9,9 +9,9 @@ import functools
 import tempfile
 from pathlib import Path
 
+from benchmarks.common.detection import DetectionSplit, compare_losses, detection_samples
+from benchmarks.common.study import pandaset_log
 from foredrive.evaluation import Benchmark
-from foredrive.recipes.detection import DetectionSplit, compare_losses, detection_samples
-from foredrive.recipes.study import pandaset_log
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.0), voxel_m=1.0, shape_zyx=(4, 64, 64))

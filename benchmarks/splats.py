@@ -23,9 +23,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.common.measuring import in_a_process
+from benchmarks.common.measuring import measure as time_of
 from foredrive.evaluation import Benchmark
-from foredrive.evaluation.measuring import in_a_process
-from foredrive.evaluation.measuring import measure as time_of
 from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import (

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from foredrive.data import find_logs
-from foredrive.recipes import open_run
+from foredrive.runs import open_run
 from foredrive.view.example_panel import front_camera
 from foredrive.view.image_drawing import Camera, resize
 from foredrive.view.log_times import LogTimes

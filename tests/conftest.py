@@ -1,5 +1,6 @@
-"""Shared by all tests: where the real logs are, arbitrary examples, Triton's interpreter."""
+"""Fixtures that several folders of tests share; Triton's interpreter."""
 
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -7,9 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from miniature import miniature, write_log
 
+from foredrive.data import LogPath
 from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.runs import Run, train_run
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
+from foredrive.towns.conditions import Conditions
+from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.world import World
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # for tests/ops; Triton reads it when something imports it first
@@ -109,3 +116,30 @@ def synthetic_example(
 def make_example() -> Callable[..., Example]:
     """See `synthetic_example`."""
     return synthetic_example
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+    return write_log(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture(scope="session")
+def trained(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run that was never interrupted."""
+    return train_run(miniature(), [log], tmp_path_factory.mktemp("runs") / "trained")
+
+
+@pytest.fixture(scope="session")
+def town_of() -> Callable[[str], TownMap]:
+    """The map of a town by its name; all of them together take some tens of MB."""
+    return functools.cache(load_town_map)
+
+
+@pytest.fixture(scope="session")
+def town02(town_of: Callable[[str], TownMap]) -> TownMap:
+    return town_of("Town02")
+
+
+@pytest.fixture(scope="session")
+def world02(town02: TownMap) -> World:
+    return World(town02, seed=3, conditions=Conditions(hour=12.0))

@@ -14,6 +14,7 @@ FLOORS = [
     {"data", "towns", "rendering", "models", "losses", "metrics", "sets"},
     {"search", "simulation", "training", "evaluation", "export"},
     {"recipes"},
+    {"runs"},
     {"view"},
     {"cli"},
 ]

@@ -5,7 +5,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("package", ["training", "evaluation", "recipes"])
+@pytest.mark.parametrize("package", ["training", "evaluation", "recipes", "runs"])
 def test_what_a_package_offers_is_there(package: str) -> None:
     module = importlib.import_module(f"foredrive.{package}")
     assert all(getattr(module, name) is not None for name in module.__all__)

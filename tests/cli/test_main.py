@@ -222,9 +222,9 @@ def test_verbs_wait_for_nothing_they_do_not_use() -> None:
     bench, convert, record, view, evaluate = heavy_after(
         "import foredrive.evaluation.bench",
         "import foredrive.data.convert",
-        "import foredrive.recipes.recording",
+        "import foredrive.runs.drive.recording",
         "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_times",
-        "import foredrive.recipes.evaluate, foredrive.view.run_report",
+        "import foredrive.runs.evaluate.run, foredrive.view.run_report",
     )
     assert bench == {"torch"}
     assert convert <= LOGS

@@ -8,7 +8,8 @@ from miniature import miniature, write_log
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
-from foredrive.recipes import RECIPES, Run, train_run
+from foredrive.recipes import RECIPES
+from foredrive.runs import Run, train_run
 
 
 @pytest.fixture

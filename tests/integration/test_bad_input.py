@@ -11,7 +11,7 @@ from arrow_surgery import rewrite_column
 
 from foredrive.data import LogPath
 from foredrive.evaluation import read_summary
-from foredrive.recipes import Run
+from foredrive.runs import Run
 
 EGO, CAMERA = "ego_state_se3", "camera.pcam_f0"
 NO_IMAGE = b"no image at all"

@@ -16,7 +16,7 @@ from foredrive.cli import main as program
 from foredrive.data import LogPath, find_logs
 from foredrive.evaluation import read_summary
 from foredrive.files import atomic_path
-from foredrive.recipes import Run
+from foredrive.runs import Run
 from foredrive.training import read_metrics
 
 Program = Callable[..., tuple[int, str]]

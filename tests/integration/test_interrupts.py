@@ -19,7 +19,7 @@ from miniature import miniature
 
 from foredrive.data import LogPath
 from foredrive.evaluation import read_summary
-from foredrive.recipes import Run, train_run
+from foredrive.runs import Run, train_run
 from foredrive.training import read_metrics
 
 PROGRAM = """

@@ -11,10 +11,10 @@ from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.lifting import project_to_cameras
 from foredrive.models.nemo import VolumeRenderer
-from foredrive.recipes.build import build_agent, build_objective
 from foredrive.recipes.config import BevEncoderSize, Recipe, Stage
 from foredrive.recipes.nemo import nemo_base, nemo_tiny
 from foredrive.recipes.nemo_rows import nemo_rows
+from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Command, Example, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))

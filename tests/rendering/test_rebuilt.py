@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import exp_se3, transform_points
-from foredrive.recipes.reconstruct import tracks_without_actors
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 from foredrive.scene import LidarSweep
 
 FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

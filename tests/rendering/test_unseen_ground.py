@@ -9,9 +9,9 @@ from test_rebuilt import FORWARD, scene_of, view
 from test_scene_graph import two_actors
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.recipes.reconstruct import tracks_without_actors
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.unseen_ground import WITHIN_M, add_unseen_ground, guessed_ground
+from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 
 WAY = torch.eye(4).repeat(21, 1, 1)
 WAY[:, 0, 3] = torch.arange(21.0)

@@ -13,7 +13,7 @@ from foredrive.data import LogPath
 from foredrive.data.collate import stack_records
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.recipes.towers import find_towers
+from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedded import (
     CARD,
     IMAGE,

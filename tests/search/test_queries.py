@@ -11,7 +11,8 @@ from miniature import miniature
 from foredrive.data import ClipDataset, LogPath, find_logs
 from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
 from foredrive.errors import InputError
-from foredrive.recipes import Run, open_run, train
+from foredrive.runs import Run, open_run
+from foredrive.runs.train import run as train
 from foredrive.search.query import Like, Query, parse_like
 from foredrive.search.rows import WHOLE
 from foredrive.search.scores import read_scores

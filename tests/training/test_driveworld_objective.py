@@ -9,7 +9,7 @@ from miniature import miniature_driveworld
 
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import motion_of
-from foredrive.recipes.build import build_agent
+from foredrive.runs.build import build_agent
 from foredrive.scene import Example
 from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_moving
 

@@ -12,11 +12,11 @@ from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import find_logs
-from foredrive.recipes import rebuilt_film
-from foredrive.recipes.rebuilt_film import edits_from_words, plan_shooting, shoot
-from foredrive.recipes.rebuilt_runs import edited_scene, open_rebuilt
-from foredrive.recipes.reconstruct import Rebuilt, reconstruct
 from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
+from foredrive.runs.rebuild import film as rebuilt_film
+from foredrive.runs.rebuild.film import edits_from_words, plan_shooting, shoot
+from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
 from foredrive.view import rebuilt_video, video
 
 FRAMES = 5

@@ -14,11 +14,11 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.errors import InputError
-from foredrive.recipes.rebuilt_runs import OpenRun, open_rebuilt
-from foredrive.recipes.reconstruct import reconstruct
 from foredrive.rendering.edits import Move, Remove, ShiftEgo, load_edits, move_between
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.tracks import states_at
+from foredrive.runs.rebuild.rebuilt_run import OpenRun, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.view.background import Background
 from foredrive.view.rebuilt_viewer import RebuiltViewer
 from foredrive.view.splat_nodes import thinned

@@ -7,7 +7,8 @@ import torch
 
 from foredrive.data import LogPath
 from foredrive.evaluation import Failure
-from foredrive.recipes import Inspection, Run, find_recipe
+from foredrive.recipes import find_recipe
+from foredrive.runs import Inspection, Run
 from foredrive.scene import Example
 from foredrive.view.run_report import inspection_panel, report_on_run
 

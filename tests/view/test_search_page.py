@@ -16,7 +16,7 @@ from miniature import write_log
 from small_towers import save_clip
 
 from foredrive.data.clip_list import read_clip_list
-from foredrive.recipes.indexing import index_logs
+from foredrive.runs.search.indexing import index_logs
 from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
 from foredrive.view.search_page import SearchPage, query_of

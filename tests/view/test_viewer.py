@@ -13,8 +13,8 @@ from miniature import miniature, write_log
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
-from foredrive.recipes import Run, train_run
-from foredrive.recipes.vision import Vision
+from foredrive.runs import Run, train_run
+from foredrive.runs.evaluate.vision import Vision
 from foredrive.scene import Trajectory, VoxelSpec
 from foredrive.view.log_times import LogTimes
 from foredrive.view.model_panel import pinhole
@@ -110,7 +110,7 @@ def test_the_model_is_shown_where_it_has_seen_enough(viewer: Viewer) -> None:
 
 def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run) -> None:
     from foredrive.data import ClipDataset, collate
-    from foredrive.recipes.predict import AgentPredictor
+    from foredrive.runs.evaluate.predict import AgentPredictor
 
     times = LogTimes(log, 96, run)
     vision, observer = times.vision(10), times.observer

@@ -59,6 +59,7 @@ def _load(path: Path) -> "Benchmark | None":
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # before it runs: its dataclasses look themselves up there
+    sys.path.insert(0, str(path.absolute().parent.parent))  # `benchmarks.common`
     spec.loader.exec_module(module)
     benchmark = getattr(module, "BENCHMARK", None)
     return benchmark if isinstance(benchmark, Benchmark) else None

@@ -19,7 +19,7 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     from rich.console import Console
 
     from foredrive.evaluation import print_summary, read_summary
-    from foredrive.recipes import full_demo, inspect_run, quick_demo, run_demo
+    from foredrive.runs import full_demo, inspect_run, quick_demo, run_demo
     from foredrive.view.hero import write_hero
     from foredrive.view.report import write_report
     from foredrive.view.run_report import inspection_panel, report_on_run

@@ -10,8 +10,8 @@ from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.recipes.driving import DriveJob, Driven, DriveSuite
-    from foredrive.recipes.rebuilt_driving import RebuiltSuite
+    from foredrive.runs.drive.rebuilt import RebuiltSuite
+    from foredrive.runs.drive.suite import DriveJob, Driven, DriveSuite
 
 FAILURES_SHOWN = 3
 
@@ -44,7 +44,7 @@ def drive(
 
 
 def _drive(suite: "DriveSuite", out: Path, workers: int, on_ray: bool) -> None:
-    from foredrive.recipes.driving import claim, drive_suite
+    from foredrive.runs.drive.suite import claim, drive_suite
     from foredrive.view.drive_report import write_drive_report
 
     claim(suite, out)
@@ -58,8 +58,8 @@ def _drive_rebuilt(suite: "RebuiltSuite", out: Path) -> None:
     from rich.console import Console
     from rich.status import Status
 
-    from foredrive.recipes.kept_drives import summarise
-    from foredrive.recipes.rebuilt_driving import drive_rebuilt
+    from foredrive.runs.drive.rebuilt import drive_rebuilt
+    from foredrive.runs.drive.records import summarise
     from foredrive.view.drive_report import score_table, write_drive_report
 
     with Status("driving") as status:
@@ -78,7 +78,7 @@ def _tell(driven: "Driven") -> None:
     """
     from rich.console import Console
 
-    from foredrive.recipes.kept_drives import summarise
+    from foredrive.runs.drive.records import summarise
     from foredrive.view.drive_report import score_table
 
     if driven.broken:

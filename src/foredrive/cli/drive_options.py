@@ -10,8 +10,8 @@ from foredrive.cli.arguments import OptionalPath
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.recipes.driving import DriveSuite
-    from foredrive.recipes.rebuilt_driving import RebuiltSuite
+    from foredrive.runs.drive.rebuilt import RebuiltSuite
+    from foredrive.runs.drive.suite import DriveSuite
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class InTowns:
 
     def suite(self, driver: str, planning: Planning) -> "DriveSuite":
         """The drives that are asked for."""
-        from foredrive.recipes.driving import DriveSuite
+        from foredrive.runs.drive.suite import DriveSuite
 
         return DriveSuite(
             driver=driver,
@@ -106,7 +106,7 @@ class InRebuilt:
             if self.start or self.threat or self.edits is not None:
                 raise InputError("--start, --threat and --edits are for drives in rebuilt logs (--in RUN)")
             return None
-        from foredrive.recipes.rebuilt_driving import RebuiltSuite
+        from foredrive.runs.drive.rebuilt import RebuiltSuite
         from foredrive.simulation.threats import Threat
 
         return RebuiltSuite(

@@ -36,7 +36,7 @@ def evaluate(
     from rich.console import Console
 
     from foredrive.evaluation import print_summary, read_summary
-    from foredrive.recipes import evaluate_run, find_all_logs, inspect_run, open_run
+    from foredrive.runs import evaluate_run, find_all_logs, inspect_run, open_run
     from foredrive.view.report import write_report
     from foredrive.view.run_report import report_on_run
 
@@ -56,8 +56,8 @@ def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from foredrive.recipes import open_run
-    from foredrive.recipes.rebuild_gap import GAP, measure_gap
+    from foredrive.runs import open_run
+    from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
     from foredrive.view.gap_table import gap_table
 
     with Progress() as progress:

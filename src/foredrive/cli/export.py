@@ -23,8 +23,8 @@ def export(
         logs: 123D logs, splits or data roots to compare on; by default those it was trained on.
         clips: How many clips are compared.
     """
-    from foredrive.recipes import find_all_logs, open_run
-    from foredrive.recipes.export import export_run
+    from foredrive.runs import find_all_logs, open_run
+    from foredrive.runs.export import export_run
 
     trained = open_run(run)
     folder = out or run / "export"

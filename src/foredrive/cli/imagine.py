@@ -28,8 +28,8 @@ def imagine(
     """
     from foredrive.data import find_logs
     from foredrive.errors import InputError
-    from foredrive.recipes import open_run
-    from foredrive.recipes.imagination import imagine_run
+    from foredrive.runs import open_run
+    from foredrive.runs.evaluate.imagination import imagine_run
     from foredrive.view.imagination_video import write_imagination_video
     from foredrive.view.video import check_video
 

@@ -37,7 +37,7 @@ def reconstruct(
     from foredrive.data import find_logs
     from foredrive.errors import InputError
     from foredrive.recipes.gaussians import find_rebuild_recipe
-    from foredrive.recipes.reconstruct import reconstruct as rebuild_log
+    from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
     from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
     logs = find_logs(log)

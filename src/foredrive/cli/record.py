@@ -14,7 +14,7 @@ from foredrive.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from foredrive.recipes.recording import Recorded
+    from foredrive.runs.drive.recording import Recorded
     from foredrive.towns.campaign import DrivePlan
 
 SHEET = "contact_sheet.png"
@@ -57,7 +57,7 @@ def record(
         workers: How many drives are recorded at a time; 0 is one for each core.
         ray: Record on Ray: on the cluster at RAY_ADDRESS, or on one started here.
     """
-    from foredrive.recipes.recording import record_drives, record_plan
+    from foredrive.runs.drive.recording import record_drives, record_plan
     from foredrive.towns.campaign import Campaign, plan_drives
 
     campaign = Campaign(

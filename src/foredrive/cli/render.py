@@ -42,10 +42,10 @@ def render(
         seconds: Length of the film, s; by default until the log's end.
         rate_hz: Frames a second, shown in real time; by default as many as the log has.
     """
-    from foredrive.recipes.rebuilt_film import edits_from_words, plan_shooting
-    from foredrive.recipes.rebuilt_runs import open_rebuilt
     from foredrive.rendering.edits import load_edits
     from foredrive.rendering.edits import save_edits as write_edits
+    from foredrive.runs.rebuild.film import edits_from_words, plan_shooting
+    from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
     from foredrive.view.rebuilt_video import write_rebuilt_video
     from foredrive.view.video import check_video
 

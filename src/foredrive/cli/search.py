@@ -35,7 +35,7 @@ def search(
         saved: Ask the query that was kept under this name, whatever else says what to look for.
         untag: Take this tag away from whatever has it; nothing is looked for.
     """
-    from foredrive.recipes.searching import ask
+    from foredrive.runs.search.searching import ask
     from foredrive.search.index import FrameIndex
     from foredrive.search.kept import remove_tag
 

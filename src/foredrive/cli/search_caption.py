@@ -26,8 +26,8 @@ def search_caption(
     from rich.console import Console
     from rich.table import Table
 
-    from foredrive.recipes.captioning import CAPTIONS, caption_views, load_captions
-    from foredrive.recipes.towers import find_towers
+    from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
+    from foredrive.runs.search.towers import find_towers
     from foredrive.search.index import FrameIndex
     from foredrive.search.query import parse_like
     from foredrive.search.target import example_views
@@ -59,8 +59,8 @@ def search_train_captions(
         epochs: How often it looks at each.
         seed: Of weights and of the order of data.
     """
-    from foredrive.recipes import find_all_logs
-    from foredrive.recipes.captioning import train_captions
+    from foredrive.runs import find_all_logs
+    from foredrive.runs.search.captioning import train_captions
     from foredrive.training import Schedule
 
     schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)

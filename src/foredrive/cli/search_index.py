@@ -15,7 +15,7 @@ from foredrive.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from foredrive.recipes.indexing import Indexed
+    from foredrive.runs.search.indexing import Indexed
 
 TOWERS = "embedded"
 FAILURES_SHOWN = 5
@@ -43,8 +43,8 @@ def search_index(
         scores: Per-frame scores of detections, one JSON object a line (docs/search.md); moments that are in
             the index are given them too.
     """
-    from foredrive.recipes import find_all_logs
-    from foredrive.recipes.indexing import index_logs
+    from foredrive.runs import find_all_logs
+    from foredrive.runs.search.indexing import index_logs
     from foredrive.search.scores import read_scores
 
     found = find_all_logs(logs)
@@ -80,8 +80,8 @@ def search_train(
         lidar_steps: Steps of the lidar tower; by default 10 epochs.
         seed: Of weights and of the order of data.
     """
-    from foredrive.recipes import find_all_logs
-    from foredrive.recipes.tower_training import embedded_recipe, train_towers
+    from foredrive.runs import find_all_logs
+    from foredrive.runs.search.tower_training import embedded_recipe, train_towers
 
     recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
     towers = train_towers(recipe, find_all_logs(logs), out, cache, beside)

@@ -110,7 +110,7 @@ class Then:
     def do(self, index: str, query: "Query", found: "Found") -> None:
         """Keep, tag and write."""
         from foredrive.data.clip_list import write_clip_list
-        from foredrive.recipes.searching import listed_clips
+        from foredrive.runs.search.searching import listed_clips
         from foredrive.search.kept import add_tag, save_query
         from foredrive.view.search_sheet import write_search_sheet
 

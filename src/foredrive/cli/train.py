@@ -27,7 +27,8 @@ def train(
             occupancy that towns record, seen or not. The run is evaluated by the same.
         start: Another run's folder: take its pre-trained weights and go straight on to fine-tuning.
     """
-    from foredrive.recipes import find_all_logs, find_recipe, labelled_by, train_run
+    from foredrive.recipes import find_recipe, labelled_by
+    from foredrive.runs import find_all_logs, train_run
 
     chosen = labelled_by(find_recipe(recipe), occupancy)
     run = train_run(chosen, find_all_logs(logs), out, cache, start)

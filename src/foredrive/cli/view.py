@@ -8,7 +8,7 @@ import tyro
 from foredrive.cli.arguments import OptionalPath
 
 if TYPE_CHECKING:
-    from foredrive.recipes import Run
+    from foredrive.runs import Run
 
 EDITS = "edits.json"
 RUN_CONFIG = "config.yaml"
@@ -77,14 +77,14 @@ def view(
 
 
 def _opened(run: Path) -> "Run":
-    from foredrive.recipes import open_run  # only now: a log alone needs none of it
+    from foredrive.runs import open_run  # only now: a log alone needs none of it
 
     return open_run(run)
 
 
 def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
-    from foredrive.recipes.rebuilt_runs import edited_scene, open_rebuilt
     from foredrive.rendering.edits import load_edits
+    from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
     from foredrive.view.rebuilt_viewer import RebuiltViewer
 
     run = open_rebuilt(folder)

@@ -12,7 +12,7 @@ from foredrive.data.logs import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.recipes.kept_drives import DRIVES, SUITE, SUMMARY, read_drive, score_of
+from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, read_drive, score_of
 from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events

@@ -11,7 +11,6 @@ import viser
 from viser.transforms import SO3
 
 from foredrive.errors import InputError
-from foredrive.recipes.rebuilt_runs import open_rebuilt
 from foredrive.rendering.edits import (
     Duplicate,
     Edit,
@@ -27,6 +26,7 @@ from foredrive.rendering.edits import (
 )
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import states_at
+from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.view.rebuilt_nodes import ROOT, RebuiltNodes
 from foredrive.view.rebuilt_video import words_of
 

@@ -6,7 +6,7 @@ from rich import box
 from rich.table import Table
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
-from foredrive.recipes.rebuild_gap import AGREEMENT, REAL, RENDERED
+from foredrive.runs.evaluate.real_to_sim_gap import AGREEMENT, REAL, RENDERED
 from foredrive.view.summary_tables import number, when_title
 
 COLUMNS = {REAL: "real", RENDERED: "rendered", AGREEMENT: "rendered beside real"}

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
-from foredrive.recipes.imagination import Moment
+from foredrive.runs.evaluate.imagination import Moment
 from foredrive.view import palette
 from foredrive.view.example_panel import COMPARISON_KEY, with_ego
 from foredrive.view.image_drawing import resize

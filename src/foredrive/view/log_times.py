@@ -11,8 +11,8 @@ from foredrive.errors import InputError
 from foredrive.scene import Clip, VoxelSpec
 
 if TYPE_CHECKING:
-    from foredrive.recipes import Run
-    from foredrive.recipes.vision import Observer, Vision
+    from foredrive.runs import Run
+    from foredrive.runs.evaluate.vision import Observer, Vision
 
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
 """Labels are made with every clip, but nobody looks at them here."""
@@ -57,8 +57,8 @@ class LogTimes:
         """Time since the log's start of every frame, s."""
         self.observer = None
         if run is not None:
-            from foredrive.recipes.train import load_agent  # a log alone does not wait for models
-            from foredrive.recipes.vision import Observer
+            from foredrive.runs.evaluate.vision import Observer
+            from foredrive.runs.train.run import load_agent  # a log alone does not wait for models
 
             size = run.recipe.clips
             self.observer = Observer(load_agent(run), size.future_frames)

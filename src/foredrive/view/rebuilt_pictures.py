@@ -11,10 +11,10 @@ from jaxtyping import UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
-from foredrive.recipes.rebuilt_film import Shooting, Shot, shoot
-from foredrive.recipes.rebuilt_runs import OpenRun
 from foredrive.rendering.edits import Edited
 from foredrive.rendering.free_views import free_camera
+from foredrive.runs.rebuild.film import Shooting, Shot, shoot
+from foredrive.runs.rebuild.rebuilt_run import OpenRun
 from foredrive.view import palette
 from foredrive.view.background import Background
 from foredrive.view.model_panel import pinhole

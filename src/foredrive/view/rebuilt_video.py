@@ -12,9 +12,9 @@ from rich.progress import track
 
 from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
-from foredrive.recipes.rebuilt_film import Shooting, Shot, shoot
-from foredrive.recipes.rebuilt_runs import OpenRun, edited_scene
 from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, Send, apply_edits
+from foredrive.runs.rebuild.film import Shooting, Shot, shoot
+from foredrive.runs.rebuild.rebuilt_run import OpenRun, edited_scene
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY

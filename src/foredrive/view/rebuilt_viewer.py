@@ -7,8 +7,8 @@ from pathlib import Path
 
 import viser
 
-from foredrive.recipes.rebuilt_runs import OpenRun
 from foredrive.rendering.edits import Edit
+from foredrive.runs.rebuild.rebuilt_run import OpenRun
 from foredrive.view.background import Background
 from foredrive.view.edit_panel import EditPanel
 from foredrive.view.page import close_page, open_page, page_url

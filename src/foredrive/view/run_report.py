@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 
 from foredrive.data import LogPath
 from foredrive.evaluation import Failure
-from foredrive.recipes import Inspection, Run
-from foredrive.recipes.train import STAGES
+from foredrive.runs import Inspection, Run
+from foredrive.runs.train.run import STAGES
 from foredrive.training import read_metrics
 from foredrive.view.example_panel import ExamplePanel
 from foredrive.view.report import ReportData

@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 from PIL import Image
 
 from foredrive.errors import InputError
-from foredrive.recipes.searching import ask, listed_clips
+from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.kept import add_tag, save_query, saved_queries

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
-from foredrive.recipes.vision import Vision
+from foredrive.runs.evaluate.vision import Vision
 from foredrive.scene import VoxelSpec
 from foredrive.view import palette
 from foredrive.view.scene_nodes import clear

@@ -1,0 +1,59 @@
+"""Forecasts of occupancy: what a run predicts for parts of logs, without looking at plans."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch.utils.data import DataLoader
+
+from foredrive.data import LogPath, collate
+from foredrive.evaluation import evaluate
+from foredrive.recipes.config import Recipe
+from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.evaluate.run import FUTURES
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.run import Run, load_agent
+
+BATCH = 4
+
+
+def forecasting(
+    recipe: Recipe, part_s: tuple[float, float], stride_s: float, future_frames: int | None = None
+) -> Recipe:
+    """Fine-tuning of the world model alone, by what pre-training learns from, on a part of each log.
+
+    Args:
+        part_s: see `ClipConfig`.
+        stride_s: time between the clips' nows.
+        future_frames: how far is imagined, and judged; None: as far as the recipe imagines.
+    """
+    assert recipe.pretrain is not None
+    stage = replace(recipe.pretrain, schedule=recipe.finetune.schedule)
+    model = replace(recipe.model, planner_base="straight_on", planner_look_m=())
+    clips = replace(
+        recipe.clips,
+        part_s=part_s,
+        now_stride_s=stride_s,
+        future_frames=recipe.clips.future_frames if future_frames is None else future_frames,
+    )
+    return replace(recipe, clips=clips, model=model, pretrain=None, finetune=stage, path=None)
+
+
+def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float]) -> dict[str, float]:
+    """Occupancy and flow of another part of logs, now and at each imagined frame, beside copies of now.
+
+    Raises:
+        InputError: if there is nothing to judge.
+    """
+    clips = run.recipe.clips
+    dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)
+    prior, _ = fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames)
+    summary = evaluate(
+        AgentPredictor(load_agent(run), clips.future_frames, 0, FUTURES),
+        DataLoader(dataset, batch_size=BATCH, collate_fn=collate),
+        frame_dt_s=clips.frame_dt_s,
+        prior=prior,
+    ).summary
+    kept = ("occupancy.iou_", "occupancy.above_ground.iou_", "occupancy.above_ground.spread_", "flow.")
+    figures = {key: float(value) for key, value in summary.items() if key.startswith(kept)}
+    return figures | {"items": float(summary["items"]), "failed": float(summary["failed"])}

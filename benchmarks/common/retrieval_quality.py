@@ -1,0 +1,233 @@
+"""What towers find of what is asked for, by kind of question and weather, with intervals over drives."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
+from foredrive.data.logs import Log, LogPath
+from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
+from foredrive.runs.search.sector_views import LogViews, Row
+from foredrive.search.facts import MANY, NOUNS
+from foredrive.search.find import collapse
+from foredrive.search.phrases import SETTINGS
+from foredrive.search.towers import Towers, embed_prompt
+from foredrive.search.zero_shot import class_vectors, classify
+from foredrive.towns.labels.setting import PLACES
+
+RANKS = (1, 10, 100)
+GAP_S = 5.0
+"""Moments of one drive that are closer than this are one hit."""
+DRAWS = 1000
+LEAST_ANSWERS = 3
+"""A question that fewer hits could answer is not asked."""
+WEATHERS = {
+    "clear": ("by day in clear weather", "on a sunny day"),
+    **{name: SETTINGS[name] for name in ("night", "rain", "fog")},
+}
+"""Of whole drives, and what they are called: clear is by day, night has dry roads and clear air."""
+THINGS = ("car", "truck", "cyclist", "pedestrian", "crossing pedestrian")
+"""What is asked for under one of the other weathers too."""
+MODALITIES = ("image", "lidar", "joint", "joint_logits", "chance")
+"""Joint by the sum of features, and by the sum of logits with a text for each modality (LidarCLIP, 4.2)."""
+ALL, EVERY = "all", "every"
+
+
+class Question(NamedTuple):
+    """A text, and the facts of the views that answer it."""
+
+    kind: str
+    """thing, manner, number, place, conditions, or composed: a thing under conditions."""
+    text: str
+    lidar_text: str
+    """What is left of it for sweeps, which show no light, where both modalities have texts of their own."""
+    facts: frozenset[str]
+
+
+class Judged(NamedTuple):
+    """Views with what is known of them, and their unit vectors."""
+
+    rows: list[Row]
+    t_us: Int[np.ndarray, "n"]
+    vectors: Mapping[str, Float[np.ndarray, "n D"]]
+    """By modality: image, lidar, joint."""
+
+    @classmethod
+    def of_logs(cls, logs: Sequence[LogPath], views: Sequence[LogViews], towers: Towers) -> "Judged":
+        """All views of some logs, `views` being what `gather_views` made of them."""
+        t_us = [
+            Log(path).t_us[[row.frame for row in mine.rows]] for path, mine in zip(logs, views, strict=True)
+        ]
+        return cls([row for log in views for row in log.rows], np.concatenate(t_us), embed_all(views, towers))
+
+
+def questions() -> list[Question]:
+    """Single facts, and things under conditions."""
+    single = [Question(_kind_of(fact), text, text, frozenset({fact})) for fact, text in QUERIES.items()]
+    return single + [
+        Question(
+            "composed",
+            f"{QUERIES[thing]} {WEATHERS[weather][0]}",
+            QUERIES[thing],
+            frozenset({thing, weather}),
+        )
+        for weather in list(WEATHERS)[1:]
+        for thing in THINGS
+    ]
+
+
+def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
+    """P@K by modality, then by "pool.kind.p_at_K"; the bounds of its 95 % interval end in "_low" and "_high".
+
+    Pools are the drives of one weather, and all; kinds those of `Question`, and every question. Sequences are
+    drives. "_above_image" is the difference to the image tower's, over the same draws of drives.
+    """
+    logs = [row.log for row in judged.rows]
+    drives = sorted(set(logs))
+    drive = np.array([drives.index(log) for log in logs])
+    weather = np.array([weather_of(judged.rows[logs.index(name)]) for name in drives])
+    asked = [(question, _rankings(question, judged, drive, towers)) for question in questions()]
+    out: dict[str, dict[str, float]] = {modality: {} for modality in MODALITIES}
+    for pool in (ALL, *WEATHERS):
+        chosen = np.flatnonzero((weather == pool) | (pool == ALL))
+        if not len(chosen):
+            continue
+        kept = [each for each in asked if _fits(*each, pool, judged, np.isin(drive, chosen), chosen)]
+        if kept:
+            drawn = chosen[draw_sequences(len(chosen), DRAWS, seed=0)]
+            for modality, figures in _pooled(kept, drawn).items():
+                out[modality] |= {f"{pool}.{name}": value for name, value in figures.items()}
+    return out
+
+
+def judge_naming(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
+    """By modality "zero_shot_accuracy" with its interval, and by weather.
+
+    It is the mean over drives of the share of views whose weather is named right (`search.zero_shot`).
+    """
+    classes, names = class_vectors(towers, WEATHERS), list(WEATHERS)
+    logs = np.array([row.log for row in judged.rows])
+    weather = {row.log: weather_of(row) for row in judged.rows}
+    drawn = draw_sequences(len(weather), DRAWS, seed=0)
+    out = {}
+    for modality, vectors in judged.vectors.items():
+        named = classify(torch.from_numpy(vectors), classes).numpy()
+        right = np.array([np.mean(named[logs == log] == names.index(true)) for log, true in weather.items()])
+        figures = _with_bounds("zero_shot_accuracy", right[drawn].mean(axis=1))
+        for name in names:
+            mine = [true == name for true in weather.values()]
+            if any(mine):
+                figures[f"{name}.zero_shot_accuracy"] = float(right[mine].mean())
+        out[modality] = figures
+    return out
+
+
+def weather_of(row: Row) -> str:
+    """One of `WEATHERS`."""
+    if row.facts.weather in ("rain", "fog"):
+        return row.facts.weather
+    return "night" if row.facts.time_of_day == "night" else "clear"
+
+
+def _kind_of(fact: str) -> str:
+    if fact in NOUNS.values():
+        return "thing"
+    if fact in SETTINGS:
+        return "place" if fact in PLACES else "conditions"
+    return "number" if fact.startswith(MANY) else "manner"
+
+
+def _rankings(
+    question: Question, judged: Judged, drive: Int[np.ndarray, "n"], towers: Towers
+) -> dict[str, Ranking]:
+    """A question's hits by modality."""
+    text, lidar_text = (embed_prompt(towers, words).numpy() for words in (question.text, question.lidar_text))
+    scores = {modality: vectors @ text for modality, vectors in judged.vectors.items()}
+    scores["joint_logits"] = scores["image"] + judged.vectors["lidar"] @ lidar_text
+    scores["chance"] = np.random.default_rng(0).random(len(drive))
+    true = _true_of(question, judged)
+    answers = _kept(np.where(true, 0.0, np.nan), drive, judged.t_us)
+    could = np.bincount(drive[answers], minlength=drive.max() + 1)
+    return {modality: _ranking(scores[modality], true, could, drive, judged.t_us) for modality in MODALITIES}
+
+
+def _ranking(
+    score: Float[np.ndarray, "n"],
+    true: Bool[np.ndarray, "n"],
+    could: Int[np.ndarray, "S"],
+    drive: Int[np.ndarray, "n"],
+    t_us: Int[np.ndarray, "n"],
+) -> Ranking:
+    kept = _kept(score, drive, t_us)
+    by_drive = [[row for row in kept if drive[row] == number] for number in range(len(could))]
+    longest = max(map(len, by_drive))
+    scores = np.full((len(could), longest), -np.inf)
+    hits = np.zeros((len(could), longest), dtype=bool)
+    for number, rows in enumerate(by_drive):
+        scores[number, : len(rows)], hits[number, : len(rows)] = score[rows], true[rows]
+    return Ranking(scores, hits, could)
+
+
+def _kept(
+    score: Float[np.ndarray, "n"], drive: Int[np.ndarray, "n"], t_us: Int[np.ndarray, "n"]
+) -> list[int]:
+    """Rows that no better one of their drive is close to."""
+    return collapse(score, [str(number) for number in drive], t_us, GAP_S, len(score))
+
+
+def _true_of(question: Question, judged: Judged) -> Bool[np.ndarray, "n"]:
+    return np.array([question.facts <= row.facts.facts for row in judged.rows])
+
+
+def _fits(
+    question: Question,
+    rankings: Mapping[str, Ranking],
+    pool: str,
+    judged: Judged,
+    inside: Bool[np.ndarray, "n"],
+    chosen: Int[np.ndarray, "s"],
+) -> bool:
+    """Whether a question is worth asking of a pool."""
+    if pool != ALL and question.kind in ("conditions", "composed"):
+        return False
+    share = _true_of(question, judged)[inside].mean()
+    return bool(share <= MOST_SHARE and rankings["image"].could[chosen].sum() >= LEAST_ANSWERS)
+
+
+def _pooled(
+    kept: Sequence[tuple[Question, Mapping[str, Ranking]]], drawn: Int[np.ndarray, "B s"]
+) -> dict[str, dict[str, float]]:
+    """The figures of one pool, by modality."""
+    kinds = np.array([question.kind for question, _ in kept])
+    found = {
+        modality: np.stack([precision_at(rankings[modality], drawn, RANKS) for _, rankings in kept])
+        for modality in MODALITIES
+    }
+    out = {}
+    for modality, values in found.items():
+        figures: dict[str, float] = {}
+        for kind in (EVERY, *sorted(set(kinds))):
+            mine = (kinds == kind) | (kind == EVERY)
+            figures[f"{kind}.questions"] = float(mine.sum())
+            means, by_image = _mean(values[mine]), _mean(found["image"][mine])
+            for n, rank in enumerate(RANKS):
+                figures |= _with_bounds(f"{kind}.p_at_{rank}", means[:, n])
+                if kind == EVERY and modality != "image":
+                    figures |= _with_bounds(f"{kind}.p_at_{rank}_above_image", means[:, n] - by_image[:, n])
+        out[modality] = figures
+    return out
+
+
+def _mean(values: Float[np.ndarray, "Q B K"]) -> Float[np.ndarray, "B K"]:
+    """Over the questions that something in a draw answers; NaN where there are none."""
+    there = ~np.isnan(values)
+    count = there.sum(axis=0)
+    return np.where(count > 0, np.where(there, values, 0).sum(axis=0) / count.clip(min=1), np.nan)
+
+
+def _with_bounds(name: str, values: Float[np.ndarray, "B"]) -> dict[str, float]:
+    value, low, high = with_interval(values)
+    return {name: value, f"{name}_low": low, f"{name}_high": high}

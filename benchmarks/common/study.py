@@ -1,0 +1,176 @@
+"""Studies: arms that differ in one thing, trained on the same recorded towns and judged in one held out."""
+
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from foredrive.data import LogPath, find_logs
+from foredrive.data.convert import convert
+from foredrive.errors import InputError
+from foredrive.evaluation import collect_provenance, read_summary
+from foredrive.files import atomic_path
+from foredrive.metrics import PROTOCOLS
+from foredrive.recipes.config import Recipe, Stage, rescheduled
+from foredrive.runs.drive.recording import record_drives
+from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
+from foredrive.runs.train.run import train_run
+from foredrive.towns.campaign import Campaign, plan_drives
+from foredrive.training import PathFit, read_metrics
+
+HEADLINE = "uniad"
+"""The protocol of NeMo's own tables."""
+JUDGED_EVERY_S = 1.0
+"""Neighbouring key frames say nearly the same."""
+PLANNERS = ("stand_still", "constant_velocity", "ego_mlp")
+
+
+@dataclass(frozen=True)
+class StudyTowns:
+    """What is driven for a study, in bright daylight, key frames alone."""
+
+    train: tuple[str, ...] = ("Town01", "Town02", "Town03", "Town04", "Town06", "Town07", "Town10HD")
+    test: tuple[str, ...] = ("Town05",)
+    train_seeds: tuple[int, ...] = tuple(range(1, 9))
+    test_seeds: tuple[int, ...] = tuple(range(1, 7))
+    seconds: float = 60.0
+    rate_hz: float = 2.0
+    image_hw: tuple[int, int] = (144, 256)
+
+
+@dataclass(frozen=True)
+class StudyLogs:
+    """The drives, by seed and then by town, so that any first part of them has all towns in it."""
+
+    train: tuple[LogPath, ...]
+    test: tuple[LogPath, ...]
+
+
+def work_folder(root: Path) -> Path:
+    """Where a study of this very code keeps its drives, labels and runs, to go on where it stopped."""
+    return root / str(collect_provenance()["commit"] or "no_commit")
+
+
+def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
+    """Record what does not lie in `out` yet.
+
+    Raises:
+        InputError: if a drive failed: arms must not differ in what they are trained on.
+    """
+    found = []
+    for names, seeds in ((towns.train, towns.train_seeds), (towns.test, towns.test_seeds)):
+        plans = plan_drives(Campaign(names, seeds, seconds=towns.seconds, rate_hz=towns.rate_hz))
+        recorded = record_drives(plans, out, towns.image_hw, workers)
+        if recorded.failed:
+            plan, reason = next(iter(recorded.failed.items()))
+            raise InputError(f"{len(recorded.failed)} drives failed, {plan.log_name}: {reason}")
+        by_seed = sorted(recorded.logs, key=lambda plan: (plan.seed, names.index(plan.town)))
+        found.append(tuple(recorded.logs[plan] for plan in by_seed))
+    return StudyLogs(*found)
+
+
+def pandaset_log(root: Path) -> LogPath:
+    """The first log of the raw PandaSet in FOREDRIVE_REAL_DATA, converted into `root` if it is not there yet.
+
+    Raises:
+        InputError: there is no raw PandaSet here.
+    """
+    if not root.is_dir():
+        with atomic_path(root) as temporary:
+            convert(_raw_pandaset(), "pandaset", temporary)
+    return find_logs(root)[0]
+
+
+def _raw_pandaset() -> Path:
+    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
+    if not source.is_dir():
+        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
+    return source
+
+
+def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:
+    """The first logs, whole ones, at least one."""
+    return tuple(logs[: max(1, round(share * len(logs)))])
+
+
+def seeded(recipe: Recipe, seed: int) -> Recipe:
+    """The recipe with another seed for weights, order of data and rays."""
+
+    return dataclasses.replace(
+        recipe,
+        pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, seed=seed),
+        finetune=rescheduled(recipe.finetune, seed=seed),
+    )
+
+
+def shortened(recipe: Recipe) -> Recipe:
+    """What is trained of a recipe that plans where many are compared: fewer steps, in bfloat16, and the head
+    along the path on fewer clips, so that a run takes a quarter of an hour on one core."""
+    pretrain = recipe.pretrain
+    if pretrain is not None:
+        pretrain = rescheduled(pretrain, steps=300, warmup_steps=20)
+    return dataclasses.replace(
+        recipe,
+        pretrain=pretrain,
+        finetune=rescheduled(recipe.finetune, steps=100, warmup_steps=20),
+        path=PathFit(stride_s=3.0),
+        precision="bf16-mixed",
+    )
+
+
+def occupancy_alone(recipe: Recipe) -> Recipe:
+    """One stage that learns the occupancy of the present and nothing else, as long as pre-training takes."""
+    stage = recipe.pretrain
+    assert isinstance(stage, Stage)
+    weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
+    stage = dataclasses.replace(stage, weights=weights, imagine=False)
+    return dataclasses.replace(recipe, pretrain=None, finetune=stage, path=None)
+
+
+def run_arm(
+    recipe: Recipe, logs: StudyLogs, folder: Path, cache_dir: Path, start: Path | None = None
+) -> dict[str, float]:
+    """Train one arm, judge it on the test drives, and return its figures; goes on where it stopped.
+
+    An arm that was judged is not judged again: `folder` belongs to one code and one set of test drives.
+
+    `occupancy_iou` is that of voxels above the ground, now; `l2_avg_m` and `collision_avg_pct` are those of
+    UniAD's protocol, which NeMo's tables follow. Those of the other protocols, of later frames and of what
+    has to be beaten stand under longer names. `train_s` is what the steps of this run took.
+    """
+    run = train_run(recipe, logs.train, folder, cache_dir, start)
+    if not (folder / SUMMARY).is_file():
+        evaluate_run(run, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
+    summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
+    lines = [
+        line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")
+    ]
+    return study_figures(summary) | {
+        "failed": float(summary["failed"]),
+        "train_s": sum(float(line["step_s"]) for line in lines),
+    }
+
+
+def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What a study keeps of a summary: figures by name; those of a recipe that does not plan mean nothing."""
+    headline = f"planning.{HEADLINE}"
+    kept = {
+        "occupancy_iou": "occupancy.above_ground.iou_now",
+        "l2_avg_m": f"{headline}.l2_avg_m",
+        "collision_avg_pct": f"{headline}.collision_avg_pct",
+    }
+    for scope in ("", "above_ground."):
+        prefixes = (f"occupancy.{scope}iou_", f"occupancy.{scope}spread_")
+        kept |= {key.removeprefix("occupancy."): key for key in summary if key.startswith(prefixes)}
+    kept |= {key: key for key in summary if key.startswith("flow.")}
+    for planner in ("", *(f"{name}." for name in PLANNERS)):
+        for protocol in PROTOCOLS:
+            for kind in ("l2_avg_m", "collision_avg_pct"):
+                kept[f"{planner}{protocol}.{kind}"] = f"planning.{planner}{protocol}.{kind}"
+    return {
+        name: float(summary[key])
+        for name, key in kept.items()
+        if "threshold" not in key and summary[key] is not None
+    }

@@ -1,0 +1,100 @@
+"""Record the towns that `learning` trains and tests on: `python benchmarks/learning_towns.py --out FOLDER`.
+
+252 drives of a minute over the seven training towns at 2 Hz (about three CPU hours, 11 GB), and six through
+Town05. Drives that lie there whole are skipped, so that the command can be interrupted and started again.
+
+Every other drive is in bright daylight, the others under all conditions in turn. Two drives in three vary the
+camera rig: mounts, heights, directions and fields of view. The drives for testing keep the nominal rig.
+"""
+
+import argparse
+import dataclasses
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.geometry.se3 import exp_se3
+from foredrive.scene import CameraRig
+from foredrive.towns.campaign import ANY_CONDITIONS, Campaign, DrivePlan, plan_drives
+from foredrive.towns.conditions import find_conditions
+from foredrive.towns.recorder import Crowd, record, split_of
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+
+TRAIN_TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town06", "Town07", "Town10HD")
+TEST_TOWNS = ("Town05",)
+TRAIN_SEEDS, TEST_SEEDS = tuple(range(1, 37)), tuple(range(1, 7))
+SECONDS, RATE_HZ, IMAGE_HW = 60.0, 2.0, (144, 256)
+VEHICLES, PEOPLE = (15, 60), (10, 40)
+SHIFT_M, RAISE_M, TURN_DEG, TILT_DEG, ZOOM = 0.2, 0.3, 6.0, 2.0, 1.2
+"""At most: one camera's shift, the height all of them are raised by, one camera's turn, tilt and zoom."""
+
+
+def plan_learning() -> list[DrivePlan]:
+    """Return the drives for testing, then those for training by seed and then by town."""
+    test = plan_drives(Campaign(TEST_TOWNS, TEST_SEEDS, seconds=SECONDS, rate_hz=RATE_HZ))
+    train = []
+    for conditions, seeds in (((), TRAIN_SEEDS[1::2]), ((ANY_CONDITIONS,), TRAIN_SEEDS[::2])):
+        train += plan_drives(
+            Campaign(TRAIN_TOWNS, seeds, conditions, VEHICLES, PEOPLE, seconds=SECONDS, rate_hz=RATE_HZ)
+        )
+    return test + sorted(train, key=lambda plan: (plan.seed, TRAIN_TOWNS.index(plan.town)))
+
+
+def rig_of(plan: DrivePlan) -> CameraRig:
+    """Return the nominal rig for testing and every third seed, else one drawn from town and seed."""
+    nominal = camera_rig(IMAGE_HW)
+    if plan.town in TEST_TOWNS or plan.seed % 3 == 0:
+        return nominal
+    rng = np.random.default_rng([plan.seed, *plan.town.encode(), *b"rig"])
+    raised_m = rng.uniform(-RAISE_M, RAISE_M)
+    T_ego_cam = torch.stack([_moved(T, rng, raised_m) for T in nominal.T_ego_cam])
+    K = nominal.K.clone()
+    K[:, 0, 0] *= torch.from_numpy(ZOOM ** rng.uniform(-1.0, 1.0, len(K))).float()
+    K[:, 1, 1] = K[:, 0, 0]
+    return dataclasses.replace(nominal, K=K, T_ego_cam=T_ego_cam)
+
+
+def _moved(
+    T_ego_cam: Float[Tensor, "4 4"], rng: np.random.Generator, raised_m: float
+) -> Float[Tensor, "4 4"]:
+    """Turn a camera about its own axes (right: tilt, down: heading, forward: roll) and shift it."""
+    turn_rad = rng.uniform(-1.0, 1.0, 3) * np.radians([TILT_DEG, TURN_DEG, 0.5 * TILT_DEG])
+    twist = torch.tensor([0.0, 0.0, 0.0, *turn_rad], dtype=torch.float32)
+    moved = T_ego_cam @ exp_se3(twist)
+    shift_m = np.append(rng.uniform(-SHIFT_M, SHIFT_M, 2), raised_m)
+    moved[:3, 3] += torch.from_numpy(shift_m).float()
+    return moved
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="123D data root")
+    out = parser.parse_args().out
+    plans = plan_learning()
+    for number, plan in enumerate(plans):
+        if (out / "logs" / split_of(plan.town) / plan.log_name).is_dir():
+            continue
+        start_s = time.process_time()
+        record(
+            plan.town,
+            plan.seconds,
+            plan.seed,
+            out,
+            plan.rate_hz,
+            SensorSuite(rig_of(plan), roof_lidar()),
+            Crowd(plan.vehicles, plan.people),
+            conditions=None if plan.conditions is None else find_conditions(plan.conditions),
+            log_name=plan.log_name,
+        )
+        took_s = time.process_time() - start_s
+        print(f"{number + 1}/{len(plans)} {plan.log_name}: {math.ceil(took_s)} s of CPU", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""The demo's part below pictures: record towns, train, evaluate on the one held out."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from foredrive.data import LogPath
+from foredrive.recipes.config import Recipe, rescheduled
+from foredrive.runs.evaluate.run import evaluate_run
+from foredrive.recipes.nemo import nemo_tiny
+from foredrive.runs.train.run import Run, train_run
+from foredrive.towns.recorder import LabelKinds, record, split_of
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+
+RATE_HZ = 2.0
+"""Key frames alone: one every 0.5 s."""
+
+
+@dataclass(frozen=True)
+class DemoSize:
+    """How much is recorded and how long is trained."""
+
+    recipe: Recipe
+    train_drives: tuple[tuple[str, int], ...]
+    """Town and seed of each."""
+    test_drives: tuple[tuple[str, int], ...]
+    train_s: float
+    test_s: float
+
+
+def full_demo() -> DemoSize:
+    """Minutes on two cores: two training towns, Town05 held out."""
+    return DemoSize(
+        recipe=nemo_tiny(),
+        train_drives=(("Town01", 1), ("Town03", 1), ("Town01", 2), ("Town03", 2)),
+        test_drives=(("Town05", 1), ("Town05", 2)),
+        train_s=60.0,
+        test_s=30.0,
+    )
+
+
+def quick_demo() -> DemoSize:
+    """The same steps in a minute or so: they run, but nothing is learned worth looking at."""
+    recipe, few = nemo_tiny(), {"batch_size": 2, "warmup_steps": 2}
+    return DemoSize(
+        recipe=dataclasses.replace(
+            recipe,
+            name="nemo_tiny (quick)",
+            pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, steps=12, **few),
+            finetune=rescheduled(recipe.finetune, steps=6, **few),
+        ),
+        train_drives=(("Town01", 1), ("Town02", 1)),
+        test_drives=(("Town05", 1),),
+        train_s=6.0,
+        test_s=6.0,
+    )
+
+
+def run_demo(size: DemoSize, out: Path, say: Callable[[str], None]) -> tuple[Run, list[LogPath]]:
+    """Record, pre-train, fine-tune, evaluate; goes on where an earlier call stopped.
+
+    Returns:
+        the run, whose folder is `out/run`, and the held-out logs.
+    """
+    say("1/4 recording the training towns and Town05, which is held out")
+    train_logs = [_drive(town, seed, size.train_s, out) for town, seed in size.train_drives]
+    test_logs = [_drive(town, seed, size.test_s, out) for town, seed in size.test_drives]
+    say("2/4 training NeMo: self-supervised pre-training, then planning")
+    run = train_run(size.recipe, train_logs, out / "run")
+    say("3/4 evaluating on Town05")
+    evaluate_run(run, test_logs, run.folder)
+    return run, test_logs
+
+
+def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
+    folder = out / "towns"
+    there = folder / "logs" / split_of(town) / f"{town}_seed{seed}"
+    if there.is_dir():  # logs are whole or not there
+        return LogPath(there, folder / "maps")
+    sensors = SensorSuite(camera_rig(nemo_tiny().clips.image_hw), roof_lidar())
+    return record(
+        town,
+        seconds,
+        seed,
+        folder,
+        rate_hz=RATE_HZ,
+        sensors=sensors,
+        labels=LabelKinds(occupancy=None, visibility=False, captions=False),
+    )

@@ -1,0 +1,127 @@
+"""Who may drive a town: agents by the names that the command line knows."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from foredrive.data.resizing import shrink_images
+from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.ego_mlp import EgoMLP
+from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.run import load_agent, open_run
+from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.lessons import Alternating, Disturbed
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.restarts import Restarting
+from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.town import TownSimulator
+from foredrive.simulation.town_expert import TownExpert
+
+CRUISE_MPS = 5.0
+EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
+DISTURBED, PUPIL = "disturbed", "pupil:"
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What an agent has to be shown."""
+
+    cameras: bool
+    lidar: bool
+    """Learned agents go on from a halt only where lidar sees nobody (`Restarting`)."""
+    past_frames: int
+    camera_names: tuple[str, ...] | None = None
+    """Which cameras; None: all there are."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sees:
+    """An agent that was trained on smaller images than the vehicle takes."""
+
+    agent: PlanningAgent
+    image_hw: tuple[int, int]
+    device: str
+
+    def act(self, observation: Clip) -> Trajectory:
+        """The plan of the agent."""
+        return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
+
+
+def needs_of(driver: str) -> Needs:
+    """What a driver has to be shown.
+
+    Args:
+        driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN", the MLP that sees ego
+            status alone, fitted to what the run was trained on; for lessons "disturbed", the expert whom
+            things happen to, or "pupil:RUN", a run and the expert by turns.
+
+    Raises:
+        InputError: there is no such driver.
+    """
+    if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
+        return Needs(cameras=False, lidar=False, past_frames=1)
+    clips = open_run(_run_folder(driver)).recipe.clips
+    if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
+        raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
+    seeing = not driver.startswith(EGO_MLP)
+    return Needs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
+
+
+def make_driver(
+    driver: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
+) -> Agent:
+    """A driver for one drive.
+
+    Args:
+        driver: as for `needs_of`.
+        clock: time of the drive, s.
+        town: where the expert is to drive; the others drive anywhere.
+        seed: of what happens in a lesson.
+
+    Raises:
+        InputError: there is no such driver, or it is the expert and there is no town.
+    """
+    if driver == EXPERT:
+        return _expert(town)
+    if driver == DISTURBED:
+        return Disturbed(_expert(town), clock, seed)
+    if driver in (STOP, CONSTANT_VELOCITY):
+        return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
+    folder = _run_folder(driver)
+    if driver.startswith(PUPIL):
+        return Alternating(_seeing(folder), _expert(town), clock, seed)
+    return Restarting(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
+
+
+def _expert(town: TownSimulator | None) -> TownExpert:
+    if town is None:
+        raise InputError("the expert knows a town's traffic from inside: it cannot drive anywhere else")
+    return TownExpert(town)
+
+
+def _run_folder(driver: str) -> Path:
+    folder = Path(driver.removeprefix(EGO_MLP).removeprefix(PUPIL))
+    if not folder.is_dir():
+        known = (
+            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {PUPIL}RUN"
+        )
+        raise InputError(f"{driver}: no such driver; there are {known}")
+    return folder
+
+
+@lru_cache(maxsize=1)  # a worker drives many routes
+def _seeing(folder: Path) -> _Sees:
+    run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
+    return _Sees(load_agent(run).to(device), run.recipe.clips.image_hw, device)
+
+
+@lru_cache(maxsize=1)
+def _fitted(folder: Path) -> EgoMLP:
+    run = open_run(folder)
+    model, clips = run.recipe.model, run.recipe.clips
+    past_frames = model.planner_history if model.planner_base == "ego_mlp" else clips.past_frames
+    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, model.planner_target)[1]

@@ -1,0 +1,93 @@
+"""What a run imagines of the seconds after some times of a log, beside what came."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.data import LogPath, collate
+from foredrive.errors import InputError
+from foredrive.models.driveworld import DriveWorld
+from foredrive.models.nemo import Nemo
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.run import Run, load_agent
+from foredrive.scene import Belief, Clip, Example
+from foredrive.training import thinned_rays
+
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One time of a log, unbatched, and F key frames from it on, now first."""
+
+    example: Example
+    """With the images and labels of all F frames."""
+    futures: Bool[Tensor, "K F Z Y X"]
+    """Occupancy in K futures, each frame in its own ego frame; K is 1 for a model that knows no chance."""
+    rendered: Float[Tensor, "F C 3 h w"] | None
+    """What the cameras would see in the first future, RGB 0 to 1; None from a model that does not render."""
+
+
+@torch.no_grad()
+def imagine_run(
+    run: Run, log: LogPath, *, seconds: float, samples: int, moments: int, ray_stride: int = 1
+) -> Iterator[Moment]:
+    """Imagine from some times spread evenly over a log.
+
+    Args:
+        seconds: how far.
+        samples: futures from a world model that knows chance; the same ones each time it is asked.
+        moments: how many times of the log; fewer if it has not as many.
+        ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
+
+    Raises:
+        InputError: on a log that cannot be read or is too short, a run without weights, or a model that does
+            not imagine as far.
+    """
+    clips = run.recipe.clips
+    steps = round(seconds / clips.frame_dt_s)
+    if min(steps, samples, moments) < 1:
+        raise InputError(f"at least one future of {clips.frame_dt_s:g} s from one moment can be imagined")
+    world = load_agent(run).world_model
+    if isinstance(world, Nemo) and steps > world.motion.steps:
+        farthest_s = world.motion.steps * clips.frame_dt_s
+        raise InputError(f"{run.folder}: this model imagines {farthest_s:g} s at most, not {seconds:g} s")
+    config = dataclasses.replace(clips, future_frames=steps, future_images=True)
+    dataset = open_clips([log], config, run.cache_dir)
+    generator = torch.Generator().manual_seed(SEED)
+    count = min(moments, len(dataset))
+    for k in range(count):
+        item = dataset[int((k + 0.5) * len(dataset) / count)]
+        observed = collate([item]).clip.observed()
+        now = world.observe(observed)
+        if isinstance(world, DriveWorld):
+            drawn = [[now, *world.imagine(now, steps, generator=generator)] for _ in range(samples)]
+            rendered = None
+        else:
+            drawn = [[now, *world.imagine(now, steps)]]
+            rendered = _views(world, drawn[0], observed, ray_stride)
+        yield Moment(item, torch.stack([_occupied(world, beliefs) for beliefs in drawn]), rendered)
+
+
+def _occupied(world: Nemo | DriveWorld, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X"]:
+    return torch.stack([world.decode(belief).occupancy_logit[0] > 0 for belief in beliefs])
+
+
+def _views(world: Nemo, beliefs: list[Belief], observed: Clip, ray_stride: int) -> Tensor:
+    """Every camera at every frame, by the rig of now."""
+    rays = thinned_rays(observed, observed.now, ray_stride)
+    _, c, _, h, w = rays.rgb.shape
+    views = []
+    for belief in beliefs:
+        seen = world.decode(belief)
+        cameras = zip(rays.origin.split(h * w, 1), rays.direction.split(h * w, 1), strict=True)
+        parts = [
+            world.renderer(seen.feature, seen.occupancy_logit, origin, direction).rgb[0]
+            for origin, direction in cameras
+        ]
+        views.append(torch.cat(parts).view(c, h, w, 3).permute(0, 3, 1, 2))
+    return torch.stack(views)

@@ -1,0 +1,158 @@
+"""Evaluating a run on logs: the model, the baselines it has to beat, one summary."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from rich.progress import Progress
+from torch import Tensor
+
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.errors import InputError
+from foredrive.evaluation import (
+    ConstantVelocity,
+    EvaluationResult,
+    StandStill,
+    collect_provenance,
+    evaluate,
+    write_summary,
+)
+from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.run import Run, load_agent
+from foredrive.scene import Example, Trajectory
+
+SUMMARY = "summary.json"
+RENDER_STRIDE = 2
+"""One pixel in this many along rows and columns is rendered and compared."""
+FUTURES = 5
+"""Drawn from world models that know chance."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """One example, unbatched, and what the model made of it: for pictures."""
+
+    example: Example
+    occupancy_prob: Float[Tensor, "F Z Y X"]
+    """Now first, then the imagined key frames."""
+    rendered: Float[Tensor, "C 3 h w"] | None
+    """The views at now, RGB 0 to 1; None from a world model that does not render."""
+    volume: Float[Tensor, "D Z Y X"]
+    plan: Trajectory
+    """[1 T]."""
+
+
+def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = None) -> ClipDataset:
+    """Clips of `logs` as the recipe has them, with the boxes that collisions up to 3 s need.
+
+    Args:
+        stride_s: time between the clips' nows; None for the recipe's.
+    """
+    clips = run.recipe.clips
+    frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
+    stride_s = stride_s or clips.now_stride_s
+    config = dataclasses.replace(clips, future_frames=frames, future_images=False, now_stride_s=stride_s)
+    return open_clips(logs, config, run.cache_dir)
+
+
+class _Batches(Iterator[Example]):
+    """Clips in batches. A clip that cannot be read raises an InputError; the next call goes on after it."""
+
+    def __init__(self, dataset: ClipDataset, batch_size: int) -> None:
+        self._dataset, self._batch_size = dataset, batch_size
+        self._left = iter(range(len(dataset)))
+        self._read: list[Example] = []
+
+    def __next__(self) -> Example:
+        while len(self._read) < self._batch_size and (index := next(self._left, None)) is not None:
+            self._read.append(self._dataset[index])
+        if not self._read:
+            raise StopIteration
+        batch, self._read = collate(self._read), []
+        return batch
+
+
+def evaluate_run(
+    run: Run,
+    logs: Sequence[LogPath],
+    out: Path,
+    batch_size: int = 4,
+    *,
+    views: bool = True,
+    stride_s: float | None = None,
+) -> EvaluationResult:
+    """Judge a trained run on logs; writes `out/summary.json`. Clips that cannot be read count as failed.
+
+    Args:
+        views: render what the cameras see, and judge that too; a quarter of the time.
+        stride_s: time between the clips' nows; None for the recipe's.
+
+    Raises:
+        InputError: if there is nothing to judge: the run has not finished a stage, no clip can be read.
+    """
+    if batch_size < 1:
+        raise InputError(f"a batch has at least one clip, got a batch size of {batch_size}")
+    agent = load_agent(run)
+    clips = run.recipe.clips
+    dataset = evaluation_data(run, logs, stride_s)
+    prior, ego_mlp = fit_rivals(
+        run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.model.planner_target
+    )
+    steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    agent.to(device)
+    with Progress() as progress:
+        task = progress.add_task("evaluate", total=len(dataset))
+        result = evaluate(
+            AgentPredictor(agent, clips.future_frames, RENDER_STRIDE if views else 0, FUTURES),
+            _Batches(dataset, batch_size),
+            frame_dt_s=clips.frame_dt_s,
+            baselines={
+                "stand_still": StandStill(steps, dt_s),
+                "constant_velocity": ConstantVelocity(steps, dt_s),
+                "ego_mlp": ego_mlp.to(device),
+            },
+            prior=prior,
+            command_source=dataset.command_source,
+            device=device,
+            on_items=lambda items: progress.advance(task, items),
+        )
+    origin = {"recipe": run.recipe.name, "run": str(run.folder)}
+    write_summary(out / SUMMARY, result.summary | collect_provenance() | origin)
+    return result
+
+
+@torch.no_grad()
+def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
+    """The model on `count` examples spread evenly over the logs; one that cannot be read is left out."""
+    agent = load_agent(run)
+    clips = run.recipe.clips
+    config = dataclasses.replace(clips, lidar=True, map=True)
+    dataset = open_clips(logs, config, run.cache_dir)
+    predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE)
+    found = []
+    for k in range(min(count, len(dataset))):
+        try:
+            item = dataset[int((k + 0.5) * len(dataset) / count)]
+        except InputError:
+            continue
+        observed = collate([item]).clip.observed()
+        prediction = predictor.predict(observed)
+        assert prediction.occupancy_logit is not None
+        assert prediction.plan is not None
+        found.append(
+            Inspection(
+                example=item,
+                occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
+                rendered=None if prediction.images is None else prediction.images[0, 0],
+                volume=agent.world_model.observe(observed).volume[0],
+                plan=prediction.plan[0],
+            )
+        )
+    return found

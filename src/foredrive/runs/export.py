@@ -1,0 +1,199 @@
+"""A trained run as files for other runtimes, compared with the run itself on clips of real logs."""
+
+import dataclasses
+import json
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.errors import InputError
+from foredrive.evaluation import collect_provenance
+from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
+from foredrive.files import atomic_path
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.nemo import Nemo
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.run import Run, load_agent
+from foredrive.scene import Clip
+
+PROGRAM, MODEL, FACTS = "model.pt2", "model.onnx", "export.json"
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+ROUNDS = 3
+"""How often each clip is run when time is taken."""
+
+Infer = Callable[[GraphInputs], GraphOutputs]
+
+
+class _Sample(NamedTuple):
+    """One observed clip, a batch of one, in both forms."""
+
+    observed: Clip
+    inputs: GraphInputs
+
+
+@torch.no_grad()
+def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> dict[str, Any]:
+    """Write model.pt2 (torch.export), model.onnx (opset 20) and export.json.
+
+    Both models take a batch of one and as many cameras as `logs` have. They are read back and compared, in
+    what they say and how long they take, with the agent as it runs here; export.json has it all, as returned.
+
+    Args:
+        run: one that has finished a stage.
+        logs: what is compared on.
+        out: folder for the files.
+        clips: how many, spread evenly over the logs.
+
+    Raises:
+        InputError: without the packages of the extra `export`; if there is nothing to export or to compare.
+    """
+    if clips < 1:
+        raise InputError(f"parity needs at least one clip, got {clips}")
+    _check_packages()
+    from foredrive.export.onnx import OPSET, write_onnx
+
+    agent = load_agent(run)
+    if not isinstance(agent.world_model, Nemo):
+        raise InputError(f"{run.folder}: only agents on NeMo can be exported, this is {run.recipe.name}")
+    size = run.recipe.clips
+    steps = size.future_frames
+    dataset = open_clips(logs, size, run.cache_dir)
+    samples = _samples(dataset, agent, min(clips, len(dataset)))
+    graph = AgentGraph(agent, dataset.camera_names, size.image_hw, steps).eval()
+    program = torch.export.export(graph, tuple(samples[0].inputs))
+    with atomic_path(out / PROGRAM) as temporary:
+        torch.export.save(program, temporary)
+    with atomic_path(out / MODEL) as temporary:
+        write_onnx(program, temporary, GraphInputs._fields, GraphOutputs._fields)
+
+    truth = [_as_it_runs_here(agent, sample.observed, steps) for sample in samples]
+    runtimes = {PROGRAM: _program(out / PROGRAM), MODEL: _session(out / MODEL)}
+    said = {name: [infer(sample.inputs) for sample in samples] for name, infer in runtimes.items()}
+    facts = {
+        "recipe": run.recipe.name,
+        "run": str(run.folder),
+        "opset": OPSET,
+        "batch_size": "1, fixed",
+        "cameras": list(dataset.camera_names),
+        "frame_dt_s": size.frame_dt_s,
+        "waypoint_dt_s": size.horizon_dt_s,
+        "voxels": dataclasses.asdict(size.voxels),
+        "inputs": _describe(samples[0].inputs),
+        "outputs": _describe(truth[0]),
+        "clips": len(samples),
+        "largest_difference": {name: _largest_difference(truth, outputs) for name, outputs in said.items()},
+        "latency_ms": _latency_ms(agent, runtimes, samples, steps),
+        "threads": torch.get_num_threads(),
+        **collect_provenance(),
+        **{f"version.{name}": metadata.version(name) for name in PACKAGES},
+    }
+    with atomic_path(out / FACTS) as temporary:
+        temporary.write_text(json.dumps(facts, indent=1))
+    return facts
+
+
+def _samples(dataset: ClipDataset, agent: PlanningAgent, count: int) -> list[_Sample]:
+    """Clips spread evenly over the logs."""
+    every = len(dataset) / count if count else 0.0
+    clips = [collate([dataset[int((k + 0.5) * every)]]).clip.observed() for k in range(count)]
+    return [_Sample(observed, GraphInputs.of(observed, agent)) for observed in clips]
+
+
+def _check_packages() -> None:
+    for name in PACKAGES:
+        try:
+            metadata.version(name)
+        except metadata.PackageNotFoundError as error:
+            raise InputError(f"no package {name}: pip install 'foredrive[export]' brings it along") from error
+
+
+def _as_it_runs_here(agent: PlanningAgent, observed: Clip, steps: int) -> GraphOutputs:
+    output = agent(observed, steps)
+    now = torch.eye(4)[None]
+    poses = [now if belief.T_now_ego is None else belief.T_now_ego for belief in output.beliefs]
+    return GraphOutputs(
+        waypoints_xy=output.plan.xy[:, 0],
+        waypoints_yaw=output.plan.yaw[:, 0],
+        occupancy_logit=torch.stack([decoded.occupancy_logit for decoded in output.decoded], dim=1),
+        T_now_ego=torch.stack(poses, dim=1),
+    )
+
+
+def _program(path: Path) -> Infer:
+    """A torch.export program, read back."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # PyTorch's own
+        module = torch.export.load(path).module()
+    return lambda inputs: GraphOutputs(**module(*inputs))
+
+
+def _session(path: Path) -> Infer:
+    """An ONNX model in onnxruntime, on the CPU with as many threads as PyTorch has."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 3  # it tells of every constant that it cannot fold
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    names = [entry.name for entry in session.get_inputs()]
+
+    def infer(inputs: GraphInputs) -> GraphOutputs:
+        fed = {name: tensor.numpy() for name, tensor in inputs._asdict().items() if name in names}
+        return GraphOutputs(*(torch.from_numpy(array) for array in session.run(None, fed)))
+
+    return infer
+
+
+def _largest_difference(truth: Sequence[GraphOutputs], said: Sequence[GraphOutputs]) -> dict[str, float]:
+    """Of every output over all clips, in its own unit; and the share of voxels on the other side of 0."""
+    found = {}
+    for name in GraphOutputs._fields:
+        pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(truth, said, strict=True)]
+        found[name] = max(float(_difference(name, a, b).abs().max()) for a, b in pairs)
+    flips = [((a.occupancy_logit > 0) != (b.occupancy_logit > 0)) for a, b in zip(truth, said, strict=True)]
+    return found | {"share_of_voxels_that_flip": float(torch.stack(flips).double().mean())}
+
+
+def _difference(name: str, a: Tensor, b: Tensor) -> Float[Tensor, "..."]:
+    """Of angles, the way round that is shorter."""
+    return torch.remainder(a - b + torch.pi, 2 * torch.pi) - torch.pi if name == "waypoints_yaw" else a - b
+
+
+def _latency_ms(
+    agent: PlanningAgent, runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
+) -> dict[str, dict[str, float]]:
+    """Median and 90th percentile of one clip, in turns, so that a busy machine slows all of them alike."""
+    times: dict[str, list[float]] = {"eager": [], **{name: [] for name in runtimes}}
+    for _ in range(ROUNDS):
+        for sample in samples:
+            start = time.perf_counter()
+            agent(sample.observed, steps)
+            times["eager"].append(time.perf_counter() - start)
+            for name, infer in runtimes.items():
+                start = time.perf_counter()
+                infer(sample.inputs)
+                times[name].append(time.perf_counter() - start)
+    return {
+        name: {"median": 1e3 * float(np.median(spent)), "p90": 1e3 * float(np.quantile(spent, 0.9))}
+        for name, spent in times.items()
+    }
+
+
+def _describe(tensors: GraphInputs | GraphOutputs) -> dict[str, dict[str, object]]:
+    return {
+        name: {
+            "shape": list(tensor.shape),
+            "dtype": str(tensor.dtype).removeprefix("torch."),
+            "meaning": MEANING[name],
+        }
+        for name, tensor in tensors._asdict().items()
+    }

@@ -1,0 +1,110 @@
+"""Finished reconstructions, opened without their logs."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.recipes.config import load_values
+from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.runs.rebuild.reconstruct import CONFIG, LOG, VEHICLE, WEIGHTS
+from foredrive.rendering.edits import Edit, Edited, apply_edits
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.vehicle import Vehicle, load_vehicle
+from foredrive.training.checkpoints import load_weights
+
+
+@dataclass(frozen=True)
+class OpenRun:
+    """A scene as it was learned, and the vehicle that saw it."""
+
+    folder: Path
+    scene: RebuiltScene
+    vehicle: Vehicle
+
+
+def open_rebuilt(folder: Path) -> OpenRun:
+    """Open a run.
+
+    Raises:
+        InputError: on a folder without a finished run.
+    """
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
+    recipe = load_values(RebuildRecipe, folder / CONFIG)
+    if not (folder / WEIGHTS).is_file():
+        raise InputError(f"{folder}: not finished; go on with `foredrive reconstruct`")
+    if not (folder / VEHICLE).is_file():
+        raise InputError(f"{folder}: of before runs kept their sensors (no {VEHICLE}): rebuild the log anew")
+    vehicle = load_vehicle(folder / VEHICLE)
+    try:
+        graph, cameras = _read_graph(folder / WEIGHTS)
+    except (OSError, SafetensorError, KeyError) as error:
+        raise InputError(f"{folder / WEIGHTS}: not the weights of a scene: {error}") from error
+    scene = RebuiltScene(graph, cameras, recipe.rolling, recipe.decoder_width, vehicle.reach_m)
+    load_weights(scene, folder / WEIGHTS)
+    return OpenRun(folder, scene, vehicle)
+
+
+def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> Edited:
+    """A scene after edits; runs that actors come from are opened."""
+    return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
+
+
+def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
+    """A graph of the sizes that were saved, and how many cameras there are."""
+    saved = load_file(weights)
+    features = saved["albedo"].shape[1] + saved["feature"].shape[1]
+    gaussians = Gaussians(
+        saved["mean_m"],
+        saved["quaternion"],
+        saved["log_scale"],
+        saved["opacity_logit"],
+        saved["albedo"].new_zeros(len(saved["albedo"]), features),
+    )
+    tracks = Tracks(
+        saved["track_id"],
+        saved["category"],
+        saved["size_lwh"],
+        saved["key_t_s"],
+        saved["T_scene_actor"],
+        saved["present"],
+    )
+    return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"])
+
+
+def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
+    """How a run was made, and the log it was made of.
+
+    Raises:
+        InputError: on a folder without a run, or if its log is gone.
+    """
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
+    try:
+        named = json.loads((folder / LOG).read_text())
+        path = LogPath(Path(named["folder"]), Path(named["maps_dir"]))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+    if not path.folder.is_dir():
+        raise InputError(f"{folder}: the log it was made of is gone: {path.folder}")
+    return load_values(RebuildRecipe, folder / CONFIG), path
+
+
+def rebuilt_cameras(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Which of the rebuilt cameras each of those is that an agent looks through.
+
+    Raises:
+        InputError: naming the cameras that were not rebuilt.
+    """
+    if missing := [name for name in wanted if name not in there]:
+        raise InputError(f"not rebuilt: {', '.join(missing)}; there are: {', '.join(there) or 'no cameras'}")
+    return [there.index(name) for name in wanted]

@@ -1,0 +1,270 @@
+"""A log becomes a scene that can be rendered: a folder with its recipe, weights, figures and pictures."""
+
+import dataclasses
+import json
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from foredrive.data import LogPath
+from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.drives import lidar_of, read_drive
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
+from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.files import atomic_path
+from foredrive.runs.rebuild.calibration_check import calibration_doubts
+from foredrive.recipes.config import load_values, save_recipe
+from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.rendering.initial import initial_scene
+from foredrive.rendering.ply import write_ply
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.scene_graph import STATIC
+from foredrive.rendering.tracks import Tracks, read_tracks
+from foredrive.rendering.unseen_ground import add_unseen_ground
+from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
+from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.scene import Clip
+from foredrive.sensors.measured_lidar import measure_lidar
+from foredrive.training.checkpoints import load_weights, save_weights
+from foredrive.training.loop import read_metrics
+from foredrive.training.rebuilding import Seen, rebuild
+
+CONFIG, LOG, WEIGHTS, SUMMARY = "config.yaml", "log.json", "model.safetensors", "summary.json"
+VEHICLE = "vehicle.json"
+"""Where the log's vehicle drove and what it carried: a scene is looked at without its log."""
+GAUSSIANS = "static.ply"
+"""What stands, for viewers of 3-D Gaussians."""
+_log = logging.getLogger(__name__)
+
+_COPIES = 14
+"""Of each number of a Gaussian: itself, its gradient, two moments, and what autograd keeps of a step."""
+_OF_A_PIXEL = 600
+"""Floats that autograd keeps of each: features, the decoder's hidden layers, SSIM."""
+_OF_A_BEAM = 120
+"""Bytes that are kept of each beam of the log."""
+_BEAMS_A_SWEEP = 120_000
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a drive offers: what is learned from, and what is held out."""
+
+    learned: Seen
+    held_out: Seen
+    tracks: Tracks
+    vehicle: Vehicle
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """A run on disk, and its scene."""
+
+    folder: Path
+    recipe: RebuildRecipe
+    summary: dict[str, float | int | str | None]
+    scene: RebuiltScene
+    learned: Seen
+    held_out: Seen
+    """What the scene was judged on."""
+
+
+def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None) -> Rebuilt:
+    """Rebuild a log, and judge the scene on the frames that were held out.
+
+    Goes on where an earlier call with the same recipe and log stopped.
+
+    Args:
+        recipe: what is done.
+        path: of the log.
+        folder: of the run.
+        cache_dir: for shrunk images; by default in `folder`.
+
+    Raises:
+        InputError: if `folder` holds a run of another recipe or log; on a log that cannot be read, that has
+            neither images nor sweeps, or for which there is too little memory.
+    """
+    _check_same(recipe, path, folder)
+    check_memory(recipe, path)
+    material = read_material(recipe, path, (cache_dir or folder / "cache").absolute())
+    if not (folder / CONFIG).is_file():
+        with atomic_path(folder / LOG) as temporary:
+            temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))
+        save_recipe(recipe, folder / CONFIG)
+    save_vehicle(material.vehicle, folder / VEHICLE)
+    scene = begin(recipe, material)
+    scene.to("cuda" if torch.cuda.is_available() else "cpu")
+    weights = folder / WEIGHTS
+    if not weights.is_file():
+        seen, names = material.learned, material.vehicle.rig.names
+        for doubt in calibration_doubts(names, seen.cameras, seen.sweeps, material.tracks):
+            _log.warning("%s: is the calibration right? %s", path.folder, doubt)
+        rebuild(scene, material.learned, recipe.schedule, folder)
+        add_unseen_ground(scene, material.vehicle.T_scene_ego, material.learned.cameras)
+        with atomic_path(weights) as temporary:
+            save_weights(scene, temporary)
+    scene.resize(weights)
+    load_weights(scene, weights)
+    if not (folder / SUMMARY).is_file():
+        write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, material))
+    if not (folder / GAUSSIANS).is_file():
+        write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
+    return Rebuilt(folder, recipe, read_summary(folder / SUMMARY), scene, material.learned, material.held_out)
+
+
+def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:
+    """Read a log's frames, and part them; says what the log lacks."""
+    drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
+    if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
+        raise InputError(f"{path.folder}: neither images nor lidar sweeps, nothing to rebuild from")
+    every, frames = recipe.hold_out_every, torch.arange(len(drive.t_s))
+    held = (frames % every == every - 1) if every else torch.zeros_like(frames, dtype=torch.bool)
+    T_world_scene = drive.T_world_ego[0]
+    known = drive.frames(frames[~held].tolist())
+    tracks = read_tracks(known, T_world_scene)
+    for lacking, what in (
+        (not bool(drive.sweep_valid.any()), "no lidar: rebuilt from its images alone"),
+        (len(tracks) == 0, "no tracks: everything in it is taken to stand still"),
+        (len(drive.rig.names) == 1, "one camera: what it never looks at is rebuilt from lidar alone"),
+        (len(drive.rig.names) == 0, "no cameras: rebuilt from its sweeps alone"),
+    ):
+        if lacking:
+            _log.warning("%s: %s", path.folder, what)
+    if not recipe.actors:
+        tracks = tracks_without_actors(tracks)
+    learned = _seen(known, T_world_scene)
+    return Material(
+        learned=learned,
+        held_out=_seen(drive.frames(frames[held].tolist()), T_world_scene),
+        tracks=tracks,
+        vehicle=_vehicle(Log(path), drive, learned.sweeps),
+    )
+
+
+def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
+    """The scene before anything is learned."""
+    generator = torch.Generator().manual_seed(recipe.schedule.seed)
+    graph = initial_scene(
+        list(material.learned.cameras),
+        list(material.learned.sweeps),
+        material.tracks,
+        recipe.initial,
+        generator,
+    )
+    torch.manual_seed(recipe.schedule.seed)  # the decoders' weights
+    return RebuiltScene(
+        graph,
+        len(material.vehicle.rig.names),
+        recipe.rolling,
+        recipe.decoder_width,
+        material.vehicle.reach_m,
+    )
+
+
+def tracks_without_actors(tracks: Tracks) -> Tracks:
+    """No actors at the same key times."""
+    nobody = {
+        field.name: getattr(tracks, field.name)[:0]
+        for field in dataclasses.fields(tracks)
+        if field.name != "t_s"
+    }
+    return dataclasses.replace(tracks, **nobody)
+
+
+def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
+    """Refuse what does not fit, before it is begun.
+
+    Raises:
+        InputError: saying what would be needed and what there is.
+    """
+    log = Log(path)
+    cameras = len(pinhole_cameras(log)) if recipe.cameras is None else len(recipe.cameras)
+    pixels = recipe.image_hw[0] * recipe.image_hw[1]
+    needed_gib = memory_needed_gib(recipe, frames=len(log), cameras=cameras)
+    free_gib = _free_memory_gib()
+    if needed_gib > free_gib:
+        raise InputError(
+            f"{recipe.name} needs about {needed_gib:.1f} GiB for {cameras} cameras of {pixels * 1e-6:.1f} MP "
+            f"and {len(log)} frames with {recipe.schedule.most_gaussians} Gaussians; "
+            f"{free_gib:.1f} GiB are free"
+        )
+
+
+def memory_needed_gib(recipe: RebuildRecipe, *, frames: int, cameras: int) -> float:
+    """About how much memory a reconstruction takes."""
+    pixels = recipe.image_hw[0] * recipe.image_hw[1]
+    of_one = 3 + 4 + 3 + 1 + 3 + recipe.initial.features
+    learning = 4 * (recipe.schedule.most_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
+    kept = frames * (cameras * pixels * 3 + _BEAMS_A_SWEEP * _OF_A_BEAM)
+    return (learning + kept) / 1024**3
+
+
+def _free_memory_gib() -> float:
+    if torch.cuda.is_available():
+        return torch.cuda.mem_get_info()[0] / 1024**3
+    meminfo = Path("/proc/meminfo")
+    if meminfo.is_file():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) / 1024**2
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1024**3
+
+
+def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> Vehicle:
+    """The vehicle of a drive; its lidar as it is known to be, or as far as the sweeps tell."""
+    T_world_scene = drive.T_world_ego[0]
+    seen = [view for view in sweeps if bool(view.beams.returned.any())]
+    if not seen:
+        return read_vehicle(drive, T_world_scene)
+    fullest = max(seen, key=lambda view: len(view.beams.dt_s))
+    beams, T_ego_lidar = fullest.beams, torch.eye(4)
+    T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
+    farthest_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
+    lidar = lidar_of(log.metadata.dataset, T_ego_lidar) or measure_lidar(
+        beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m
+    )
+    reach_m = farthest_m if lidar is None else lidar.max_range_m
+    return read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
+
+
+def _seen(clip: Clip, T_world_scene: torch.Tensor) -> Seen:
+    cameras: list[CameraView] = [view for views in camera_views(clip, T_world_scene) for view in views]
+    sweeps: list[SweepView] = sweep_views(clip, T_world_scene)
+    return Seen(cameras, sweeps)
+
+
+def _summary(
+    recipe: RebuildRecipe, path: LogPath, folder: Path, scene: RebuiltScene, material: Material
+) -> dict[str, float | int | str | None]:
+    steps = read_metrics(folder / "metrics.jsonl")
+    held = material.held_out
+    return {
+        "recipe": recipe.name,
+        "log": path.name,
+        "gaussians": len(scene.actor),
+        "actors": len(material.tracks),
+        "minutes": sum(float(line["step_s"]) for line in steps) / 60,
+        "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
+        "peak_memory_gib": peak_rss_gib(),
+        **judge_cameras(scene, held.cameras, material.learned.cameras),
+        **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
+        **collect_provenance(),
+    }
+
+
+def _check_same(recipe: RebuildRecipe, path: LogPath, folder: Path) -> None:
+    if not (folder / CONFIG).is_file():
+        return
+    if load_values(RebuildRecipe, folder / CONFIG) != recipe:
+        raise InputError(f"{folder}: holds a run with another recipe; choose another folder")
+    try:
+        same = json.loads((folder / LOG).read_text())["folder"] == str(path.folder)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+    if not same:
+        raise InputError(f"{folder}: holds a run of another log; choose another folder")

@@ -1,0 +1,45 @@
+"""Asking an index, with the towers that made it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from foredrive.data.clip_list import ListedClip, clip_list
+from foredrive.runs.search.towers import find_towers
+from foredrive.search.find import Found, Hit, find
+from foredrive.search.index import FrameIndex
+from foredrive.search.query import Query
+from foredrive.search.target import Target, example_target, text_target
+
+
+def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble: bool = True) -> Found:
+    """The hits of a query.
+
+    Args:
+        towers: where the towers lie that made the index; by default where they lay then.
+        ensemble: word each text in several ways.
+
+    Raises:
+        InputError: these are other towers; the query cannot be answered.
+    """
+    return find(index, query, _target(index, query, towers, ensemble))
+
+
+def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool) -> Target | None:
+    if not query.compares:
+        return None
+    chosen = find_towers(towers or index.making.towers)
+    index.check_towers(chosen.name, chosen.fingerprint)
+    if query.example is not None:
+        return example_target(index, query.example, chosen)
+    return text_target(query, chosen, ensemble=ensemble)
+
+
+def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[str, object]:
+    """Hits as a list of clips (`data.clip_list`), each with some time before and after."""
+    clips, notes = [], []
+    for hit in hits:
+        t_s = float(str(hit.facts["t_s"]))
+        folder, maps_dir = Path(str(hit.facts["folder"])), Path(str(hit.facts["maps_dir"]))
+        clips.append(ListedClip(folder, maps_dir, max(0.0, t_s - before_s), t_s + after_s))
+        notes.append({"log": hit.facts["log"], "t_s": t_s, "view": hit.facts["view"], "score": hit.score})
+    return clip_list(clips, notes)

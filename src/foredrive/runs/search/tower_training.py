@@ -1,0 +1,197 @@
+"""Training towers: an image tower beside sentences, then a lidar tower beside the image tower."""
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import torch
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.models.text_encoder import IN_A_PACKAGE
+from foredrive.runs.search.sector_views import LogViews, gather_views
+from foredrive.runs.search.tower_data import (
+    CaptionedViews,
+    ImagedViews,
+    collate_captioned,
+    collate_imaged,
+    image_targets,
+    text_targets,
+)
+from foredrive.runs.search.towers import find_towers
+from foredrive.search.embedded import (
+    ImageSize,
+    LidarSize,
+    LidarTowers,
+    SentenceTowers,
+    TowerCard,
+    build_image_tower,
+    build_lidar_tower,
+    load_towers,
+    save_towers,
+)
+from foredrive.search.towers import Towers
+from foredrive.training import Schedule, train
+from foredrive.training.alignment import ContrastObjective, DistilObjective
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+RECIPE = "recipe.json"
+IMAGE_STAGE, LIDAR_STAGE = "image", "lidar"
+TOWERS = "towers"
+
+
+@dataclass(frozen=True)
+class TowerRecipe:
+    """How towers are trained."""
+
+    contrast: Schedule
+    distil: Schedule
+    image: ImageSize
+    lidar: LidarSize
+    stride_s: float = 0.2
+    """Time between the moments of a log that are looked at."""
+    texts: int = 16
+    """True of each view, of which a step takes one."""
+    loss: Literal["mse", "cosine"] = "mse"
+    """Of the lidar tower."""
+    text: str = IN_A_PACKAGE
+    """The sentence encoder, as `TextEncoder` knows it."""
+
+
+def embedded_recipe(
+    loss: Literal["mse", "cosine"] = "mse",
+    image_steps: int | None = None,
+    lidar_steps: int | None = None,
+    seed: int = 0,
+) -> TowerRecipe:
+    """That of the towers which need no download; of other lengths if steps are given."""
+    contrast = Schedule(batch_size=64, lr=1e-3, epochs=20, weight_decay=0.05, warmup_steps=100, seed=seed)
+    distil = Schedule(batch_size=32, lr=1e-3, epochs=10, weight_decay=0.05, warmup_steps=100, seed=seed)
+    return TowerRecipe(
+        contrast=_with_steps(contrast, image_steps),
+        distil=_with_steps(distil, lidar_steps),
+        image=ImageSize(widths=(32, 64, 128, 256), depths=(2, 2, 2, 2), heads=8, side_px=128),
+        lidar=LidarSize(),
+        loss=loss,
+    )
+
+
+def _with_steps(schedule: Schedule, steps: int | None) -> Schedule:
+    if steps is None:
+        return schedule
+    return replace(schedule, steps=steps, epochs=None, warmup_steps=min(schedule.warmup_steps, steps // 10))
+
+
+def train_towers(
+    recipe: TowerRecipe,
+    logs: Sequence[LogPath],
+    folder: Path,
+    cache_dir: Path | None = None,
+    beside: str | None = None,
+) -> Path:
+    """Train towers, or go on where an earlier call with the same arguments stopped.
+
+    Args:
+        folder: of the run.
+        cache_dir: for images and points of views; by default in `folder`.
+        beside: towers, as `find_towers` knows them: only a lidar tower is trained, beside their image tower.
+            By default an image tower is trained first, beside the recipe's sentence encoder.
+
+    Returns:
+        The folder of the towers.
+
+    Raises:
+        InputError: `folder` holds another run; logs cannot be read or tell nothing.
+    """
+    from foredrive.training import make_fabric  # Fabric takes seconds
+
+    _check_same(folder, recipe, logs, beside)
+    cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
+    if beside is None:
+        views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
+        base: Towers = _train_image(recipe, views, folder, fabric)
+    else:
+        base = find_towers(beside)
+        base = base.base if isinstance(base, LidarTowers) else base
+        views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
+    return _train_lidar(recipe, views, folder, fabric, base)
+
+
+def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabric: "Fabric") -> Towers:
+    """The image tower, saved as towers without lidar: the lidar tower learns from what is kept."""
+    stage = folder / IMAGE_STAGE
+    if not (stage / TOWERS).is_dir():
+        embed = functools.partial(text_targets, model=recipe.text, folder=stage)
+        dataset = CaptionedViews(views, embed, recipe.texts)
+        torch.manual_seed(recipe.contrast.seed)
+        tower = build_image_tower(recipe.image, len(dataset.text_mean))
+        train(ContrastObjective(tower), dataset, collate_captioned, recipe.contrast, stage, fabric)
+        card = TowerCard(
+            dim=len(dataset.text_mean),
+            text=recipe.text,
+            image=recipe.image,
+            base_fingerprint="",
+            lidar=None,
+            trained=_told(recipe, views),
+        )
+        save_towers(stage / TOWERS, card, (tower, dataset.text_mean), None)
+    return load_towers(stage / TOWERS)
+
+
+def _train_lidar(
+    recipe: TowerRecipe,
+    views: list[LogViews],
+    folder: Path,
+    fabric: "Fabric",
+    base: Towers,
+) -> Path:
+    """The lidar tower, which meets no text: its views come as points and embeddings of images."""
+    final = folder / TOWERS
+    if not final.is_dir():
+        dataset = ImagedViews(views, image_targets(views, base, folder / LIDAR_STAGE))
+        torch.manual_seed(recipe.distil.seed)
+        encoder = build_lidar_tower(recipe.lidar, base.dim)
+        objective = DistilObjective(encoder, recipe.loss)
+        train(objective, dataset, collate_imaged, recipe.distil, folder / LIDAR_STAGE, fabric)
+        sentences = base if isinstance(base, SentenceTowers) else None
+        card = TowerCard(
+            dim=base.dim,
+            text=base.name if sentences is None else sentences.text,
+            image=None if sentences is None else sentences.size,
+            base_fingerprint=base.fingerprint,
+            lidar=recipe.lidar,
+            trained=_told(recipe, views),
+        )
+        image = None if sentences is None else (sentences.tower, sentences.text_mean)
+        save_towers(final, card, image, encoder)
+    return final
+
+
+def _told(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
+    """What a card says of the training: the recipe, and on how much."""
+    logs = sorted({row.log for log in views for row in log.rows})
+    return {"recipe": asdict(recipe), "logs": logs, "views": sum(map(len, views))}
+
+
+def _check_same(folder: Path, recipe: TowerRecipe, logs: Sequence[LogPath], beside: str | None) -> None:
+    """Write down what is asked for, or compare it with what was asked for before."""
+    file = folder / RECIPE
+    asked = {"recipe": asdict(recipe), "logs": [str(log.folder) for log in logs], "beside": beside}
+    wanted = json.loads(json.dumps(asked))
+    if not file.is_file():
+        with atomic_path(file) as temporary:
+            temporary.write_text(json.dumps(wanted, indent=1))
+        return
+    try:
+        there = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from error
+    for what in wanted:
+        if there.get(what) != wanted[what]:
+            raise InputError(f"{folder}: holds a run with another {what}; choose another folder")

@@ -1,0 +1,194 @@
+"""Training runs: a folder with the recipe, two stages, their weights."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from foredrive.data import ClipDataset, LogPath, collate, find_logs
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.models.agent import PlanningAgent
+from foredrive.runs.build import build_agent, build_objective
+from foredrive.recipes.config import AnyStage, Recipe, load_recipe, save_recipe
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.path_features import read_paths
+from foredrive.runs.train.baselines import fit_rivals
+from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
+STAGES = ("pretrain", "finetune")
+PATH = "path"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run on disk: its recipe, the logs it was trained on, where its label cache lies."""
+
+    folder: Path
+    recipe: Recipe
+    logs: tuple[LogPath, ...]
+    cache_dir: Path
+    start: Path | None = None
+    """The run whose pre-trained weights this one went on from, if it was not pre-trained itself."""
+
+    @property
+    def weights(self) -> Path:
+        """Weights of the last finished stage."""
+        for stage in (PATH, *reversed(STAGES)):
+            if (self.folder / stage / WEIGHTS).is_file():
+                return self.folder / stage / WEIGHTS
+        raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
+
+
+def find_all_logs(paths: Sequence[Path]) -> tuple[LogPath, ...]:
+    """The logs at several places, each once."""
+    return tuple({log.folder: log for path in paths for log in find_logs(path)}.values())
+
+
+def open_run(folder: Path) -> Run:
+    """Open a run folder that `train_run` made."""
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder}: not a run folder (no {CONFIG})")
+    recipe = load_recipe(folder / CONFIG)
+    try:
+        written = json.loads((folder / LOGS).read_text())
+        logs = tuple(_read_log(entry) for entry in written["logs"])
+        start = written.get("start")
+        return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
+
+
+def train_run(
+    recipe: Recipe,
+    logs: Sequence[LogPath],
+    folder: Path,
+    cache_dir: Path | None = None,
+    start: Path | None = None,
+) -> Run:
+    """Pre-train, fine-tune, then fit what the planner reads along its path, if the recipe says so.
+
+    Goes on where an earlier call with the same arguments stopped.
+
+    Args:
+        recipe: one without pre-training starts from scratch.
+        logs: for both stages.
+        folder: of the run.
+        cache_dir: for labels and shrunk images; by default in `folder`.
+        start: a run folder. Its pre-trained world model is taken and that stage is left out here:
+            pre-trained on many logs, fine-tuned on few, or with another planner.
+
+    Raises:
+        InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
+            cannot be read; if `start` has not finished pre-training or its world model has other sizes.
+    """
+    from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
+
+    start = None if start is None else start.absolute()
+    run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
+    started_before = (folder / CONFIG).is_file()
+    if started_before:
+        _check_same(open_run(folder), run)
+    dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
+    pretrained = None if start is None else _pretrained(start)
+    if not started_before:  # only now: logs that cannot be read must not make a run
+        _write(run)
+    fabric = make_fabric(recipe.precision)
+    fabric.launch()
+    torch.manual_seed(recipe.finetune.schedule.seed)
+    agent = build_agent(recipe)
+    if pretrained is not None:
+        load_weights(agent.world_model, pretrained, "world_model")
+    elif recipe.pretrain is not None:
+        _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
+    if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
+        # The very rival it will be judged beside.
+        base = agent.planner.ego_mlp
+        _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
+        base.load_state_dict(fitted.state_dict())
+    _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
+    if recipe.path is not None:
+        _fit_path(run, recipe.path, agent, fabric)
+    return run
+
+
+def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent, fabric: "Fabric") -> None:
+    """Fit what the planner reads along its path in the volume as it has become."""
+    path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
+    if path is None or weights.is_file():
+        return
+    if fabric.is_global_zero:
+        agent.to(fabric.device)
+        shown = read_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
+        fit_path(path, shown, fit, run.recipe.finetune.schedule.seed)
+        with atomic_path(weights) as temporary:
+            save_weights(agent, temporary)
+    fabric.barrier()
+
+
+def _pretrained(start: Path) -> Path:
+    weights = start / "pretrain" / WEIGHTS
+    if not weights.is_file():
+        raise InputError(f"{start}: no pre-trained weights here (no pretrain/{WEIGHTS})")
+    return weights
+
+
+def _train_stage(
+    run: Run,
+    name: str,
+    stage: AnyStage,
+    agent: PlanningAgent,
+    dataset: ClipDataset,
+    fabric: "Fabric",
+) -> None:
+    weights = run.folder / name / WEIGHTS
+    if not weights.is_file():
+        objective = build_objective(run.recipe, stage, agent)
+        train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
+        if fabric.is_global_zero:
+            with atomic_path(weights) as temporary:
+                save_weights(agent, temporary)
+        fabric.barrier()
+    load_weights(agent, weights)
+
+
+def load_agent(run: Run) -> PlanningAgent:
+    """The trained agent, ready to act."""
+    agent = build_agent(run.recipe, fetch=False)
+    load_weights(agent, run.weights)
+    return agent.eval()
+
+
+def _write(run: Run) -> None:
+    logs = [
+        {"folder": str(log.folder), "maps_dir": str(log.maps_dir)}
+        | ({"parts_s": log.parts_s} if log.parts_s else {})
+        for log in run.logs
+    ]
+    with atomic_path(run.folder / LOGS) as temporary:
+        start = None if run.start is None else str(run.start)
+        entries = {"logs": logs, "cache_dir": str(run.cache_dir), "start": start}
+        temporary.write_text(json.dumps(entries, indent=1))
+    save_recipe(run.recipe, run.folder / CONFIG)
+
+
+def _read_log(entry: dict[str, Any]) -> LogPath:
+    parts = tuple((float(start), float(end)) for start, end in entry.get("parts_s", ()))
+    return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts)
+
+
+def _check_same(there: Run, wanted: Run) -> None:
+    for what, same in (
+        ("another recipe", there.recipe == wanted.recipe),
+        ("other logs", there.logs == wanted.logs),
+        ("another start", there.start == wanted.start),
+    ):
+        if not same:
+            raise InputError(f"{there.folder}: holds a run with {what}; choose another folder")

@@ -1,0 +1,127 @@
+"""What a town's sensors see after edits, and wrong calibrations that are noticed there."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
+from foredrive.rendering.calibration import with_images_of
+from foredrive.rendering.edits import Duplicate, Move, Remove, ShiftEgo
+from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.runs.rebuild.calibration_check import calibration_doubts
+from foredrive.scene import Category
+from foredrive.towns.actors import ActorState
+
+DRIVE = TownDrive(
+    "Town02", seed=3, seconds=6.0, rate_hz=2.0, cameras=("PCAM_F0", "PCAM_R0"), image_hw=(120, 240)
+)
+AHEAD = 1_000
+"""A car that is put ahead: whom traffic puts there depends on the last digits of the machine's arithmetic."""
+NOBODY = Tracks(
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, 3),
+    torch.tensor([0.0]),
+    torch.zeros(0, 1, 4, 4),
+    torch.zeros(0, 1, dtype=torch.bool),
+)
+
+
+@pytest.fixture(scope="module")
+def truth() -> TownTruth:
+    return TownTruth(DRIVE)
+
+
+@pytest.fixture(scope="module")
+def driven(truth: TownTruth) -> list[TrueViews]:
+    return [truth.seen(frame) for frame in range(8)]
+
+
+def points_m(view: SweepView) -> torch.Tensor:
+    """In the scene's frame."""
+    return transform_points(view.T_scene_ego, view.beams.points_ego[view.beams.returned])
+
+
+def test_from_beside_the_same_town_is_seen(truth: TownTruth) -> None:
+    driven, beside = truth.seen(4), truth.seen(4, [ShiftEgo((0.0, 2.0, 0.0))])
+    T = inverse_se3(driven.cameras[0].T_scene_cam) @ beside.cameras[0].T_scene_cam
+    torch.testing.assert_close(T[:3, 3], torch.tensor([-2.0, 0.0, 0.0]), atol=1e-4, rtol=0)
+    apart_m = cKDTree(points_m(driven.sweep)).query(points_m(beside.sweep))[0]
+    near = (points_m(beside.sweep) - beside.sweep.T_scene_ego[:3, 3]).norm(dim=-1) < 12
+    assert float(torch.from_numpy(apart_m)[near].median()) < 0.1
+    assert not torch.equal(beside.cameras[0].image, driven.cameras[0].image)
+
+
+def car_ahead(T_world_ego: np.ndarray) -> ActorState:
+    """It drives 10 m ahead on a level road."""
+    size_lwh = np.array([4.5, 1.8, 1.5])
+    centre_m = (T_world_ego @ [10.0, 0.0, 0.5 * size_lwh[2], 1.0])[:3]
+    yaw = float(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
+    velocity_mps = T_world_ego[:3, 0] * 3.0
+    return ActorState(AHEAD, Category.CAR, centre_m, yaw, 0.0, size_lwh, velocity_mps, style=1, parked=False)
+
+
+def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
+    truth = TownTruth(DRIVE)
+    actor = car_ahead(truth.moments[4].T_world_ego)
+    truth.moments[4] = dataclasses.replace(truth.moments[4], actors=[actor])
+    driven = truth.seen(4).sweep
+    T_scene_world = torch.from_numpy(truth.moments[0].T_world_ego).inverse()
+    centre_m = transform_points(T_scene_world, torch.from_numpy(actor.centre_m)[None]).float()[0]
+    forward = (T_scene_world[:3, :3] @ torch.from_numpy(actor.velocity_mps)).float()
+    forward = forward / forward.norm()
+    left = torch.tensor([-float(forward[1]), float(forward[0]), 0.0])
+    length_m, width_m, height_m = actor.size_lwh
+
+    def beams_at(view: SweepView, where_m: torch.Tensor) -> int:
+        """That met something above the ground; the lidar looks ahead 0.05 s before the frame's time."""
+        beside_m = points_m(view) - where_m
+        inside = (beside_m @ forward).abs() < 0.5 * length_m + 0.7
+        inside &= (beside_m @ left).abs() < 0.5 * width_m + 0.1
+        return int((inside & (beside_m[:, 2] > 0.3 - 0.5 * height_m)).sum())
+
+    removed, moved = truth.seen(4, [Remove(AHEAD)]), truth.seen(4, [Move(AHEAD, (0.0, 6.0, 0.0))])
+    there_m = centre_m + 6 * left
+    as_driven = beams_at(driven, centre_m)
+    assert as_driven > 20
+    assert beams_at(removed.sweep, centre_m) < 0.1 * as_driven
+    assert beams_at(moved.sweep, centre_m) < 0.1 * as_driven
+    assert beams_at(moved.sweep, there_m) > beams_at(driven, there_m) + 10
+    with pytest.raises(InputError, match="not: duplicate"):
+        truth.seen(4, [Duplicate(AHEAD, 1)])
+
+
+def doubts(cameras: list[CameraView], sweeps: list[SweepView]) -> list[str]:
+    return calibration_doubts(DRIVE.cameras, cameras, sweeps, NOBODY)
+
+
+def test_a_calibration_that_is_right_is_not_doubted(driven: list[TrueViews]) -> None:
+    cameras, sweeps = [c for seen in driven for c in seen.cameras], [seen.sweep for seen in driven]
+    assert doubts(cameras, sweeps) == []
+    assert doubts(cameras, []) == []
+
+
+def test_a_camera_that_is_turned_is_told(driven: list[TrueViews]) -> None:
+    turned = exp_se3(torch.tensor([0.0, 0.0, 0.0, 0.0, math.radians(2.0), 0.0]))
+    cameras = [
+        dataclasses.replace(seen.cameras[1], T_scene_cam=seen.cameras[1].T_scene_cam @ turned)
+        for seen in driven
+    ]
+    (said,) = doubts(cameras, [seen.sweep for seen in driven])
+    assert said.startswith("camera PCAM_R0: it fits the lidar better turned")
+    assert any(f"{degrees:.2f}° to the left" in said for degrees in (1.75, 2.0, 2.25))
+
+
+def test_cameras_that_are_exchanged_are_told(driven: list[TrueViews]) -> None:
+    front, right = ([seen.cameras[i] for seen in driven] for i in (0, 1))
+    cameras = with_images_of(front, right) + with_images_of(right, front)
+    said = doubts(cameras, [seen.sweep for seen in driven])
+    assert "camera PCAM_F0: its images fit the place of PCAM_R0" in said
+    assert "camera PCAM_R0: its images fit the place of PCAM_F0" in said

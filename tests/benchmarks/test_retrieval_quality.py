@@ -1,0 +1,103 @@
+"""Towers that know all and towers that know nothing, judged on views of made-up drives."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.common.retrieval_quality import (
+    MODALITIES,
+    WEATHERS,
+    Judged,
+    judge_naming,
+    judge_retrieval,
+    questions,
+    weather_of,
+)
+from foredrive.runs.search.sector_views import Row
+from foredrive.search.facts import Thing, ViewFacts
+from foredrive.search.phrases import SETTINGS
+from foredrive.search.towers import unit
+
+ASKED = questions()
+FACTS = sorted({fact for question in ASKED for fact in question.facts})
+
+
+class AllKnowing:
+    """Texts are what they say, one number for each fact; so are views."""
+
+    name, fingerprint, dim, image_side_px, has_lidar = "all-knowing", "1", len(FACTS), 8, True
+
+    def embed_images(self, images: Tensor) -> Tensor:
+        raise AssertionError
+
+    def embed_sweeps(self, sweeps: object) -> None:
+        raise AssertionError
+
+    def embed_text(self, texts: Sequence[str]) -> Tensor:
+        return torch.stack([self._facts(text) for text in texts])
+
+    def _facts(self, text: str) -> Tensor:
+        said = [q.facts for q in ASKED if q.text in text]
+        named = {weather for weather, ways in WEATHERS.items() if any(way in text for way in ways)}
+        longest = max(said, key=len, default=frozenset[str]())
+        return torch.tensor([float(fact in longest | named) for fact in FACTS])
+
+
+def drives() -> list[Row]:
+    """Two drives of ten moments in each weather: a car in every other view, one truck among them."""
+    told = {"clear": ("midday", "clear"), "night": ("night", "clear"), "rain": ("midday", "rain")}
+    rows = []
+    for weather, (time, air) in told.items():
+        for number in range(2):
+            for frame in range(10):
+                nouns = ["car"] * (frame % 2 == 0) + ["truck"] * (frame == 4)
+                things = tuple(Thing(noun, ("near",)) for noun in nouns)
+                facts = ViewFacts(time, air, "street", things)
+                rows.append(Row(f"town/{weather}{number}", frame, "ahead", facts))
+    return rows
+
+
+def judged(vectors: np.ndarray) -> Judged:
+    rows = drives()
+    t_us = np.array([row.frame * 6_000_000 for row in rows])
+    return Judged(rows, t_us, dict.fromkeys(("image", "lidar", "joint"), vectors))
+
+
+def truth() -> np.ndarray:
+    """What each view shows; its weather by one name alone."""
+    rows = drives()
+    known = [(row.facts.facts - set(WEATHERS)) | {weather_of(row)} for row in rows]
+    return unit(torch.tensor([[float(f in facts) for f in FACTS] for facts in known])).numpy()
+
+
+def test_who_knows_all_finds_all() -> None:
+    figures = judge_retrieval(judged(truth()), AllKnowing())
+    assert set(figures) == set(MODALITIES)
+    assert figures["image"]["all.thing.p_at_1"] == figures["joint_logits"]["night.thing.p_at_10"] == 1
+    assert figures["lidar"]["all.every.p_at_10_above_image"] == 0
+    assert figures["chance"]["all.thing.p_at_10"] < 0.9
+    assert "all.composed.p_at_1" in figures["image"]
+    assert not any("night.composed" in name for name in figures["image"])
+    low, value, high = (figures["chance"][f"all.thing.p_at_10{end}"] for end in ("_low", "", "_high"))
+    assert low <= value <= high
+    # trucks are too few to be asked for in one weather: two, and three are wanted
+    assert figures["image"]["night.thing.questions"] == 1
+    assert figures["image"]["all.thing.questions"] == 2
+
+
+def test_weather_is_named_by_texts_alone() -> None:
+    named = judge_naming(judged(truth()), AllKnowing())["image"]
+    assert named["zero_shot_accuracy"] == named["night.zero_shot_accuracy"] == 1
+    blind = judge_naming(judged(np.tile(truth()[:1], (len(drives()), 1))), AllKnowing())["lidar"]
+    assert blind["zero_shot_accuracy"] == pytest.approx(1 / 3)  # everything is called clear
+
+
+def test_weather_of_a_drive() -> None:
+    row = drives()[0]
+    told = {"rain": ("night", "rain"), "night": ("night", "clear"), "clear": ("dusk", "cloudy")}
+    for weather, (time, air) in told.items():
+        assert weather_of(row._replace(facts=ViewFacts(time, air, None, None))) == weather
+    assert set(WEATHERS) <= set(SETTINGS)

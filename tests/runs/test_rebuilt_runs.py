@@ -1,0 +1,117 @@
+"""Runs opened again without their logs, and actors that go from one to another."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+import torch
+from small_rebuild import SMALLEST
+
+from foredrive.data import find_logs
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
+from foredrive.rendering.edits import Insert, Remove
+from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
+
+ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
+    folder = tmp_path_factory.mktemp("opened")
+    (log,) = find_logs(world.write(folder, frames=5))
+    return reconstruct(ONE_CAMERA, log, folder / "run")
+
+
+@torch.no_grad()
+def test_an_opened_scene_shows_the_same(run: Rebuilt) -> None:
+    scene = open_rebuilt(run.folder).scene
+    view = run.held_out.cameras[0]
+    assert torch.equal(scene(scene.graph, view).rgb, run.scene(run.scene.graph, view).rgb)
+
+
+@torch.no_grad()
+def test_a_view_that_is_asked_for_is_the_recorded_one(run: Rebuilt) -> None:
+    """The vehicle drives at a constant speed, so that its poses between frames are known as well."""
+    opened = open_rebuilt(run.folder)
+    vehicle, recorded = opened.vehicle, run.held_out.cameras[1]
+    assert vehicle.rig.names == ("ahead",)
+    view = free_camera(vehicle.rig, vehicle.camera("ahead"), vehicle.at(recorded.t_s))
+    assert torch.allclose(view.T_scene_cam, recorded.T_scene_cam, atol=1e-4)
+    assert torch.allclose(view.twist_cam, recorded.twist_cam, atol=1e-3)
+    asked, judged = (opened.scene(opened.scene.graph, v).rgb for v in (view, recorded))
+    assert torch.allclose(asked, judged, atol=2e-3)
+    between = vehicle.at(0.13)
+    assert torch.allclose(between.T_scene_ego[:3, 3], torch.tensor([0.65, 0, 0]), atol=1e-4)
+    left = between.shifted(matrix_from_yaw(torch.tensor(0.0), torch.tensor([0.0, 2.0, 0.0])))
+    aside = free_camera(vehicle.rig, 0, left.later(0.1))
+    assert aside.t_s == pytest.approx(0.23)
+    assert torch.allclose(aside.T_scene_cam[:3, 3], torch.tensor([1.15 + 1.6, 2.0, 1.5]), atol=1e-4)
+
+
+@torch.no_grad()
+def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Rebuilt) -> None:
+    """Its channels, columns and reach are told from the recorded beams."""
+    opened = open_rebuilt(run.folder)
+    lidar = opened.vehicle.lidar
+    assert lidar is not None
+    assert torch.allclose(torch.tensor(lidar.elevation_rad), torch.linspace(-25, 5, 16).deg2rad(), atol=1e-4)
+    assert lidar.azimuth_steps == 120
+    assert lidar.rate_hz == pytest.approx(10)
+    farthest_m = max(float(v.beams.range_m[v.beams.returned].max()) for v in run.held_out.sweeps)
+    assert lidar.max_range_m == opened.vehicle.reach_m == pytest.approx(farthest_m, abs=1.0)
+    view = free_sweep(lidar, opened.vehicle.at(0.2))
+    scene = opened.scene
+    sweep = rendered_sweep(view, scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s))
+    assert 0.1 < float(sweep.returned.float().mean()) <= 1
+    steep = sweep.returned & (sweep.beam == 0)  # 25° down, from 1.8 m: never farther than the ground
+    assert float(sweep.range_m[steep].median()) < 1.3 * 1.8 / math.sin(math.radians(25))
+
+
+@torch.no_grad()
+def test_nothing_beyond_a_lidars_reach_returns(run: Rebuilt) -> None:
+    opened = open_rebuilt(run.folder)
+    scene, view = opened.scene, run.held_out.sweeps[0]
+    points = scene.prepare_sweep(view)
+    far = scene.sweep(scene.graph, points, view.t_s)
+    scene.reach_m = 10.0
+    near = scene.sweep(scene.graph, points, view.t_s)
+    assert float(far.hit_range_m[far.returned].max()) > 15
+    assert float(near.hit_range_m[near.returned].max()) < 11
+    lost = far.hit_range_m > 15
+    assert float(near.returned[lost].float().mean()) < 0.05
+    kept = far.hit_range_m < 5
+    assert torch.equal(near.returned[kept], far.returned[kept])
+
+
+@torch.no_grad()
+def test_an_actor_of_another_run_is_where_one_of_this_was(run: Rebuilt) -> None:
+    edits = [Insert(str(run.folder), actor=7, copy=70, follows=11), Remove(11)]
+    edited = edited_scene(run.scene, edits)
+    assert edited.graph.tracks.track_id.tolist() == [7, 70]
+    view = run.held_out.cameras[0]
+    before, after = (run.scene(graph, view).rgb for graph in (run.scene.graph, edited.graph))
+    changed = (before - after).abs().amax(0) > 0.02
+    assert 0 < float(changed.float().mean()) < 0.5  # the moving box, and nothing else
+    assert float(changed[:, :24].float().mean()) < 0.02  # it is to the right
+
+
+def test_what_is_no_finished_run_is_told(run: Rebuilt, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not the folder of a reconstruction"):
+        open_rebuilt(tmp_path)
+    (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
+    with pytest.raises(InputError, match="not finished"):
+        open_rebuilt(tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no vehicle\.json\): rebuild the log anew"):
+        open_rebuilt(tmp_path)
+    (tmp_path / "vehicle.json").write_text("{}")
+    with pytest.raises(InputError, match="does not describe a vehicle"):
+        open_rebuilt(tmp_path)
+    (tmp_path / "vehicle.json").write_bytes((run.folder / "vehicle.json").read_bytes())
+    with pytest.raises(InputError, match="not the weights of a scene"):
+        open_rebuilt(tmp_path)

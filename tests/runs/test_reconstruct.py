@@ -1,0 +1,175 @@
+"""A log is rebuilt in seconds: whole, interrupted, and without what logs may lack."""
+
+import dataclasses
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+import torch
+from safetensors.torch import load_file
+
+from foredrive.data import LogPath, find_logs
+from foredrive.errors import InputError
+from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.recipes.config import load_values
+from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
+from foredrive.runs.rebuild.reconstruct import begin, memory_needed_gib, read_material, reconstruct
+from foredrive.rendering.initial import InitialSize
+from foredrive.rendering.ply import read_ply
+from foredrive.rendering.scene_graph import STATIC
+from foredrive.training import rebuilding
+from foredrive.training.rebuilding import LearningRates, RebuildSchedule
+
+STEPS = 40
+
+
+def recipe(steps: int = STEPS) -> RebuildRecipe:
+    return RebuildRecipe(
+        name="smallest",
+        image_hw=(24, 48),
+        initial=InitialSize(
+            lidar_points=1100,
+            unseen_points=400,
+            pixel_points=300,
+            near_points=0,
+            actor_points=50,
+            actor_points_most=100,
+            features=2,
+            scale=0.7,
+        ),
+        schedule=RebuildSchedule(
+            steps=steps,
+            most_gaussians=2200,
+            rates=LearningRates(mean_m=1e-3, albedo=1e-2),
+            images_per_sweep=2,
+            beam_stride=2,
+            shrink_steps=(10,),
+            grow_from=10,
+            grow_until=30,
+            grow_every=10,
+            checkpoint_every=20,
+        ),
+        cameras=("ahead",),
+    )
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+    (log,) = find_logs(world.write(tmp_path_factory.mktemp("rebuilt"), frames=9))
+    return log
+
+
+@pytest.fixture(scope="module")
+def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    reconstruct(recipe(), log, folder)
+    return folder
+
+
+def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: LogPath) -> None:
+    summary = reconstruct(recipe(), log, run).summary  # is there already
+    assert summary["images"] == summary["sweeps"] == 4
+    assert summary["actors"] == 2
+    assert summary["gaussians"] > 2200  # those that learning may make, and ground that nobody saw
+    material = read_material(recipe(), log, run / "cache")
+    scene = begin(recipe(), material)
+    before = judge_cameras(scene, material.held_out.cameras, material.learned.cameras)
+    before |= judge_sweeps(scene, material.held_out.sweeps)
+    after = {name: value for name, value in summary.items() if isinstance(value, float)}
+    assert after["psnr_db"] > before["psnr_db"] + 2
+    assert after["ssim"] > before["ssim"]
+    assert after["intensity_rmse"] < before["intensity_rmse"]
+    assert after["drop_accuracy"] > before["drop_accuracy"]
+    assert after["depth_median_sq_m2"] < 2.0
+    assert after["moving.psnr_db"] == pytest.approx(after["psnr_db"])  # it drives all the time
+
+
+def test_an_interrupted_run_comes_to_the_same(
+    run: Path, log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped after the first checkpoint, when Gaussians have been added and moved."""
+
+    save = rebuilding.save_checkpoint
+
+    def save_and_stop(*args):  # type: ignore[no-untyped-def]
+        save(*args)
+        if args[-1] == 20:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "halves"
+    with monkeypatch.context() as patched:
+        patched.setattr(rebuilding, "save_checkpoint", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(recipe(), log, folder)
+    reconstruct(recipe(), log, folder)
+    whole, halves = load_file(run / "model.safetensors"), load_file(folder / "model.safetensors")
+    assert all(torch.equal(whole[name], halves[name]) for name in whole)
+
+
+def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
+    assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+
+
+def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
+    folder = tmp_path / "damaged"
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("cache"))
+    (folder / "model.safetensors").write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match="weights of a scene cannot be read"):
+        reconstruct(recipe(), log, folder)
+
+
+def test_what_stands_is_there_for_other_viewers(run: Path) -> None:
+    weights = load_file(run / "model.safetensors")
+    static = weights["actor"] == STATIC
+    assert 0 < int(static.sum()) < len(static)
+    assert torch.equal(read_ply(run / "static.ply").mean_m, weights["mean_m"][static])
+
+
+def test_a_folder_with_another_run_is_refused(run: Path, log: LogPath, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="another recipe"):
+        reconstruct(recipe(7), log, run)
+    (other,) = find_logs(world.write(tmp_path, frames=2, name="other"))
+    with pytest.raises(InputError, match="another log"):
+        reconstruct(recipe(), other, run)
+
+
+def test_what_a_log_lacks_is_said(log: LogPath, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Without lidar, without tracks and with one camera there are cameras' figures alone."""
+    for name in ("lidar.lidar_top", "custom.lidar_beams", "box_detections_se3"):
+        assert list(log.folder.glob(f"{name}*")), name
+    folder = tmp_path / "logs" / "flat_train" / "less"
+    folder.mkdir(parents=True)
+    for file in log.folder.iterdir():
+        if not file.name.startswith(("lidar", "custom.lidar", "box_detections")):
+            (folder / file.name).write_bytes(file.read_bytes())
+    (less,) = find_logs(folder)
+    with caplog.at_level(logging.WARNING):
+        summary = reconstruct(recipe(4), less, tmp_path / "run").summary
+    said = " ".join(record.message for record in caplog.records)
+    assert "no lidar" in said
+    assert "no tracks" in said
+    assert "one camera" in said
+    assert "psnr_db" in summary
+    assert "drop_accuracy" not in summary
+    assert summary["actors"] == 0
+
+
+def test_too_little_memory_is_said_before(
+    log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    huge = dataclasses.replace(
+        recipe(), schedule=dataclasses.replace(recipe().schedule, most_gaussians=10**12)
+    )
+    with pytest.raises(InputError, match=r"smallest needs about \d+\.\d GiB .* GiB are free"):
+        reconstruct(huge, log, tmp_path / "huge")
+    assert not (tmp_path / "huge").exists()
+
+
+def test_named_recipes() -> None:
+    assert find_rebuild_recipe("gaussians_tiny") == gaussians_tiny()
+    with pytest.raises(InputError, match="gaussians_tiny, gaussians_base"):
+        find_rebuild_recipe("gaussians_huge")
+    assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
+    assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
