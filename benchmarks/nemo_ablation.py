@@ -35,8 +35,7 @@ def _alike(name: str) -> str:
     """The first row with the same pre-training of the same world model."""
 
     def world(row: str) -> tuple[object, ...]:
-        model = dataclasses.replace(RECIPES[row].model, planner_future="none")
-        return RECIPES[row].pretrain, model, RECIPES[row].clips
+        return RECIPES[row].pretrain, RECIPES[row].model, RECIPES[row].clips
 
     return next(row for row in ROWS if world(row) == world(name))
 

@@ -23,7 +23,7 @@ from foredrive.evaluation import Benchmark, fit_ego_mlp, read_status
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, ego_motion
-from foredrive.models.planner import VolumePlanner
+from foredrive.models.planner import PathCorrectionConfig, VolumePlanner
 from foredrive.recipes import find_recipe
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
 
@@ -116,7 +116,7 @@ def scenes() -> tuple[Scenes, Scenes, EgoMLP]:
     """For training, for testing, and the MLP that both planners start from."""
     logs = record_study(TOWNS, WORK / "towns", workers=2)
     train, test = read_scenes(logs.train, "demonstrations"), read_scenes(logs.test, "tests")
-    past_frames, dt_s = RECIPE.model.planner_history, RECIPE.clips.horizon_dt_s
+    past_frames, dt_s = RECIPE.planner.history, RECIPE.clips.horizon_dt_s
     fitted = fit_ego_mlp(read_status([train.clip], past_frames), past_frames=past_frames, dt_s=dt_s, seed=0)
     return train, test, fitted
 
@@ -124,28 +124,22 @@ def scenes() -> tuple[Scenes, Scenes, EgoMLP]:
 class Sighted(nn.Module):
     """NeMo's planner on a plane that holds the truth, seen through three convolutions."""
 
-    def __init__(self, ego_mlp: EgoMLP, look_m: tuple[float, ...]) -> None:
+    def __init__(self, ego_mlp: EgoMLP, path: PathCorrectionConfig | None) -> None:
         super().__init__()
-        model, clips = RECIPE.model, RECIPE.clips
+        clips = RECIPE.clips
         self.see = nn.Sequential(
             nn.Conv2d(CHANNELS, HIDDEN, 3, padding=1), nn.ReLU(),
             nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1), nn.ReLU(),
             nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1),
         )  # fmt: skip
         self.planner = VolumePlanner(
+            dataclasses.replace(RECIPE.planner, future="none", pool=(1, 1, 1), path=path),
+            plane(clips.voxels),
             channels=HIDDEN,
-            spec=plane(clips.voxels),
-            width=model.planner_width,
-            layers=model.planner_layers,
-            heads=model.planner_heads,
-            future="none",
-            pool=(1, 1, 1),
-            history=model.planner_history,
             horizon_steps=clips.horizon_steps,
             dt_s=clips.horizon_dt_s,
-            ego_mlp=ego_mlp.requires_grad_(False),
-            look_m=look_m,
         )
+        self.planner.ego_mlp = ego_mlp.requires_grad_(False)
 
     def forward(self, scenes: Scenes) -> Trajectory:
         """The plan of every clip."""
@@ -157,13 +151,13 @@ class Sighted(nn.Module):
         return self.planner(volume, None, *status)
 
 
-def planned(seen: int, look_m: tuple[float, ...]) -> Callable[[int], dict[str, float]]:
+def planned(seen: int, path: PathCorrectionConfig | None) -> Callable[[int], dict[str, float]]:
     """Learned from so many demonstrations, with or without reading the plane along the path."""
 
     def measure(seed: int) -> dict[str, float]:
         train, test, ego_mlp = scenes()
         torch.manual_seed(seed)
-        model = Sighted(ego_mlp, look_m)
+        model = Sighted(ego_mlp, path)
         steps = seen // BATCH
         optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=LEARNING_RATE)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -200,11 +194,10 @@ def _errors_m(model: Sighted, test: Scenes, ego_mlp: EgoMLP) -> tuple[float, flo
     return own, rival
 
 
-LOOK_M = RECIPE.model.planner_look_m
 BENCHMARK = Benchmark(
     question="What could NeMo's planner gain by looking if it saw perfectly?",
-    arms={f"seen_{seen}": planned(seen, LOOK_M) for seen in SEEN}
-    | {f"seen_{seen}_without_path": planned(seen, ()) for seen in SEEN[:-1]},
+    arms={f"seen_{seen}": planned(seen, RECIPE.planner.path) for seen in SEEN}
+    | {f"seen_{seen}_without_path": planned(seen, None) for seen in SEEN[:-1]},
     seeds=(0,),
     config={
         "recipe": dataclasses.asdict(RECIPE),

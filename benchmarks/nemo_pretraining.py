@@ -20,8 +20,9 @@ from benchmarks.common.study import (
     work_folder,
 )
 from foredrive.evaluation import Benchmark
+from foredrive.models.averaging import AveragingConfig
 from foredrive.recipes import find_recipe
-from foredrive.recipes.config import AveragingEncoderSize, Recipe
+from foredrive.recipes.config import Recipe
 from foredrive.runs.train.run import train_run
 from foredrive.training import read_metrics
 
@@ -29,7 +30,7 @@ WORK = work_folder(Path("runs/nemo_study"))
 SHARES = (0.1, 0.3, 1.0)
 TOWNS = StudyTowns()
 RECIPE = "nemo_town"
-AVERAGING = AveragingEncoderSize(hidden=128)
+AVERAGING = AveragingConfig(hidden=128)
 OCCUPANCY_STEPS, PROBE_STEPS = 300, 30
 
 

@@ -6,24 +6,24 @@ from pathlib import Path
 import synthetic_log
 
 from foredrive.data import ClipConfig, LogPath, find_logs
+from foredrive.models.backbone import BackboneConfig
+from foredrive.models.driveworld import DriveWorldConfig
+from foredrive.models.driveworld.state_space import StateSpaceConfig
+from foredrive.models.lift_splat import LiftSplatConfig
+from foredrive.models.lifting import LiftingConfig
+from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
+from foredrive.models.planner import PlannerConfig
 from foredrive.recipes import Recipe
-from foredrive.recipes.config import (
-    BackboneSize,
-    DriveWorldSize,
-    DriveWorldStage,
-    LiftSplatSize,
-    NemoSize,
-    Stage,
-    VolumeEncoderSize,
-)
+from foredrive.recipes.driveworld import DriveWorldRecipe
+from foredrive.recipes.nemo import NemoRecipe
 from foredrive.scene import VoxelSpec
-from foredrive.training import DriveWorldWeights, LossWeights, Schedule
+from foredrive.training import DriveWorldStage, DriveWorldWeights, LossWeights, NemoStage, Schedule
 
 STEPS = 3
 """Of either stage."""
 
 
-def miniature() -> Recipe:
+def miniature() -> NemoRecipe:
     """A step takes some hundredths of a second."""
     return Recipe(
         name="miniature",
@@ -33,33 +33,27 @@ def miniature() -> Recipe:
             image_hw=(32, 64),
             voxels=VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=2.0, shape_zyx=(2, 16, 16)),
         ),
-        model=NemoSize(
-            backbone=BackboneSize(
+        model=NemoConfig(
+            backbone=BackboneConfig(
                 embedding_size=8,
                 hidden_sizes=(8, 16, 16),
                 depths=(1, 1, 1),
                 layer_type="basic",
                 stages=("stage2", "stage3"),
             ),
-            encoder=VolumeEncoderSize(heads=2, points=2, layers=1),
+            encoder=LiftingConfig(heads=2, points=2, layers=1),
+            motion=MotionConfig(hidden=4),
+            renderer=RendererConfig(near_m=1.0, far_m=24.0, samples=8, hidden=16),
             channels=8,
             occupancy_hidden=8,
-            motion_hidden=4,
-            ray_near_m=1.0,
-            ray_far_m=24.0,
-            ray_samples=8,
-            recon_hidden=16,
-            planner_width=16,
-            planner_layers=1,
-            planner_heads=2,
-            attention_pool=(1, 4, 4),
         ),
-        pretrain=Stage(
+        planner=PlannerConfig(width=16, layers=1, heads=2, pool=(1, 4, 4)),
+        pretrain=NemoStage(
             schedule=Schedule(batch_size=2, lr=2e-3, steps=STEPS, warmup_steps=1),
             weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=4,
         ),
-        finetune=Stage(
+        finetune=NemoStage(
             schedule=Schedule(batch_size=2, lr=1e-3, steps=STEPS, warmup_steps=1),
             weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
@@ -67,34 +61,27 @@ def miniature() -> Recipe:
     )
 
 
-def miniature_driveworld() -> Recipe:
+def miniature_driveworld() -> DriveWorldRecipe:
     """The same with a DriveWorld, but without task prompts, which need a text encoder."""
     nemo = miniature()
     return Recipe(
         name="miniature_driveworld",
         clips=nemo.clips,
-        model=DriveWorldSize(
+        model=DriveWorldConfig(
             backbone=nemo.model.backbone,
-            encoder=LiftSplatSize(near_m=1.0, far_m=17.0, step_m=2.0),
+            encoder=LiftSplatConfig(near_m=1.0, far_m=17.0, step_m=2.0),
+            states=StateSpaceConfig(
+                observation=8, state=6, history=8, memory=4, heads=2, objects=3, hidden=16
+            ),
             channels=8,
             plane=8,
-            observation=8,
             observation_hidden=4,
-            state=6,
-            history=8,
-            memory=4,
-            memory_heads=2,
-            objects=3,
-            states_hidden=16,
             expanded=(8, 4),
             volume_hidden=4,
             statics=4,
             prompt=None,
-            planner_width=16,
-            planner_layers=1,
-            planner_heads=2,
-            attention_pool=(1, 4, 4),
         ),
+        planner=nemo.planner,
         pretrain=DriveWorldStage(
             schedule=Schedule(batch_size=2, lr=2e-3, steps=STEPS, warmup_steps=1), weights=DriveWorldWeights()
         ),

@@ -29,14 +29,14 @@ def forecasting(
     """
     assert recipe.pretrain is not None
     stage = replace(recipe.pretrain, schedule=recipe.finetune.schedule)
-    model = replace(recipe.model, planner_base="straight_on", planner_look_m=())
+    planner = replace(recipe.planner, ego_mlp=None, path=None)
     clips = replace(
         recipe.clips,
         part_s=part_s,
         now_stride_s=stride_s,
         future_frames=recipe.clips.future_frames if future_frames is None else future_frames,
     )
-    return replace(recipe, clips=clips, model=model, pretrain=None, finetune=stage, path=None)
+    return replace(recipe, clips=clips, planner=planner, pretrain=None, finetune=stage, path=None)
 
 
 def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float]) -> dict[str, float]:

@@ -13,7 +13,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, read_summary
 from foredrive.files import atomic_path
 from foredrive.metrics import PROTOCOLS
-from foredrive.recipes.config import Recipe, Stage, rescheduled
+from foredrive.recipes.config import Recipe, rescheduled
+from foredrive.recipes.nemo import NemoRecipe
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
@@ -120,10 +121,10 @@ def shortened(recipe: Recipe) -> Recipe:
     )
 
 
-def occupancy_alone(recipe: Recipe) -> Recipe:
+def occupancy_alone(recipe: NemoRecipe) -> NemoRecipe:
     """One stage that learns the occupancy of the present and nothing else, as long as pre-training takes."""
     stage = recipe.pretrain
-    assert isinstance(stage, Stage)
+    assert stage is not None
     weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
     stage = dataclasses.replace(stage, weights=weights, imagine=False)
     return dataclasses.replace(recipe, pretrain=None, finetune=stage, path=None)

@@ -1,5 +1,6 @@
 """Backbone and VGG features: levels, and weights that are there or are not."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -7,21 +8,20 @@ import torch
 from safetensors.torch import save_file
 
 from foredrive.errors import InputError
-from foredrive.models.backbone import ImageBackbone, normalise_images
+from foredrive.models.backbone import BackboneConfig, ImageBackbone, normalise_images
 from foredrive.models.vgg import Vgg16Features
 
-SIZE = {
-    "embedding_size": 8,
-    "hidden_sizes": (8, 16, 24, 32),
-    "depths": (1, 1, 1, 1),
-    "layer_type": "basic",
-    "stages": ("stage1", "stage3"),
-    "channels": 12,
-}
+CONFIG = BackboneConfig(
+    embedding_size=8,
+    hidden_sizes=(8, 16, 24, 32),
+    depths=(1, 1, 1, 1),
+    layer_type="basic",
+    stages=("stage1", "stage3"),
+)
 
 
 def test_levels_have_the_strides_of_their_stages() -> None:
-    levels = ImageBackbone(**SIZE)(torch.zeros(2, 3, 64, 96, dtype=torch.uint8))
+    levels = ImageBackbone(CONFIG, channels=12)(torch.zeros(2, 3, 64, 96, dtype=torch.uint8))
     assert [tuple(level.shape) for level in levels] == [(2, 16, 24, 12), (2, 4, 6, 12)]
 
 
@@ -31,16 +31,17 @@ def test_white_is_normalised_as_imagenet_does() -> None:
 
 
 def test_saved_resnet_weights_are_loaded(tmp_path: Path) -> None:
-    original = ImageBackbone(**SIZE)
+    original = ImageBackbone(CONFIG, channels=12)
     original.resnet.save_pretrained(tmp_path)
-    loaded = ImageBackbone(**SIZE, weights=str(tmp_path))
+    loaded = ImageBackbone(dataclasses.replace(CONFIG, weights=str(tmp_path)), channels=12)
     assert loaded.pretrained
     torch.testing.assert_close(loaded.resnet.state_dict(), original.resnet.state_dict())
 
 
 def test_missing_weights_are_said_loudly(tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, weights=str(tmp_path / "nothing_here"))
     with pytest.warns(UserWarning, match="RANDOM weights"):
-        backbone = ImageBackbone(**SIZE, weights=str(tmp_path / "nothing_here"))
+        backbone = ImageBackbone(config, channels=12)
     assert not backbone.pretrained
 
 

@@ -10,63 +10,56 @@ import torch
 from torch.distributions import Independent, Normal
 
 from foredrive.errors import InputError
-from foredrive.models.backbone import ImageBackbone
+from foredrive.models.backbone import BackboneConfig
 from foredrive.models.driveworld import (
     DiagonalGaussian,
     DriveWorld,
+    DriveWorldConfig,
     actions_of,
     balanced_kl,
     kl_divergence,
     motion_of,
 )
-from foredrive.models.driveworld.planes import (
-    PlanesToVolume,
-    PlaneToVector,
-    StaticScene,
-    VectorToPlane,
-    carried_plane,
-)
-from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace
-from foredrive.models.driveworld.task_prompt import PROMPTS, TaskPrompt
-from foredrive.models.lift_splat import LiftSplatEncoder
-from foredrive.scene import Clip, Example, VoxelSpec
+from foredrive.models.driveworld.planes import carried_plane
+from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace, StateSpaceConfig
+from foredrive.models.driveworld.task_prompt import PromptConfig
+from foredrive.models.lift_splat import LiftSplatConfig
+from foredrive.scene import Clip, Example, VoxelSpec, last_frames
 
 SPEC = VoxelSpec(lower_m=(-4.0, -6.0, -1.0), voxel_m=1.0, shape_zyx=(2, 12, 10))
 STATE, HISTORY, MEMORY, WIDTH, PAST = 12, 16, 5, 8, 2
 
 
+SIZES = StateSpaceConfig(
+    observation=10, state=STATE, history=HISTORY, objects=3, heads=2, memory=MEMORY, hidden=16
+)
+
+
 def states(**changes: bool) -> StateSpace:
-    return StateSpace(
-        observation=10, state=STATE, history=HISTORY, objects=3, heads=2, memory=MEMORY, hidden=16, **changes
-    )
+    return StateSpace(dataclasses.replace(SIZES, **changes))
 
 
 @pytest.fixture(scope="module")
 def model() -> DriveWorld:
     torch.manual_seed(0)
-    texts = {task: torch.randn(6) for task in PROMPTS}
-    size_yx = SPEC.shape_zyx[1:]
-    return DriveWorld(
-        backbone=ImageBackbone(
-            embedding_size=8,
-            hidden_sizes=(8, 8),
-            depths=(1, 1),
-            layer_type="basic",
-            stages=("stage2",),
-            channels=8,
+    config = DriveWorldConfig(
+        backbone=BackboneConfig(
+            embedding_size=8, hidden_sizes=(8, 8), depths=(1, 1), layer_type="basic", stages=("stage2",)
         ),
-        encoder=LiftSplatEncoder(SPEC, channels=8, width=WIDTH, near_m=1.0, far_m=7.0, step_m=1.0),
-        states=states(),
-        to_vector=PlaneToVector(WIDTH, 4, 10),
-        from_vector=VectorToPlane(HISTORY + STATE, (8, 8), size_yx),
-        to_volume=PlanesToVolume(8 + 4 + 4, 4, 8, SPEC.shape_zyx[0]),
-        statics=StaticScene(WIDTH, 4),
-        carry_statics=False,
-        prompt=TaskPrompt(texts, (4, 4), size_yx),
-        past_frames=PAST,
-        dt_s=0.5,
+        encoder=LiftSplatConfig(near_m=1.0, far_m=7.0, step_m=1.0),
+        states=SIZES,
         channels=8,
-    ).eval()
+        plane=WIDTH,
+        observation_hidden=4,
+        expanded=(8, 8),
+        volume_hidden=4,
+        statics=4,
+        prompt=PromptConfig(widths=(4, 4), encoding=6, text_encoder="none"),
+    )
+    model = DriveWorld(config, SPEC, past_frames=PAST, dt_s=0.5, fetch=False).eval()
+    assert model.prompt is not None
+    torch.nn.init.normal_(model.prompt.encodings)
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +215,7 @@ def test_actions_are_those_that_led_from_pose_to_pose(clip: Clip) -> None:
 
 
 def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, clip: Clip) -> None:
-    seen = model.unroll(model.see(clip), 2, torch.Generator().manual_seed(0))
+    seen = model.unroll(model.see(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
     assert (len(seen.beliefs), len(seen.posteriors), len(seen.priors)) == (PAST + 3, PAST + 1, PAST + 1)
     assert seen.actions.shape == (2, PAST + 3, 2)
     assert seen.velocities_mps.shape == (2, PAST + 1, 3, 2)
@@ -239,7 +232,7 @@ def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, cli
     without = {name for name, parameter in model.named_parameters() if parameter.grad is None}
     assert without == set()
     assert not any(name.endswith("encodings") for name, _ in model.named_parameters())  # the text is frozen
-    repeated = model.unroll(model.see(clip), 2, torch.Generator().manual_seed(0))
+    repeated = model.unroll(model.see(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
     assert torch.equal(repeated.beliefs[-1].volume, seen.beliefs[-1].volume)
 
 
@@ -282,7 +275,7 @@ def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: C
         torch.testing.assert_close(model.observe(clip).volume, now.volume)
         standing, going = (model.imagine(now, 2, actions)[-1] for actions in (stand, go))
         torch.testing.assert_close(model.volume_for(going, "forecast"), going.volume)
-        seen = model.see(clip)
+        seen = model.see(last_frames(clip, PAST))
         first, *_, last = model.unroll(seen, 0, None).beliefs  # statics of now
         torch.testing.assert_close(last.volume, now.volume)
     finally:

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from foredrive.models.averaging import AveragingEncoder
-from foredrive.models.bev import BevEncoder, PillarCrossAttention
+from foredrive.models.averaging import AveragingConfig, AveragingEncoder
+from foredrive.models.bev import BevConfig, BevEncoder, PillarCrossAttention
 from foredrive.models.lifting import place_code, project_to_cameras
 from foredrive.scene import CameraRig, VoxelSpec
 
@@ -32,8 +32,13 @@ def rig() -> CameraRig:
 SEEN = torch.ones(1, 1, dtype=torch.bool)
 
 
+def bev_encoder(channels: int, points: int = 1, layers: int = 1) -> BevEncoder:
+    config = BevConfig(width=8, heads=2, points=points, pillars=2, layers=layers)
+    return BevEncoder(config, SPEC, channels=channels, levels=1)
+
+
 def test_pillars_stand_on_the_middle_of_their_cells() -> None:
-    encoder = BevEncoder(SPEC, channels=4, width=8, heads=2, points=1, pillars=2, levels=1, layers=1)
+    encoder = bev_encoder(channels=4)
     pillars = encoder.pillars_m.view(16, 16, 2, 3)
     assert pillars[0, 0].tolist() == [[-7.5, -7.5, 0.0], [-7.5, -7.5, 2.0]]
     assert pillars[3, 10, :, :2].tolist() == [[2.5, -4.5]] * 2
@@ -58,7 +63,7 @@ def test_a_cell_hears_of_every_height_above_it() -> None:
 
 def test_the_volume_unfolds_from_the_plane() -> None:
     """What the last layer says of a cell's height z lies at z above that cell."""
-    encoder = BevEncoder(SPEC, channels=3, width=8, heads=2, points=1, pillars=2, levels=1, layers=1)
+    encoder = bev_encoder(channels=3)
     with torch.no_grad():
         encoder.unfold.weight.zero_()
         encoder.unfold.bias.copy_(torch.arange(12.0))
@@ -69,7 +74,7 @@ def test_the_volume_unfolds_from_the_plane() -> None:
 
 
 def test_averaging_reads_at_the_projection_and_nowhere_else() -> None:
-    encoder = AveragingEncoder(SPEC, channels=2, hidden=2)
+    encoder = AveragingEncoder(AveragingConfig(hidden=2), SPEC, channels=2, levels=2)
     encoder.convolve = torch.nn.Sequential(torch.nn.Identity())  # type: ignore[assignment]
     rows, columns = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(16) + 0.5, indexing="ij")
     image = torch.stack([columns / 16, rows / 8], dim=-1)[None, None]  # says where in the image it is
@@ -85,9 +90,9 @@ def test_a_camera_without_an_image_is_not_looked_at(kind: str) -> None:
     torch.manual_seed(0)
     encoder: BevEncoder | AveragingEncoder
     if kind == "bev":
-        encoder = BevEncoder(SPEC, channels=4, width=8, heads=2, points=2, pillars=2, levels=1, layers=2)
+        encoder = bev_encoder(channels=4, points=2, layers=2)
     else:
-        encoder = AveragingEncoder(SPEC, channels=4, hidden=4)
+        encoder = AveragingEncoder(AveragingConfig(hidden=4), SPEC, channels=4, levels=1)
     one, other = torch.randn(2, 1, 1, 8, 16, 4)
     assert torch.equal(encoder([one], rig(), ~SEEN), encoder([other], rig(), ~SEEN))
     assert not torch.allclose(encoder([one], rig(), SEEN), encoder([other], rig(), SEEN))

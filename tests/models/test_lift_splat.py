@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import torch
 
-from foredrive.models.lift_splat import LiftSplatEncoder, splat
+from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder, splat
 from foredrive.scene import CameraRig, Example, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -18,7 +18,8 @@ def rig_of(make_example: Callable[..., Example]) -> CameraRig:
 
 def encoder() -> LiftSplatEncoder:
     torch.manual_seed(0)
-    return LiftSplatEncoder(SPEC, channels=3, width=4, near_m=1.0, far_m=10.0, step_m=1.0)
+    depths = LiftSplatConfig(near_m=1.0, far_m=10.0, step_m=1.0)
+    return LiftSplatEncoder(depths, SPEC, channels=3, width=4, levels=1)
 
 
 def test_depths_lie_along_the_optical_axis(make_example: Callable[..., Example]) -> None:

@@ -9,24 +9,29 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
+from foredrive.models.bev import BevConfig
 from foredrive.models.lifting import project_to_cameras
-from foredrive.models.nemo import VolumeRenderer
-from foredrive.recipes.config import BevEncoderSize, Recipe, Stage
-from foredrive.recipes.nemo import nemo_base, nemo_tiny
+from foredrive.models.nemo import RendererConfig, VolumeRenderer
+from foredrive.recipes.nemo import NemoRecipe, nemo_base, nemo_tiny
 from foredrive.recipes.nemo_rows import nemo_rows
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Command, Example, VoxelSpec
+from foredrive.training import NemoStage
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
 
 
-def small_recipe() -> Recipe:
+def small_recipe() -> NemoRecipe:
     """nemo_tiny on a grid small enough for unit tests."""
     recipe = nemo_tiny()
     return dataclasses.replace(
         recipe,
         clips=dataclasses.replace(recipe.clips, voxels=SPEC),
-        model=dataclasses.replace(recipe.model, channels=16, ray_samples=16, ray_far_m=12.0),
+        model=dataclasses.replace(
+            recipe.model,
+            channels=16,
+            renderer=dataclasses.replace(recipe.model.renderer, samples=16, far_m=12.0),
+        ),
     )
 
 
@@ -114,7 +119,7 @@ def test_driving_forward_moves_the_volume_back(agent: PlanningAgent, example: Ex
 
 
 def test_rays_stop_at_a_wall_and_pass_through_air() -> None:
-    renderer = VolumeRenderer(SPEC, channels=2, near_m=0.5, far_m=7.5, samples=28, hidden=8)
+    renderer = VolumeRenderer(RendererConfig(near_m=0.5, far_m=7.5, samples=28, hidden=8), SPEC, channels=2)
     logit = torch.full((1, *SPEC.shape_zyx), -30.0)
     logit[..., 12] = 30.0  # opaque from x = 4 to 5 m
     feature = torch.zeros(1, 2, *SPEC.shape_zyx)
@@ -127,7 +132,7 @@ def test_rays_stop_at_a_wall_and_pass_through_air() -> None:
 
 
 def test_what_passes_through_shows_the_background() -> None:
-    renderer = VolumeRenderer(SPEC, channels=2, near_m=0.5, far_m=7.5, samples=8, hidden=8)
+    renderer = VolumeRenderer(RendererConfig(near_m=0.5, far_m=7.5, samples=8, hidden=8), SPEC, channels=2)
     with torch.no_grad():
         renderer.background.copy_(torch.tensor([3.0, -1.0]))
     empty = torch.full((1, *SPEC.shape_zyx), -30.0)
@@ -161,14 +166,14 @@ def test_an_unknown_command_is_not_taken_for_a_known_one(agent: PlanningAgent, e
     assert not any(torch.allclose(unknown[0], plan) for plan in plans.values())
 
 
-ROWS = nemo_rows(small_recipe(), BevEncoderSize(width=24, heads=4, points=2, pillars=2, layers=1))
+ROWS = nemo_rows(small_recipe(), BevConfig(width=24, heads=4, points=2, pillars=2, layers=1))
 
 
 @pytest.mark.parametrize("row", ROWS)
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
 def test_what_is_trained_is_what_gets_a_gradient(row: str, stage: str, example: Example) -> None:
     recipe = ROWS[row]
-    chosen: Stage | None = getattr(recipe, stage)
+    chosen: NemoStage | None = getattr(recipe, stage)
     if chosen is None:
         return
     torch.manual_seed(0)
@@ -205,7 +210,7 @@ def test_the_rows_of_the_tables() -> None:
     assert base.pretrain == full.pretrain
     assert (scratch.model, scratch.finetune) == (base.model, base.finetune)
     assert base.finetune.weights == dataclasses.replace(full.finetune.weights, recon=0.0, occ=0.0)
-    futures = {name.removeprefix("nemo_tiny_"): row.model.planner_future for name, row in ROWS.items()}
+    futures = {name.removeprefix("nemo_tiny_"): row.planner.future for name, row in ROWS.items()}
     assert {name for name, future in futures.items() if future == "attention"} == {"nemo_tiny", "attention"}
     assert {name for name, future in futures.items() if future == "concatenation"} == {"concatenation"}
     lacks = {
@@ -223,10 +228,13 @@ def test_the_rows_of_the_tables() -> None:
 @pytest.mark.parametrize("row", ["nemo_tiny", "nemo_tiny_bev"])
 def test_computing_again_changes_nothing_but_memory(row: str, example: Example) -> None:
     found = []
-    for checkpoint in ((), ("backbone", "encoder")):
-        recipe = dataclasses.replace(
-            ROWS[row], model=dataclasses.replace(ROWS[row].model, checkpoint=checkpoint)
-        )
+    for checkpoint in (False, True):
+        model = ROWS[row].model
+        parts = {
+            "backbone": dataclasses.replace(model.backbone, checkpoint=checkpoint),
+            "encoder": dataclasses.replace(model.encoder, checkpoint=checkpoint),
+        }
+        recipe = dataclasses.replace(ROWS[row], model=dataclasses.replace(model, **parts))
         torch.manual_seed(0)
         assert recipe.pretrain is not None
         objective = build_objective(recipe, recipe.pretrain, build_agent(recipe))

@@ -6,8 +6,15 @@ from typing import Literal
 import pytest
 import torch
 
-from foredrive.models.ego_mlp import EgoMLP
-from foredrive.models.planner import FutureAttention, PathCorrection, VolumePlanner, _headings
+from foredrive.models.ego_mlp import EgoMLPConfig
+from foredrive.models.planner import (
+    FutureAttention,
+    PathCorrection,
+    PathCorrectionConfig,
+    PlannerConfig,
+    VolumePlanner,
+    _headings,
+)
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
@@ -18,25 +25,27 @@ def small_planner(
     *,
     history: int,
     steps: int,
-    ego_mlp: EgoMLP | None = None,
-    look_m: tuple[float, ...] = (),
+    ego_mlp: EgoMLPConfig | None = None,
+    path: PathCorrectionConfig | None = None,
     target: bool = False,
 ) -> VolumePlanner:
-    return VolumePlanner(
-        channels=4,
-        spec=SPEC,
+    config = PlannerConfig(
         width=16,
         layers=1,
         heads=2,
         future=future,
         pool=(1, 2, 2),
         history=history,
-        horizon_steps=steps,
-        dt_s=0.5,
         ego_mlp=ego_mlp,
-        look_m=look_m,
+        path=path,
         target=target,
-    ).eval()
+    )
+    return VolumePlanner(config, SPEC, channels=4, horizon_steps=steps, dt_s=0.5).eval()
+
+
+def path_correction(distances_m: tuple[float, ...], *, told: int, steps: int) -> PathCorrection:
+    config = PathCorrectionConfig(distances_m=distances_m, width=8, hidden=4)
+    return PathCorrection(config, SPEC, channels=3, told=told, steps=steps)
 
 
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
@@ -88,8 +97,10 @@ def test_where_nothing_is_learned_it_goes_straight_on() -> None:
 
 def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
     torch.manual_seed(0)
-    ego_mlp = EgoMLP(past_frames=1, horizon_steps=3, dt_s=0.5)
-    planner = small_planner("none", history=1, steps=3, ego_mlp=ego_mlp, look_m=(1.0, 3.0))
+    path = PathCorrectionConfig(distances_m=(1.0, 3.0), width=8, hidden=4)
+    planner = small_planner("none", history=1, steps=3, ego_mlp=EgoMLPConfig(), path=path)
+    ego_mlp = planner.ego_mlp
+    assert ego_mlp is not None
     x, y, yaw, before, now, known = -2.5, 0.1, 0.05, 4.0, 6.0, torch.tensor([True, False])
     past, speed = torch.tensor([[[x, y, yaw, before]]]).expand(2, 1, 4), torch.full((2,), now)
     command = torch.tensor([1, 1])
@@ -100,8 +111,9 @@ def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:
 
 def test_a_planner_that_knows_where_the_route_leads_asks_and_goes_by_it() -> None:
     torch.manual_seed(0)
-    ego_mlp = EgoMLP(past_frames=0, horizon_steps=3, dt_s=0.5, target=True)
-    planner = small_planner("none", history=0, steps=3, ego_mlp=ego_mlp, target=True)
+    planner = small_planner("none", history=0, steps=3, ego_mlp=EgoMLPConfig(), target=True)
+    ego_mlp = planner.ego_mlp
+    assert ego_mlp is not None
     told = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
     volume, left = torch.randn(1, 4, 2, 8, 8), torch.tensor([[15.0, 9.0, 1.0]])
     plan = planner(volume, None, *told, left)
@@ -117,7 +129,7 @@ def test_a_planner_that_knows_where_the_route_leads_asks_and_goes_by_it() -> Non
 
 def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
     """3 m ahead, then 4 m to the left: distances 1.5, 5 and 9 m lie on both legs and 2 m beyond."""
-    reading = PathCorrection(SPEC, channels=3, width=8, distances_m=(1.5, 5.0, 9.0), told=0, steps=2)
+    reading = path_correction((1.5, 5.0, 9.0), told=0, steps=2)
     places = reading.places(torch.tensor([[[3.0, 0.0], [3.0, 4.0]]]))[0]
     right, middle, left = places.unbind(1)
     torch.testing.assert_close(middle, torch.tensor([[1.5, 0.0], [3.0, 2.0], [3.0, 6.0]]))
@@ -129,7 +141,7 @@ def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
 
 def test_what_stands_on_the_path_matters_and_what_stands_elsewhere_does_not() -> None:
     torch.manual_seed(0)
-    reading = PathCorrection(SPEC, channels=3, width=8, distances_m=(1.0, 2.5), told=1, steps=1).eval()
+    reading = path_correction((1.0, 2.5), told=1, steps=1).eval()
     torch.nn.init.normal_(reading.change[-2].weight)
     path = torch.tensor([[[2.5, 0.0]]])
 

@@ -1,5 +1,6 @@
 """Recipes on disk and by name."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import yaml
 from foredrive.errors import InputError
 from foredrive.recipes import RECIPES, find_recipe, labelled_by
 from foredrive.recipes.config import load_recipe, save_recipe
+from foredrive.recipes.gaussians import find_rebuild_recipe
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -82,10 +84,64 @@ def test_a_file_that_is_no_recipe_is_one_line(content: bytes, tmp_path: Path) ->
 
 
 def test_a_folder_without_a_config_is_no_run(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{tmp_path}: not a run folder, config.yaml cannot be read"):
+    with pytest.raises(InputError, match="cannot be read: No such file or directory"):
         load_recipe(tmp_path / "config.yaml")
 
 
 def test_an_unknown_name_is_told_the_known_ones() -> None:
-    with pytest.raises(InputError, match="no recipe 'nemo_huge'; there are: nemo_tiny,"):
+    with pytest.raises(InputError, match="no recipe 'nemo_huge'; near: nemo_base"):
         find_recipe("nemo_huge")
+
+
+WRITTEN_BEFORE = sorted((Path(__file__).parent / "written_before").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("file", WRITTEN_BEFORE, ids=lambda file: file.stem)
+def test_a_recipe_in_the_flat_format_opens_as_the_same_recipe(file: Path) -> None:
+    assert load_recipe(file) == find_recipe(file.stem)
+
+
+def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    save_recipe(dataclasses.replace(find_recipe("nemo_town"), name="own"), own)
+    settings = (
+        "finetune.schedule.lr=1e-3",
+        "model.encoder.layers=1",
+        "pretrain=null",
+        "clips.cameras=[pcam_f0]",
+    )
+    chosen = find_recipe(str(own), settings)
+    assert (chosen.name, chosen.finetune.schedule.lr, chosen.model.encoder.layers) == ("own", 1e-3, 1)
+    assert chosen.pretrain is None
+    assert chosen.clips.cameras == ("pcam_f0",)
+    unchanged = find_recipe("nemo_town")
+    assert chosen.planner == unchanged.planner
+    assert chosen.finetune.weights == unchanged.finetune.weights
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("lr=1e-3", "no entry 'lr'; did you mean pretrain.schedule.lr?"),
+        ("finetune.schedul.lr=1", "no entry 'schedul'; 'schedule' is near"),
+        ("finetune.schedule.lr.x=1", "finetune.schedule.lr has no entries"),
+        ("finetune.schedule.lr", "write KEY=VALUE"),
+        ("finetune.schedule.lr=fast", "nemo_town: not a recipe: finetune.schedule.lr: "),
+        ("model.kind=none", "model.kind: 'none' is none of nemo, driveworld"),
+        ("clips.cameras=[", "'\\[' is no value"),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_one_line(setting: str, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        find_recipe("nemo_town", (setting,))
+    assert "\n" not in str(caught.value)
+
+
+def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    save_recipe(find_rebuild_recipe("gaussians_tiny"), own)
+    chosen = find_rebuild_recipe(str(own), ("schedule.steps=7", "rolling=false"))
+    assert (chosen.schedule.steps, chosen.rolling) == (7, False)
+    assert chosen.initial == find_rebuild_recipe("gaussians_tiny").initial
+    with pytest.raises(InputError, match="near: gaussians_tiny"):
+        find_rebuild_recipe("gaussian_tiny")

@@ -11,21 +11,24 @@ from miniature import STEPS, miniature, miniature_driveworld
 from safetensors.torch import load_file
 from transformers import BertConfig, BertModel, BertTokenizerFast
 
+from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.models.driveworld import DriveWorld
-from foredrive.models.driveworld.task_prompt import PROMPTS
+from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
+from foredrive.models.lifting import LiftingConfig
+from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
+from foredrive.recipes.config import load_recipe, save_recipe
+from foredrive.recipes.driveworld_rows import driveworld_rows
 from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
 from foredrive.runs.build import build_agent
-from foredrive.recipes.config import PooledLiftingSize, PromptSize, load_recipe, save_recipe
 from foredrive.runs.drive.agents import Needs, needs_of
-from foredrive.recipes.driveworld_rows import driveworld_rows
-from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.runs.evaluate.imagination import imagine_run
-from foredrive.runs.train.run import load_agent
 from foredrive.runs.evaluate.vision import Observer
+from foredrive.runs.export import export_run
+from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
 from foredrive.training import DriveWorldObjective, load_weights, read_metrics, save_weights
 from foredrive.view.imagination_video import write_imagination_video
@@ -173,7 +176,7 @@ def example(log: LogPath) -> Example:
 
 def test_the_plane_may_come_from_deformable_lifting(example: Example) -> None:
     recipe = miniature_driveworld()
-    lifting = PooledLiftingSize(heads=2, points=2, layers=1)
+    lifting = PooledLiftingConfig(LiftingConfig(heads=2, points=2, layers=1))
     agent = build_agent(dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, encoder=lifting)))
     objective = DriveWorldObjective(agent, recipe.pretrain.weights, steps=2)
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()
@@ -182,7 +185,7 @@ def test_the_plane_may_come_from_deformable_lifting(example: Example) -> None:
 
 def prompted(text_encoder: Path) -> Recipe:
     recipe = miniature_driveworld()
-    prompt = PromptSize(widths=(8, 4), encoding=16, text_encoder=str(text_encoder))
+    prompt = PromptConfig(widths=(8, 4), encoding=16, text_encoder=str(text_encoder))
     return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
 
 
@@ -218,6 +221,13 @@ def test_whose_recipe_it_is_shows_in_what_is_written(tmp_path: Path) -> None:
         save_recipe(recipe, tmp_path / "config.yaml")
         assert load_recipe(tmp_path / "config.yaml") == recipe
         text = (tmp_path / "config.yaml").read_text()
-        (tmp_path / "config.yaml").write_text(text.replace("planner_width: 16", "planner_width: wide"))
-        with pytest.raises(InputError, match=r"not a recipe: model\.planner_width: "):
+        (tmp_path / "config.yaml").write_text(text.replace("  width: 16", "  width: wide"))
+        with pytest.raises(InputError, match=r"not a recipe: planner\.width: "):
             load_recipe(tmp_path / "config.yaml")
+
+
+def test_it_is_exported_as_it_runs_here(run: Run, log: LogPath, tmp_path: Path) -> None:
+    facts = export_run(run, [log], tmp_path, clips=1)
+    for program in ("model.pt2", "model.onnx"):
+        assert facts["largest_difference"][program]["waypoints_xy"] < 1e-4
+        assert facts["largest_difference"][program]["occupancy_logit"] < 1e-4

@@ -12,8 +12,7 @@ from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.export.graph import GraphInputs
-from foredrive.runs import export
-from foredrive.runs import Run
+from foredrive.runs import Run, export
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Command
 

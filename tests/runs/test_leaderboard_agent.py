@@ -13,8 +13,8 @@ from miniature import miniature
 
 import foredrive.runs.drive.leaderboard_agent as agent_file
 from foredrive.errors import InputError
-from foredrive.runs.build import build_agent
 from foredrive.recipes.config import save_recipe
+from foredrive.runs.build import build_agent
 from foredrive.runs.drive.leaderboard_agent import driver_of
 from foredrive.training import save_weights
 

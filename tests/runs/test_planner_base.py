@@ -8,13 +8,15 @@ import torch
 from miniature import miniature
 from safetensors.torch import load_file
 
+from benchmarks.common.study import seeded
 from foredrive.data import LogPath, collate
+from foredrive.models.ego_mlp import EgoMLPConfig
+from foredrive.models.planner import PathCorrectionConfig
 from foredrive.recipes import Recipe
 from foredrive.runs import Run, evaluate_run, train_run
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.path_features import read_paths
-from benchmarks.common.study import seeded
 from foredrive.runs.train.run import load_agent
 from foredrive.training import PathFit
 
@@ -25,8 +27,11 @@ def recipe(lr: float, path: PathFit | None = None) -> Recipe:
     return dataclasses.replace(
         small,
         pretrain=None,
-        model=dataclasses.replace(
-            small.model, planner_base="ego_mlp", planner_history=1, planner_look_m=(2.0, 6.0)
+        planner=dataclasses.replace(
+            small.planner,
+            history=1,
+            ego_mlp=EgoMLPConfig(),
+            path=PathCorrectionConfig(distances_m=(2.0, 6.0), width=8, hidden=4),
         ),
         path=path,
         finetune=dataclasses.replace(

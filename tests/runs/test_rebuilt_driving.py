@@ -13,12 +13,12 @@ from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
 from foredrive.data.drives import read_drive as read_log
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
+from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs import Run, evaluate_run
-from foredrive.runs.drive.records import score_of
 from foredrive.runs.drive.rebuilt import REPLAY, RebuiltSuite, drive_rebuilt
+from foredrive.runs.drive.records import score_of
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.scene import Renderer, VoxelSpec
 from foredrive.simulation.threats import Threat
 from foredrive.view.drive_report import write_drive_report

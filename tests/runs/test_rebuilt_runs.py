@@ -12,10 +12,10 @@ from small_rebuild import SMALLEST
 from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
 from foredrive.rendering.edits import Insert, Remove
 from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
+from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
 
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 

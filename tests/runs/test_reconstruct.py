@@ -15,10 +15,10 @@ from foredrive.errors import InputError
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
 from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
-from foredrive.runs.rebuild.reconstruct import begin, memory_needed_gib, read_material, reconstruct
 from foredrive.rendering.initial import InitialSize
 from foredrive.rendering.ply import read_ply
 from foredrive.rendering.scene_graph import STATIC
+from foredrive.runs.rebuild.reconstruct import begin, memory_needed_gib, read_material, reconstruct
 from foredrive.training import rebuilding
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from foredrive.runs.fan_out import fan_out
 from foredrive.runs.drive.recording import Recorded, is_recorded, record_drives, record_plan
+from foredrive.runs.fan_out import fan_out
 from foredrive.towns.campaign import DrivePlan
 
 IMAGE_HW = (36, 64)

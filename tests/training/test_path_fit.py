@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from foredrive.models.planner import PathCorrection, PathReads
+from foredrive.models.planner import PathCorrection, PathCorrectionConfig, PathReads
 from foredrive.scene import VoxelSpec
 from foredrive.training import PathDemonstrations, PathFit, fit_path
 
@@ -15,7 +15,8 @@ COUNT, DISTANCES = 400, (2.0, 6.0)
 
 def correction() -> PathCorrection:
     torch.manual_seed(0)
-    return PathCorrection(SPEC, channels=2, width=32, distances_m=DISTANCES, told=1, steps=2)
+    config = PathCorrectionConfig(distances_m=DISTANCES, width=32, hidden=16)
+    return PathCorrection(config, SPEC, channels=2, told=1, steps=2)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
+from foredrive.cli.recipes import recipes
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
 from foredrive.cli.render import render
@@ -33,6 +34,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "record": record,
     "convert": convert,
+    "recipes": recipes,
     "train": train,
     "evaluate": evaluate,
     "drive": drive,

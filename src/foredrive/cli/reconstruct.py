@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, Settings
 
 
 def reconstruct(
@@ -16,6 +16,7 @@ def reconstruct(
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
     image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None,
     cache: OptionalPath = None,
+    set: Settings = (),  # noqa: A002: the flag's name
 ) -> None:
     """Rebuild a log as a scene to render cameras and lidars from, or go on with an interrupted run.
 
@@ -27,10 +28,13 @@ def reconstruct(
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: Folder of the run. Where it holds this run already, it goes on from the last checkpoint.
         method: What the scene is made of.
-        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_base (a GPU).
+        recipe: Name of the recipe, gaussians_tiny (minutes on two cores) or gaussians_base (a GPU), or a YAML
+            file.
         cameras: Only these, by their own names or 123D's, such as pcam_f0; by default the recipe's.
         image_size: Images are shrunk to this, px; by default the recipe's, 270 480 or 1080 1920.
         cache: Folder for shrunk images; by default "cache" in the run's folder.
+        set: Entries of the recipe to replace, such as schedule.steps=2000; `foredrive recipes RECIPE` prints
+            them all.
     """
     import dataclasses
 
@@ -43,7 +47,7 @@ def reconstruct(
     logs = find_logs(log)
     if len(logs) > 1:
         raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
-    chosen = find_rebuild_recipe(recipe)
+    chosen = find_rebuild_recipe(recipe, set)
     if cameras:
         chosen = dataclasses.replace(chosen, cameras=cameras)
     if image_size is not None:

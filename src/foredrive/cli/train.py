@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.arguments import OptionalPath, Settings, SomePaths
 
 
 def train(
@@ -15,22 +15,25 @@ def train(
     cache: OptionalPath = None,
     occupancy: Literal["lidar", "recorded"] = "lidar",
     start: OptionalPath = None,
+    set: Settings = (),  # noqa: A002: the flag's name
 ) -> None:
     """Train a recipe on logs, or go on with a run that was interrupted.
 
     Args:
-        recipe: Name of the recipe, such as nemo_tiny; an unknown name lists the known ones.
+        recipe: Name of the recipe, such as nemo_tiny (`foredrive recipes` lists all), or a YAML file.
         logs: 123D logs, splits or data roots to train on.
         out: Folder of the run. Where it holds this run already, training goes on from the last checkpoint.
         cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
         occupancy: What voxel labels are made from: what lidar beams met and passed through, or the exact
             occupancy that towns record, seen or not. The run is evaluated by the same.
         start: Another run's folder: take its pre-trained weights and go straight on to fine-tuning.
+        set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
+            prints them all.
     """
     from foredrive.recipes import find_recipe, labelled_by
     from foredrive.runs import find_all_logs, train_run
 
-    chosen = labelled_by(find_recipe(recipe), occupancy)
+    chosen = labelled_by(find_recipe(recipe, set), occupancy)
     run = train_run(chosen, find_all_logs(logs), out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

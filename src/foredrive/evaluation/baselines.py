@@ -10,7 +10,7 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.evaluation.run import labels_from_now
 from foredrive.metrics import VoxelPrior
-from foredrive.models.ego_mlp import EgoMLP, ego_status
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_status
 from foredrive.scene import Clip, Example, Trajectory
 from foredrive.scene.record import Record
 
@@ -134,7 +134,9 @@ def fit_ego_mlp(
     horizon_steps = data.driven.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = EgoMLP(past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target)
+        model = EgoMLP(
+            EgoMLPConfig(), past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target
+        )
     _standardise(model, data)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)

@@ -1,15 +1,14 @@
 """What is exported: an agent's way from images to plan and occupancy, with plain tensors at both ends."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor, nn
 
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import ego_motion, route_lead
-from foredrive.models.nemo import Nemo
-from foredrive.scene import CameraRig, Clip
+from foredrive.scene import CameraRig, Clip, Frames, last_frames
 
 
 class GraphInputs(NamedTuple):
@@ -26,24 +25,32 @@ class GraphInputs(NamedTuple):
     command_valid: Bool[Tensor, "1"]
     past_motion: Float[Tensor, "1 P 4"]
     route_lead: Float[Tensor, "1 3"]
+    frame_t_s: Float[Tensor, "1 T"]
+    T_now_frame: Float64[Tensor, "1 T 4 4"]
+    frame_speed_mps: Float[Tensor, "1 T"]
+    frame_speed_valid: Bool[Tensor, "1 T"]
 
     @classmethod
-    def of(cls, observed: Clip, agent: PlanningAgent) -> "GraphInputs":
-        """What `agent` looks at of an observed clip with a batch of one."""
-        rig, frames = observed.rig, agent.world_model.past_frames + 1
+    def of(cls, observed: Clip, agent: PlanningAgent[Any]) -> "GraphInputs":
+        """Return the inputs of `agent` from an observed clip with a batch of one."""
+        frames = last_frames(observed, agent.world_model.past_frames)
         poses, speeds = ego_motion(observed, agent.planner.history)
         return cls(
-            images=observed.images[:, -frames:].contiguous(),
-            image_valid=observed.image_valid[:, -frames:].contiguous(),
-            K=rig.K[:, -frames:].contiguous(),
-            T_ego_cam=rig.T_ego_cam[:, -frames:].contiguous(),
-            dist=rig.dist[:, -frames:].contiguous(),
+            images=frames.images.contiguous(),
+            image_valid=frames.image_valid.contiguous(),
+            K=frames.rig.K.contiguous(),
+            T_ego_cam=frames.rig.T_ego_cam.contiguous(),
+            dist=frames.rig.dist.contiguous(),
             speed_mps=observed.ego_speed_mps[:, -1],
             speed_valid=observed.ego_speed_valid[:, -1],
             command=observed.command.long(),
             command_valid=observed.command_valid,
             past_motion=torch.cat([poses, speeds[:, :-1, None]], dim=-1),
             route_lead=route_lead(observed),
+            frame_t_s=frames.t_s.contiguous(),
+            T_now_frame=frames.T_now_ego.contiguous(),
+            frame_speed_mps=frames.speed_mps.contiguous(),
+            frame_speed_valid=frames.speed_valid.contiguous(),
         )
 
 
@@ -71,6 +78,10 @@ MEANING = {
     "frames before now; P is 0 where the planner does not look at them",
     "route_lead": "x, y of where the route is 20 m on, in the ego frame at now, m, and 1; zeros where that "
     "is not known; planners that go by the command alone do not look at it",
+    "frame_t_s": "time of each key frame, s; 0 at now",
+    "T_now_frame": "ego frame of each key frame -> ego frame now, m",
+    "frame_speed_mps": "of the ego vehicle at each key frame, m/s",
+    "frame_speed_valid": "whether that speed is known",
     "waypoints_xy": "rear axle in the ego frame now, m; the first one step ahead",
     "waypoints_yaw": "heading relative to now's, rad",
     "occupancy_logit": "before the sigmoid; now first, then the imagined key frames, each in its own ego "
@@ -81,7 +92,7 @@ MEANING = {
 
 
 class AgentGraph(nn.Module):
-    """An agent on a NeMo between plain tensors: nothing in it depends on what data say, so it can be traced.
+    """An agent between plain tensors: no step depends on the values of the data, so that it can be traced.
 
     Args:
         agent: in evaluation mode.
@@ -90,7 +101,7 @@ class AgentGraph(nn.Module):
     """
 
     def __init__(
-        self, agent: PlanningAgent, camera_names: tuple[str, ...], image_hw: tuple[int, int], steps: int
+        self, agent: PlanningAgent[Any], camera_names: tuple[str, ...], image_hw: tuple[int, int], steps: int
     ) -> None:
         super().__init__()
         self.agent, self.camera_names, self.image_hw, self.steps = agent, camera_names, image_hw, steps
@@ -108,10 +119,13 @@ class AgentGraph(nn.Module):
         command_valid: Bool[Tensor, "1"],
         past_motion: Float[Tensor, "1 P 4"],
         route_lead: Float[Tensor, "1 3"],
+        frame_t_s: Float[Tensor, "1 T"],
+        T_now_frame: Float64[Tensor, "1 T 4 4"],
+        frame_speed_mps: Float[Tensor, "1 T"],
+        frame_speed_valid: Bool[Tensor, "1 T"],
     ) -> dict[str, Tensor]:
         """As `PlanningAgent.forward`: the fields of `GraphOutputs`; `MEANING` says what all of them are."""
         model, planner = self.agent.world_model, self.agent.planner
-        assert isinstance(model, Nemo)
         rig = CameraRig(
             K=K,
             T_ego_cam=T_ego_cam,
@@ -120,11 +134,21 @@ class AgentGraph(nn.Module):
             names=self.camera_names,
             size_hw=self.image_hw,
         )
-        now = model.encode(images, image_valid, rig)
+        frames = Frames(
+            t_s=frame_t_s,
+            T_now_ego=T_now_frame,
+            images=images,
+            image_valid=image_valid,
+            rig=rig,
+            speed_mps=frame_speed_mps,
+            speed_valid=frame_speed_valid,
+        )
+        now = model.encode(frames)
         beliefs = [now, *model.imagine(now, max(self.steps, planner.looks_ahead))]
-        ahead = beliefs[1].volume if planner.looks_ahead else None
+        planned_on = self.agent.planned_on
+        ahead = planned_on(beliefs[1]) if planner.looks_ahead else None
         plan = planner(
-            now.volume, ahead, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
+            planned_on(now), ahead, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
         )
         shown = beliefs[: self.steps + 1]
         poses = [torch.eye(4)[None] if belief.T_now_ego is None else belief.T_now_ego for belief in shown]

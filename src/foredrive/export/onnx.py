@@ -84,13 +84,19 @@ def _attention(
     scale: float | None = None,
     enable_gqa: bool = False,
 ) -> Any:
-    """softmax(Q Kᵀ / √d) V for any number of leading dimensions; PyTorch's exporter knows two."""
-    if attn_mask is not None or dropout_p or is_causal or scale is not None or enable_gqa:
-        raise NotImplementedError("attention with a mask, dropout, another scale or shared heads")
+    """softmax(Q Kᵀ / √d + mask) V for any number of leading dimensions; PyTorch's exporter knows two.
+
+    The mask is added: 0 where attention is allowed, -∞ elsewhere, as `nn.MultiheadAttention` gives it.
+    """
+    if dropout_p or is_causal or scale is not None or enable_gqa:
+        raise NotImplementedError("attention with dropout, another scale or shared heads")
     rank = len(query.shape)
     turned = op.Transpose(key, perm=[*range(rank - 2), rank - 1, rank - 2])
     scaled = op.Mul(query, op.Constant(value_float=int(query.shape[-1]) ** -0.5))
-    return op.MatMul(op.Softmax(op.MatMul(scaled, turned), axis=-1), value)
+    score = op.MatMul(scaled, turned)
+    if attn_mask is not None:
+        score = op.Add(score, attn_mask)
+    return op.MatMul(op.Softmax(score, axis=-1), value)
 
 
 def _slice(tensor: Any, axis: int, start: int, stop: int) -> Any:

@@ -1,17 +1,17 @@
 """Something that drives: a world model, and the planner on top of it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.models.driveworld import DriveWorld
 from foredrive.models.ego_mlp import ego_motion, route_lead
-from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
-from foredrive.scene import Belief, Clip, Decoded, Trajectory
+from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
+
+W = TypeVar("W", bound=WorldModel)
 
 
 class AgentOutput(NamedTuple):
@@ -23,12 +23,12 @@ class AgentOutput(NamedTuple):
     plan: Trajectory
 
 
-class PlanningAgent(nn.Module):
+class PlanningAgent(nn.Module, Generic[W]):
     """An `Agent` over any world model: plans from the volume at now and the one imagined next (NeMo §3.3)."""
 
-    def __init__(self, world_model: Nemo | DriveWorld, planner: VolumePlanner) -> None:
+    def __init__(self, world_model: W, planner: VolumePlanner) -> None:
         super().__init__()
-        self.world_model = world_model
+        self.world_model: W = world_model
         self.planner = planner
 
     def forward(self, clip: Clip, steps: int) -> AgentOutput:

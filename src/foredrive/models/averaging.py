@@ -1,6 +1,8 @@
 """The plainest way from camera features to a volume: the yardstick for attention."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +13,15 @@ from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, VoxelSpec
 
 
+@dataclass(frozen=True)
+class AveragingConfig:
+    """Sizes of an `AveragingEncoder`."""
+
+    hidden: int
+    """Channels between the convolutions."""
+    kind: Literal["averaging"] = "averaging"
+
+
 class AveragingEncoder(nn.Module):
     """One bilinear sample per voxel and camera, the mean over cameras, two 3-D convolutions.
 
@@ -18,16 +29,17 @@ class AveragingEncoder(nn.Module):
     where to look, and what lies along a ray is told apart by the convolutions alone.
 
     Args:
+        config: sizes.
         spec: the volume's grid.
         channels: D.
-        hidden: channels between the convolutions.
+        levels: number of image feature levels; the finest is read.
     """
 
     centres_m: Tensor
 
-    def __init__(self, spec: VoxelSpec, *, channels: int, hidden: int) -> None:
+    def __init__(self, config: AveragingConfig, spec: VoxelSpec, *, channels: int, levels: int) -> None:
         super().__init__()
-        self.spec = spec
+        self.spec, hidden = spec, config.hidden
         centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
         self.convolve = nn.Sequential(

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -23,46 +24,50 @@ def normalise_images(images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W
     return (images.float() / 255 - mean) / std
 
 
+@dataclass(frozen=True)
+class BackboneConfig:
+    """Sizes of an `ImageBackbone`."""
+
+    embedding_size: int
+    """Channels of the ResNet's stem."""
+    hidden_sizes: tuple[int, ...]
+    """Channels of its stages, as in `transformers.ResNetConfig`; so are `depths` and `layer_type`."""
+    depths: tuple[int, ...]
+    layer_type: Literal["basic", "bottleneck"]
+    stages: tuple[str, ...]
+    """The stages that feed the pyramid, e.g. ("stage2", "stage3")."""
+    weights: str | None = None
+    """A hub name or local folder of a `transformers` ResNet, whose sizes then replace the ones given here;
+    None starts from random weights."""
+    checkpoint: bool = False
+    """Keep only the images for the backward pass and compute the rest again. The running statistics of batch
+    normalisation then count every batch twice."""
+
+
 class ImageBackbone(nn.Module):
     """ResNet (He et al. 2016) with a feature pyramid (Lin et al. 2017) of one channel count.
 
     Args:
-        hidden_sizes, depths, layer_type: the ResNet's stages, as in `transformers.ResNetConfig`.
-        embedding_size: channels of its stem.
-        stages: which stages feed the pyramid, e.g. ("stage2", "stage3").
+        config: sizes.
         channels: D of every pyramid level.
-        weights: a hub name or local folder of a `transformers` ResNet, whose sizes then replace the ones
-            given here; None starts from random weights.
-        checkpoint: keep only the images for the backward pass and compute the rest again; the running
-            statistics of batch normalisation then see every batch twice.
+        fetch: load `config.weights`; not needed where trained weights will replace them.
     """
 
-    def __init__(
-        self,
-        *,
-        embedding_size: int,
-        hidden_sizes: Sequence[int],
-        depths: Sequence[int],
-        layer_type: Literal["basic", "bottleneck"],
-        stages: Sequence[str],
-        channels: int,
-        weights: str | None = None,
-        checkpoint: bool = False,
-    ) -> None:
+    def __init__(self, config: BackboneConfig, *, channels: int, fetch: bool = True) -> None:
         super().__init__()
-        self.checkpoint = checkpoint
+        self.checkpoint = config.checkpoint
         self.pretrained = False
         self.resnet = ResNetBackbone(
             ResNetConfig(
-                embedding_size=embedding_size,
-                hidden_sizes=list(hidden_sizes),
-                depths=list(depths),
-                layer_type=layer_type,
-                out_features=list(stages),
+                embedding_size=config.embedding_size,
+                hidden_sizes=list(config.hidden_sizes),
+                depths=list(config.depths),
+                layer_type=config.layer_type,
+                out_features=list(config.stages),
             )
         )
-        if weights is not None:
-            self._load(weights, stages)
+        if fetch and config.weights is not None:
+            self._load(config.weights, config.stages)
         widths = self.resnet.channels
         self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])

@@ -1,6 +1,8 @@
 """A bird's-eye-view encoder after BEVFormer (Li et al. 2022): the planar baseline of NeMo's Table 1."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +13,26 @@ from foredrive.models.lifting import LiftingLayer, directions_2d, place_code, pr
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, VoxelSpec
+
+
+@dataclass(frozen=True)
+class BevConfig:
+    """Sizes of a `BevEncoder`."""
+
+    width: int
+    """W, the channels of a cell."""
+    heads: int
+    points: int
+    """Read per head, level and height."""
+    pillars: int
+    """Heights above a cell that are read, evenly spaced over the grid's."""
+    layers: int
+    """Rounds of refinement."""
+    feed_forward: float = 2.0
+    """Hidden width of the feed-forward networks over the width."""
+    checkpoint: bool = False
+    """Keep only each round's input for the backward pass and compute the rest again."""
+    kind: Literal["bev"] = "bev"
 
 
 class PlaneSelfAttention(nn.Module):
@@ -99,32 +121,19 @@ class BevEncoder(nn.Module):
     one (BEVFormer-S); what lies between them is the motion module's.
 
     Args:
+        config: sizes.
         spec: the volume's grid.
         channels: D, of the volume and of the image features.
-        width: W, of a cell.
-        heads, points, levels, layers: as in `LiftingEncoder`; `points` per height.
-        pillars: heights above a cell that are looked at, evenly spaced over the grid's.
-        checkpoint: keep only each round's input for the backward pass and compute the rest again.
+        levels: number of image feature levels.
     """
 
     place: Tensor
     pillars_m: Tensor
 
-    def __init__(
-        self,
-        spec: VoxelSpec,
-        *,
-        channels: int,
-        width: int,
-        heads: int,
-        points: int,
-        pillars: int,
-        levels: int,
-        layers: int,
-        checkpoint: bool = False,
-    ) -> None:
+    def __init__(self, config: BevConfig, spec: VoxelSpec, *, channels: int, levels: int) -> None:
         super().__init__()
-        self.spec, self.checkpoint = spec, checkpoint
+        self.spec, self.checkpoint = spec, config.checkpoint
+        width, heads, points, pillars = config.width, config.heads, config.points, config.pillars
         height, ny, nx = spec.shape_zyx
         y, x = torch.meshgrid(torch.arange(ny) + 0.5, torch.arange(nx) + 0.5, indexing="ij")
         place = torch.stack([x, y, torch.full_like(x, 0.5)], dim=-1).flatten(0, 1)
@@ -142,8 +151,9 @@ class BevEncoder(nn.Module):
                     width,
                     PlaneSelfAttention(width, heads, points),
                     PillarCrossAttention(channels, width, heads, levels, points, pillars),
+                    config.feed_forward,
                 )
-                for _ in range(layers)
+                for _ in range(config.layers)
             ]
         )
         self.unfold = nn.Linear(width, height * channels)

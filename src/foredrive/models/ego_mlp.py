@@ -1,5 +1,7 @@
 """A planner that sees nothing but the ego vehicle's own status."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -60,6 +62,14 @@ def status_row(
     return row if lead is None else torch.cat([row, lead.to(row)], dim=-1)
 
 
+@dataclass(frozen=True)
+class EgoMLPConfig:
+    """Sizes of an `EgoMLP`."""
+
+    hidden: int = 512
+    """Width of both hidden layers (512 in the paper)."""
+
+
 class EgoMLP(nn.Module):
     """An `Agent`: ego status to waypoints by a three-layer perceptron (Zhai et al. 2023, "AD-MLP").
 
@@ -67,9 +77,9 @@ class EgoMLP(nn.Module):
     standardised by the training set's mean and spread, which are part of the weights.
 
     Args:
+        config: sizes.
         past_frames: key frames before now that it looks back on (4 in the paper).
         horizon_steps, dt_s: of the plan.
-        hidden: width of both hidden layers (512 in the paper).
         target: it also knows where the route leads, which in the paper it does not.
     """
 
@@ -79,9 +89,16 @@ class EgoMLP(nn.Module):
     plan_std: Tensor
 
     def __init__(
-        self, *, past_frames: int, horizon_steps: int, dt_s: float, hidden: int = 512, target: bool = False
+        self,
+        config: EgoMLPConfig,
+        *,
+        past_frames: int,
+        horizon_steps: int,
+        dt_s: float,
+        target: bool = False,
     ) -> None:
         super().__init__()
+        hidden = config.hidden
         self.past_frames, self.horizon_steps, self.dt_s = past_frames, horizon_steps, dt_s
         self.target = target
         inputs, outputs = 4 * past_frames + 1 + len(Command) + 3 * target, 3 * horizon_steps

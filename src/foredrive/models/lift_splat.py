@@ -1,6 +1,8 @@
 """Lift, splat (Philion & Fidler 2020): image features to a plane by a distribution over depth."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,29 +12,42 @@ from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.scene import CameraRig, VoxelSpec
 
 
+@dataclass(frozen=True)
+class LiftSplatConfig:
+    """The depths of a `LiftSplatEncoder` (4 to 45 m by 1 m in the paper)."""
+
+    near_m: float
+    far_m: float
+    step_m: float
+    norm_groups: int = 4
+    kind: Literal["lift_splat"] = "lift_splat"
+
+
 class LiftSplatEncoder(nn.Module):
     """Each feature of the finest level is put at every depth along its ray, as far as it is likely to belong
     there; what falls into a cell of the plane is summed up.
 
     Args:
+        config: depths.
         spec: the grid whose plane (and range of heights) is filled.
         channels: D of the image features.
         width: C of the plane.
-        near_m, far_m, step_m: of the depths (4 to 45 m by 1 m in the paper).
+        levels: number of image feature levels; the finest is read.
     """
 
     depths_m: Tensor
 
     def __init__(
-        self, spec: VoxelSpec, *, channels: int, width: int, near_m: float, far_m: float, step_m: float
+        self, config: LiftSplatConfig, spec: VoxelSpec, *, channels: int, width: int, levels: int
     ) -> None:
         super().__init__()
         self.spec, self.width = spec, width
-        self.register_buffer("depths_m", torch.arange(near_m, far_m, step_m), persistent=False)
+        depths_m = torch.arange(config.near_m, config.far_m, config.step_m)
+        self.register_buffer("depths_m", depths_m, persistent=False)
         self.depth_and_context = nn.Linear(channels, len(self.depths_m) + width)
         self.out = nn.Sequential(
             nn.Conv2d(width, width, 3, padding=1),
-            nn.GroupNorm(4, width),
+            nn.GroupNorm(config.norm_groups, width),
             nn.ReLU(),
             nn.Conv2d(width, width, 1),
         )

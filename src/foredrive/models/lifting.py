@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -49,6 +51,22 @@ def place_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, 
     code += [(math.pi * 2**k * axis / reach).sin() for k in range(3) for axis in (x, y)]
     rest = 0.02 * torch.randn(len(centres_m), max(channels - len(code), 0), device=centres_m.device)
     return torch.cat([torch.stack(code, dim=-1), rest], dim=-1)[:, :channels].contiguous()
+
+
+@dataclass(frozen=True)
+class LiftingConfig:
+    """Sizes of a `LiftingEncoder`."""
+
+    heads: int
+    points: int
+    """Read per head, and per level of image features."""
+    layers: int
+    """Rounds of refinement."""
+    feed_forward: float = 2.0
+    """Hidden width of the feed-forward networks over the channels."""
+    checkpoint: bool = False
+    """Keep only each round's input for the backward pass and compute the rest again."""
+    kind: Literal["lifting"] = "lifting"
 
 
 class VolumeSelfAttention(nn.Module):
@@ -123,14 +141,16 @@ class LiftingLayer(nn.Module):
         channels: D.
         self_attention: among the queries, as `VolumeSelfAttention`.
         cross_attention: to the cameras, as `CameraCrossAttention`.
+        feed_forward: hidden width over D.
     """
 
-    def __init__(self, channels: int, self_attention: nn.Module, cross_attention: nn.Module) -> None:
+    def __init__(
+        self, channels: int, self_attention: nn.Module, cross_attention: nn.Module, feed_forward: float
+    ) -> None:
         super().__init__()
         self.self_attention, self.cross_attention = self_attention, cross_attention
-        self.feed_forward = nn.Sequential(
-            nn.Linear(channels, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels)
-        )
+        hidden = round(feed_forward * channels)
+        self.feed_forward = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
         self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(3)])
 
     def forward(
@@ -188,30 +208,18 @@ class LiftingEncoder(nn.Module):
     """Learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
 
     Args:
+        config: sizes.
         spec: the volume's grid.
         channels: D.
-        heads, points: of the deformable attentions; `points` per head and level.
         levels: number of image feature levels.
-        layers: rounds of refinement.
-        checkpoint: keep only each round's input for the backward pass and compute the rest again.
     """
 
     place: Tensor
     centres_m: Tensor
 
-    def __init__(
-        self,
-        spec: VoxelSpec,
-        *,
-        channels: int,
-        heads: int,
-        points: int,
-        levels: int,
-        layers: int,
-        checkpoint: bool = False,
-    ) -> None:
+    def __init__(self, config: LiftingConfig, spec: VoxelSpec, *, channels: int, levels: int) -> None:
         super().__init__()
-        self.spec, self.checkpoint = spec, checkpoint
+        self.spec, self.checkpoint = spec, config.checkpoint
         centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
@@ -221,10 +229,11 @@ class LiftingEncoder(nn.Module):
             [
                 LiftingLayer(
                     channels,
-                    VolumeSelfAttention(channels, heads, points),
-                    CameraCrossAttention(channels, heads, levels, points),
+                    VolumeSelfAttention(channels, config.heads, config.points),
+                    CameraCrossAttention(channels, config.heads, levels, config.points),
+                    config.feed_forward,
                 )
-                for _ in range(layers)
+                for _ in range(config.layers)
             ]
         )
 

@@ -1,7 +1,7 @@
 """The temporal attention planner (NeMo §3.3, eq. 12–14)."""
 
 import copy
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -9,22 +9,65 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from foredrive.models.ego_mlp import EgoMLP, status_row
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_row
 from foredrive.models.few_queries import FewQueriesDecoderLayer
 from foredrive.ops.precision import full_precision
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import Command, Trajectory, VoxelSpec
 
-SPEED_SCALE_MPS = 10.0
 MOVES_M = 0.1
-PAST_SCALE = (5.0, 5.0, 1.0, SPEED_SCALE_MPS)
-LEAD_SCALE = (20.0, 20.0, 1.0)
-STEP_SCALE_M = 1.0
-"""What an output of 1 stands for: with steps of this order the last layer need not grow first."""
-PLACE_SCALE_M = 20.0
-PATH_DROPOUT = 0.2
-ASIDE_M = (-3.0, 0.0, 3.0)
-"""Where beside a path it is looked: on it and in the lanes next to it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathCorrectionConfig:
+    """Sizes of a `PathCorrection`."""
+
+    distances_m: tuple[float, ...]
+    """Along the path; it goes on straight where it ends."""
+    aside_m: tuple[float, ...] = (-3.0, 0.0, 3.0)
+    """Places across the path that are read: on it and in the lanes next to it."""
+    width: int
+    hidden: int
+    """Width of what is kept of one distance."""
+    dropout: float = 0.2
+    place_scale_m: float = 20.0
+    """Places are divided by it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Sizes of a `VolumePlanner`, and the inputs that it is given."""
+
+    width: int
+    """C (256 in the paper)."""
+    layers: int
+    """Of the decoder (3 in the paper)."""
+    heads: int
+    pool: tuple[int, int, int]
+    """Block of voxels (z, y, x) that share a key and a value in the attention within the future volume."""
+    future: Literal["attention", "concatenation", "none"] = "attention"
+    """How the predicted next volume is put together with the present one."""
+    history: int = 0
+    """Key frames before now whose pose and speed the query knows. In the paper it knows the speed at now
+    alone, which does not tell whether the vehicle brakes."""
+    target: bool = False
+    """The query knows where the route leads (`Clip.target_xy`), as agents on CARLA's leaderboards do; in the
+    paper it knows the command alone."""
+    ego_mlp: EgoMLPConfig | None = None
+    """The MLP whose plan is changed, fitted to the demonstrations before fine-tuning; None changes the plan
+    that goes straight on at the present speed."""
+    path: PathCorrectionConfig | None = None
+    """Read the volume along the plan made without looking, too; not in the paper."""
+    feed_forward: float = 2.0
+    """Hidden width of the decoder's feed-forward networks over C."""
+    dropout: float = 0.1
+    """Of the decoder."""
+    speed_scale_mps: float = 10.0
+    past_scale_m: float = 5.0
+    target_scale_m: float = 20.0
+    """Inputs are divided by these."""
+    step_scale_m: float = 1.0
+    """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
 
 
 class FutureAttention(nn.Module):
@@ -76,10 +119,9 @@ class PathCorrection(nn.Module):
     (`bench nemo-planning-limits`).
 
     Args:
+        config: sizes.
         spec: grid of the volume.
         channels: of the volume.
-        width: of the layers.
-        distances_m: along the path; it goes on straight where it ends.
         told: how many numbers about the ego vehicle come with it: whether 20 m are near depends on its speed.
         steps: T, of the plan.
     """
@@ -91,31 +133,24 @@ class PathCorrection(nn.Module):
     std: Tensor
 
     def __init__(
-        self,
-        spec: VoxelSpec,
-        *,
-        channels: int,
-        width: int,
-        distances_m: Sequence[float],
-        told: int,
-        steps: int,
+        self, config: PathCorrectionConfig, spec: VoxelSpec, *, channels: int, told: int, steps: int
     ) -> None:
         super().__init__()
-        self.voxel_m = spec.voxel_m
-        self.register_buffer("distances_m", torch.tensor(distances_m), persistent=False)
-        self.register_buffer("aside_m", torch.tensor(ASIDE_M), persistent=False)
+        self.voxel_m, self.place_scale_m = spec.voxel_m, config.place_scale_m
+        self.register_buffer("distances_m", torch.tensor(config.distances_m), persistent=False)
+        self.register_buffer("aside_m", torch.tensor(config.aside_m), persistent=False)
         self.register_buffer("lower_m", torch.tensor(spec.lower_m[:2]), persistent=False)
-        features, hidden = spec.shape_zyx[0] * channels, width // 2
+        features, width, hidden = spec.shape_zyx[0] * channels, config.width, config.hidden
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
         self.place = nn.Sequential(
-            nn.Linear(len(ASIDE_M) * (features + 2), width),
+            nn.Linear(len(config.aside_m) * (features + 2), width),
             nn.ReLU(),
-            nn.Dropout(PATH_DROPOUT),
+            nn.Dropout(config.dropout),
             nn.Linear(width, hidden),
         )
         self.together = nn.Sequential(
-            nn.Linear(len(distances_m) * hidden, width), nn.ReLU(), nn.Dropout(PATH_DROPOUT)
+            nn.Linear(len(config.distances_m) * hidden, width), nn.ReLU(), nn.Dropout(config.dropout)
         )
         self.change = nn.Sequential(
             nn.Linear(width + told, width),
@@ -134,7 +169,7 @@ class PathCorrection(nn.Module):
             told: about the ego vehicle, in numbers of order 1.
         """
         values = (reads.values.float() - self.mean) / self.std
-        seen = torch.cat([values, reads.places_m / PLACE_SCALE_M], dim=-1).flatten(2)
+        seen = torch.cat([values, reads.places_m / self.place_scale_m], dim=-1).flatten(2)
         along = self.together(self.place(seen).flatten(1))
         return self.change(torch.cat([along, told], dim=-1)).float()
 
@@ -173,46 +208,32 @@ class VolumePlanner(nn.Module):
     they are summed up. That plan goes straight on at this speed, or is what `ego_mlp` says.
 
     Args:
-        channels: D.
+        config: sizes and inputs.
         spec: grid of the volumes.
-        width: C (256 in the paper).
-        layers, heads: of the decoder (3 layers in the paper).
-        future: what becomes of the predicted volume.
-        pool: blocks of the future attention.
-        history: how many key frames before now the query knows pose and speed of; in the paper it knows the
-            speed at now alone, from which nobody can tell who brakes.
-        target: the query also knows where the route leads (`Clip.target_xy`), as agents on CARLA's
-            leaderboards do; in the paper it knows the command alone.
+        channels: D.
         horizon_steps, dt_s: of the plan.
-        ego_mlp: fitted beforehand, knows `history` frames, the target if the query does, and has the same
-            horizon; it is not trained on.
-        look_m: distances along the plan made without looking at which the volume of now is read as well
-            (`PathCorrection`); none in the paper.
     """
 
     def __init__(
-        self,
-        *,
-        channels: int,
-        spec: VoxelSpec,
-        width: int,
-        layers: int,
-        heads: int,
-        future: Literal["attention", "concatenation", "none"],
-        pool: tuple[int, int, int],
-        history: int,
-        target: bool = False,
-        horizon_steps: int,
-        dt_s: float,
-        ego_mlp: EgoMLP | None = None,
-        look_m: Sequence[float] = (),
+        self, config: PlannerConfig, spec: VoxelSpec, *, channels: int, horizon_steps: int, dt_s: float
     ) -> None:
         super().__init__()
         height, ny, nx = spec.shape_zyx
+        width, self.config = config.width, config
         self.horizon_steps, self.dt_s = horizon_steps, dt_s
-        self.future, self.history, self.target = future, history, target
-        self.fuse_future = FutureAttention(channels, pool) if future == "attention" else None
-        volumes = 2 if future == "concatenation" else 1
+        self.history, self.target = config.history, config.target
+        self.ego_mlp: EgoMLP | None = None
+        if config.ego_mlp is not None:
+            self.ego_mlp = EgoMLP(
+                config.ego_mlp,
+                past_frames=config.history,
+                horizon_steps=horizon_steps,
+                dt_s=dt_s,
+                target=config.target,
+            )
+        attends = config.future == "attention"
+        self.fuse_future = FutureAttention(channels, config.pool) if attends else None
+        volumes = 2 if config.future == "concatenation" else 1
         self.fold = nn.Sequential(
             nn.Linear(height * channels * volumes, width),
             nn.ReLU(),
@@ -222,30 +243,30 @@ class VolumePlanner(nn.Module):
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last one: not known
-        told = 2 + 4 * history + 3 * target
+        told = 2 + 4 * config.history + 3 * config.target
         self.speed = nn.Sequential(nn.Linear(told, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
         # Normalising first keeps an open path for speed and command, which most of a plan follows from.
-        layer = FewQueriesDecoderLayer(width, heads, 2 * width)
-        self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(layers)])  # as torch's decoder
+        layer = FewQueriesDecoderLayer(
+            width, config.heads, round(config.feed_forward * width), config.dropout
+        )
+        self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(config.layers)])  # as torch's
         self.waypoints = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
-        if ego_mlp is not None:  # what it says is good already: only what is learned by looking is added
+        if self.ego_mlp is not None:  # its plan is good already: looking starts from no change to it
             for parameter in self.waypoints[-1].parameters():
                 nn.init.zeros_(parameter)
-        told = 0 if ego_mlp is None else len(ego_mlp.status_mean)
+        told = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
         self.path: PathCorrection | None = None
-        if look_m:
-            sizes = {"channels": channels, "width": width // 2, "told": told, "steps": horizon_steps}
-            self.path = PathCorrection(spec, distances_m=look_m, **sizes)
-        self.ego_mlp = ego_mlp
+        if config.path is not None:
+            self.path = PathCorrection(config.path, spec, channels=channels, told=told, steps=horizon_steps)
 
     @property
     def looks_ahead(self) -> int:
-        """How many key frames have to be imagined for a plan."""
-        return 0 if self.future == "none" else 1
+        """The number of key frames that have to be imagined for a plan."""
+        return 0 if self.config.future == "none" else 1
 
     def forward(
         self,
@@ -272,17 +293,21 @@ class VolumePlanner(nn.Module):
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
         unseen, told = self.without_looking(command, command_valid, speed_mps, past, lead)
         command = torch.where(command_valid, command, len(Command))
-        status = torch.stack([speed_mps / SPEED_SCALE_MPS, speed_valid.to(speed_mps)], dim=-1)
-        status = torch.cat([status, (past / past.new_tensor(PAST_SCALE)).flatten(1)], dim=-1)
+        sizes = self.config
+        status = torch.stack([speed_mps / sizes.speed_scale_mps, speed_valid.to(speed_mps)], dim=-1)
+        past_scale = past.new_tensor((sizes.past_scale_m, sizes.past_scale_m, 1.0, sizes.speed_scale_mps))
+        status = torch.cat([status, (past / past_scale).flatten(1)], dim=-1)
         if self.target and lead is not None:
-            status = torch.cat([status, lead / lead.new_tensor(LEAD_SCALE)], dim=-1)
+            lead_scale = lead.new_tensor((sizes.target_scale_m, sizes.target_scale_m, 1.0))
+            status = torch.cat([status, lead / lead_scale], dim=-1)
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
         asked = self.fuse_query(query)[:, None]
         for layer in self.decoder:
             asked = layer(asked, memory)
-        change = STEP_SCALE_M * self.waypoints(asked[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
+        change = self.waypoints(asked[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
+        change = sizes.step_scale_m * change
         if self.path is not None:
             change = change + self.path(self.path.read(now, unseen), told)
         xy = (unseen + change.cumsum(dim=1))[:, None]
@@ -318,7 +343,7 @@ class VolumePlanner(nn.Module):
     def _fuse(
         self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"] | None
     ) -> Float[Tensor, "b _D Z Y X"]:
-        if self.future == "none":
+        if self.config.future == "none":
             return now
         if future is None:
             raise ValueError("this planner looks at the next volume too")

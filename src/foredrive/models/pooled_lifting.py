@@ -1,27 +1,42 @@
 """A plane from a lifted volume: heights folded into channels."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import LiftingEncoder
+from foredrive.models.lifting import LiftingConfig, LiftingEncoder
 from foredrive.scene import CameraRig, VoxelSpec
+
+
+@dataclass(frozen=True)
+class PooledLiftingConfig:
+    """Sizes of a `PooledLiftingEncoder`."""
+
+    lifting: LiftingConfig
+    kind: Literal["pooled"] = "pooled"
 
 
 class PooledLiftingEncoder(nn.Module):
     """Deformable lifting into a volume whose columns are folded into one vector each.
 
     Args:
-        lifting: the encoder of the volume, of D channels.
+        config: sizes.
+        spec: the volume's grid.
         channels: D.
         width: C of the plane.
+        levels: number of image feature levels.
     """
 
-    def __init__(self, lifting: LiftingEncoder, *, channels: int, width: int) -> None:
+    def __init__(
+        self, config: PooledLiftingConfig, spec: VoxelSpec, *, channels: int, width: int, levels: int
+    ) -> None:
         super().__init__()
-        self.lifting, self.width = lifting, width
-        self.fold = nn.Linear(lifting.spec.shape_zyx[0] * channels, width)
+        self.width = width
+        self.lifting = LiftingEncoder(config.lifting, spec, channels=channels, levels=levels)
+        self.fold = nn.Linear(spec.shape_zyx[0] * channels, width)
 
     @property
     def spec(self) -> VoxelSpec:

@@ -1,270 +1,195 @@
-"""What a recipe holds: values only, so that it can be read, written and compared."""
+"""The records that recipes are: plain values only, so that they can be read, written and compared."""
 
-from dataclasses import asdict, dataclass, replace
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import yaml
-from pydantic import Discriminator, Tag, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from foredrive.data import ClipConfig
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training import DriveWorldWeights, LossWeights, PathFit, Schedule
+from foredrive.models.planner import PlannerConfig
+from foredrive.recipes.old_formats import upgraded
+from foredrive.recipes.world_models import WORLD_MODELS
+from foredrive.training import PathFit
 
-NEMO: Final = "nemo"
-DRIVEWORLD: Final = "driveworld"
-
-
-@dataclass(frozen=True)
-class BackboneSize:
-    """A ResNet and its pyramid; see `models.backbone.ImageBackbone`."""
-
-    embedding_size: int
-    hidden_sizes: tuple[int, ...]
-    depths: tuple[int, ...]
-    layer_type: Literal["basic", "bottleneck"]
-    stages: tuple[str, ...]
-    weights: str | None = None
+M = TypeVar("M")
+S = TypeVar("S")
+V = TypeVar("V")
+R = TypeVar("R", bound="Recipe[Any, Any]")
 
 
 @dataclass(frozen=True)
-class VolumeEncoderSize:
-    """NeMo's own way from images to a volume; see `models.lifting.LiftingEncoder`."""
+class Recipe(Generic[M, S]):
+    """Everything that decides a run, but for where the logs are.
 
-    heads: int
-    points: int
-    layers: int
-    kind: Literal["volume"] = "volume"
-
-
-@dataclass(frozen=True)
-class BevEncoderSize:
-    """A plane first, which is then unfolded; see `models.bev.BevEncoder`."""
-
-    width: int
-    heads: int
-    points: int
-    pillars: int
-    layers: int
-    kind: Literal["bev"] = "bev"
-
-
-@dataclass(frozen=True)
-class AveragingEncoderSize:
-    """No attention at all; see `models.averaging.AveragingEncoder`."""
-
-    hidden: int
-    kind: Literal["averaging"] = "averaging"
-
-
-@dataclass(frozen=True)
-class PooledLiftingSize:
-    """Deformable lifting into a volume, folded into a plane; see `models.pooled_lifting`."""
-
-    heads: int
-    points: int
-    layers: int
-    kind: Literal["pooled"] = "pooled"
-
-
-@dataclass(frozen=True)
-class LiftSplatSize:
-    """Lift, splat; see `models.lift_splat.LiftSplatEncoder`."""
-
-    near_m: float
-    far_m: float
-    step_m: float
-    kind: Literal["lift_splat"] = "lift_splat"
-
-
-@dataclass(frozen=True, kw_only=True)
-class AgentSize:
-    """Sizes of what all agents have: a backbone, a volume of D channels, the planner; see `VolumePlanner`."""
-
-    backbone: BackboneSize
-    channels: int
-    planner_width: int
-    planner_layers: int
-    planner_heads: int
-    attention_pool: tuple[int, int, int]
-    planner_future: Literal["attention", "concatenation", "none"] = "attention"
-    """How the planner looks at the predicted next volume."""
-    planner_history: int = 0
-    """Key frames before now whose pose and speed the planner is told; in the paper, now's speed alone."""
-    planner_target: bool = False
-    """Whether it knows where the route leads, beyond the command; agents on CARLA's leaderboards do."""
-    planner_base: Literal["straight_on", "ego_mlp"] = "straight_on"
-    """What the planner regresses changes from: the speed now, as it is; or what an MLP says that knows ego
-    status alone (`planner_history` frames of it), fitted to the demonstrations before fine-tuning."""
-    planner_look_m: tuple[float, ...] = ()
-    """Distances along that plan at which the planner reads the volume as well; see `PathCorrection`."""
-    checkpoint: tuple[Literal["backbone", "encoder"], ...] = ()
-    """Trade time for memory: what these parts compute is not kept but computed again."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NemoSize(AgentSize):
-    """Sizes of NeMo's parts; see the modules' own docstrings."""
-
-    encoder: VolumeEncoderSize | BevEncoderSize | AveragingEncoderSize
-    occupancy_hidden: int
-    motion_hidden: int
-    ray_near_m: float
-    ray_far_m: float
-    ray_samples: int
-    recon_hidden: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class PromptSize:
-    """Task prompts; see `models.driveworld.task_prompt`."""
-
-    widths: tuple[int, ...]
-    """Channels of the steps from a sentence to a plane."""
-    encoding: int
-    """How many numbers the text encoder makes of a sentence."""
-    text_encoder: str
-    """By name or folder; needed once, by training from scratch."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveWorldSize(AgentSize):
-    """Sizes of DriveWorld's parts; see the modules' own docstrings."""
-
-    encoder: PooledLiftingSize | LiftSplatSize
-    plane: int
-    """C, channels of the plane that images are lifted to."""
-    observation: int
-    """Of x_t (512 in the paper)."""
-    observation_hidden: int
-    state: int
-    history: int
-    memory: int
-    """How many histories the Dynamic Memory Bank holds."""
-    memory_heads: int
-    objects: int
-    """K, moving objects whose velocities are estimated."""
-    states_hidden: int
-    expanded: tuple[int, ...]
-    """Channels of the steps from a state to a plane (m_θ)."""
-    volume_hidden: int
-    statics: int
-    """Channels of latent statics; 0 leaves Static Scene Propagation out."""
-    prompt: PromptSize | None
-    memory_bank: bool = True
-    motion_norm: bool = True
-    carry_statics: bool = False
-    """Latent statics move along with the ego vehicle; in the paper they do not."""
-    kind: Literal["driveworld"] = DRIVEWORLD
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of NeMo's training."""
-
-    schedule: Schedule
-    weights: LossWeights
-    ray_stride: int
-    vgg16: str | None = None
-    """File of VGG-16 weights for the perceptual loss, or "download"; None leaves that loss out (weight 0)."""
-    imagine: bool = True
-    """Imagine the future key frames and supervise them too, by what happened; otherwise the present alone."""
-
-
-@dataclass(frozen=True)
-class DriveWorldStage:
-    """One stage of DriveWorld's training."""
-
-    schedule: Schedule
-    weights: DriveWorldWeights
-    temporal: bool = True
-    """Otherwise each frame's occupancy is learned from that frame alone."""
-    statics_of: Literal["random", "now"] = "random"
-    """The frame that all frames take what stands from: a random one, as the paper pre-trains, or the present,
-    as it is when the model is used."""
-    kind: Literal["driveworld"] = DRIVEWORLD
-
-
-def _kind_of(written: object) -> str:
-    """Whose size or stage was written: only DriveWorld's say so."""
-    return DRIVEWORLD if isinstance(written, dict) and written.get("kind") == DRIVEWORLD else NEMO
-
-
-AnyModel = Annotated[
-    Annotated[NemoSize, Tag(NEMO)] | Annotated[DriveWorldSize, Tag(DRIVEWORLD)], Discriminator(_kind_of)
-]
-AnyStage = Annotated[
-    Annotated[Stage, Tag(NEMO)] | Annotated[DriveWorldStage, Tag(DRIVEWORLD)], Discriminator(_kind_of)
-]
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """Everything that decides a run, but for where the logs are. The stages are of the model's kind."""
+    M is the config of a world model and S that of its training stages: a row of `WORLD_MODELS`.
+    """
 
     name: str
     clips: ClipConfig
-    model: AnyModel
-    pretrain: AnyStage | None
+    model: M
+    planner: PlannerConfig
+    pretrain: S | None
     """None: fine-tuning starts from scratch, or from weights that are given."""
-    finetune: AnyStage
+    finetune: S
     path: PathFit | None = None
-    """How the planner's `PathCorrection` is fitted to what the fine-tuned world model sees, which joint
-    fine-tuning then leaves alone; None leaves it to joint fine-tuning."""
+    """How the planner's `PathCorrection` is fitted to what the fine-tuned world model sees; joint fine-tuning
+    then leaves it alone. None leaves it to joint fine-tuning."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-
-
-S = TypeVar("S", bound=Stage | DriveWorldStage)
+    about: str = field(default="", compare=False)
+    """One line for lists of recipes."""
 
 
 def rescheduled(stage: S, **changes: Any) -> S:
-    """The stage with other entries of its schedule."""
-    return replace(stage, schedule=replace(stage.schedule, **changes))
+    """Return the stage with other entries of its schedule."""
+    return replace(stage, schedule=replace(stage.schedule, **changes))  # type: ignore[attr-defined, type-var]
 
 
-def labelled_by(recipe: Recipe, occupancy_source: Literal["lidar", "recorded"]) -> Recipe:
-    """The recipe with voxel labels of another source; its name tells."""
+def labelled_by(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
+    """Return the recipe with voxel labels of another source; its name tells."""
     if occupancy_source == recipe.clips.occupancy_source:
         return recipe
     clips = replace(recipe.clips, occupancy_source=occupancy_source)
     return replace(recipe, name=f"{recipe.name} ({occupancy_source} occupancy)", clips=clips)
 
 
-V = TypeVar("V")
-
-
 def save_recipe(recipe: Any, path: Path) -> None:
     """Write a recipe of any kind, a dataclass of plain values, as YAML."""
     with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(_plain(asdict(recipe)), sort_keys=False))
+        temporary.write_text(recipe_yaml(recipe))
 
 
-def load_recipe(path: Path) -> Recipe:
-    """Read a recipe that `save_recipe` wrote.
+def recipe_yaml(recipe: Any) -> str:
+    """Return a recipe of any kind as YAML."""
+    plain = _plain(asdict(recipe))
+    return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100)
+
+
+def is_recipe_file(name: str) -> bool:
+    """Return whether the name of a recipe is that of a file."""
+    return name.endswith((".yaml", ".yml"))
+
+
+def load_recipe(path: Path) -> Recipe[Any, Any]:
+    """Read a recipe that `save_recipe` wrote, today or in an earlier format.
 
     Raises:
         InputError: naming the file, and the entry that is wrong, missing or unknown.
     """
-    return load_values(Recipe, path)
+    return recipe_from(upgraded(read_values(path)), str(path))
+
+
+def recipe_from(written: Any, source: str) -> Recipe[Any, Any]:
+    """Validate the plain values of a recipe.
+
+    Args:
+        source: named in errors.
+
+    Raises:
+        InputError: naming the entry that is wrong, missing or unknown.
+    """
+    model = written.get("model") if isinstance(written, Mapping) else None
+    kind = model.get("kind") if isinstance(model, Mapping) else None
+    if kind not in WORLD_MODELS:
+        raise InputError(f"{source}: not a recipe: model.kind: {kind!r} is none of {', '.join(WORLD_MODELS)}")
+    row = WORLD_MODELS[kind]
+    recipe: Recipe[Any, Any] = validated(Recipe[row.config, row.stage], written, source)  # type: ignore[name-defined]
+    return recipe
 
 
 def load_values(kind: type[V], path: Path) -> V:
-    """`load_recipe` for any kind of recipe."""
+    """Read plain values of a dataclass; raises as `load_recipe` does."""
+    found: V = validated(kind, read_values(path), str(path))
+    return found
+
+
+def read_values(path: Path) -> Any:
+    """Read YAML.
+
+    Raises:
+        InputError: the file cannot be read or is no YAML.
+    """
     try:
-        return TypeAdapter(kind).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
+        return yaml.safe_load(path.read_text())
     except OSError as error:
-        raise InputError(f"{path.parent}: not a run folder, {path.name} cannot be read") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"] if part not in (NEMO, DRIVEWORLD))
-        raise InputError(f"{path}: not a recipe: {f'{where}: ' if where else ''}{first['msg']}") from error
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a recipe: {str(error).splitlines()[0]}") from error
 
 
-def _plain(value: object) -> object:
-    """Tuples as lists, as YAML has them."""
-    if isinstance(value, dict):
+def validated(kind: Any, written: Any, source: str) -> Any:
+    """Return plain values as a dataclass, generic or not.
+
+    Raises:
+        InputError: naming the entry that is wrong, missing or unknown.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(written, extra="forbid")
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{source}: not a recipe: {f'{where}: ' if where else ''}{first['msg']}") from error
+
+
+def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+    """Return plain values with some of them replaced.
+
+    Args:
+        written: of a recipe of any kind, complete.
+        settings: each KEY.KEY=VALUE; the value is read as YAML.
+
+    Raises:
+        InputError: on a setting of another form or an unknown key, with the nearest known one.
+    """
+    values: dict[str, Any] = _plain(written)
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: write KEY=VALUE, such as finetune.schedule.lr=1e-3")
+        *parents, last = name.split(".")
+        place: Any = values
+        for depth, key in enumerate([*parents, last]):
+            if not isinstance(place, Mapping):
+                raise InputError(f"--set {setting}: {'.'.join(parents[:depth])} has no entries")
+            if key not in place:
+                raise InputError(f"--set {setting}: no entry {key!r}{_nearest(key, name, place, values)}")
+            if depth < len(parents):
+                place = place[key]
+        try:
+            place[last] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise InputError(f"--set {setting}: {text!r} is no value") from error
+    return values
+
+
+def _nearest(key: str, name: str, siblings: Mapping[str, Any], values: Mapping[str, Any]) -> str:
+    """Return what an unknown key may have meant, as the end of a sentence."""
+    near = difflib.get_close_matches(key, siblings, n=1)
+    if near:
+        return f"; {near[0]!r} is near"
+    everywhere = list(_names(values))
+    near = [known for known in everywhere if known.split(".")[-1] == key]
+    near = near or difflib.get_close_matches(name, everywhere, n=1, cutoff=0.4)
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(siblings)}"
+
+
+def _names(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Return the dotted names of all entries."""
+    found = []
+    for key, value in values.items():
+        found.append(prefix + key)
+        if isinstance(value, Mapping):
+            found += _names(value, f"{prefix}{key}.")
+    return found
+
+
+def _plain(value: object) -> Any:
+    """Return tuples as lists, as YAML has them."""
+    if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value

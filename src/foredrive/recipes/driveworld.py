@@ -3,56 +3,48 @@
 from dataclasses import replace
 
 from foredrive.data import ClipConfig
+from foredrive.models.driveworld import DriveWorldConfig
+from foredrive.models.driveworld.state_space import StateSpaceConfig
+from foredrive.models.driveworld.task_prompt import PromptConfig
+from foredrive.models.lift_splat import LiftSplatConfig
+from foredrive.models.lifting import LiftingConfig
+from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.models.text_encoder import IN_A_PACKAGE
-from foredrive.recipes.config import (
-    DriveWorldSize,
-    DriveWorldStage,
-    LiftSplatSize,
-    NemoSize,
-    PooledLiftingSize,
-    PromptSize,
-    Recipe,
-    rescheduled,
-)
+from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_base, nemo_tiny, nemo_town
-from foredrive.training import DriveWorldWeights, Schedule
+from foredrive.training import DriveWorldStage, DriveWorldWeights, Schedule
+
+DriveWorldRecipe = Recipe[DriveWorldConfig, DriveWorldStage]
 
 OBSERVED, IMAGINED = 4, 4
 """T and L of the paper."""
 
 
-def driveworld_tiny() -> Recipe:
+def driveworld_tiny() -> DriveWorldRecipe:
     """DriveWorld small enough for two CPU cores. Every part is there, only smaller; T and L are the paper's.
 
     Images, voxels and the planner are those of `nemo_tiny`.
     """
     nemo = nemo_tiny()
-    assert isinstance(nemo.model, NemoSize)
     return Recipe(
         name="driveworld_tiny",
+        about="DriveWorld small enough for two CPU cores",
         clips=_in_time(nemo.clips),
-        model=DriveWorldSize(
+        model=DriveWorldConfig(
             backbone=nemo.model.backbone,
-            encoder=LiftSplatSize(near_m=1.0, far_m=34.0, step_m=1.0),
+            encoder=LiftSplatConfig(near_m=1.0, far_m=34.0, step_m=1.0),
+            states=StateSpaceConfig(
+                observation=128, state=64, history=128, memory=8, heads=4, objects=8, hidden=128
+            ),
             channels=32,
             plane=32,
-            observation=128,
             observation_hidden=16,
-            state=64,
-            history=128,
-            memory=8,
-            memory_heads=4,
-            objects=8,
-            states_hidden=128,
             expanded=(64, 32, 16, 8),
             volume_hidden=8,
             statics=32,
-            prompt=PromptSize(widths=(32, 16, 8), encoding=384, text_encoder=IN_A_PACKAGE),
-            planner_width=nemo.model.planner_width,
-            planner_layers=nemo.model.planner_layers,
-            planner_heads=nemo.model.planner_heads,
-            attention_pool=nemo.model.attention_pool,
+            prompt=PromptConfig(widths=(32, 16, 8), encoding=384, text_encoder=IN_A_PACKAGE),
         ),
+        planner=nemo.planner,
         pretrain=DriveWorldStage(
             schedule=Schedule(batch_size=4, lr=2e-3, steps=400, warmup_steps=20, workers=1),
             weights=DriveWorldWeights(),
@@ -65,7 +57,7 @@ def driveworld_tiny() -> Recipe:
     )
 
 
-def driveworld_town() -> Recipe:
+def driveworld_town() -> DriveWorldRecipe:
     """DriveWorld for claims tested on two CPU cores: grid, planner and steps are those of `nemo_town`.
 
     One round of deformable lifting: after 300 steps, statics carried along, above-ground IoU on 32 clips of
@@ -74,60 +66,51 @@ def driveworld_town() -> Recipe:
     tiny, nemo = driveworld_tiny(), nemo_town()
     pretrain, finetune = tiny.pretrain, tiny.finetune
     assert pretrain is not None
-    assert isinstance(tiny.model, DriveWorldSize)
-    assert isinstance(nemo.model, NemoSize)
     return replace(
         tiny,
         name="driveworld_town",
+        about="DriveWorld for claims tested on two CPU cores, on towns",
         clips=_in_time(nemo.clips),
-        model=replace(
-            tiny.model,
-            encoder=PooledLiftingSize(heads=4, points=4, layers=1),
-            planner_history=nemo.model.planner_history,
-            planner_base=nemo.model.planner_base,
-            planner_look_m=nemo.model.planner_look_m,
-        ),
+        model=replace(tiny.model, encoder=PooledLiftingConfig(LiftingConfig(heads=4, points=4, layers=1))),
+        planner=nemo.planner,
         path=nemo.path,
         pretrain=rescheduled(pretrain, steps=500, warmup_steps=50),
         finetune=rescheduled(finetune, steps=150, warmup_steps=20),
     )
 
 
-def driveworld_base() -> Recipe:
+def driveworld_base() -> DriveWorldRecipe:
     """The paper's size: ResNet-101, 200×200×16 voxels, 24 epochs at 2e-4, then 20 (UniAD's second stage).
 
     Constants of §4.1 and of MILE (state and history); what they leave open: D = 64, a plane of 256 channels,
     a memory of 16, K = 32, images of 448×800, voxels of 0.5 m.
     """
     nemo = nemo_base()
-    assert isinstance(nemo.model, NemoSize)
     schedule = replace(nemo.finetune.schedule, epochs=24)
     return Recipe(
         name="driveworld_base",
+        about="DriveWorld at the paper's size, for a GPU",
         clips=_in_time(nemo.clips),
-        model=DriveWorldSize(
-            backbone=replace(nemo.model.backbone, depths=(3, 4, 23, 3), weights="microsoft/resnet-101"),
-            encoder=PooledLiftingSize(heads=8, points=8, layers=3),
+        model=DriveWorldConfig(
+            backbone=replace(
+                nemo.model.backbone,
+                depths=(3, 4, 23, 3),
+                weights="microsoft/resnet-101",
+                checkpoint=True,
+            ),
+            encoder=PooledLiftingConfig(LiftingConfig(heads=8, points=8, layers=3, checkpoint=True)),
+            states=StateSpaceConfig(
+                observation=512, state=512, history=1024, memory=16, heads=8, objects=32, hidden=1024
+            ),
             channels=64,
             plane=256,
-            observation=512,
             observation_hidden=128,
-            state=512,
-            history=1024,
-            memory=16,
-            memory_heads=8,
-            objects=32,
-            states_hidden=1024,
             expanded=(512, 256, 128, 64),
             volume_hidden=16,
             statics=256,
-            prompt=PromptSize(widths=(256, 128, 64, 64), encoding=384, text_encoder=IN_A_PACKAGE),
-            planner_width=nemo.model.planner_width,
-            planner_layers=nemo.model.planner_layers,
-            planner_heads=nemo.model.planner_heads,
-            attention_pool=nemo.model.attention_pool,
-            checkpoint=("backbone", "encoder"),
+            prompt=PromptConfig(widths=(256, 128, 64, 64), encoding=384, text_encoder=IN_A_PACKAGE),
         ),
+        planner=nemo.planner,
         pretrain=DriveWorldStage(schedule=schedule, weights=DriveWorldWeights()),
         finetune=DriveWorldStage(
             schedule=replace(schedule, epochs=20),

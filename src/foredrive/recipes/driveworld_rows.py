@@ -2,10 +2,21 @@
 
 from dataclasses import replace
 
-from foredrive.recipes.config import DriveWorldSize, DriveWorldStage, Recipe
+from foredrive.recipes.driveworld import DriveWorldRecipe
+
+ROWS = {
+    "scratch": "without pre-training (Table 1)",
+    "occupancy": "pre-trained by the occupancy of single frames, as OccNet and UniScene are",
+    "rssm": "plain latent dynamics in one vector (Table 1)",
+    "ssp": "rssm with Static Scene Propagation (Table 1)",
+    "dmb": "ssp with the Dynamic Memory Bank (Table 1)",
+    "mln": "dmb with motion-aware layer normalisation (Table 1)",
+    "carried": "latent statics moved along with the ego vehicle; not in the paper",
+}
+"""What each row changes; the full model has task prompts besides."""
 
 
-def driveworld_rows(full: Recipe) -> dict[str, Recipe]:
+def driveworld_rows(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
     """All rows by name, the full DriveWorld first under its own; the others are named FULL_ROW.
 
     Table 1: `scratch` (no pre-training); `rssm`, plain latent dynamics in one vector; `ssp`, with Static
@@ -18,11 +29,10 @@ def driveworld_rows(full: Recipe) -> dict[str, Recipe]:
         full: a recipe with pre-training.
     """
     size, stage = full.model, full.pretrain
-    assert isinstance(size, DriveWorldSize)
-    assert isinstance(stage, DriveWorldStage)
+    assert stage is not None
     mln = replace(size, prompt=None)
-    dmb = replace(mln, motion_norm=False)
-    ssp = replace(dmb, memory_bank=False)
+    dmb = replace(mln, states=replace(mln.states, motion_norm=False))
+    ssp = replace(dmb, states=replace(dmb.states, memory_bank=False))
     rows = {
         "scratch": replace(full, pretrain=None),
         "occupancy": replace(full, pretrain=replace(stage, temporal=False)),
@@ -34,5 +44,6 @@ def driveworld_rows(full: Recipe) -> dict[str, Recipe]:
     }
     found = {full.name: full}
     for name, recipe in rows.items():
-        found[f"{full.name}_{name}"] = replace(recipe, name=f"{full.name}_{name}")
+        about = f"{full.name}: {ROWS[name]}"
+        found[f"{full.name}_{name}"] = replace(recipe, name=f"{full.name}_{name}", about=about)
     return found

@@ -1,8 +1,12 @@
 """How logs are rebuilt from Gaussians."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 from foredrive.errors import InputError
+from foredrive.recipes.config import is_recipe_file, load_values, overridden, validated
+from foredrive.recipes.known import nearest_name
 from foredrive.rendering.initial import InitialSize
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
@@ -27,6 +31,8 @@ class RebuildRecipe:
     """Rows of an image and beams of a sweep look at their own times."""
     drop: bool = True
     """Beams may fail to return; False: all do."""
+    about: str = field(default="", compare=False)
+    """One line for lists of recipes."""
 
 
 def gaussians_tiny() -> RebuildRecipe:
@@ -34,6 +40,7 @@ def gaussians_tiny() -> RebuildRecipe:
     steps = 500
     return RebuildRecipe(
         name="gaussians_tiny",
+        about="a log rebuilt from Gaussians in minutes on two CPU cores",
         image_hw=(270, 480),
         initial=InitialSize(
             lidar_points=45_000,
@@ -64,6 +71,7 @@ def gaussians_base() -> RebuildRecipe:
     """SplatAD as published, for a GPU: all cameras at full size, 30 000 steps, five million Gaussians."""
     return RebuildRecipe(
         name="gaussians_base",
+        about="SplatAD's sizes, for a GPU",
         image_hw=(1080, 1920),
         initial=InitialSize(
             lidar_points=1_500_000,
@@ -86,12 +94,12 @@ REBUILD_RECIPES: dict[str, RebuildRecipe] = {
 }
 
 
-def find_rebuild_recipe(name: str) -> RebuildRecipe:
-    """The recipe of a name.
-
-    Raises:
-        InputError: naming the known ones, if there is none of that name.
-    """
-    if name not in REBUILD_RECIPES:
-        raise InputError(f"no recipe {name!r} to rebuild logs; there are: {', '.join(REBUILD_RECIPES)}")
-    return REBUILD_RECIPES[name]
+def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe:
+    """Return a recipe by its name or from a YAML file; arguments and errors as of `find_recipe`."""
+    if is_recipe_file(name):
+        recipe = load_values(RebuildRecipe, Path(name))
+    elif name in REBUILD_RECIPES:
+        recipe = REBUILD_RECIPES[name]
+    else:
+        raise InputError(f"no recipe {name!r} to rebuild logs{nearest_name(name, REBUILD_RECIPES)}")
+    return validated(RebuildRecipe, overridden(asdict(recipe), settings), name) if settings else recipe

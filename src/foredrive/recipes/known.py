@@ -1,13 +1,19 @@
 """The recipes that have a name."""
 
+import difflib
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
 from foredrive.errors import InputError
-from foredrive.recipes.config import Recipe
+from foredrive.recipes.config import Recipe, is_recipe_file, load_recipe, overridden, recipe_from
 from foredrive.recipes.driveworld import driveworld_base, driveworld_tiny, driveworld_town
 from foredrive.recipes.driveworld_rows import driveworld_rows
 from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
 from foredrive.recipes.nemo_rows import nemo_rows
 
-RECIPES: dict[str, Recipe] = {
+RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
     **nemo_rows(nemo_town(), TOWN_BEV),
@@ -18,12 +24,27 @@ RECIPES: dict[str, Recipe] = {
 }
 
 
-def find_recipe(name: str) -> Recipe:
-    """The recipe of a name.
+def find_recipe(name: str, settings: Sequence[str] = ()) -> Recipe[Any, Any]:
+    """Return a recipe by its name or from a YAML file.
+
+    Args:
+        name: a key of `RECIPES`, or the path of a file.
+        settings: KEY.KEY=VALUE each; entries of the recipe to replace.
 
     Raises:
-        InputError: naming the known ones, if there is none of that name.
+        InputError: there is no such recipe, or a setting does not fit it.
     """
-    if name not in RECIPES:
-        raise InputError(f"no recipe {name!r}; there are: {', '.join(RECIPES)}")
-    return RECIPES[name]
+    if is_recipe_file(name):
+        recipe = load_recipe(Path(name))
+    elif name in RECIPES:
+        recipe = RECIPES[name]
+    else:
+        raise InputError(f"no recipe {name!r}{nearest_name(name, RECIPES)}")
+    return recipe_from(overridden(asdict(recipe), settings), name) if settings else recipe
+
+
+def nearest_name(name: str, known: Sequence[str] | dict[str, Any]) -> str:
+    """Return the end of a sentence about an unknown recipe, with the nearest known names."""
+    near = difflib.get_close_matches(name, known, n=3)
+    hint = f"; near: {', '.join(near)}" if near else ""
+    return f"{hint}; `foredrive recipes` lists all"

@@ -3,12 +3,20 @@
 import dataclasses
 
 from foredrive.data import ClipConfig
-from foredrive.recipes.config import BackboneSize, BevEncoderSize, NemoSize, Recipe, Stage, VolumeEncoderSize
+from foredrive.models.backbone import BackboneConfig
+from foredrive.models.bev import BevConfig
+from foredrive.models.ego_mlp import EgoMLPConfig
+from foredrive.models.lifting import LiftingConfig
+from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
+from foredrive.models.planner import PathCorrectionConfig, PlannerConfig
+from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.scene import VoxelSpec
-from foredrive.training import LossWeights, PathFit, Schedule
+from foredrive.training import LossWeights, NemoStage, PathFit, Schedule
+
+NemoRecipe = Recipe[NemoConfig, NemoStage]
 
 
-def nemo_tiny() -> Recipe:
+def nemo_tiny() -> NemoRecipe:
     """NeMo small enough for two CPU cores: the demo. Every part is there, only smaller.
 
     With the paper's λ (scal 10, BCE 1) a few hundred steps end in a road and nothing on it: the affinity loss
@@ -19,6 +27,7 @@ def nemo_tiny() -> Recipe:
     few_steps = LossWeights(wpts=0.0, recon=0.0, occ=0.0, scal=1.0, bce=10.0, occupied=3.0, future=0.25)
     return Recipe(
         name="nemo_tiny",
+        about="NeMo small enough for two CPU cores: the demo",
         clips=ClipConfig(
             past_frames=1,
             future_frames=2,
@@ -26,33 +35,27 @@ def nemo_tiny() -> Recipe:
             image_hw=(96, 160),
             voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 48)),
         ),
-        model=NemoSize(
-            backbone=BackboneSize(
+        model=NemoConfig(
+            backbone=BackboneConfig(
                 embedding_size=24,
                 hidden_sizes=(24, 48, 96),
                 depths=(1, 1, 1),
                 layer_type="basic",
                 stages=("stage2", "stage3"),
             ),
-            encoder=VolumeEncoderSize(heads=4, points=4, layers=2),
+            encoder=LiftingConfig(heads=4, points=4, layers=2),
+            motion=MotionConfig(hidden=16),
+            renderer=RendererConfig(near_m=1.0, far_m=34.0, samples=32, hidden=64),
             channels=32,
             occupancy_hidden=32,
-            motion_hidden=16,
-            ray_near_m=1.0,
-            ray_far_m=34.0,
-            ray_samples=32,
-            recon_hidden=64,
-            planner_width=128,
-            planner_layers=3,
-            planner_heads=4,
-            attention_pool=(2, 4, 4),
         ),
-        pretrain=Stage(
+        planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4)),
+        pretrain=NemoStage(
             schedule=Schedule(batch_size=4, lr=2e-3, steps=200, warmup_steps=20, workers=1),
             weights=dataclasses.replace(few_steps, wpts=0.0, recon=2.0, occ=1.0),
             ray_stride=8,
         ),
-        finetune=Stage(
+        finetune=NemoStage(
             schedule=Schedule(batch_size=4, lr=1e-3, steps=160, warmup_steps=10, workers=1),
             weights=dataclasses.replace(few_steps, wpts=1.0, recon=1.0, occ=0.5),
             ray_stride=16,
@@ -60,7 +63,7 @@ def nemo_tiny() -> Recipe:
     )
 
 
-def nemo_town() -> Recipe:
+def nemo_town() -> NemoRecipe:
     """NeMo for claims tested on two CPU cores: 500 steps of pre-training, 150 of fine-tuning on towns.
 
     As `nemo_tiny`, but it sees further ahead and is trained for longer. Its planner knows the last key frame
@@ -68,35 +71,32 @@ def nemo_town() -> Recipe:
     looking brings; it reads the volume along that plan by a head that is fitted last.
     """
     tiny = nemo_tiny()
-    pretrain, finetune = tiny.pretrain, tiny.finetune
-    assert pretrain is not None
-    assert isinstance(tiny.model, NemoSize)
+    assert tiny.pretrain is not None
+    renderer = dataclasses.replace(tiny.model.renderer, far_m=48.0)
+    along_m = (2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0)
     return dataclasses.replace(
         tiny,
         name="nemo_town",
+        about="NeMo for claims tested on two CPU cores, on towns",
         clips=dataclasses.replace(
             tiny.clips,
             now_stride_s=0.5,
             voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
         ),
-        model=dataclasses.replace(
-            tiny.model,
-            ray_far_m=48.0,
-            planner_history=1,
-            planner_base="ego_mlp",
-            planner_look_m=(2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0),
+        model=dataclasses.replace(tiny.model, renderer=renderer),
+        planner=dataclasses.replace(
+            tiny.planner,
+            history=1,
+            ego_mlp=EgoMLPConfig(),
+            path=PathCorrectionConfig(distances_m=along_m, width=64, hidden=32),
         ),
         path=PathFit(),
-        pretrain=dataclasses.replace(
-            pretrain, schedule=dataclasses.replace(pretrain.schedule, steps=500, warmup_steps=50)
-        ),
-        finetune=dataclasses.replace(
-            finetune, schedule=dataclasses.replace(finetune.schedule, steps=150, warmup_steps=20)
-        ),
+        pretrain=rescheduled(tiny.pretrain, steps=500, warmup_steps=50),
+        finetune=rescheduled(tiny.finetune, steps=150, warmup_steps=20),
     )
 
 
-def nemo_drive() -> Recipe:
+def nemo_drive() -> NemoRecipe:
     """`nemo_town` to drive in closed loop, trained on lessons (`foredrive drive --agent disturbed`).
 
     Two things differ in what the planner is told. It does not know where it was half a second ago: who
@@ -107,12 +107,13 @@ def nemo_drive() -> Recipe:
     return dataclasses.replace(
         town,
         name="nemo_drive",
+        about="nemo_town to drive in closed loop, trained on DAgger demonstrations",
         clips=dataclasses.replace(town.clips, future_source="taught"),
-        model=dataclasses.replace(town.model, planner_history=0, planner_target=True),
+        planner=dataclasses.replace(town.planner, history=0, target=True),
     )
 
 
-def nemo_base() -> Recipe:
+def nemo_base() -> NemoRecipe:
     """The paper's size: ResNet-50, 200×200×16 voxels of 0.5 m, six cameras, two stages of 10 epochs.
 
     Constants of §4.1; what it leaves open: D = 64, three rounds of lifting with 8 heads and 8 points, four
@@ -129,14 +130,15 @@ def nemo_base() -> Recipe:
     )
     return Recipe(
         name="nemo_base",
+        about="NeMo at the paper's size, for a GPU",
         clips=ClipConfig(
             past_frames=1,
             future_frames=3,
             image_hw=(448, 800),
             voxels=VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200)),
         ),
-        model=NemoSize(
-            backbone=BackboneSize(
+        model=NemoConfig(
+            backbone=BackboneConfig(
                 embedding_size=64,
                 hidden_sizes=(256, 512, 1024, 2048),
                 depths=(3, 4, 6, 3),
@@ -144,27 +146,20 @@ def nemo_base() -> Recipe:
                 stages=("stage1", "stage2", "stage3", "stage4"),
                 weights="microsoft/resnet-50",
             ),
-            encoder=VolumeEncoderSize(heads=8, points=8, layers=3),
+            encoder=LiftingConfig(heads=8, points=8, layers=3, checkpoint=True),  # saves 16 of 23 GiB
+            motion=MotionConfig(hidden=64),
+            renderer=RendererConfig(near_m=1.0, far_m=72.0, samples=96, hidden=128),
             channels=64,
             occupancy_hidden=64,
-            motion_hidden=64,
-            ray_near_m=1.0,
-            ray_far_m=72.0,
-            ray_samples=96,
-            recon_hidden=128,
-            planner_width=256,
-            planner_layers=3,
-            planner_heads=8,
-            attention_pool=(4, 8, 8),
-            checkpoint=("encoder",),  # 16 of the 23 GiB that would be kept
         ),
-        pretrain=Stage(
+        planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8)),
+        pretrain=NemoStage(
             schedule=schedule,
             weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=8,
             vgg16="download",
         ),
-        finetune=Stage(
+        finetune=NemoStage(
             schedule=schedule,
             weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
@@ -174,6 +169,6 @@ def nemo_base() -> Recipe:
     )
 
 
-BASE_BEV = BevEncoderSize(width=256, heads=8, points=2, pillars=4, layers=3)
+BASE_BEV = BevConfig(width=256, heads=8, points=2, pillars=4, layers=3, checkpoint=True)
 """BEVFormer's width and heights; as many rounds as NeMo's own encoder."""
-TOWN_BEV = BevEncoderSize(width=96, heads=4, points=2, pillars=4, layers=2)
+TOWN_BEV = BevConfig(width=96, heads=4, points=2, pillars=4, layers=2)

@@ -4,10 +4,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from foredrive.recipes.config import BevEncoderSize, NemoSize, Recipe, Stage
+from foredrive.models.bev import BevConfig
+from foredrive.recipes.nemo import NemoRecipe
+
+ROWS = {
+    "scratch": "without pre-training; planned from the present volume alone (Table 1)",
+    "base": "pre-trained, then planning alone, from the present volume alone (Table 1)",
+    "concatenation": "base, the predicted volume concatenated to the present one (Table 1)",
+    "attention": "base, attention to the predicted volume (Table 1)",
+    "bev_scratch": "scratch on a BEV encoder (Table 1)",
+    "bev": "base on a BEV encoder, pre-trained by occupancy alone (Table 1)",
+    "no_image": "base, pre-trained without image reconstruction (Table 3)",
+    "no_occupancy": "base, pre-trained without occupancy prediction (Table 3)",
+    "no_flow": "base, pre-trained on the present alone (Table 3)",
+}
+"""What each row of the paper's tables changes."""
 
 
-def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
+def nemo_rows(full: NemoRecipe, bev: BevConfig) -> dict[str, NemoRecipe]:
     """All rows by name, the full NeMo first under its own; the others are named FULL_ROW.
 
     Table 1: `scratch` (no pre-training), `base` (pre-trained, then planning alone, from the present volume
@@ -21,7 +35,7 @@ def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
         full: a recipe with pre-training whose planner attends to the future.
         bev: size of the baseline's encoder.
     """
-    rows: dict[str, Callable[[Recipe], Recipe]] = {
+    rows: dict[str, Callable[[NemoRecipe], NemoRecipe]] = {
         "scratch": lambda recipe: replace(_planning_alone(recipe, "none"), pretrain=None),
         "base": lambda recipe: _planning_alone(recipe, "none"),
         "concatenation": lambda recipe: _planning_alone(recipe, "concatenation"),
@@ -42,31 +56,30 @@ def nemo_rows(full: Recipe, bev: BevEncoderSize) -> dict[str, Recipe]:
     }
     found = {full.name: full}
     for name, change in rows.items():
-        found[f"{full.name}_{name}"] = replace(change(full), name=f"{full.name}_{name}")
+        about = f"{full.name}: {ROWS[name]}"
+        found[f"{full.name}_{name}"] = replace(change(full), name=f"{full.name}_{name}", about=about)
     return found
 
 
-def _planning_alone(recipe: Recipe, future: Literal["attention", "concatenation", "none"]) -> Recipe:
+def _planning_alone(recipe: NemoRecipe, future: Literal["attention", "concatenation", "none"]) -> NemoRecipe:
     """Fine-tuning by the waypoints alone."""
     stage = recipe.finetune
-    assert isinstance(stage, Stage)
     weights = replace(stage.weights, recon=0.0, occ=0.0)
     return replace(
         recipe,
-        model=replace(recipe.model, planner_future=future),
+        planner=replace(recipe.planner, future=future),
         finetune=replace(stage, weights=weights, imagine=False),
     )
 
 
-def _in_bev(recipe: Recipe, bev: BevEncoderSize) -> Recipe:
-    assert isinstance(recipe.model, NemoSize)
+def _in_bev(recipe: NemoRecipe, bev: BevConfig) -> NemoRecipe:
     return replace(recipe, model=replace(recipe.model, encoder=bev))
 
 
-def _pretrained_with(recipe: Recipe, *, image: bool, occupancy: bool, flow: bool) -> Recipe:
+def _pretrained_with(recipe: NemoRecipe, *, image: bool, occupancy: bool, flow: bool) -> NemoRecipe:
     """Pre-training with some of its three parts."""
     stage = recipe.pretrain
-    assert isinstance(stage, Stage)
+    assert stage is not None
     weights = stage.weights
     weights = replace(weights, recon=weights.recon if image else 0.0, occ=weights.occ if occupancy else 0.0)
     return replace(recipe, pretrain=replace(stage, weights=weights, imagine=flow))

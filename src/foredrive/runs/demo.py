@@ -7,8 +7,8 @@ from pathlib import Path
 
 from foredrive.data import LogPath
 from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.recipes.nemo import nemo_tiny
+from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.train.run import Run, train_run
 from foredrive.towns.recorder import LabelKinds, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite

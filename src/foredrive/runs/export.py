@@ -20,7 +20,6 @@ from foredrive.evaluation import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
-from foredrive.models.nemo import Nemo
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip
@@ -62,8 +61,6 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     from foredrive.export.onnx import OPSET, write_onnx
 
     agent = load_agent(run)
-    if not isinstance(agent.world_model, Nemo):
-        raise InputError(f"{run.folder}: only agents on NeMo can be exported, this is {run.recipe.name}")
     size = run.recipe.clips
     steps = size.future_frames
     dataset = open_clips(logs, size, run.cache_dir)
@@ -101,7 +98,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     return facts
 
 
-def _samples(dataset: ClipDataset, agent: PlanningAgent, count: int) -> list[_Sample]:
+def _samples(dataset: ClipDataset, agent: PlanningAgent[Any], count: int) -> list[_Sample]:
     """Clips spread evenly over the logs."""
     every = len(dataset) / count if count else 0.0
     clips = [collate([dataset[int((k + 0.5) * every)]]).clip.observed() for k in range(count)]
@@ -116,7 +113,7 @@ def _check_packages() -> None:
             raise InputError(f"no package {name}: pip install 'foredrive[export]' brings it along") from error
 
 
-def _as_it_runs_here(agent: PlanningAgent, observed: Clip, steps: int) -> GraphOutputs:
+def _as_it_runs_here(agent: PlanningAgent[Any], observed: Clip, steps: int) -> GraphOutputs:
     output = agent(observed, steps)
     now = torch.eye(4)[None]
     poses = [now if belief.T_now_ego is None else belief.T_now_ego for belief in output.beliefs]
@@ -169,7 +166,7 @@ def _difference(name: str, a: Tensor, b: Tensor) -> Float[Tensor, "..."]:
 
 
 def _latency_ms(
-    agent: PlanningAgent, runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
+    agent: PlanningAgent[Any], runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
 ) -> dict[str, dict[str, float]]:
     """Median and 90th percentile of one clip, in turns, so that a busy machine slows all of them alike."""
     times: dict[str, list[float]] = {"eager": [], **{name: [] for name in runtimes}}

@@ -3,6 +3,7 @@
 from foredrive.scene.boxes import Boxes, Category
 from foredrive.scene.clip import Clip, Command, Example
 from foredrive.scene.detections import Detections
+from foredrive.scene.frames import Frames, last_frames
 from foredrive.scene.map_patch import MapKind, MapPatch
 from foredrive.scene.protocols import (
     Agent,
@@ -10,7 +11,9 @@ from foredrive.scene.protocols import (
     Control,
     Decoded,
     Event,
+    RayRenderer,
     Rendered,
+    RenderedRays,
     Renderer,
     Simulator,
     Step,
@@ -35,10 +38,13 @@ __all__ = [
     "Detections",
     "Event",
     "Example",
+    "Frames",
     "LidarSweep",
     "MapKind",
     "MapPatch",
+    "RayRenderer",
     "Rendered",
+    "RenderedRays",
     "Renderer",
     "Simulator",
     "Step",
@@ -47,4 +53,5 @@ __all__ = [
     "VoxelGrid",
     "VoxelSpec",
     "WorldModel",
+    "last_frames",
 ]

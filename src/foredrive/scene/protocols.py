@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from foredrive.scene.clip import Clip
+from foredrive.scene.frames import Frames
 from foredrive.scene.record import Record
 from foredrive.scene.rig import CameraRig
 from foredrive.scene.sweep import LidarSweep
@@ -29,6 +31,8 @@ class Belief(Record):
     """Volumes of the past frames, now last, where imagining needs them."""
     statics: Float[Tensor, "b _C Y X"] | None = None
     """What stands, as features of the plane, for models that hand it on without warping."""
+    flow_mps: Float[Tensor, "b 3 Z Y X"] | None = None
+    """Velocity over ground of each voxel's content, in the ego axes, where imagining it gave one."""
     T_now_ego: Float[Tensor, "b 4 4"] | None = None
     """Predicted ego motion: this belief's ego frame -> the ego frame at now; None for now's belief."""
 
@@ -45,28 +49,111 @@ class Decoded(Record):
     action: Float[Tensor, "b A"] | None = None
 
 
+class RenderedRays(NamedTuple):
+    """What R rays through a volume see."""
+
+    rgb: Float[Tensor, "b R 3"]
+    """0 to 1."""
+    range_m: Float[Tensor, "b R"]
+    """Expected distance of the hit; a ray without a hit counts with the far end."""
+    alpha: Float[Tensor, "b R"]
+    """Probability that the ray ends inside the volume."""
+
+
+@runtime_checkable
+class RayRenderer(Protocol):
+    """Renders colour and range along rays through a decoded belief."""
+
+    def __call__(
+        self,
+        feature: Float[Tensor, "b D Z Y X"],
+        occupancy_logit: Float[Tensor, "b Z Y X"],
+        origin: Float[Tensor, "b R 3"],
+        direction: Float[Tensor, "b R 3"],
+        generator: torch.Generator | None = None,
+    ) -> RenderedRays:
+        """Render rays given in the belief's ego frame; a generator jitters the samples along them."""
+        ...
+
+
 @runtime_checkable
 class WorldModel(Protocol):
-    """A model of what is around and what comes next (NeMo, DriveWorld)."""
+    """Observes the present, imagines the next key frames and decodes both (NeMo, DriveWorld).
 
-    spec: VoxelSpec
+    An implementation is a `torch.nn.Module` too: its parameters are what training changes.
+    """
+
+    @property
+    def spec(self) -> VoxelSpec:
+        """The grid of its volumes."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """D, the channels of its volumes."""
+        ...
+
+    @property
+    def past_frames(self) -> int:
+        """The number of key frames before now that it reads."""
+        ...
+
+    @property
+    def dt_s(self) -> float:
+        """The time between key frames, s."""
+        ...
+
+    @property
+    def max_steps(self) -> int | None:
+        """The most key frames it imagines; None if there is no limit."""
+        ...
+
+    @property
+    def samples_futures(self) -> bool:
+        """Whether `imagine` draws another future with each state of its generator."""
+        ...
+
+    @property
+    def renderer(self) -> RayRenderer | None:
+        """Renders what it decodes; None if the model cannot be rendered."""
+        ...
 
     def observe(self, clip: Clip) -> Belief:
-        """What the frames up to now say about now. Raises InputError on a clip that shows the future."""
+        """Return the belief about now from the frames up to now.
+
+        Raises:
+            InputError: the clip shows the future or has too few frames.
+        """
+        ...
+
+    def encode(self, frames: Frames) -> Belief:
+        """Return the belief about now from T = `past_frames` + 1 frames.
+
+        No step depends on the values of the data, so that it can be traced for export.
+        """
         ...
 
     def imagine(
-        self, belief: Belief, steps: int, actions: Float[Tensor, "b K A"] | None = None
+        self,
+        belief: Belief,
+        steps: int,
+        actions: Float[Tensor, "b K A"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> list[Belief]:
-        """The next `steps` key frames, each in its own predicted ego frame."""
+        """Return the next `steps` key frames, each in its own predicted ego frame.
+
+        Args:
+            actions: given to models that take actions.
+            generator: draws one of many futures from models that sample; without one they return the mean.
+        """
         ...
 
     def decode(self, belief: Belief) -> Decoded:
-        """Occupancy, flow and renderable features of a belief."""
+        """Return occupancy, flow and renderable features of a belief."""
         ...
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """The volume of a belief as the head of a task is given it."""
+        """Return the volume of a belief as the head of a task reads it."""
         ...
 
 

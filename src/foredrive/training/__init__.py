@@ -6,19 +6,25 @@ from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
     from foredrive.training.checkpoints import load_weights, save_weights
-    from foredrive.training.driveworld_objective import DriveWorldObjective, DriveWorldWeights
+    from foredrive.training.driveworld_objective import (
+        DriveWorldObjective,
+        DriveWorldStage,
+        DriveWorldWeights,
+    )
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
-    from foredrive.training.objective import LossWeights, NemoObjective
+    from foredrive.training.objective import LossWeights, NemoObjective, NemoStage
     from foredrive.training.path_fit import PathDemonstrations, PathFit, fit_path
     from foredrive.training.rays import ImageRays, thinned_rays
 
 __all__ = [
     "DriveWorldObjective",
+    "DriveWorldStage",
     "DriveWorldWeights",
     "ImageRays",
     "LossWeights",
     "NemoObjective",
+    "NemoStage",
     "PathDemonstrations",
     "PathFit",
     "Schedule",
@@ -35,10 +41,10 @@ __getattr__ = on_demand(
     __name__,
     {
         "checkpoints": ("load_weights", "save_weights"),
-        "driveworld_objective": ("DriveWorldObjective", "DriveWorldWeights"),
+        "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
         "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
-        "objective": ("LossWeights", "NemoObjective"),
+        "objective": ("LossWeights", "NemoObjective", "NemoStage"),
         "path_fit": ("PathDemonstrations", "PathFit", "fit_path"),
         "rays": ("ImageRays", "thinned_rays"),
     },

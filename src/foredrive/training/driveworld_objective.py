@@ -12,7 +12,8 @@ from foredrive.losses import occupancy_loss, waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.models.driveworld.state_space import ACTION_SCALE
-from foredrive.scene import Belief, Boxes, Clip, Example
+from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
+from foredrive.training.loop import Schedule
 from foredrive.training.objective import train_planner
 
 MOVING_MPS = 0.5
@@ -43,6 +44,20 @@ class DriveWorldWeights:
     """Of the waypoints; with 0 the planner is left as it is."""
 
 
+@dataclass(frozen=True)
+class DriveWorldStage:
+    """One stage of DriveWorld's training."""
+
+    schedule: Schedule
+    weights: DriveWorldWeights
+    temporal: bool = True
+    """Otherwise each frame's occupancy is learned from that frame alone."""
+    statics_of: Literal["random", "now"] = "random"
+    """The frame whose statics all frames are decoded from: a random one, as the paper pre-trains, or the
+    present, as when the model is used."""
+    kind: Literal["driveworld"] = "driveworld"
+
+
 class DriveWorldObjective(nn.Module):
     """Maps a batch to its losses.
 
@@ -57,7 +72,7 @@ class DriveWorldObjective(nn.Module):
 
     def __init__(
         self,
-        agent: PlanningAgent,
+        agent: PlanningAgent[DriveWorld],
         weights: DriveWorldWeights,
         *,
         steps: int,
@@ -69,7 +84,6 @@ class DriveWorldObjective(nn.Module):
         self.temporal, self.statics_of = temporal, statics_of
         train_planner(agent.planner, weights.wpts > 0)
         world = agent.world_model
-        assert isinstance(world, DriveWorld)
         world.states.requires_grad_(temporal)
         world.to_vector.requires_grad_(temporal)
         world.occupancy.requires_grad_(weights.occ > 0)
@@ -78,9 +92,8 @@ class DriveWorldObjective(nn.Module):
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is what to descend. The generator draws states and the frame of statics."""
         clip, weights, world = example.clip, self.weights, self.agent.world_model
-        assert isinstance(world, DriveWorld)
         observed = clip.observed()
-        seen = world.see(observed)
+        seen = world.see(last_frames(observed, world.past_frames))
         losses: dict[str, Float[Tensor, ""]] = {}
         if not self.temporal:
             losses |= self._volume_losses(world, world.without_time(seen), example)

@@ -1,6 +1,7 @@
 """NeMo's two training objectives (eq. 9–11 and 15)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from foredrive.models.agent import PlanningAgent
 from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Example, Trajectory
+from foredrive.training.loop import Schedule
 from foredrive.training.rays import thinned_rays
 
 
@@ -34,6 +36,21 @@ class LossWeights:
     """Weight of each imagined key frame beside now's; the paper counts all alike."""
 
 
+@dataclass(frozen=True)
+class NemoStage:
+    """One stage of NeMo's training."""
+
+    schedule: Schedule
+    weights: LossWeights
+    ray_stride: int
+    """One pixel in `ray_stride` along rows and columns is rendered."""
+    vgg16: str | None = None
+    """File of VGG-16 weights for the perceptual loss, or "download"; None leaves that loss out (weight 0)."""
+    imagine: bool = True
+    """Imagine the future key frames and supervise them by what happened; otherwise the present alone."""
+    kind: Literal["nemo"] = "nemo"
+
+
 class NemoObjective(nn.Module):
     """Maps a batch to its losses; the module that is trained, so that DDP sees one forward pass.
 
@@ -47,7 +64,7 @@ class NemoObjective(nn.Module):
 
     def __init__(
         self,
-        agent: PlanningAgent,
+        agent: PlanningAgent[Nemo],
         weights: LossWeights,
         *,
         steps: int,
@@ -58,7 +75,6 @@ class NemoObjective(nn.Module):
         self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
         self.image_features = image_features
         world, plans = agent.world_model, weights.wpts > 0
-        assert isinstance(world, Nemo)
         train_planner(agent.planner, plans)
         world.motion.requires_grad_(steps > 0 or (plans and agent.planner.looks_ahead > 0))
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
@@ -67,7 +83,6 @@ class NemoObjective(nn.Module):
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""
         clip, world = example.clip, self.agent.world_model
-        assert isinstance(world, Nemo)
         now, weights = clip.now, self.weights
         observed = clip.observed()
         plan: Trajectory | None = None

@@ -78,10 +78,11 @@ def show_occupancy(
 def show_flow(
     scene: viser.SceneApi, vision: Vision, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
 ) -> None:
-    """From where shown voxels of frame k came since frame k - 1, as arrows over ground; none for now."""
-    if k == 0:
+    """Draw the movement of shown voxels since frame k - 1 as arrows over ground; none for now."""
+    movement = None if k == 0 else vision.movement_m(k, spec)
+    if movement is None:
         return clear(scene, "/flow")
-    start, end = vision.movement_m(k, spec)
+    start, end = movement
     moves = shown & ((end - start).norm(dim=-1) > MOVES_M)
     if not bool(moves.any()):
         return clear(scene, "/flow")

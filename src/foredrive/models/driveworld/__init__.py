@@ -2,11 +2,12 @@
 
 from foredrive.models.driveworld.actions import actions_of, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence
-from foredrive.models.driveworld.world_model import DriveWorld, Seen, Unrolled
+from foredrive.models.driveworld.world_model import DriveWorld, DriveWorldConfig, Seen, Unrolled
 
 __all__ = [
     "DiagonalGaussian",
     "DriveWorld",
+    "DriveWorldConfig",
     "Seen",
     "Unrolled",
     "actions_of",

@@ -3,11 +3,11 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from foredrive.geometry.se3 import inverse_se3, yaw_of
-from foredrive.scene import Clip
+from foredrive.scene import Clip, Frames
 
 WHEELBASE_M = 2.86
 SLOW_MPS = 0.5
@@ -15,16 +15,33 @@ SLOW_MPS = 0.5
 
 
 def actions_of(clip: Clip) -> Float[Tensor, "b T 2"]:
-    """What was done at each frame up to the next: velocity, m/s, and the bicycle's steering angle, rad.
+    """Return `actions_between` for all frames of a clip."""
+    return actions_between(clip.T_world_ego, clip.t_s, clip.ego_speed_mps, clip.ego_speed_valid)
+
+
+def actions_in(frames: Frames) -> Float[Tensor, "b T 2"]:
+    """Return `actions_between` for observed frames."""
+    return actions_between(frames.T_now_ego, frames.t_s, frames.speed_mps, frames.speed_valid)
+
+
+def actions_between(
+    T_any_ego: Float64[Tensor, "b T 4 4"],
+    t_s: Float[Tensor, "b T"],
+    speed_mps: Float[Tensor, "b T"],
+    speed_valid: Bool[Tensor, "b T"],
+) -> Float[Tensor, "b T 2"]:
+    """Return the action from each frame to the next: velocity, m/s, and the bicycle's steering angle, rad.
 
     The angle is that of the arc between two poses; 0 at the last frame, where it is not known, and while
     the vehicle hardly moves.
+
+    Args:
+        T_any_ego: poses in any one frame.
     """
-    T = clip.T_world_ego
-    T_step = inverse_se3(T[:, :-1]) @ T[:, 1:]
+    T_step = (inverse_se3(T_any_ego[:, :-1]) @ T_any_ego[:, 1:]).float()
     way_m = T_step[..., :2, 3].norm(dim=-1)
-    dt_s = torch.diff(clip.t_s, dim=1).to(way_m)
-    speed = torch.where(clip.ego_speed_valid[:, :-1], clip.ego_speed_mps[:, :-1].to(way_m), way_m / dt_s)
+    dt_s = torch.diff(t_s, dim=1).to(way_m)
+    speed = torch.where(speed_valid[:, :-1], speed_mps[:, :-1].to(way_m), way_m / dt_s)
     curvature = yaw_of(T_step) / way_m.clamp_min(1e-3)
     steering = torch.where(way_m > SLOW_MPS * dt_s, torch.atan(WHEELBASE_M * curvature), 0.0)
     done = torch.stack([speed, steering], dim=-1).float()

@@ -15,6 +15,32 @@ ACTION_SCALE = (10.0, 0.1)
 """What actions are divided by on their way in and multiplied by on their way out."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class StateSpaceConfig:
+    """Sizes of a `StateSpace`."""
+
+    observation: int
+    """Width of x_t (512 in the paper)."""
+    state: int
+    """S (512 in MILE)."""
+    history: int
+    """H (1024 in MILE)."""
+    memory: int
+    """M, the number of histories that the Dynamic Memory Bank holds."""
+    heads: int
+    """Of the attention to the memory."""
+    objects: int
+    """K, the moving objects whose velocities are estimated."""
+    hidden: int
+    """Width of the MLPs."""
+    action: int = 64
+    """Width of an action's encoding."""
+    memory_bank: bool = True
+    """Attend to the memory; otherwise h̃ is h."""
+    motion_norm: bool = True
+    """Motion-aware layer normalisation; otherwise s̃ is s."""
+
+
 @dataclass(frozen=True)
 class Latent(Record):
     """What the model carries from one time to the next."""
@@ -85,41 +111,22 @@ class StateSpace(nn.Module):
     so that they can be in imagination too, and learned from labelled boxes where there are any.
 
     Args:
-        observation: width of x_t (512 in the paper).
-        state: S (512, MILE).
-        history: H (1024, MILE).
-        objects: K.
-        heads: of the attention to the memory.
-        memory: M.
-        hidden: width of the MLPs.
-        memory_bank: the Dynamic Memory Bank; without it h̃ is h.
-        motion_norm: motion-aware layer normalisation; without it s̃ is s.
+        config: sizes.
     """
 
-    def __init__(
-        self,
-        *,
-        observation: int,
-        state: int,
-        history: int,
-        objects: int,
-        heads: int,
-        memory: int,
-        hidden: int,
-        action: int = 64,
-        memory_bank: bool = True,
-        motion_norm: bool = True,
-    ) -> None:
+    def __init__(self, config: StateSpaceConfig) -> None:
         super().__init__()
-        self.sizes = (history, state, memory)
+        history, state, objects = config.history, config.state, config.objects
+        observation, action, hidden = config.observation, config.action, config.hidden
+        self.sizes = (history, state, config.memory)
         self.objects = objects
         self.action_in = nn.Linear(ACTIONS, action)
         self.posterior_net = _mlp(history + action + observation, hidden, 2 * state)
         self.prior_net = _mlp(history + action, hidden, 2 * state)
         self.policy = _mlp(history + state, hidden, ACTIONS)
         self.velocity = nn.Linear(state, 2 * objects)
-        self.motion_norm = MotionAwareNorm(state, objects) if motion_norm else None
-        self.recall = Recall(history, heads) if memory_bank else None
+        self.motion_norm = MotionAwareNorm(state, objects) if config.motion_norm else None
+        self.recall = Recall(history, config.heads) if config.memory_bank else None
         self.into = nn.Sequential(nn.Linear(state, history), nn.LeakyReLU())
         self.cell = nn.GRUCell(history, history)
         self.register_buffer("action_scale", torch.tensor(ACTION_SCALE), persistent=False)

@@ -1,18 +1,20 @@
 """DriveWorld's world model: images to planes, latent dynamics and statics, occupancy now and later (§3)."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Discriminator
 from torch import Tensor, nn
 from torch.nn.functional import conv3d
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.models.backbone import ImageBackbone
-from foredrive.models.driveworld.actions import actions_of, motion_of
+from foredrive.models.backbone import BackboneConfig, ImageBackbone
+from foredrive.models.driveworld.actions import actions_in, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian
 from foredrive.models.driveworld.planes import (
     PlanesToVolume,
@@ -21,15 +23,48 @@ from foredrive.models.driveworld.planes import (
     VectorToPlane,
     carried_plane,
 )
-from foredrive.models.driveworld.state_space import Latent, StateSpace
-from foredrive.models.driveworld.task_prompt import TaskPrompt
-from foredrive.models.lift_splat import LiftSplatEncoder
-from foredrive.models.pooled_lifting import PooledLiftingEncoder
-from foredrive.scene import Belief, Clip, Decoded, Task, VoxelSpec
+from foredrive.models.driveworld.state_space import Latent, StateSpace, StateSpaceConfig
+from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig, TaskPrompt, encode_prompts
+from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
+from foredrive.models.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
+from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
 from foredrive.scene.record import Record
 
-OCCUPIED_PRIOR = 0.02
-"""Where occupancy starts: most of space is free."""
+Encoder = LiftSplatEncoder | PooledLiftingEncoder
+ENCODERS: Mapping[type, Callable[..., Encoder]] = {
+    LiftSplatConfig: LiftSplatEncoder,
+    PooledLiftingConfig: PooledLiftingEncoder,
+}
+"""Each takes its config, the grid, the channels, the plane's width and the number of image feature levels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveWorldConfig:
+    """Sizes of a `DriveWorld`."""
+
+    backbone: BackboneConfig
+    encoder: Annotated[PooledLiftingConfig | LiftSplatConfig, Discriminator("kind")]
+    states: StateSpaceConfig
+    channels: int
+    """D, of the volume and of the image features."""
+    plane: int
+    """C, channels of the plane that images are lifted to."""
+    observation_hidden: int
+    """Channels of the convolutions from a plane to x_t."""
+    expanded: tuple[int, ...]
+    """Channels of the steps from a state to a plane (m_θ)."""
+    volume_hidden: int
+    """Channels of the volume before its last convolution (l_θ)."""
+    statics: int
+    """Channels of latent statics; 0 leaves Static Scene Propagation out."""
+    prompt: PromptConfig | None
+    """Task prompts; None leaves them out."""
+    carry_statics: bool = False
+    """Move latent statics along with the ego vehicle, by the driven path and, in imagination, by the actions.
+    The paper hands them on as they are."""
+    occupied_prior: float = 0.02
+    """Where occupancy starts: most of space is free."""
+    kind: Literal["driveworld"] = "driveworld"
 
 
 @dataclass(frozen=True)
@@ -63,78 +98,72 @@ class DriveWorld(nn.Module):
     """A `WorldModel`. Beliefs of later frames are in those frames' own ego frames, nothing is warped.
 
     Args:
-        backbone: image features.
-        encoder: image features to a plane of `plane` channels.
-        states: the state-space model.
-        to_vector: the plane as x_t.
-        from_vector: (h̃, s) as a plane, m_θ.
-        to_volume: all planes as a volume, l_θ.
-        statics: Static Scene Propagation; None leaves it out (the rows of plain dynamics).
-        carry_statics: move latent statics along with the ego vehicle, by the driven path and, where that is
-            imagined, by the actions. The paper hands them on as they are.
-        prompt: task prompts; None leaves them out.
+        config: sizes.
+        spec: the volume's grid.
         past_frames: T - 1.
-        dt_s: between key frames.
-        channels: D of the volume.
+        dt_s: time between key frames.
+        fetch: load the backbone's weights and encode the task prompts; not needed where trained weights will
+            replace them.
+
+    Raises:
+        InputError: the text encoder cannot be loaded.
     """
 
+    max_steps = None
+    samples_futures = True
+    renderer = None
+
     def __init__(
-        self,
-        *,
-        backbone: ImageBackbone,
-        encoder: LiftSplatEncoder | PooledLiftingEncoder,
-        states: StateSpace,
-        to_vector: PlaneToVector,
-        from_vector: VectorToPlane,
-        to_volume: PlanesToVolume,
-        statics: StaticScene | None,
-        carry_statics: bool,
-        prompt: TaskPrompt | None,
-        past_frames: int,
-        dt_s: float,
-        channels: int,
+        self, config: DriveWorldConfig, spec: VoxelSpec, *, past_frames: int, dt_s: float, fetch: bool = True
     ) -> None:
         super().__init__()
-        self.backbone, self.encoder, self.states = backbone, encoder, states
-        self.to_vector, self.from_vector, self.to_volume = to_vector, from_vector, to_volume
-        self.statics, self.carry_statics, self.prompt = statics, carry_statics, prompt
-        self.past_frames, self.dt_s = past_frames, dt_s
+        channels, plane, states = config.channels, config.plane, config.states
+        height, size_yx = spec.shape_zyx[0], spec.shape_zyx[1:]
+        self.spec, self.channels, self.past_frames, self.dt_s = spec, channels, past_frames, dt_s
+        self.carry_statics = config.carry_statics
+        self.backbone = ImageBackbone(config.backbone, channels=channels, fetch=fetch)
+        self.encoder = ENCODERS[type(config.encoder)](
+            config.encoder, spec, channels=channels, width=plane, levels=len(config.backbone.stages)
+        )
+        self.states = StateSpace(states)
+        self.to_vector = PlaneToVector(plane, config.observation_hidden, states.observation)
+        self.from_vector = VectorToPlane(states.history + states.state, config.expanded, size_yx)
+        prompted = 0 if config.prompt is None else config.prompt.widths[-1]
+        planes = config.expanded[-1] + config.statics + prompted
+        self.to_volume = PlanesToVolume(planes, config.volume_hidden, channels, height)
+        self.statics = StaticScene(plane, config.statics) if config.statics else None
+        self.prompt: TaskPrompt | None = None
+        if config.prompt is not None:
+            encodings = torch.zeros(len(PROMPTS), config.prompt.encoding)
+            encodings = encode_prompts(config.prompt) if fetch else encodings
+            self.prompt = TaskPrompt(encodings, config.prompt.widths, size_yx)
         self.occupancy = nn.Linear(channels, 1)
-        nn.init.constant_(self.occupancy.bias, math.log(OCCUPIED_PRIOR / (1 - OCCUPIED_PRIOR)))
+        prior = config.occupied_prior
+        nn.init.constant_(self.occupancy.bias, math.log(prior / (1 - prior)))
         self.flow = nn.Linear(channels, 3)
         for parameter in self.flow.parameters():
             nn.init.zeros_(parameter)  # nothing moves until it is learned
 
-    @property
-    def spec(self) -> VoxelSpec:
-        """The volume's grid."""
-        return self.encoder.spec
-
     def observe(self, clip: Clip) -> Belief:
-        """What the last T frames say about now, by the posterior's means; statics are now's.
+        """Return the belief about now by the posterior's means; statics are now's.
 
         Raises:
             InputError: if the clip shows the future or has too few frames.
         """
-        return self.believe(self.see(clip))
+        return self.encode(last_frames(clip, self.past_frames))
 
-    def see(self, clip: Clip) -> Seen:
-        """The last T frames as planes; raises as `observe` does."""
-        frames = clip.t_s.shape[-1]
-        if clip.now != frames - 1:
-            raise InputError("a world model observes frames up to now only: pass clip.observed()")
-        if frames < self.past_frames + 1:
-            raise InputError(
-                f"DriveWorld needs {self.past_frames} frames before now, the clip has {frames - 1}"
-            )
-        seen = clip.frames(slice(frames - self.past_frames - 1, frames))
-        b, t, c = seen.image_valid.shape
-        levels = self.backbone(seen.images.flatten(0, 2))
+    def encode(self, frames: Frames) -> Belief:
+        """Do the work of `observe`; no step depends on the values of the data."""
+        return self.believe(self.see(frames))
+
+    def see(self, frames: Frames) -> Seen:
+        """Lift each of the last T frames to a plane."""
+        b, t, c = frames.image_valid.shape
+        levels = self.backbone(frames.images.flatten(0, 2))
         features = [level.unflatten(0, (b * t, c)) for level in levels]
-        per_image = seen.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-        planes = self.encoder(features, per_image, seen.image_valid.flatten(0, 1)).unflatten(0, (b, t))
-        T_now_ego = inverse_se3(seen.T_world_ego[:, -1:]) @ seen.T_world_ego
-        return Seen(planes, actions_of(seen), T_now_ego.float())
+        per_image = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+        planes = self.encoder(features, per_image, frames.image_valid.flatten(0, 1)).unflatten(0, (b, t))
+        return Seen(planes, actions_in(frames), frames.T_now_ego.float())
 
     def believe(self, seen: Seen) -> Belief:
         """`observe` of frames that have been seen."""

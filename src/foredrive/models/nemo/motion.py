@@ -1,5 +1,6 @@
 """NeMo's motion flow module: what moves, and how the ego vehicle does (§3.2, eq. 7–8)."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -8,8 +9,15 @@ from torch import Tensor, nn
 
 from foredrive.geometry.se3 import exp_se3
 
-XI_SCALE = 0.1
-"""Raw network outputs are scaled to metres and radians by this, so that early steps warp gently."""
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Sizes of a `MotionFlow`."""
+
+    hidden: int
+    """Channels of the ConvNets."""
+    xi_scale: float = 0.1
+    """Scales the rigid head's outputs to metres and radians, so that early steps warp gently."""
 
 
 class Motion(NamedTuple):
@@ -29,16 +37,16 @@ class MotionFlow(nn.Module):
     """The 3-D ConvNets H (flow per voxel) and G (SE(3)) on the concatenated volumes of past and present.
 
     Args:
+        config: sizes.
         channels: D of one volume.
         frames: number of volumes put together, T_p + 1.
-        hidden: width of the ConvNets.
         steps: T_f, the number of future key frames.
     """
 
-    def __init__(self, *, channels: int, frames: int, hidden: int, steps: int) -> None:
+    def __init__(self, config: MotionConfig, *, channels: int, frames: int, steps: int) -> None:
         super().__init__()
-        self.steps = steps
-        wide = channels * frames
+        self.steps, self.xi_scale = steps, config.xi_scale
+        wide, hidden = channels * frames, config.hidden
         to_flow = nn.Conv3d(hidden, 3 * steps, 3, padding=1)
         to_xi = nn.Linear(4 * hidden, 6 * steps)
         for parameter in (*to_flow.parameters(), *to_xi.parameters()):
@@ -71,4 +79,4 @@ class MotionFlow(nn.Module):
             stacked = stacked.expand(2, -1, -1, -1, -1)
         flow = self.flow(stacked)[:batch].float().unflatten(1, (self.steps, 3))
         xi = self.rigid(stacked)[:batch].float().unflatten(1, (self.steps, 6))
-        return Motion(flow=flow, T_prev_next=exp_se3(XI_SCALE * xi))
+        return Motion(flow=flow, T_prev_next=exp_se3(self.xi_scale * xi))

@@ -1,6 +1,6 @@
 """Features composited along rays, then colour (NeMo eq. 2, 5, 6)."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -9,18 +9,19 @@ from torch import Tensor, nn
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.compositing import composite, stratified_depths
 from foredrive.ops.volume import sample_volume
-from foredrive.scene import VoxelSpec
+from foredrive.scene import RenderedRays, VoxelSpec
 
 
-class RenderedRays(NamedTuple):
-    """What R rays see."""
+@dataclass(frozen=True)
+class RendererConfig:
+    """Sizes of a `VolumeRenderer`."""
 
-    rgb: Float[Tensor, "b R 3"]
-    """0 to 1."""
-    range_m: Float[Tensor, "b R"]
-    """Expected distance of what was hit, with the far end for what was not."""
-    alpha: Float[Tensor, "b R"]
-    """Probability that the ray ends inside the volume."""
+    near_m: float
+    """Ray samples are stratified between `near_m` and `far_m`."""
+    far_m: float
+    samples: int
+    hidden: int
+    """Width of f_recon."""
 
 
 class VolumeRenderer(nn.Module):
@@ -30,26 +31,17 @@ class VolumeRenderer(nn.Module):
     learned background feature, which stands for the sky and for all that is too far for the grid.
 
     Args:
+        config: sizes.
         spec: the volume's grid.
         channels: D.
-        near_m, far_m, samples: the stratified samples of a ray.
-        hidden: width of f_recon.
     """
 
     lower_m: Tensor
 
-    def __init__(
-        self,
-        spec: VoxelSpec,
-        *,
-        channels: int,
-        near_m: float,
-        far_m: float,
-        samples: int,
-        hidden: int,
-    ) -> None:
+    def __init__(self, config: RendererConfig, spec: VoxelSpec, *, channels: int) -> None:
         super().__init__()
-        self.spec, self.near_m, self.far_m, self.samples = spec, near_m, far_m, samples
+        self.spec, hidden = spec, config.hidden
+        self.near_m, self.far_m, self.samples = config.near_m, config.far_m, config.samples
         self.register_buffer("lower_m", torch.tensor(spec.lower_m), persistent=False)
         self.background = nn.Parameter(torch.zeros(channels))
         self.recon = nn.Sequential(

@@ -1,57 +1,86 @@
 """NeMo's world model: images to volume, occupancy, motion, imagined futures."""
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
+from pydantic import Discriminator
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.averaging import AveragingEncoder
-from foredrive.models.backbone import ImageBackbone
-from foredrive.models.bev import BevEncoder
-from foredrive.models.lifting import LiftingEncoder
-from foredrive.models.nemo.motion import MotionFlow
-from foredrive.models.nemo.rendering import VolumeRenderer
+from foredrive.models.averaging import AveragingConfig, AveragingEncoder
+from foredrive.models.backbone import BackboneConfig, ImageBackbone
+from foredrive.models.bev import BevConfig, BevEncoder
+from foredrive.models.lifting import LiftingConfig, LiftingEncoder
+from foredrive.models.nemo.motion import MotionConfig, MotionFlow
+from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
 from foredrive.ops.volume import warp_volume
-from foredrive.scene import Belief, CameraRig, Clip, Decoded, Task, VoxelSpec
+from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
 
-OCCUPIED_PRIOR = 0.02
-"""Where f_occ starts: most of space is free, and a volume that starts opaque hides what lies behind."""
+Encoder = LiftingEncoder | BevEncoder | AveragingEncoder
+ENCODERS: Mapping[type, Callable[..., Encoder]] = {
+    LiftingConfig: LiftingEncoder,
+    BevConfig: BevEncoder,
+    AveragingConfig: AveragingEncoder,
+}
+"""Each takes its config, the grid, the channels and the number of image feature levels."""
+
+
+@dataclass(frozen=True)
+class NemoConfig:
+    """Sizes of a `Nemo`."""
+
+    backbone: BackboneConfig
+    encoder: Annotated[LiftingConfig | BevConfig | AveragingConfig, Discriminator("kind")]
+    motion: MotionConfig
+    renderer: RendererConfig
+    channels: int
+    """D, of the volume."""
+    occupancy_hidden: int
+    """Width of the occupancy MLP f_occ."""
+    occupied_prior: float = 0.02
+    """Where f_occ starts: most of space is free, and a volume that starts opaque hides what lies behind."""
+    kind: Literal["nemo"] = "nemo"
 
 
 class Nemo(nn.Module):
     """A `WorldModel` (NeMo §3.2): ResNet features → deformable lifting → volume → occupancy, motion, colour.
 
     Args:
-        backbone, encoder, motion, renderer: the parts.
-        past_frames: T_p, how many key frames before now are seen.
-        channels: D.
-        hidden: width of the occupancy MLP f_occ.
+        config: sizes.
+        spec: the volume's grid.
+        past_frames: T_p, the key frames before now that are read.
+        max_steps: T_f, the most key frames that are imagined.
+        dt_s: time between key frames.
+        fetch: load the backbone's weights; not needed where trained weights will replace them.
     """
+
+    samples_futures = False
 
     def __init__(
         self,
+        config: NemoConfig,
+        spec: VoxelSpec,
         *,
-        backbone: ImageBackbone,
-        encoder: LiftingEncoder | BevEncoder | AveragingEncoder,
-        motion: MotionFlow,
-        renderer: VolumeRenderer,
         past_frames: int,
-        channels: int,
-        hidden: int,
+        max_steps: int,
+        dt_s: float,
+        fetch: bool = True,
     ) -> None:
         super().__init__()
-        self.backbone, self.encoder, self.motion, self.renderer = backbone, encoder, motion, renderer
-        self.past_frames = past_frames
-        to_logit = nn.Linear(hidden, 1)
-        nn.init.constant_(to_logit.bias, math.log(OCCUPIED_PRIOR / (1 - OCCUPIED_PRIOR)))
-        self.occupancy = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), to_logit)
-
-    @property
-    def spec(self) -> VoxelSpec:
-        """The volume's grid."""
-        return self.encoder.spec
+        channels, levels = config.channels, len(config.backbone.stages)
+        self.spec, self.channels, self.dt_s = spec, channels, dt_s
+        self.past_frames, self.max_steps = past_frames, max_steps
+        self.backbone = ImageBackbone(config.backbone, channels=channels, fetch=fetch)
+        self.encoder = ENCODERS[type(config.encoder)](config.encoder, spec, channels=channels, levels=levels)
+        self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
+        self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)
+        to_logit = nn.Linear(config.occupancy_hidden, 1)
+        nn.init.constant_(to_logit.bias, math.log(config.occupied_prior / (1 - config.occupied_prior)))
+        self.occupancy = nn.Sequential(nn.Linear(channels, config.occupancy_hidden), nn.ReLU(), to_logit)
 
     def observe(self, clip: Clip) -> Belief:
         """Encode the last T_p + 1 frames, each in its own ego frame (V_t of eq. 1).
@@ -59,54 +88,51 @@ class Nemo(nn.Module):
         Raises:
             InputError: if the clip shows the future or has too few frames.
         """
-        frames = clip.t_s.shape[-1]
-        if clip.now != frames - 1:
-            raise InputError("a world model observes frames up to now only: pass clip.observed()")
-        if frames < self.past_frames + 1:
-            raise InputError(f"NeMo needs {self.past_frames} frames before now, the clip has {frames - 1}")
-        seen = clip.frames(slice(frames - self.past_frames - 1, frames))
-        return self.encode(seen.images, seen.image_valid, seen.rig)
+        return self.encode(last_frames(clip, self.past_frames))
 
-    def encode(
-        self, images: UInt8[Tensor, "b T C 3 H W"], image_valid: Bool[Tensor, "b T C"], rig: CameraRig
-    ) -> Belief:
-        """The frames of `observe`, now last, as a belief; nothing here depends on what the data say."""
-        b, t, c = image_valid.shape
-        levels = self.backbone(images.flatten(0, 2))
+    def encode(self, frames: Frames) -> Belief:
+        """Do the work of `observe`; no step depends on the values of the data."""
+        b, t, c = frames.image_valid.shape
+        levels = self.backbone(frames.images.flatten(0, 2))
         features = [level.unflatten(0, (b * t, c)) for level in levels]
-        per_image = rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-        volumes = self.encoder(features, per_image, image_valid.flatten(0, 1)).unflatten(0, (b, t))
+        per_image = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+        volumes = self.encoder(features, per_image, frames.image_valid.flatten(0, 1)).unflatten(0, (b, t))
         return Belief(volume=volumes[:, -1], history=volumes)
 
     def imagine(
-        self, belief: Belief, steps: int, actions: Float[Tensor, "b K A"] | None = None
+        self,
+        belief: Belief,
+        steps: int,
+        actions: Float[Tensor, "b K A"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> list[Belief]:
         """Warp the volume into the next key frames by predicted flow and ego motion (eq. 7–8).
 
-        NeMo predicts its own ego motion; it takes no actions.
+        NeMo predicts its own ego motion and takes no actions. It has one future, whatever the generator.
         """
         if belief.history is None:
             raise InputError("NeMo imagines from what `observe` returned, not from an imagined belief")
         if actions is not None:
             raise InputError("NeMo predicts the ego motion by itself and takes no actions")
-        if not 0 < steps <= self.motion.steps:
-            raise InputError(f"this NeMo imagines 1 to {self.motion.steps} steps, not {steps}")
+        if not 0 < steps <= self.max_steps:
+            raise InputError(f"this NeMo imagines 1 to {self.max_steps} steps, not {steps}")
         motion = self.motion(belief.history)
         volume = belief.volume
         T_now_ego = torch.eye(4, device=volume.device).expand(len(volume), 4, 4)
         futures = []
         for k in range(steps):
             T_prev_next = motion.T_prev_next[:, k]
-            volume = warp_volume(volume, motion.flow[:, k], T_prev_next, self.spec.lower_m, self.spec.voxel_m)
+            came_from_m = motion.flow[:, k]
+            volume = warp_volume(volume, came_from_m, T_prev_next, self.spec.lower_m, self.spec.voxel_m)
             T_now_ego = T_now_ego @ T_prev_next
-            futures.append(Belief(volume=volume, T_now_ego=T_now_ego))
+            futures.append(Belief(volume=volume, flow_mps=-came_from_m / self.dt_s, T_now_ego=T_now_ego))
         return futures
 
     def decode(self, belief: Belief) -> Decoded:
-        """Occupancy of every voxel (eq. 4); the volume itself is what is rendered."""
+        """Return the occupancy of every voxel (eq. 4) and the volume itself as renderable features."""
         logit = self.occupancy(belief.volume.permute(0, 2, 3, 4, 1))[..., 0].float()
-        return Decoded(occupancy_logit=logit, feature=belief.volume)
+        return Decoded(occupancy_logit=logit, feature=belief.volume, flow=belief.flow_mps)
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """The belief's own volume: NeMo's features are the same for all tasks."""
+        """Return the belief's own volume: NeMo's features are the same for all tasks."""
         return belief.volume

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -42,7 +43,7 @@ class Needs:
 class _Sees:
     """An agent that was trained on smaller images than the vehicle takes."""
 
-    agent: PlanningAgent
+    agent: PlanningAgent[Any]
     image_hw: tuple[int, int]
     device: str
 
@@ -122,6 +123,6 @@ def _seeing(folder: Path) -> _Sees:
 @lru_cache(maxsize=1)
 def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
-    model, clips = run.recipe.model, run.recipe.clips
-    past_frames = model.planner_history if model.planner_base == "ego_mlp" else clips.past_frames
-    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, model.planner_target)[1]
+    planner, clips = run.recipe.planner, run.recipe.clips
+    past_frames = clips.past_frames if planner.ego_mlp is None else planner.history
+    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, planner.target)[1]

@@ -12,11 +12,17 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import read_lane_outlines
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import write_json, write_summary
-from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
-from foredrive.runs.rebuild.rebuilt_run import OpenRun, edited_scene, open_rebuilt, open_run_log, rebuilt_cameras
 from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.runs.drive.agents import make_driver, needs_of
+from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
+from foredrive.runs.rebuild.rebuilt_run import (
+    OpenRun,
+    edited_scene,
+    open_rebuilt,
+    open_run_log,
+    rebuilt_cameras,
+)
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.drive import Drive, Pace, drive_route
 from foredrive.simulation.drive_log import rebuilt_drive_log, rebuilt_key_frame

@@ -21,8 +21,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import write_json, write_summary
 from foredrive.files import atomic_path
 from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
+from foredrive.runs.fan_out import fan_out, reason
 from foredrive.simulation.drive import Pace, drive_route
 from foredrive.simulation.drive_log import drive_log, key_frame
 from foredrive.simulation.lessons import Alternating, Disturbed

@@ -10,11 +10,9 @@ from torch import Tensor
 
 from foredrive.data import LogPath, collate
 from foredrive.errors import InputError
-from foredrive.models.driveworld import DriveWorld
-from foredrive.models.nemo import Nemo
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
-from foredrive.scene import Belief, Clip, Example
+from foredrive.scene import Belief, Clip, Example, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
 
 SEED = 0
@@ -53,8 +51,8 @@ def imagine_run(
     if min(steps, samples, moments) < 1:
         raise InputError(f"at least one future of {clips.frame_dt_s:g} s from one moment can be imagined")
     world = load_agent(run).world_model
-    if isinstance(world, Nemo) and steps > world.motion.steps:
-        farthest_s = world.motion.steps * clips.frame_dt_s
+    if world.max_steps is not None and steps > world.max_steps:
+        farthest_s = world.max_steps * clips.frame_dt_s
         raise InputError(f"{run.folder}: this model imagines {farthest_s:g} s at most, not {seconds:g} s")
     config = dataclasses.replace(clips, future_frames=steps, future_images=True)
     dataset = open_clips([log], config, run.cache_dir)
@@ -64,20 +62,20 @@ def imagine_run(
         item = dataset[int((k + 0.5) * len(dataset) / count)]
         observed = collate([item]).clip.observed()
         now = world.observe(observed)
-        if isinstance(world, DriveWorld):
-            drawn = [[now, *world.imagine(now, steps, generator=generator)] for _ in range(samples)]
-            rendered = None
-        else:
-            drawn = [[now, *world.imagine(now, steps)]]
-            rendered = _views(world, drawn[0], observed, ray_stride)
+        futures = samples if world.samples_futures else 1
+        drawn = [[now, *world.imagine(now, steps, generator=generator)] for _ in range(futures)]
+        renderer = world.renderer
+        rendered = None if renderer is None else _views(world, renderer, drawn[0], observed, ray_stride)
         yield Moment(item, torch.stack([_occupied(world, beliefs) for beliefs in drawn]), rendered)
 
 
-def _occupied(world: Nemo | DriveWorld, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X"]:
+def _occupied(world: WorldModel, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X"]:
     return torch.stack([world.decode(belief).occupancy_logit[0] > 0 for belief in beliefs])
 
 
-def _views(world: Nemo, beliefs: list[Belief], observed: Clip, ray_stride: int) -> Tensor:
+def _views(
+    world: WorldModel, renderer: RayRenderer, beliefs: list[Belief], observed: Clip, ray_stride: int
+) -> Tensor:
     """Every camera at every frame, by the rig of now."""
     rays = thinned_rays(observed, observed.now, ray_stride)
     _, c, _, h, w = rays.rgb.shape
@@ -86,7 +84,7 @@ def _views(world: Nemo, beliefs: list[Belief], observed: Clip, ray_stride: int) 
         seen = world.decode(belief)
         cameras = zip(rays.origin.split(h * w, 1), rays.direction.split(h * w, 1), strict=True)
         parts = [
-            world.renderer(seen.feature, seen.occupancy_logit, origin, direction).rgb[0]
+            renderer(seen.feature, seen.occupancy_logit, origin, direction).rgb[0]
             for origin, direction in cameras
         ]
         views.append(torch.cat(parts).view(c, h, w, 3).permute(0, 3, 1, 2))

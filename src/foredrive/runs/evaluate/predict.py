@@ -1,6 +1,7 @@
 """An agent under evaluation: what it says about a clip, in the form an evaluation asks for."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,9 +9,7 @@ from torch import Tensor
 
 from foredrive.evaluation.predictor import Prediction
 from foredrive.models.agent import PlanningAgent
-from foredrive.models.driveworld import DriveWorld
-from foredrive.models.nemo import Nemo, VolumeRenderer
-from foredrive.scene import Belief, Clip, Decoded
+from foredrive.scene import Belief, Clip, Decoded, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
 
 
@@ -26,7 +25,7 @@ class AgentPredictor:
             order of clips.
     """
 
-    def __init__(self, agent: PlanningAgent, steps: int, ray_stride: int, futures: int = 0) -> None:
+    def __init__(self, agent: PlanningAgent[Any], steps: int, ray_stride: int, futures: int = 0) -> None:
         self.agent, self.steps, self.ray_stride, self.futures = agent, steps, ray_stride, futures
         self._generator = torch.Generator().manual_seed(0)
 
@@ -37,10 +36,10 @@ class AgentPredictor:
         decoded, world = output.decoded, self.agent.world_model
         flow = [frame.flow for frame in decoded if frame.flow is not None]
         views = None
-        if self.ray_stride and isinstance(world, Nemo):
+        if self.ray_stride and world.renderer is not None:
             views = self._views(world.renderer, observed, decoded[0])[:, None]
         futures = None
-        if self.futures and self.steps and isinstance(world, DriveWorld):
+        if self.futures and self.steps and world.samples_futures:
             drawn = [
                 world.imagine(output.beliefs[0], self.steps, generator=self._generator)
                 for _ in range(self.futures)
@@ -49,18 +48,18 @@ class AgentPredictor:
         return Prediction(
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
             plan=output.plan,
-            flow_mps=torch.stack(flow, dim=1) if flow else None,
+            flow_mps=torch.stack(flow, dim=1) if len(flow) == len(decoded) else None,
             futures=futures,
             images=views,
             image_stride=max(self.ray_stride, 1),
         )
 
-    def _views(self, renderer: VolumeRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
+    def _views(self, renderer: RayRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
         rays = thinned_rays(observed, observed.now, self.ray_stride)
         rendered = renderer(now.feature, now.occupancy_logit, rays.origin, rays.direction)
         b, c, _, h, w = rays.rgb.shape
         return rendered.rgb.view(b, c, h, w, 3).permute(0, 1, 4, 2, 3)
 
 
-def _occupied(world: DriveWorld, beliefs: Sequence[Belief]) -> Bool[Tensor, "b F Z Y X"]:
+def _occupied(world: WorldModel, beliefs: Sequence[Belief]) -> Bool[Tensor, "b F Z Y X"]:
     return torch.stack([world.decode(belief).occupancy_logit > 0 for belief in beliefs], dim=1)

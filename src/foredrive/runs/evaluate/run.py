@@ -21,8 +21,8 @@ from foredrive.evaluation import (
     write_summary,
 )
 from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.runs.open_clips import open_clips
 from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_rivals
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Example, Trajectory
@@ -101,9 +101,7 @@ def evaluate_run(
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)
-    prior, ego_mlp = fit_rivals(
-        run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.model.planner_target
-    )
+    prior, ego_mlp = fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.planner.target)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)

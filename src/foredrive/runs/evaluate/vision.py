@@ -1,15 +1,16 @@
 """A trained agent looking at one clip at a time: everything that a person may want to see of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
-from foredrive.models.agent import AgentOutput, PlanningAgent
-from foredrive.models.nemo import Nemo
-from foredrive.scene import CameraRig, Clip, Trajectory, VoxelSpec
+from foredrive.models.agent import PlanningAgent
+from foredrive.scene import CameraRig, Clip, Decoded, RayRenderer, Trajectory, VoxelSpec
 from foredrive.scene.record import Record
 from foredrive.sensors import camera_rays
 
@@ -25,19 +26,22 @@ class Vision(Record):
     volume: Float[Tensor, "F D Z Y X"]
     T_now_ego: Float[Tensor, "F 4 4"]
     """Predicted ego frame of each -> ego frame now."""
-    flow_m: Float[Tensor, "K 3 Z Y X"]
-    """f of NeMo's eq. 7: what is at z in frame k + 1 came from z + f, over ground."""
+    flow_m: Float[Tensor, "K 3 Z Y X"] | None
+    """Of imagined frames: the content at z came from z + flow since the frame before, over ground; None from
+    a model without flow."""
     plan: Trajectory
     """[1 T]."""
 
     def movement_m(
         self, k: int, spec: VoxelSpec
-    ) -> tuple[Float[Tensor, "Z Y X 3"], Float[Tensor, "Z Y X 3"]]:
-        """Where the content of every voxel of imagined frame k ≥ 1 came from, and where it is.
+    ) -> tuple[Float[Tensor, "Z Y X 3"], Float[Tensor, "Z Y X 3"]] | None:
+        """Return start and end of the movement of each voxel's content up to imagined frame k ≥ 1.
 
-        Both over ground, in the ego frame now, m: what stands still came from where it is, however fast the
-        vehicle goes.
+        Both over ground, in the ego frame now, m: static content has start = end, however fast the vehicle
+        drives. None if the model predicts no flow.
         """
+        if self.flow_m is None:
+            return None
         centre = spec.centres_m().flatten(0, 2)
         came_from = centre + self.flow_m[k - 1].flatten(1).T
         start, end = (transform_points(self.T_now_ego[k], place) for place in (came_from, centre))
@@ -45,20 +49,20 @@ class Vision(Record):
 
 
 class Observer:
-    """An agent to whom clips are shown, and who renders what it holds to be the case.
+    """Runs an agent on clips and renders its predictions.
 
     Args:
         agent: in evaluation mode.
-        steps: how many key frames it imagines.
+        steps: number of key frames to imagine.
     """
 
-    def __init__(self, agent: PlanningAgent, steps: int) -> None:
+    def __init__(self, agent: PlanningAgent[Any], steps: int) -> None:
         self.agent, self.steps = agent, steps
-        self._renderer = agent.world_model.renderer if isinstance(agent.world_model, Nemo) else None
+        self._renderer: RayRenderer | None = agent.world_model.renderer
 
     @property
     def renders(self) -> bool:
-        """Whether there is anything to render with."""
+        """Whether the world model can be rendered."""
         return self._renderer is not None
 
     @torch.no_grad()
@@ -71,19 +75,13 @@ class Observer:
             occupancy_logit=torch.stack([frame.occupancy_logit[0] for frame in output.decoded]),
             volume=torch.stack([belief.volume[0] for belief in beliefs]),
             T_now_ego=torch.stack([eye if b.T_now_ego is None else b.T_now_ego[0] for b in beliefs]),
-            flow_m=self._flow_m(output)[0],
+            flow_m=self._flow_m(output.decoded[1:]),
             plan=output.plan[0],
         )
 
-    def _flow_m(self, output: AgentOutput) -> Float[Tensor, "1 K 3 Z Y X"]:
-        """Where the content of imagined voxels came from; from decoded velocities where there are any."""
-        world = self.agent.world_model
-        if isinstance(world, Nemo):
-            history = output.beliefs[0].history
-            assert history is not None
-            return world.motion(history).flow[:, : self.steps]
-        back = [-world.dt_s * frame.flow for frame in output.decoded if frame.flow is not None]
-        return torch.stack(back, dim=1)[:, 1:]
+    def _flow_m(self, imagined: Sequence[Decoded]) -> Float[Tensor, "K 3 Z Y X"] | None:
+        flow = [frame.flow[0] for frame in imagined if frame.flow is not None]
+        return -self.agent.world_model.dt_s * torch.stack(flow) if flow else None
 
     @torch.no_grad()
     def render(self, vision: Vision, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:

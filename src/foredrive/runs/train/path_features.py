@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.progress import track
@@ -25,7 +26,7 @@ BATCH = 8
 
 @torch.no_grad()
 def read_paths(
-    agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
+    agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
 ) -> PathDemonstrations:
     """Read the present volume of clips `stride_s` apart along the plans made without looking; half precision
     is kept.
@@ -46,7 +47,7 @@ def read_paths(
 
 
 def _read(
-    agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path
+    agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path
 ) -> dict[str, Tensor]:
     dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
     loader: Iterable[Example] = DataLoader(dataset, batch_size=BATCH, collate_fn=collate)
@@ -59,7 +60,7 @@ def _read(
     return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
 
-def _row(agent: PlanningAgent, example: Example) -> dict[str, Tensor]:
+def _row(agent: PlanningAgent[Any], example: Example) -> dict[str, Tensor]:
     planner = agent.planner
     assert planner.path is not None
     clip = example.clip.observed()
@@ -84,7 +85,7 @@ def _row(agent: PlanningAgent, example: Example) -> dict[str, Tensor]:
     return {name: tensor.contiguous().cpu() for name, tensor in row.items()}
 
 
-def _key(agent: PlanningAgent, logs: Sequence[LogPath], clips: ClipConfig, stride_s: float) -> str:
+def _key(agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, stride_s: float) -> str:
     digest = hashlib.blake2b(digest_size=16)
     read = (str(logs), repr(dataclasses.asdict(clips)), repr(stride_s))
     digest.update("\n".join(read).encode())

@@ -12,11 +12,11 @@ from foredrive.data import ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
+from foredrive.recipes.config import Recipe, load_recipe, save_recipe
 from foredrive.runs.build import build_agent, build_objective
-from foredrive.recipes.config import AnyStage, Recipe, load_recipe, save_recipe
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.path_features import read_paths
 from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.path_features import read_paths
 from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def train_run(
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
     if pretrained is not None:
-        load_weights(agent.world_model, pretrained, "world_model")
+        load_weights(agent.get_submodule("world_model"), pretrained, "world_model")
     elif recipe.pretrain is not None:
         _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
@@ -119,7 +119,7 @@ def train_run(
     return run
 
 
-def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent, fabric: "Fabric") -> None:
+def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric") -> None:
     """Fit what the planner reads along its path in the volume as it has become."""
     path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
     if path is None or weights.is_file():
@@ -143,8 +143,8 @@ def _pretrained(start: Path) -> Path:
 def _train_stage(
     run: Run,
     name: str,
-    stage: AnyStage,
-    agent: PlanningAgent,
+    stage: Any,
+    agent: PlanningAgent[Any],
     dataset: ClipDataset,
     fabric: "Fabric",
 ) -> None:
@@ -159,7 +159,7 @@ def _train_stage(
     load_weights(agent, weights)
 
 
-def load_agent(run: Run) -> PlanningAgent:
+def load_agent(run: Run) -> PlanningAgent[Any]:
     """The trained agent, ready to act."""
     agent = build_agent(run.recipe, fetch=False)
     load_weights(agent, run.weights)

@@ -1,0 +1,27 @@
+"""`foredrive recipes`."""
+
+from typing import Annotated
+
+import tyro
+
+
+def recipes(
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECIPE")] = None,
+) -> None:
+    """List the recipes, or print one as YAML, to be changed and given to `train` or `reconstruct`.
+
+    Args:
+        name: Print this recipe; without a name all are listed.
+    """
+    from foredrive.recipes.config import recipe_yaml
+    from foredrive.recipes.gaussians import REBUILD_RECIPES, find_rebuild_recipe
+    from foredrive.recipes.known import RECIPES, find_recipe
+
+    if name is not None:
+        recipe = find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name)
+        print(recipe_yaml(recipe), end="")
+        return
+    for verb, known in (("train", RECIPES), ("reconstruct", REBUILD_RECIPES)):
+        print(f"foredrive {verb}:")
+        for key, entry in known.items():
+            print(f"  {key:28} {entry.about}")

@@ -1,0 +1,82 @@
+"""The world models that recipes can name: their configs, how each is built and what it learns from."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from torch import nn
+
+from foredrive.data import ClipConfig
+from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.driveworld import DriveWorld, DriveWorldConfig
+from foredrive.models.nemo import Nemo, NemoConfig
+from foredrive.models.vgg import Vgg16Features
+from foredrive.scene import WorldModel
+from foredrive.training import DriveWorldObjective, DriveWorldStage, NemoObjective, NemoStage
+
+
+class WorldModelKind(NamedTuple):
+    """One kind of world model."""
+
+    config: type
+    """Frozen dataclass of its sizes; its `kind` is the key of `WORLD_MODELS`."""
+    stage: type
+    """Frozen dataclass of a training stage with the same `kind` and a `schedule`."""
+    build: Callable[[Any, ClipConfig, bool], WorldModel]
+    """Builds the model from its config and that of its clips; fetches named weights if the last is true."""
+    objective: Callable[[Any, PlanningAgent[Any], ClipConfig], nn.Module]
+    """Builds the module that maps an example to its losses from a stage and the agent."""
+
+
+def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
+    """Build a NeMo with fresh weights."""
+    return Nemo(
+        config,
+        clips.voxels,
+        past_frames=clips.past_frames,
+        max_steps=clips.future_frames,
+        dt_s=clips.frame_dt_s,
+        fetch=fetch,
+    )
+
+
+def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConfig) -> NemoObjective:
+    """Build NeMo's objective; without real VGG-16 weights the perceptual loss has weight 0."""
+    features = None
+    if stage.vgg16 is not None:
+        try:
+            features = Vgg16Features(stage.vgg16)
+        except (OSError, InputError) as error:
+            warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
+    return NemoObjective(
+        agent,
+        stage.weights,
+        steps=clips.future_frames if stage.imagine else 0,
+        ray_stride=stage.ray_stride,
+        image_features=features,
+    )
+
+
+def build_driveworld(config: DriveWorldConfig, clips: ClipConfig, fetch: bool) -> DriveWorld:
+    """Build a DriveWorld with fresh weights."""
+    return DriveWorld(config, clips.voxels, past_frames=clips.past_frames, dt_s=clips.frame_dt_s, fetch=fetch)
+
+
+def driveworld_objective(
+    stage: DriveWorldStage, agent: PlanningAgent[DriveWorld], clips: ClipConfig
+) -> DriveWorldObjective:
+    """Build DriveWorld's objective."""
+    return DriveWorldObjective(
+        agent,
+        stage.weights,
+        steps=clips.future_frames,
+        temporal=stage.temporal,
+        statics_of=stage.statics_of,
+    )
+
+
+WORLD_MODELS: dict[str, WorldModelKind] = {
+    "nemo": WorldModelKind(NemoConfig, NemoStage, build_nemo, nemo_objective),
+    "driveworld": WorldModelKind(DriveWorldConfig, DriveWorldStage, build_driveworld, driveworld_objective),
+}

@@ -1,0 +1,164 @@
+"""A world model that the package does not know: one row of a table takes it through everything."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from miniature import miniature
+from torch import Tensor, nn
+
+from foredrive.data import ClipConfig, LogPath
+from foredrive.losses import waypoint_loss
+from foredrive.models.agent import PlanningAgent
+from foredrive.recipes import Recipe
+from foredrive.recipes.config import load_recipe
+from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
+from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
+from foredrive.runs.drive.suite import DriveJob, DriveSuite, drive_one
+from foredrive.runs.evaluate.imagination import imagine_run
+from foredrive.runs.export import export_run
+from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.traffic.lane_graph import build_lane_graph
+from foredrive.training import Schedule
+from foredrive.view.log_times import LogTimes
+from foredrive.view.viewer import Viewer
+
+
+@dataclass(frozen=True)
+class FrozenConfig:
+    channels: int
+    kind: Literal["frozen"] = "frozen"
+
+
+@dataclass(frozen=True)
+class FrozenStage:
+    schedule: Schedule
+    kind: Literal["frozen"] = "frozen"
+
+
+class FrozenWorld(nn.Module):
+    """Believes in one learned volume, scaled by the mean brightness of the images, that never changes."""
+
+    samples_futures = False
+    max_steps = None
+    renderer = None
+
+    def __init__(self, config: FrozenConfig, clips: ClipConfig) -> None:
+        super().__init__()
+        self.spec, self.channels = clips.voxels, config.channels
+        self.past_frames, self.dt_s = clips.past_frames, clips.frame_dt_s
+        self.volume = nn.Parameter(torch.randn(config.channels, *clips.voxels.shape_zyx))
+
+    def observe(self, clip: Clip) -> Belief:
+        return self.encode(last_frames(clip, self.past_frames))
+
+    def encode(self, frames: Frames) -> Belief:
+        brightness = frames.images[:, -1].float().mean(dim=(1, 2, 3, 4)) / 255
+        return Belief(volume=brightness[:, None, None, None, None] * self.volume)
+
+    def imagine(
+        self,
+        belief: Belief,
+        steps: int,
+        actions: Float[Tensor, "b K A"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> list[Belief]:
+        still = torch.eye(4).expand(len(belief.volume), 4, 4)
+        return [replace(belief, T_now_ego=still) for _ in range(steps)]
+
+    def decode(self, belief: Belief) -> Decoded:
+        return Decoded(occupancy_logit=belief.volume.mean(dim=1), feature=belief.volume)
+
+    def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
+        return belief.volume
+
+
+class FrozenObjective(nn.Module):
+    def __init__(self, agent: PlanningAgent[FrozenWorld]) -> None:
+        super().__init__()
+        self.agent = agent
+
+    def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
+        output = self.agent(example.clip.observed(), 0)
+        return {"loss": waypoint_loss(output.plan, example.clip.future)}
+
+
+def build(config: FrozenConfig, clips: ClipConfig, fetch: bool) -> FrozenWorld:
+    return FrozenWorld(config, clips)
+
+
+def objective(stage: FrozenStage, agent: PlanningAgent[Any], clips: ClipConfig) -> FrozenObjective:
+    return FrozenObjective(agent)
+
+
+def recipe() -> Recipe[FrozenConfig, FrozenStage]:
+    small = miniature()
+    voxels = VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=2.0, shape_zyx=(2, 16, 16))
+    return Recipe(
+        name="frozen",
+        clips=replace(small.clips, voxels=voxels),
+        model=FrozenConfig(channels=4),
+        planner=small.planner,
+        pretrain=None,
+        finetune=FrozenStage(Schedule(batch_size=2, lr=1e-3, steps=2, warmup_steps=1)),
+    )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def known() -> Iterator[None]:
+    """The one row that a new world model adds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(WORLD_MODELS, "frozen", WorldModelKind(FrozenConfig, FrozenStage, build, objective))
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(log: LogPath, known: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return train_run(recipe(), [log], tmp_path_factory.mktemp("frozen"))
+
+
+def test_it_is_a_world_model_and_its_recipe_is_read_back(run: Run) -> None:
+    assert isinstance(FrozenWorld(FrozenConfig(channels=4), recipe().clips), WorldModel)
+    assert load_recipe(run.folder / "config.yaml") == recipe()
+    assert open_run(run.folder).weights.is_file()
+
+
+def test_it_is_evaluated_and_looked_at(run: Run, log: LogPath, tmp_path: Path) -> None:
+    summary = evaluate_run(run, [log], tmp_path).summary
+    assert summary["failed"] == 0
+    assert 0 <= summary["occupancy.above_ground.iou_now"] < 1
+    (seen,) = inspect_run(run, [log], 1)
+    assert seen.rendered is None
+    (imagined,) = imagine_run(run, log, seconds=2.0, samples=3, moments=1)  # beyond the recipe's own future
+    assert imagined.futures.shape[:2] == (1, 5)
+    assert imagined.rendered is None
+
+
+def test_it_is_viewed(run: Run, log: LogPath) -> None:
+    viewer = Viewer(LogTimes(log, 96, run), "localhost", 0)
+    viewer.show(20)  # far enough into the log for a clip
+    assert viewer.server.scene.get_handle_by_name("/plan") is not None
+    viewer.close()
+
+
+def test_it_is_exported(run: Run, log: LogPath, tmp_path: Path) -> None:
+    facts = export_run(run, [log], tmp_path, clips=1)
+    assert facts["largest_difference"]["model.onnx"]["waypoints_xy"] < 1e-4
+
+
+def test_it_drives(run: Run, tmp_path: Path) -> None:
+    graph = build_lane_graph(load_town_map("Town02"))
+    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
+    ends = graph.position(np.full(2, lane), np.array([20.0, 26.0]))
+    points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
+    routes = tmp_path / "one.xml"
+    routes.write_text(f'<routes><route id="a" town="Town02">{points}</route></routes>')
+    suite = DriveSuite(str(run.folder), str(routes), image_hw=(18, 32), vehicles=2, people=0)
+    drive = drive_one(DriveJob("a", 0), suite, tmp_path / "drives", threads=1)
+    assert drive
