@@ -54,7 +54,7 @@ def caption(situation: Situation, seed: int) -> str:
         *_traffic(seen, setting, words),
         *_crossing(seen, words),
         _on_foot(seen, words),
-        _parked(seen, words),
+        _parked(seen),
         _light(setting, words),
     ]
     return " ".join(f"{s[0].upper()}{s[1:]}." for s in sentences if s)
@@ -245,7 +245,7 @@ def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
     return f"{_counted(people)} {words.pick(f'{walkway} ', '')}{where}"
 
 
-def _parked(seen: Sequence[Thing], words: _Words) -> str:
+def _parked(seen: Sequence[Thing]) -> str:
     cars = [t for t in seen if t.parked]
     if not cars:
         return ""
