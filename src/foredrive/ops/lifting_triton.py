@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from foredrive.ops.lifting import join_levels
 from foredrive.ops.tiles import launch, neighbours, read, read_back
 
 
@@ -28,12 +29,7 @@ def lift_triton(
 
     The gradient of the values is added up by atomics: its last bits differ from run to run.
     """
-    sizes, start = [], 0
-    for value in values:
-        sizes.append((value.shape[2], value.shape[3], start))
-        start += value.shape[2] * value.shape[3]
-    levels = [value.flatten(2, 3) for value in values]
-    joined = torch.cat(levels, dim=2) if len(levels) > 1 else levels[0]
+    joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
     share = visible / visible.sum(1, keepdim=True).clamp_min(1)
     out: Tensor = _Lift.apply(
