@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
 from foredrive.data.logs import Log, LogPath
+from foredrive.data.setting import Place
 from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
 from foredrive.runs.search.sector_views import LogViews, Row
 from foredrive.search.facts import MANY, NOUNS
@@ -16,7 +17,6 @@ from foredrive.search.find import collapse
 from foredrive.search.phrases import SETTINGS
 from foredrive.search.towers import Towers, embed_prompt
 from foredrive.search.zero_shot import class_vectors, classify
-from foredrive.towns.labels.setting import PLACES
 
 RANKS = (1, 10, 100)
 GAP_S = 5.0
@@ -136,7 +136,7 @@ def _kind_of(fact: str) -> str:
     if fact in NOUNS.values():
         return "thing"
     if fact in SETTINGS:
-        return "place" if fact in PLACES else "conditions"
+        return "place" if fact in set(Place) else "conditions"
     return "number" if fact.startswith(MANY) else "manner"
 
 

@@ -16,7 +16,24 @@ from py123d.datatypes import (
 
 from foredrive.data.log_writer import FullOccupancy, LogWriter
 from foredrive.data.logs import Log, LogPath
-from foredrive.data.recorded import read_caption, read_occupancy, read_traffic_lights, read_visibility
+from foredrive.data.recorded import (
+    read_caption,
+    read_occupancy,
+    read_setting,
+    read_traffic_lights,
+    read_visibility,
+)
+from foredrive.data.setting import (
+    Doing,
+    LightColour,
+    ObjectKind,
+    Place,
+    Setting,
+    TimeOfDay,
+    Weather,
+    pack_setting,
+    unpack_setting,
+)
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
 
@@ -26,6 +43,12 @@ DEPTH_M = np.where(RNG.random(HW) < 0.2, np.inf, RNG.uniform(0.5, 600.0, HW)).as
 SEMANTIC = RNG.integers(0, 15, HW).astype(np.uint8)
 LIGHTS = {40: TrafficLightStatus.RED, 7: TrafficLightStatus.GREEN}
 INSTANCE = RNG.integers(0, 2**16, HW).astype(np.uint16)
+
+
+SETTING = Setting(
+    TimeOfDay.DUSK, Weather.FOG, Place.JUNCTION, Doing.FOLLOWS, 8.25, ObjectKind.VAN, LightColour.RED,
+    hour=17.7, clouds=0.3, rain_mmph=0.0, wetness=0.2, visibility_m=150.0,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +62,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
         plain,
         occupancy=FullOccupancy(spec, np.array([[1, 2, 3]]), np.array([-1]), np.zeros((1, 3), np.float32)),
         visibility=np.array([0.4, 1.0], np.float32),
+        setting=SETTING,
         caption="Noon, clear, on a street.",
         traffic_lights=LIGHTS,
         depth_m={"ahead": DEPTH_M},
@@ -58,11 +82,23 @@ def test_rows_of_a_frame_come_back_and_other_frames_have_none(log: Log) -> None:
     assert visibility is not None
     np.testing.assert_allclose(visibility, [0.4, 1.0], atol=5e-4)
     assert read_caption(log, 0) == "Noon, clear, on a street."
+    assert read_setting(log, 0) == SETTING
     assert occupancy is not None
     np.testing.assert_array_equal(occupancy.index_zyx, [[1, 2, 3]])
     assert read_traffic_lights(log, 0) == LIGHTS
     assert read_traffic_lights(log, 1) is None
-    assert read_visibility(log, 1) is read_caption(log, 1) is read_occupancy(log, 1) is None
+    for read in (read_visibility, read_caption, read_occupancy, read_setting):
+        assert read(log, 1) is None
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("weather", "drizzle"), ("place", None), ("leader", "ghost"), ("hour", "noon")]
+)
+def test_a_setting_that_is_none_is_refused(field: str, value: object) -> None:
+    plain = pack_setting(SETTING)
+    assert unpack_setting(plain) == SETTING
+    with pytest.raises((ValueError, TypeError)):
+        unpack_setting({**plain, field: value})
 
 
 def test_py123d_reads_label_images(log: Log) -> None:

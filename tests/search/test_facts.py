@@ -1,12 +1,18 @@
 """What is true of a view, and texts that say it."""
 
+import dataclasses
+from pathlib import Path
+
 import pytest
+import synthetic_log
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foredrive.data import LogPath
+from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
+from foredrive.data.setting import Doing, Place, Setting, TimeOfDay, Weather
 from foredrive.scene import Boxes, Category
 from foredrive.search.embedding import read_views
 from foredrive.search.facts import NOUNS, Thing, ViewFacts, _things, view_facts
@@ -132,6 +138,22 @@ def test_views_of_a_log_have_the_facts_of_what_lies_in_their_sector(log: LogPath
     turned = {name: sector._replace(camera=None, azimuth_rad=3.14) for name, sector in sectors.items()}
     behind = view_facts(opened, 10, turned)
     assert len({facts.things for facts in behind.values()}) == 1
+
+
+def test_time_weather_and_place_are_recorded_facts_not_a_caption_read_again(tmp_path: Path) -> None:
+    night = Setting(
+        TimeOfDay.NIGHT, Weather.FOG, Place.BRIDGE, Doing.WAITS, 0.0, None, None,
+        hour=23.0, clouds=1.0, rain_mmph=0.0, wetness=0.0, visibility_m=100.0,
+    )  # fmt: skip
+    specs = synthetic_log.cameras(24, 48)
+    plain = dataclasses.replace(synthetic_log.frame(0, specs), caption="Noon, rain, on a street.")
+    for setting, told in ((night, ("night", "fog", "bridge")), (None, (None, None, None))):
+        with LogWriter(tmp_path, "flat_train", f"log{told[0]}", specs, None, None, None) as writer:
+            writer.write(dataclasses.replace(plain, setting=setting))
+        opened = Log(LogPath(writer.folder, tmp_path))
+        sectors = {name: view.sector for name, view in read_views(opened, 0, 24, with_lidar=False).items()}
+        for facts in view_facts(opened, 0, sectors).values():
+            assert facts[:3] == told
 
 
 def test_a_caption_tells_all_of_a_view_in_one_way() -> None:

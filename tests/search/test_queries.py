@@ -1,7 +1,6 @@
 """What may be asked, and how examples and clips are written."""
 
 import dataclasses
-import itertools
 import json
 from pathlib import Path
 
@@ -16,9 +15,6 @@ from foredrive.runs.train import run as train
 from foredrive.search.query import Like, Query, parse_like
 from foredrive.search.rows import WHOLE
 from foredrive.search.scores import read_scores
-from foredrive.towns.conditions import CONDITIONS
-from foredrive.towns.labels.captions import Doing, Place, Situation, caption
-from foredrive.towns.labels.setting import read_setting
 
 
 @pytest.mark.parametrize(
@@ -107,28 +103,6 @@ def test_scores_come_by_frame(tmp_path: Path) -> None:
     path.write_text('{"frame": "a@17"}\n{"frame": "a"}\n')
     with pytest.raises(InputError, match="line 2"):
         read_scores(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "setting"),
-    [
-        ("clear", ("midday", "clear")),
-        ("morning", ("morning", "clear")),
-        ("overcast", ("midday", "overcast")),
-        ("dusk", ("dusk", "clear")),
-        ("night_rain", ("night", "rain")),
-        ("fog", ("morning", "fog")),
-    ],
-)
-def test_settings_are_read_back_out_of_captions(name: str, setting: tuple[str, str]) -> None:
-    for seed, place in itertools.product(range(12), Place):
-        told = caption(Situation(CONDITIONS[name], place, Doing.DRIVES, 8.0, ()), seed)
-        assert read_setting(told + " A van at night on a bridge in rain and fog.") == (*setting, place.value)
-
-
-def test_a_caption_of_somebody_elses_tells_what_its_first_sentence_does() -> None:
-    assert read_setting("A street. Rain at night.") == (None, None, "street")
-    assert read_setting("Two dogs. Rain at night.") == (None, None, None)
 
 
 def test_a_run_remembers_which_parts_of_its_logs_it_learned_from(log: LogPath, tmp_path: Path) -> None:

@@ -6,12 +6,13 @@ import re
 import numpy as np
 import pytest
 
+from foredrive.data.setting import Doing, LightColour, Place, Setting
+from foredrive.data.setting import ObjectKind as Kind
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import CONDITIONS, Conditions
-from foredrive.towns.labels.captions import Doing, Kind, Place, Situation, Thing, caption
+from foredrive.towns.labels.captions import Situation, Thing, caption
 from foredrive.towns.labels.situation import kind_of
-from foredrive.towns.traffic.lights import Light
 
 SEEDS = range(24)
 
@@ -21,9 +22,18 @@ def thing(kind: Kind, x: float, y: float, **changes: object) -> Thing:
     return dataclasses.replace(standing, **changes)
 
 
-def situation(*things: Thing, **changes: object) -> Situation:
-    plain = Situation(Conditions(), Place.STREET, Doing.DRIVES, 10.0, things)
-    return dataclasses.replace(plain, **changes)
+def situation(*things: Thing, conditions: Conditions = CONDITIONS["clear"], **changes: object) -> Situation:
+    plain = Setting(
+        time_of_day=conditions.time_of_day,
+        weather=conditions.weather,
+        place=Place.STREET,
+        doing=Doing.DRIVES,
+        speed_mps=10.0,
+        leader=None,
+        light=None,
+        **dataclasses.asdict(conditions),
+    )
+    return Situation(dataclasses.replace(plain, **changes), things)
 
 
 WALKER = thing(Kind.PEDESTRIAN, 12.0, -4.0, velocity_mps=np.array([0.0, 1.4]), on_road=True)
@@ -32,7 +42,7 @@ RAINY_NIGHT = situation(
     thing(Kind.CAR, 30.0, 3.0),
     WALKER,
     conditions=Conditions(hour=23.0, clouds=1.0, rain_mmph=30.0),
-    light=Light.RED,
+    light=LightColour.RED,
     doing=Doing.SLOWS,
 )
 
@@ -58,7 +68,11 @@ def test_language_varies_with_the_seed_alone() -> None:
     [
         (situation(thing(Kind.CAR, 20, 0, visibility=0.3)), "nearby", "car ahead|car in front"),
         (situation(thing(Kind.BUS, 60, 0)), "nearby", "bus"),
-        (situation(thing(Kind.BUS, 40, 0), conditions=Conditions(visibility_m=50.0)), "dense fog", "bus"),
+        (
+            situation(thing(Kind.BUS, 40, 0), conditions=Conditions(visibility_m=50.0)),
+            "dense fog",
+            "bus",
+        ),
         (situation(thing(Kind.CAR, 0, 9)), "a car (on|to) the left", "ahead|right"),
         (situation(thing(Kind.TRUCK, -12, 0)), "a truck behind", "ahead"),
         (
@@ -73,7 +87,8 @@ def test_language_varies_with_the_seed_alone() -> None:
         ),
         (
             situation(
-                thing(Kind.VAN, 25, 3, yaw=1.5, velocity_mps=np.array([0.0, 6.0])), doing=Doing.TURNS_LEFT
+                thing(Kind.VAN, 25, 3, yaw=1.5, velocity_mps=np.array([0.0, 6.0])),
+                doing=Doing.TURNS_LEFT,
             ),
             "a van (ahead|in front)",
             "across|crossing",
@@ -96,13 +111,13 @@ def test_language_varies_with_the_seed_alone() -> None:
             "walkway",
         ),
         (
-            situation(doing=Doing.TURNS_LEFT, place=Place.JUNCTION, light=Light.RED),
+            situation(doing=Doing.TURNS_LEFT, place=Place.JUNCTION, light=LightColour.RED),
             "a red traffic light ahead",
             "light is|light shows",
         ),
         (situation(dataclasses.replace(WALKER, on_road=False)), "a pedestrian", "cross|across"),
         (
-            situation(doing=Doing.WAITS, light=Light.RED, speed_mps=0.0),
+            situation(doing=Doing.WAITS, light=LightColour.RED, speed_mps=0.0),
             "waits at (the|a) red light",
             "light is|light shows|km/h",
         ),
@@ -140,3 +155,18 @@ def test_vans_and_riders_go_by_their_own_names() -> None:
     assert named(Category.BICYCLE, 1.7, 0.6, 1.7) is Kind.CYCLIST
     assert named(Category.MOTORCYCLE, 2.1, 0.8, 1.5) is Kind.MOTORCYCLE
     assert all(named(category, 5.5, 2.0, 2.3) for category in Category)
+
+
+@pytest.mark.parametrize(
+    ("name", "facts"),
+    [
+        ("clear", ("midday", "clear")),
+        ("morning", ("morning", "clear")),
+        ("overcast", ("midday", "overcast")),
+        ("dusk", ("dusk", "clear")),
+        ("night_rain", ("night", "rain")),
+        ("fog", ("morning", "fog")),
+    ],
+)
+def test_conditions_in_words(name: str, facts: tuple[str, str]) -> None:
+    assert (CONDITIONS[name].time_of_day, CONDITIONS[name].weather) == facts

@@ -5,7 +5,9 @@ import pytest
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from foredrive.errors import InputError
 from foredrive.towns.place.mesh import Mesh, triangles
+from foredrive.towns.sensing.embree import check_release
 from foredrive.towns.sensing.raycast import PlacedShapes, Surroundings, TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
@@ -86,3 +88,11 @@ def test_nobody_there() -> None:
     assert world.cast(start, ahead).t[0] == pytest.approx(5.0)
     assert world.cast(start, away).triangle[0] == MISS
     assert np.isinf(world.cast(start, away).t[0])
+
+
+def test_an_embree_with_other_structs_is_refused() -> None:
+    check_release(40400)
+    check_release(40403)
+    for version, told in ((40399, r"4\.3\.99"), (40500, r"4\.5\.0"), (50400, r"5\.4\.0")):
+        with pytest.raises(InputError, match=told):
+            check_release(version)

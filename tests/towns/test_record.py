@@ -21,7 +21,7 @@ from foredrive.data.labels import make_labels
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.data.logs import Log, LogPath
 from foredrive.data.maps import read_map_patch
-from foredrive.data.recorded import read_caption, read_traffic_lights, read_visibility
+from foredrive.data.recorded import read_caption, read_setting, read_traffic_lights, read_visibility
 from foredrive.data.recorded_labels import recorded_labels
 from foredrive.errors import InputError
 from foredrive.scene import Category, MapKind, VoxelSpec
@@ -283,6 +283,13 @@ def test_every_frame_has_a_caption(recording: LogPath) -> None:
     assert all(caption and caption.endswith(".") for caption in captions)
 
 
+def test_every_frame_has_its_setting(recording: LogPath) -> None:
+    log = Log(recording)
+    settings = [read_setting(log, frame) for frame in range(FRAMES)]
+    assert [setting.speed_mps for setting in settings] == pytest.approx(log.speed_mps, abs=0.05)
+    assert len({(setting.time_of_day, setting.weather, setting.hour) for setting in settings}) == 1
+
+
 def test_the_map_is_around_the_vehicle(recording: LogPath) -> None:
     log = Log(recording)
     patch = read_map_patch(log, 0)
@@ -333,7 +340,7 @@ def test_labels_may_be_left_out(tmp_path: Path) -> None:
     bare = LabelKinds(occupancy=None, visibility=False, captions=False)
     sensors = SensorSuite(camera_rig((12, 16)), roof_lidar(channels=4, azimuth_steps=36))
     log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, Crowd(4, 2), bare))
-    assert read_visibility(log, 0) is read_caption(log, 0) is None
+    assert read_visibility(log, 0) is read_caption(log, 0) is read_setting(log, 0) is None
     assert not list(log.path.folder.glob("custom.[!l]*"))
     boxes = read_boxes(log, 0)
     assert boxes is not None

@@ -63,6 +63,7 @@ from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
     LIDAR_BEAMS,
+    SETTING,
     TAUGHT_PLAN,
     FullOccupancy,
     occupancy_metadata,
@@ -71,6 +72,7 @@ from foredrive.data.modalities import (
     pack_plan,
     pack_visibility,
 )
+from foredrive.data.setting import Setting, pack_setting
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import log_so3, matrix_from_yaw
@@ -127,6 +129,7 @@ class Frame:
     """Returns from each of `boxes`: 0 where it is hidden; None if they were not counted."""
     visibility: Float[np.ndarray, "M"] | None = None
     """Share of each of `boxes` that the cameras see of what they would if nothing hid it, 0 to 1."""
+    setting: Setting | None = None
     caption: str | None = None
     taught: Trajectory | None = None
     """What a teacher would do from here, unbatched, in the ego frame at `t_us`."""
@@ -227,6 +230,8 @@ class LogWriter:
             modalities.append(self._occupancy(frame.t_us, frame.occupancy))
         if frame.visibility is not None:
             modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
+        if frame.setting is not None:
+            modalities.append(_custom(frame, SETTING, pack_setting(frame.setting)))
         if frame.caption is not None:
             modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
         if frame.taught is not None:

@@ -1,5 +1,5 @@
-"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility, captions,
-what a teacher would do.
+"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility,
+settings, captions, what a teacher would do.
 
 All travel as 123D custom modalities, one row a frame; arrays are zstd-compressed one by one, so that a row
 can be read without touching its neighbours.
@@ -20,6 +20,8 @@ from foredrive.scene import LidarSweep, Trajectory, VoxelSpec
 LIDAR_BEAMS = "lidar_beams"
 FULL_OCCUPANCY = "full_occupancy"
 BOX_VISIBILITY = "box_visibility"
+SETTING = "setting"
+"""The facts of `data.setting.Setting`, words and numbers by their names."""
 CAPTION = "caption"
 """One text a frame."""
 TAUGHT_PLAN = "taught_plan"

@@ -11,12 +11,14 @@ from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
     FULL_OCCUPANCY,
+    SETTING,
     TAUGHT_PLAN,
     FullOccupancy,
     unpack_occupancy,
     unpack_plan,
     unpack_visibility,
 )
+from foredrive.data.setting import Setting, unpack_setting
 from foredrive.scene import Trajectory
 
 
@@ -29,6 +31,17 @@ def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
     with reading(log.file(f"custom.{BOX_VISIBILITY}"), f"the visibility at frame {frame}"):
         row = _row(log, frame, BOX_VISIBILITY)
         return None if row is None else from_numpy(unpack_visibility(row.data))
+
+
+def read_setting(log: Log, frame: int) -> Setting | None:
+    """Return the facts of a frame; None if they were not recorded.
+
+    Raises:
+        InputError: on a row that cannot be read.
+    """
+    with reading(log.file(f"custom.{SETTING}"), f"the setting at frame {frame}"):
+        row = _row(log, frame, SETTING)
+        return None if row is None else unpack_setting(row.data)
 
 
 def read_caption(log: Log, frame: int) -> str | None:

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.lifting_kernels import BLOCK, Gradients, Inputs, lift_pairs, lift_pairs_backward
+from foredrive.ops.corners import BLOCK
+from foredrive.ops.lifting_kernels import Gradients, Inputs, lift_pairs, lift_pairs_backward
 from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
 from foredrive.ops.threads import in_parallel
 
@@ -59,15 +60,22 @@ def lift(
     if not (small and points <= BLOCK and numba_can(*values, uv, offsets, weights)):
         return lift_reference(values, uv, visible, offsets, weights)
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
-        sizes, start = [], 0
-        for value in values:
-            sizes.append((value.shape[2], value.shape[3], start))
-            start += value.shape[2] * value.shape[3]
-        levels = [value.flatten(2, 3) for value in values]
-        joined = torch.cat(levels, dim=2) if len(levels) > 1 else levels[0]
+        joined, sizes = join_levels(values)
         pairs = _visible_pairs(uv, visible)
         out: Tensor = _Lift.apply(joined, offsets, weights, np.array(sizes, np.int32), pairs)
         return out
+
+
+def join_levels(
+    values: Sequence[Float[Tensor, "b C _h _w D"]],
+) -> tuple[Float[Tensor, "b C S D"], list[tuple[int, int, int]]]:
+    """All levels' pixels one after the other, and each level's height, width and first pixel."""
+    sizes, start = [], 0
+    for value in values:
+        sizes.append((value.shape[2], value.shape[3], start))
+        start += value.shape[2] * value.shape[3]
+    levels = [value.flatten(2, 3) for value in values]
+    return torch.cat(levels, dim=2) if len(levels) > 1 else levels[0], sizes
 
 
 def lift_reference(

@@ -1,32 +1,15 @@
 """Numba kernels of `foredrive.ops.lifting`: what visible pairs read from all levels, and its gradients.
 
-A pair is a query and a camera that sees it. Pairs go through in blocks of some hundred points, head by head:
-the points' coordinates are collected, then turned into corners and weights by loops that LLVM vectorises over
-points, then the corners are read eight channels at a time.
+A pair is a query and a camera that sees it. Pairs go through in blocks of some hundred points, head by head
+and, within a block, level by level.
 """
 
 from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import (
-    HALF,
-    ONE,
-    WIDTH,
-    ZERO,
-    add_dots,
-    kernel,
-    kernel_part,
-    load,
-    mul_add,
-    neighbours,
-    store,
-    zeros8,
-)
-
-BLOCK = 256
-"""Most points prepared at once: their buffers stay in the first-level cache. Buffers are flat, with rows of
-constant length, which lets LLVM see that rows do not overlap."""
+from foredrive.ops.corners import BLOCK, Block, new_block, read_point, send_back
+from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, neighbours, store, zeros8
 
 
 class Inputs(NamedTuple):
@@ -59,36 +42,12 @@ class Gradients(NamedTuple):
     weights: np.ndarray
 
 
-class _Block(NamedTuple):
-    """The points of a block of pairs, of one head, level by level; row k of a buffer begins at k · BLOCK."""
-
-    x: np.ndarray
-    """Float, integers are pixel centres."""
-    y: np.ndarray
-    weight: np.ndarray
-    """Float, attention weight times the camera's share."""
-    corner: np.ndarray
-    """Int32, four rows: where the pixels around a point lie in its image's memory."""
-    part: np.ndarray
-    """Float, four rows: their parts of the weight."""
-    dots: np.ndarray
-    """Float, four in a row for each point: what the pixels hold, times the gradient of the result."""
-
-
-@kernel_part
-@no_type_check
-def _new_block():
-    x, y, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    part, dots = np.empty(4 * BLOCK, np.float32), np.empty(4 * BLOCK, np.float32)
-    return _Block(x, y, weight, np.empty(4 * BLOCK, np.int32), part, dots)
-
-
 @kernel_part
 @no_type_check
 def _level(block, start):
     """The buffers from a level's first point on."""
-    x, y, weight = block.x[start:], block.y[start:], block.weight[start:]
-    return _Block(x, y, weight, block.corner[start:], block.part[start:], block.dots[4 * start :])
+    place, weight = block.place[start:], block.weight[start:]
+    return Block(place, weight, block.corner[start:], block.part[start:], block.dots[4 * start :])
 
 
 @kernel_part
@@ -104,8 +63,8 @@ def _collect(inputs, block, first, last, head):
             v = inputs.uv[pair, 1] * np.float32(inputs.sizes[level, 0]) - HALF
             i = level * count + (pair - first) * points
             for p in range(points):
-                block.x[i + p] = u + inputs.offsets[q, head, level, p, 0]
-                block.y[i + p] = v + inputs.offsets[q, head, level, p, 1]
+                block.place[i + p] = u + inputs.offsets[q, head, level, p, 0]
+                block.place[BLOCK + i + p] = v + inputs.offsets[q, head, level, p, 1]
                 block.weight[i + p] = inputs.weights[q, head, level, p] * share
     for level in range(levels):
         _corners(_level(block, level * count), count, inputs.sizes[level], np.int32(inputs.values.shape[2]))
@@ -118,7 +77,7 @@ def _corners(block, count, size, channels):
     height, width, start = size
     corner, part = block.corner, block.part
     for i in range(count):
-        x, y = block.x[i], block.y[i]
+        x, y = block.place[i], block.place[BLOCK + i]
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
         w = block.weight[i] if (x == x) & (y == y) else np.float32(np.nan)
@@ -145,11 +104,7 @@ def _read(inputs, block, first, last, channel, zero, out):
         for level in range(levels):
             i = (level * (last - first) + pair - first) * points
             for p in range(i, i + points):
-                point = zero
-                for k in range(4):
-                    value = load(inputs.values, base + block.corner[k * BLOCK + p], zero)
-                    point = mul_add(block.part[k * BLOCK + p], value, point)
-                total = mul_add(ONE, point, total)
+                total = read_point(inputs.values, base, block, p, 4, total, zero)
         store(out, at, total)
 
 
@@ -159,7 +114,7 @@ def lift_pairs(inputs, first_pair, last_pair, out):
     """Add what the pairs first_pair … last_pair read to `out`, Float[b·Q D]. L·P ≤ BLOCK."""
     heads, width = inputs.weights.shape[1], inputs.values.shape[2] // inputs.weights.shape[1]
     whole = width - width % WIDTH
-    block, step = _new_block(), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
+    block, step = new_block(2), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
     for first in range(first_pair, last_pair, step):
         last = min(first + step, last_pair)
         for head in range(heads):
@@ -177,29 +132,13 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
     """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
     levels, points = inputs.weights.shape[2:]
     pixels, channels = inputs.values.shape[1:]
-    corner = block.corner
-    to_values, to_points = grads.values.size > 0, grads.weights.size > 0
     for pair in range(first, last):
         base = inputs.image[pair] * pixels * channels + channel
         grad = load(grads.out, inputs.query[pair] * channels + channel, zero)
         for level in range(levels):
             i = (level * (last - first) + pair - first) * points
             for p in range(i, i + points):
-                if to_points:
-                    add_dots(
-                        block.dots,
-                        4 * p,
-                        load(inputs.values, base + corner[p], zero),
-                        load(inputs.values, base + corner[BLOCK + p], zero),
-                        load(inputs.values, base + corner[2 * BLOCK + p], zero),
-                        load(inputs.values, base + corner[3 * BLOCK + p], zero),
-                        grad,
-                    )
-                if to_values:
-                    for k in range(4):
-                        at = base + corner[k * BLOCK + p]
-                        total = load(grads.values, at, zero)
-                        store(grads.values, at, mul_add(block.part[k * BLOCK + p], grad, total))
+                send_back(inputs.values, base, block, p, 4, grad, zero, grads.values, grads.weights.size > 0)
 
 
 @kernel_part
@@ -209,8 +148,8 @@ def _slopes(block, count, size):
     height, width, _ = size
     dots, slope = block.dots, block.part
     for i in range(count):
-        _, _, wx0, wx1, dx0, dx1 = neighbours(block.x[i], width)
-        _, _, wy0, wy1, dy0, dy1 = neighbours(block.y[i], height)
+        _, _, wx0, wx1, dx0, dx1 = neighbours(block.place[i], width)
+        _, _, wy0, wy1, dy0, dy1 = neighbours(block.place[BLOCK + i], height)
         d00, d01, d10, d11 = dots[4 * i], dots[4 * i + 1], dots[4 * i + 2], dots[4 * i + 3]
         w = block.weight[i]
         slope[i] = w * (wy0 * (dx0 * d00 + dx1 * d01) + wy1 * (dx0 * d10 + dx1 * d11))
@@ -248,7 +187,7 @@ def lift_pairs_backward(inputs, first_pair, last_pair, head, grads):
     width = inputs.values.shape[2] // inputs.weights.shape[1]
     start = head * width
     whole = width - width % WIDTH
-    block, step = _new_block(), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
+    block, step = new_block(2), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
     for first in range(first_pair, last_pair, step):
         last = min(first + step, last_pair)
         _collect(inputs, block, first, last, head)

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.tiles import neighbours, read, read_back, tile_of
+from foredrive.ops.lifting import join_levels
+from foredrive.ops.tiles import launch, neighbours, read, read_back
 
 
 def lift_triton(
@@ -28,12 +29,7 @@ def lift_triton(
 
     The gradient of the values is added up by atomics: its last bits differ from run to run.
     """
-    sizes, start = [], 0
-    for value in values:
-        sizes.append((value.shape[2], value.shape[3], start))
-        start += value.shape[2] * value.shape[3]
-    levels = [value.flatten(2, 3) for value in values]
-    joined = torch.cat(levels, dim=2) if len(levels) > 1 else levels[0]
+    joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
     share = visible / visible.sum(1, keepdim=True).clamp_min(1)
     out: Tensor = _Lift.apply(
@@ -88,27 +84,9 @@ class _Lift(torch.autograd.Function):
 
 def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | None], **flags: bool) -> None:
     values, _, weights, uv, _, _ = inputs
-    queries, heads, levels, points = weights.shape[1:]
-    rows, width = len(weights) * queries * heads, values.shape[-1] // heads
-    tile = tile_of(points, width)
-    if rows * values.numel() == 0:
-        return
-    kernel[(triton.cdiv(rows, tile.rows),)](
-        *inputs,
-        *outputs,
-        rows,
-        queries,
-        uv.shape[1],
-        values.shape[2],
-        levels,
-        HEADS=heads,
-        POINTS=points,
-        WIDTH=width,
-        ROWS=tile.rows,
-        P=tile.points,
-        W=tile.channels,
-        **flags,
-    )
+    if values.numel():
+        sizes = (uv.shape[1], values.shape[2], weights.shape[3])
+        launch(kernel, [*inputs, *outputs], sizes, weights, values.shape[-1], **flags)
 
 
 @triton.jit

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.ops.precision import numba_can
-from foredrive.ops.rows import ROW
 from foredrive.ops.set_attention_kernels import attend_sets
 from foredrive.ops.threads import in_parallel
+from foredrive.ops.vectors import ROW
 
 MIN_SETS = 8
 """Fewer are not worth a thread of their own."""

@@ -4,19 +4,21 @@ from typing import no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import inlined_part, kernel
-from foredrive.ops.rows import (
+from foredrive.ops.vectors import (
+    ONE,
     ROW,
+    ZERO,
     exp2_row,
     greatest,
     greatest_in,
+    inlined_part,
+    kernel,
     load_row,
     row_of,
-    store_row,
+    store,
     total_of,
 )
 
-ZERO, ONE = np.float32(0), np.float32(1)
 SCALE = np.float32(np.log2(np.e) / np.sqrt(ROW))
 """1 / √d, and powers of 2 in place of e."""
 NOTHING = np.float32(-1e30)
@@ -40,15 +42,15 @@ def attend_sets(first, last, query_key, value, order, ends, largest, out):
         for channel in range(0, width, ROW):
             _pack(query_key, value, tokens, channel, room, keys, values)
             for token in tokens:
-                store_row(query, 0, load_row(query_key, 2 * width * token + channel) * SCALE)
+                store(query, 0, load_row(query_key, 2 * width * token + channel) * SCALE)
                 best = _fits(query, keys, start, room, blocks, share)
                 total = row_of(ZERO)
                 for block in range(blocks):
                     part = exp2_row(load_row(share, ROW * block) - best)
-                    store_row(share, ROW * block, part)
+                    store(share, ROW * block, part)
                     total = total + part
                 mean = _weigh(share, values, blocks) * (ONE / total_of(total))
-                store_row(out, width * token + channel, mean)
+                store(out, width * token + channel, mean)
 
 
 @inlined_part
@@ -58,11 +60,11 @@ def _pack(query_key, value, tokens, channel, room, keys, values):
     width, count = value.shape[1], len(tokens)
     for place in range(count):
         token = tokens[place]
-        store_row(values, ROW * place, load_row(value, width * token + channel))
+        store(values, ROW * place, load_row(value, width * token + channel))
         for k in range(ROW):
             keys[room * k + place] = query_key[token, width + channel + k]
     for place in range(count, (count + ROW - 1) // ROW * ROW):
-        store_row(values, ROW * place, row_of(ZERO))
+        store(values, ROW * place, row_of(ZERO))
         for k in range(ROW):
             keys[room * k + place] = ZERO
 
@@ -78,7 +80,7 @@ def _fits(query, keys, start, room, blocks, share):
             even = even + load_row(keys, room * k + ROW * block) * query[k]
             odd = odd + load_row(keys, room * (k + 1) + ROW * block) * query[k + 1]
         fit = even + odd
-        store_row(share, ROW * block, fit)
+        store(share, ROW * block, fit)
         best = greatest(best, fit)
     return greatest_in(best)
 

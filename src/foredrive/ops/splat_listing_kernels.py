@@ -4,7 +4,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import inlined_part, kernel
+from foredrive.ops.vectors import inlined_part, kernel
 
 LOG2_E = np.float32(1.4426950408889634)
 ZERO, HALF = np.float32(0), np.float32(0.5)

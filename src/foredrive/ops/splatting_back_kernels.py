@@ -8,35 +8,36 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import inlined_part, kernel
-from foredrive.ops.rows import (
-    ROW,
-    bits_more,
-    least,
-    load_row,
-    lowest_bit,
-    row_of,
-    store_row,
-    totals,
-    where_more,
-)
 from foredrive.ops.splat_listing_kernels import MEAN_X, turned
 from foredrive.ops.splatting_kernels import (
     ALL,
     BATCH,
     EXTRA,
-    HALF,
     MAX_ALPHA,
     MIN_LEFT,
-    ONE,
     POINTS,
-    ZERO,
     aligned,
     gather_hits,
     look_for,
     offsets,
     opacity_at,
     range_at,
+)
+from foredrive.ops.vectors import (
+    HALF,
+    ONE,
+    ROW,
+    ZERO,
+    bits_more,
+    inlined_part,
+    kernel,
+    least,
+    load_row,
+    lowest_bit,
+    row_of,
+    store,
+    totals,
+    where_more,
 )
 
 SUMS = 12
@@ -90,11 +91,11 @@ def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
         grad = load_row(state, at)
         worth = worth + grad * feature[d]
         to_feature = (SUMS + d) * ROW
-        store_row(sums, to_feature, load_row(sums, to_feature) + weight * grad)
+        store(sums, to_feature, load_row(sums, to_feature) + weight * grad)
         at += ROW
     behind = load_row(state, base + ROW) - weight * worth
-    store_row(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
-    store_row(state, base + ROW, behind)
+    store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
+    store(state, base + ROW, behind)
     slope = weight * worth - alpha * behind / (row_of(ONE) - alpha)
     return bits_more(passed, MIN_LEFT) != 0, where_more(opacity, MAX_ALPHA, ZERO, slope), weight * to_range
 
@@ -128,7 +129,7 @@ def composite_back(start, stop, scene, places, out, grad_out, pairs):
                 going = _pass_back(scene, places, tile, at, blocks, going, hits, state, sums)
                 pair = scene.slot[at] * pairs.shape[1]
                 for c in range(0, pairs.shape[1], ROW):
-                    store_row(pairs, pair + c, totals(sums, c * ROW))
+                    store(pairs, pair + c, totals(sums, c * ROW))
             if going == 0:
                 break
 
@@ -142,7 +143,7 @@ def _pass_back(scene, places, tile, at, blocks, going, hits, state, sums):
     x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = row_of(ZERO)
     for d in range(feature.size):
-        store_row(sums, (SUMS + d) * ROW, s0)
+        store(sums, (SUMS + d) * ROW, s0)
     while blocks != 0:
         block = lowest_bit(blocks)
         blocks &= blocks - np.uint32(1)
@@ -157,7 +158,7 @@ def _pass_back(scene, places, tile, at, blocks, going, hits, state, sums):
         s6, s7 = s6 + ex * t, s7 + ey * t
         s8, s9, s10, s11 = s8 + h, s9 + h * dx, s10 + h * dy, s11 + h * t
     for k, row in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)):
-        store_row(sums, k * ROW, row)
+        store(sums, k * ROW, row)
     return going
 
 

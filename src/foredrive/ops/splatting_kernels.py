@@ -8,20 +8,6 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import inlined_part, kernel
-from foredrive.ops.rows import (
-    ROW,
-    bits_more,
-    exp2_row,
-    greatest,
-    least,
-    load_row,
-    lowest_bit,
-    prefetch,
-    row_of,
-    store_row,
-    where_more,
-)
 from foredrive.ops.splat_listing_kernels import (
     LEAST,
     LOG_OPACITY,
@@ -40,8 +26,25 @@ from foredrive.ops.splat_listing_kernels import (
     YY,
     turned,
 )
+from foredrive.ops.vectors import (
+    HALF,
+    ONE,
+    ROW,
+    ZERO,
+    bits_more,
+    exp2_row,
+    greatest,
+    inlined_part,
+    kernel,
+    least,
+    load_row,
+    lowest_bit,
+    prefetch,
+    row_of,
+    store,
+    where_more,
+)
 
-ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 MIN_ALPHA, MAX_ALPHA, MIN_LEFT = np.float32(1 / 255), np.float32(0.999), np.float32(1e-4)
 POINTS = ROW * ROW
 """Slots of a tile."""
@@ -154,8 +157,8 @@ def _start(state, columns):
     state[:] = 0
     for block in range(ROW):
         base = block * columns * ROW
-        store_row(state, base, row_of(ONE))
-        store_row(state, base + 2 * ROW, row_of(np.float32(np.inf)))
+        store(state, base, row_of(ONE))
+        store(state, base + 2 * ROW, row_of(np.float32(np.inf)))
 
 
 @inlined_part
@@ -167,18 +170,18 @@ def _add(splat, feature, base, state, dx, dy, t, hit):
     passed = left - left * alpha
     weight = where_more(passed, MIN_LEFT, left * alpha, ZERO)
     range_m = range_at(splat, dx, dy, t)
-    store_row(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
-    store_row(state, base + ROW, load_row(state, base + ROW) + weight * range_m)
+    store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
+    store(state, base + ROW, load_row(state, base + ROW) + weight * range_m)
     crossed = where_more(weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO)  # 0.5 where it may cross
     crossed = where_more(passed, HALF, ZERO, crossed)
     median = load_row(state, base + 2 * ROW)
-    store_row(state, base + 2 * ROW, where_more(crossed, ZERO, range_m, median))
-    store_row(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
+    store(state, base + 2 * ROW, where_more(crossed, ZERO, range_m, median))
+    store(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
     nearer = where_more(hit, range_m, weight, ZERO)
-    store_row(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
+    store(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
     at = base + (EXTRA + 1) * ROW
     for d in range(feature.size):
-        store_row(state, at, load_row(state, at) + weight * feature[d])
+        store(state, at, load_row(state, at) + weight * feature[d])
         at += ROW
     return bits_more(passed, MIN_LEFT) != 0
 

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.rows import ROW
 from foredrive.ops.splat_listing_kernels import (
     COLUMNS,
     Raw,
@@ -22,6 +21,7 @@ from foredrive.ops.splat_points import TiledPoints
 from foredrive.ops.splatting_back_kernels import SUMS, Gradients, composite_back, gather_gradients
 from foredrive.ops.splatting_kernels import EXTRA, Places, Scene, composite_tiles
 from foredrive.ops.threads import in_parallel
+from foredrive.ops.vectors import ROW
 
 MIN_SPLATS, MIN_TILES = 4096, 8
 """Fewer are not worth a thread of their own."""

@@ -5,10 +5,12 @@ GPU the kernels run in Triton's interpreter if TRITON_INTERPRET=1 is set before 
 tests do it.
 """
 
-from typing import NamedTuple, no_type_check
+from collections.abc import Sequence
+from typing import Any, NamedTuple, no_type_check
 
 import triton
 import triton.language as tl
+from torch import Tensor
 
 TILE = 1024
 """Numbers in a tile: eight to a thread."""
@@ -31,10 +33,45 @@ def tile_of(points: int, channels: int) -> Tile:
     return Tile(rows=max(min(TILE // wide, PLACES) // many, 1), points=many, channels=wide)
 
 
+def launch(
+    kernel: Any,
+    tensors: Sequence[Tensor | None],
+    sizes: Sequence[int],
+    weights: Tensor,
+    channels: int,
+    **flags: bool,
+) -> None:
+    """Run a kernel over all rows.
+
+    Args:
+        tensors: its first arguments; then come the numbers of rows and of queries.
+        sizes: its next ones.
+        weights: [b Q H … P], of what is read.
+        channels: of all heads.
+    """
+    (queries, heads), points = weights.shape[1:3], weights.shape[-1]
+    rows, width = len(weights) * queries * heads, channels // heads
+    tile = tile_of(points, width)
+    if rows:
+        kernel[(triton.cdiv(rows, tile.rows),)](
+            *tensors,
+            rows,
+            queries,
+            *sizes,
+            HEADS=heads,
+            POINTS=points,
+            WIDTH=width,
+            ROWS=tile.rows,
+            P=tile.points,
+            W=tile.channels,
+            **flags,
+        )
+
+
 @triton.jit
 @no_type_check
 def neighbours(x, size):
-    """See `lanes.neighbours`: the cells beside a coordinate whose integers are cell centres."""
+    """See `vectors.neighbours`: the cells beside a coordinate whose integers are cell centres."""
     x = tl.where(x > -2.0, x, -2.0)  # NaN goes there too
     x = tl.where(x < size, x, size * 1.0)
     floor = tl.floor(x)

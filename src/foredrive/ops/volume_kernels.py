@@ -1,32 +1,14 @@
 """Numba kernels behind `sample_volume` and `attend_volume`: weighted sums of trilinear readings.
 
-Queries go through in blocks of some hundred points: the points' coordinates are collected, then turned into
-corners and weights by loops that LLVM vectorises over points, then the corners are read eight channels at a
-time.
+Queries go through in blocks of some hundred points, head by head.
 """
 
 from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.lanes import (
-    HALF,
-    ONE,
-    WIDTH,
-    ZERO,
-    add_dots,
-    kernel,
-    kernel_part,
-    load,
-    mul_add,
-    neighbours,
-    store,
-    zeros8,
-)
-
-BLOCK = 256
-"""Most points prepared at once: their buffers stay in the first-level cache. Buffers are flat, with rows of
-constant length, which lets LLVM see that rows do not overlap."""
+from foredrive.ops.corners import BLOCK, new_block, read_point, send_back
+from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, neighbours, store, zeros8
 
 
 class Inputs(NamedTuple):
@@ -58,29 +40,6 @@ class Reader(NamedTuple):
     first_channel: int
     last_channel: int
     slot: int
-
-
-class _Block(NamedTuple):
-    """The points of a block of queries, of one head; row k of a buffer begins at k · BLOCK."""
-
-    place: np.ndarray
-    """Float, rows x y z; integers are voxel centres."""
-    weight: np.ndarray
-    """Float, one row."""
-    corner: np.ndarray
-    """Int32, eight rows: where the voxels around a point lie in its volume's memory."""
-    part: np.ndarray
-    """Float, eight rows: their parts of the weight."""
-    dots: np.ndarray
-    """Float, eight in a row for each point: what the voxels hold, times the gradient of the result."""
-
-
-@kernel_part
-@no_type_check
-def _new_block():
-    corner = np.empty(8 * BLOCK, np.int32)
-    part, dots = np.empty(8 * BLOCK, np.float32), np.empty(8 * BLOCK, np.float32)
-    return _Block(np.empty(3 * BLOCK, np.float32), np.empty(BLOCK, np.float32), corner, part, dots)
 
 
 @kernel_part
@@ -141,11 +100,7 @@ def _read(inputs, block, item, first, last, channel, zero, out):
         total = zero
         i = (q - first) * points
         for p in range(i, i + points):
-            point = zero
-            for k in range(8):
-                value = load(inputs.values, base + block.corner[k * BLOCK + p], zero)
-                point = mul_add(block.part[k * BLOCK + p], value, point)
-            total = mul_add(ONE, point, total)
+            total = read_point(inputs.values, base, block, p, 8, total, zero)
         store(out, (item * queries + q) * channels + channel, total)
 
 
@@ -156,7 +111,7 @@ def read_queries(inputs, item, first_query, last_query, out):
     heads = inputs.weights.shape[2]
     width = inputs.values.shape[4] // heads
     whole = width - width % WIDTH
-    block, step = _new_block(), BLOCK // inputs.weights.shape[3]
+    block, step = new_block(3), BLOCK // inputs.weights.shape[3]
     for first in range(first_query, last_query, step):
         last = min(first + step, last_query)
         for head in range(heads):
@@ -175,30 +130,12 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
     points, channels = inputs.weights.shape[3], inputs.values.shape[4]
     queries = grads.out.shape[1]
     base = item * inputs.values[0].size + channel
-    to_values, to_points = grads.values.size > 0, grads.points.size + grads.weights.size > 0
+    to_points = grads.points.size + grads.weights.size > 0
     for q in range(first, last):
         grad = load(grads.out, (item * queries + q) * channels + channel, zero)
         i = (q - first) * points
         for p in range(i, i + points):
-            if to_points:
-                for k in range(0, 8, 4):
-                    add_dots(
-                        block.dots,
-                        8 * p + k,
-                        load(inputs.values, base + block.corner[k * BLOCK + p], zero),
-                        load(inputs.values, base + block.corner[(k + 1) * BLOCK + p], zero),
-                        load(inputs.values, base + block.corner[(k + 2) * BLOCK + p], zero),
-                        load(inputs.values, base + block.corner[(k + 3) * BLOCK + p], zero),
-                        grad,
-                    )
-            if to_values:
-                for k in range(8):
-                    at = base + block.corner[k * BLOCK + p]
-                    store(
-                        grads.values,
-                        at,
-                        mul_add(block.part[k * BLOCK + p], grad, load(grads.values, at, zero)),
-                    )
+            send_back(inputs.values, base, block, p, 8, grad, zero, grads.values, to_points)
 
 
 @kernel_part
@@ -257,7 +194,7 @@ def read_back(inputs, item, reader, grads):
     """
     width = reader.last_channel - reader.first_channel
     whole = reader.first_channel + width - width % WIDTH
-    block, step = _new_block(), BLOCK // inputs.weights.shape[3]
+    block, step = new_block(3), BLOCK // inputs.weights.shape[3]
     queries = inputs.weights.shape[1]
     for first in range(0, queries, step):
         last = min(first + step, queries)

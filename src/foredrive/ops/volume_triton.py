@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.tiles import neighbours, read, read_back, tile_of
+from foredrive.ops.tiles import launch, neighbours, read, read_back
 
 
 def read_volume_triton(
@@ -76,24 +76,7 @@ class _ReadVolume(torch.autograd.Function):
 
 def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | None], **flags: bool) -> None:
     values, _, weights = inputs
-    queries, heads, points = weights.shape[1:]
-    rows, width = len(weights) * queries * heads, values.shape[-1] // heads
-    tile = tile_of(points, width)
-    if rows:
-        kernel[(triton.cdiv(rows, tile.rows),)](
-            *inputs,
-            *outputs,
-            rows,
-            queries,
-            *values.shape[1:4],
-            HEADS=heads,
-            POINTS=points,
-            WIDTH=width,
-            ROWS=tile.rows,
-            P=tile.points,
-            W=tile.channels,
-            **flags,
-        )
+    launch(kernel, [*inputs, *outputs], values.shape[1:4], weights, values.shape[-1], **flags)
 
 
 @triton.jit

@@ -15,12 +15,11 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.collate import stack_records
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
-from foredrive.data.recorded import read_caption
+from foredrive.data.recorded import read_caption, read_setting
 from foredrive.scene import Category, LidarSweep
 from foredrive.search.rows import COUNTS, FACTS, SCORES, WHOLE, row_schema
 from foredrive.search.sectors import Sector, blind_sectors
 from foredrive.search.towers import Towers, unit
-from foredrive.towns.labels.setting import Setting, read_setting
 
 FRAMES_AT_ONCE = 8
 """Read and embedded together: memory stays flat over a log of any length."""
@@ -129,8 +128,7 @@ def _vector_column(vectors: Float[np.ndarray, "n D"]) -> pa.FixedSizeListArray:
 
 
 def _facts(log: Log, frame: int) -> dict[str, object]:
-    caption = read_caption(log, frame)
-    setting = Setting(None, None, None) if caption is None else read_setting(caption)
+    setting = read_setting(log, frame)
     speed = float(log.speed_mps[frame])
     return {
         "key": f"{log.path.name}@{log.t_us[frame]}",
@@ -143,9 +141,9 @@ def _facts(log: Log, frame: int) -> dict[str, object]:
         "dataset": log.metadata.dataset,
         "place": log.metadata.location,
         "ego_speed": speed if np.isfinite(speed) else None,
-        "time_of_day": setting.time_of_day,
-        "weather": setting.weather,
-        "caption": caption,
+        "time_of_day": None if setting is None else setting.time_of_day.value,
+        "weather": None if setting is None else setting.weather.value,
+        "caption": read_caption(log, frame),
         **{f"score_{name}": None for name in SCORES},
     }
 

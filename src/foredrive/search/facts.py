@@ -9,7 +9,8 @@ from torch import Tensor
 
 from foredrive.data.boxes import read_boxes
 from foredrive.data.logs import Log
-from foredrive.data.recorded import read_caption, read_visibility
+from foredrive.data.recorded import read_setting, read_visibility
+from foredrive.data.setting import Weather
 from foredrive.scene import Boxes, Category
 from foredrive.search.sectors import Sector
 from foredrive.towns.labels.captions import (
@@ -20,7 +21,6 @@ from foredrive.towns.labels.captions import (
     SEEN,
     WALKING_MPS,
 )
-from foredrive.towns.labels.setting import Setting, read_setting
 
 NEAR_M, FAR_M = 12.0, 25.0
 IN_FOG_M = 25.0
@@ -87,18 +87,20 @@ def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
 def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, ViewFacts]:
     """The facts of each sector of a moment, by its name.
 
-    Time, weather and place are read out of the moment's caption, where there is one. Things are boxes whose
-    centre lies in the sector, near enough and not hidden, where the log knows that.
+    Time, weather and place are those of the moment's recorded setting, where there is one. Things are boxes
+    whose centre lies in the sector, near enough and not hidden, where the log knows that.
 
     Raises:
         InputError: on data that cannot be read.
     """
-    caption = read_caption(log, frame)
-    setting = Setting(None, None, None) if caption is None else read_setting(caption)
+    told = read_setting(log, frame)
+    setting: tuple[str | None, str | None, str | None] = (None, None, None)
+    if told is not None:
+        setting = (told.time_of_day.value, told.weather.value, told.place.value)
     boxes, visibility = read_boxes(log, frame), read_visibility(log, frame)
     if boxes is None:
         return {name: ViewFacts(*setting, None) for name in sectors}
-    reach_m = IN_FOG_M if setting.weather == "fog" else AHEAD_M
+    reach_m = IN_FOG_M if told is not None and told.weather is Weather.FOG else AHEAD_M
     seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
     if visibility is not None:
         seen = seen & (visibility >= SEEN)

@@ -30,15 +30,15 @@ class Plane(NamedTuple):
 SHOWN = ("key", "log", "t_s", "view", "place", "weather", "time_of_day")
 
 
-def project_scenes(index: FrameIndex, name: str = "image") -> Plane:
-    """Principal components of the whole scenes' embeddings."""
-    where = f"view = {quoted(WHOLE)} AND {name} IS NOT NULL"
+def project_scenes(index: FrameIndex) -> Plane:
+    """Principal components of the whole scenes' image embeddings."""
+    where = f"view = {quoted(WHOLE)} AND image IS NOT NULL"
     total = index.count(where)
     step = -(-total // MOST_POINTS) if total else 1
     if step > 1:
         where += f" AND frame % {step} = 0"
-    rows = index.select(where, [*SHOWN, name])
-    vectors = vectors_of(rows, name)
+    rows = index.select(where, [*SHOWN, "image"])
+    vectors = vectors_of(rows, "image")
     if len(vectors) < 2:
         return Plane(np.zeros((len(vectors), 2)), rows.select(list(SHOWN)).to_pylist(), 0.0, total)
     centred = vectors - vectors.mean(0)

@@ -7,8 +7,6 @@ from jaxtyping import Bool, Float64
 
 LEAST_S = 0.95
 """nuPlan's bound: nearer is not safe (Karnchanachari et al. 2024, time_to_collision_within_bound)."""
-HORIZON_S = 3.0
-"""nuPlan looks this far ahead."""
 
 
 class MovingBoxes(NamedTuple):

@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foredrive.data.setting import TimeOfDay, Weather
 from foredrive.errors import InputError
 
 CLEAR_VISIBILITY_M = 20_000.0
+FOG_M = 1000.0
+"""Visibility below which haze is called fog."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,30 @@ class Conditions:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"{name} lies between {low:g} and {high:g}, got {value:g}")
+
+    @property
+    def time_of_day(self) -> TimeOfDay:
+        """By the height of the sun, and by the clock while it is day."""
+        if self.hour < 5.3 or self.hour >= 18.7:
+            return TimeOfDay.NIGHT
+        if self.hour < 6.7:
+            return TimeOfDay.DAWN
+        if self.hour >= 17.3:
+            return TimeOfDay.DUSK
+        if self.hour < 11.0:
+            return TimeOfDay.MORNING
+        return TimeOfDay.MIDDAY if self.hour < 13.0 else TimeOfDay.AFTERNOON
+
+    @property
+    def weather(self) -> Weather:
+        """In one word."""
+        if self.rain_mmph > 0:
+            return Weather.RAIN
+        if self.visibility_m < FOG_M:
+            return Weather.FOG
+        if self.clouds >= 0.9:
+            return Weather.OVERCAST
+        return Weather.CLOUDY if self.clouds >= 0.5 else Weather.CLEAR
 
 
 CONDITIONS = {

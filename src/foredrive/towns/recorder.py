@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
@@ -76,6 +76,7 @@ class LabelKinds:
     instance: bool = False
     """Track ids as images, and for each lidar return."""
     captions: bool = True
+    """With the facts that they are made from (`Setting`)."""
 
 
 def split_of(town: str) -> str:
@@ -203,11 +204,15 @@ def _frame(
     everyone = [*moment.actors, *world.parked]
     near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
     returned = seen.beam_ids[seen.sweep.returned.numpy()]
-    visibility, text = None, None
+    visibility, setting, text = None, None, None
     if labels.visibility or labels.captions:
         visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
         if labels.captions:
-            text = _caption(narrator, moment, near, visibility, seen, sensors.rig, seed)
+            range_m = np.stack(list(seen.pixel_range_m.values()))
+            situation = narrator.situation(
+                moment, near, visibility, lambda xyz: is_seen(xyz, sensors.rig, range_m)
+            )
+            setting, text = situation.setting, caption(situation, seed)
     spec = labels.occupancy
     return Frame(
         t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
@@ -220,24 +225,11 @@ def _frame(
         occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
         lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         visibility=visibility if labels.visibility else None,
+        setting=setting,
         caption=text,
         traffic_lights=lights_of_lanes(world.town, moment.lights),
         **_ray_labels(seen, everyone, sensors, labels),
     )
-
-
-def _caption(
-    narrator: Narrator,
-    moment: Moment,
-    near: list[ActorState],
-    visibility: Float[np.ndarray, "M"],
-    seen: SensorFrame,
-    rig: CameraRig,
-    seed: int,
-) -> str:
-    range_m = np.stack(list(seen.pixel_range_m.values()))
-    situation = narrator.situation(moment, near, visibility, lambda xyz: is_seen(xyz, rig, range_m))
-    return caption(situation, seed)
 
 
 def _ray_labels(

@@ -186,10 +186,6 @@ def _told(hit: Hit) -> dict[str, Any]:
     }
 
 
-def _moment_name(row: Mapping[str, Any]) -> str:
-    return f"{row['log']}@{row['t_s']:.1f}s"
-
-
 def _key(row: Mapping[str, object]) -> str:
     return f"{row['key']}|{row['view']}"
 

@@ -25,7 +25,6 @@ def project_lidar(
     velocity_mps: Float[Tensor, "N 3"] | None = None,
     twist_lidar: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
-    spread_rad2: float = SPREAD_RAD2,
     reach_m: float = math.inf,
 ) -> Splats:
     """Splats over azimuth and elevation, for `beam_points`; those that no beam can see are left out.
@@ -41,7 +40,6 @@ def project_lidar(
         twist_lidar: velocity (m/s) then turn rate (rad/s) of the lidar in its own axes; None: it stands
             still. See `geometry.se3.sensor_twist`.
         compensate: take as much opacity away as ε spreads a splat.
-        spread_rad2: ε.
         reach_m: Gaussians whose centre is farther than this are not seen.
     """
     position = positions_in_sensor(gaussians, T_lidar_scene)
@@ -54,7 +52,7 @@ def project_lidar(
     them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     angles, range_m, jacobian = _project(them.position_m)
     spread = through(jacobian, them.factor_m)
-    shape = footprint(spread[:2], spread_rad2)
+    shape = footprint(spread[:2], SPREAD_RAD2)
     with_azimuth, with_elevation = (spread[:2] * spread[2]).sum(1)
     xx, xy, yy = shape.inverse.unbind(-1)
     velocity = (jacobian * them.velocity_mps).sum(1)

@@ -22,7 +22,7 @@ from foredrive.search.embedding import View, read_views
 from foredrive.search.facts import Thing, ViewFacts, view_facts
 
 ROWS, TENSORS = "rows.json", "views.safetensors"
-VIEWS_VERSION = 1
+VIEWS_VERSION = 2
 """Part of every file's name: raise it when views come out differently."""
 
 

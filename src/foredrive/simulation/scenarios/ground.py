@@ -13,6 +13,7 @@ from foredrive.towns.world import World
 
 AROUND_M = 25.0
 """Routes may cross themselves: a place is looked for so near to where it should be."""
+ONWARD_LANES = 4
 
 
 class Stretch(NamedTuple):
@@ -60,10 +61,10 @@ def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Floa
     return at, step / np.hypot(*step)
 
 
-def onward(graph: LaneGraph, lane: int, count: int = 4) -> list[int]:
+def onward(graph: LaneGraph, lane: int) -> list[int]:
     """Where a lane leads straight on."""
     lanes = [lane]
-    for _ in range(count):
+    for _ in range(ONWARD_LANES):
         options = graph.successors[lanes[-1], : graph.successor_count[lanes[-1]]]
         if not len(options):
             break

@@ -21,6 +21,8 @@ STANDS_MPS = 0.3
 ROUNDED_M = 0.5
 FRONT_M = EGO.axle_to_centre_m + 0.5 * EGO.length_m
 """From the rear axle to the front bumper."""
+SOON_S, TO_SPEED_MPS2 = 0.5, 3.0
+"""How soon a vehicle is to drive at the speed it is told, and how hard it may brake or speed up for that."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +133,7 @@ class Scene(NamedTuple):
         """Half a vehicle's length."""
         return 0.5 * float(self.state.vehicles.size_lwh[slot, 0])
 
-    def towards_mps(
-        self, slot: int, wanted_mps: float, within_s: float = 0.5, most_mps2: float = 3.0
-    ) -> None:
+    def towards_mps(self, slot: int, wanted_mps: float) -> None:
         """Order a vehicle to drive no faster than a speed, soon."""
-        wanted = (wanted_mps - self.speed_mps(slot)) / within_s
-        self.orders.most_mps2[slot] = min(max(wanted, -most_mps2), most_mps2)
+        wanted = (wanted_mps - self.speed_mps(slot)) / SOON_S
+        self.orders.most_mps2[slot] = min(max(wanted, -TO_SPEED_MPS2), TO_SPEED_MPS2)

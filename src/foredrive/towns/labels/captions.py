@@ -1,14 +1,13 @@
-"""Captions: plain English sentences about what the cameras see, composed from exact facts."""
+"""Captions: plain English sentences about what the cameras see, composed from a frame's facts."""
 
-import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from foredrive.towns.conditions import Conditions
-from foredrive.towns.traffic.lights import Light
+from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
+from foredrive.towns.conditions import FOG_M
 
 SEEN = 0.4
 """Road users of which less is visible go unmentioned: nuScenes' lowest visibility level."""
@@ -22,59 +21,11 @@ FOG_SHARE = 0.7
 BOTH_SIDES = "on both sides"
 
 
-class Place(enum.StrEnum):
-    """Where the vehicle is."""
-
-    STREET = "street"
-    JUNCTION = "junction"
-    ROUNDABOUT = "roundabout"
-    BRIDGE = "bridge"
-    UNDERPASS = "underpass"
-    HIGHWAY = "highway"
-
-
-class Kind(enum.StrEnum):
-    """Who or what there is, in one word."""
-
-    CAR = "car"
-    VAN = "van"
-    TRUCK = "truck"
-    BUS = "bus"
-    TRAILER = "trailer"
-    CONSTRUCTION_VEHICLE = "construction vehicle"
-    MOTORCYCLE = "motorcycle"
-    CYCLIST = "cyclist"
-    PEDESTRIAN = "pedestrian"
-    ANIMAL = "animal"
-    TRAFFIC_CONE = "traffic cone"
-    BARRIER = "barrier"
-    OBJECT = "object"
-
-    @property
-    def plural(self) -> str:
-        """Of several."""
-        return f"{self.value}{'es' if self.value.endswith('s') else 's'}"
-
-
-class Doing(enum.StrEnum):
-    """What the vehicle does."""
-
-    DRIVES = "drives"
-    TURNS_LEFT = "turns left"
-    TURNS_RIGHT = "turns right"
-    CHANGES_LEFT = "changes left"
-    CHANGES_RIGHT = "changes right"
-    FOLLOWS = "follows"
-    SLOWS = "slows"
-    SPEEDS_UP = "speeds up"
-    WAITS = "waits"
-
-
 @dataclass(frozen=True)
 class Thing:
     """A road user in the vehicle's ego frame."""
 
-    kind: Kind
+    kind: ObjectKind
     xy_m: Float[np.ndarray, "2"]
     velocity_mps: Float[np.ndarray, "2"]
     """Over ground, along the ego axes."""
@@ -89,29 +40,22 @@ class Thing:
 class Situation:
     """What there is to tell of one moment."""
 
-    conditions: Conditions
-    place: Place
-    doing: Doing
-    speed_mps: float
+    setting: Setting
     things: Sequence[Thing]
-    leader: Kind | None = None
-    """The vehicle right ahead on the same way, if one is seen."""
-    light: Light = Light.NONE
-    """What the vehicle's own traffic light shows, if it is in view."""
 
 
 def caption(situation: Situation, seed: int) -> str:
     """Two to six sentences; the seed chooses among phrasings, never among facts."""
-    words = _Words(np.random.default_rng(seed))
-    seen = [thing for thing in situation.things if _is_seen(thing, situation.conditions)]
+    words, setting = _Words(np.random.default_rng(seed)), situation.setting
+    seen = [thing for thing in situation.things if _is_seen(thing, setting)]
     sentences = [
-        _setting(situation, words),
-        _action(situation, words),
-        *_traffic(seen, situation, words),
+        _setting(setting, words),
+        _action(setting, words),
+        *_traffic(seen, setting, words),
         *_crossing(seen, words),
         _on_foot(seen, words),
-        _parked(seen, words),
-        _light(situation, words),
+        _parked(seen),
+        _light(setting, words),
     ]
     return " ".join(f"{s[0].upper()}{s[1:]}." for s in sentences if s)
 
@@ -124,10 +68,10 @@ class _Words:
         return ways[int(self.rng.integers(len(ways)))]
 
 
-def _is_seen(thing: Thing, conditions: Conditions) -> bool:
+def _is_seen(thing: Thing, setting: Setting) -> bool:
     distance_m = float(np.hypot(*thing.xy_m))
     reach_m = AHEAD_M if _sector(thing) == "ahead" else NEAR_M
-    return thing.visibility >= SEEN and distance_m < min(reach_m, FOG_SHARE * conditions.visibility_m)
+    return thing.visibility >= SEEN and distance_m < min(reach_m, FOG_SHARE * setting.visibility_m)
 
 
 def _sector(thing: Thing) -> str:
@@ -139,39 +83,34 @@ def _sector(thing: Thing) -> str:
     return "left" if azimuth > 0 else "right"
 
 
-def _setting(situation: Situation, words: _Words) -> str:
-    c = situation.conditions
-    facts = [_hour(c.hour, words)]
-    if c.rain_mmph > 0:
-        facts.append("light rain" if c.rain_mmph < 5 else "rain" if c.rain_mmph < 20 else "heavy rain")
-    if c.visibility_m < 1000.0:
-        facts.append("dense fog" if c.visibility_m < 100.0 else "fog")
+def _setting(setting: Setting, words: _Words) -> str:
+    facts, rain_mmph = [words.pick(*_HOURS[setting.time_of_day])], setting.rain_mmph
+    if rain_mmph > 0:
+        facts.append("light rain" if rain_mmph < 5 else "rain" if rain_mmph < 20 else "heavy rain")
+    if setting.visibility_m < FOG_M:
+        facts.append("dense fog" if setting.visibility_m < 100.0 else "fog")
     if len(facts) == 1:
-        facts.append(_sky(c, words))
-    if c.wetness > 0.3 and not c.rain_mmph:
+        facts.append(words.pick(*(_DAY_SKIES if setting.time_of_day in _DAY else _SKIES)[setting.weather]))
+    if setting.wetness > 0.3 and not rain_mmph:
         facts.append(words.pick("wet road", "the road is wet"))
-    return ", ".join([*facts, _where(situation.place, words)])
+    return ", ".join([*facts, _where(setting.place, words)])
 
 
-def _hour(hour: float, words: _Words) -> str:
-    if hour < 5.3 or hour >= 18.7:
-        return words.pick("night", "at night", "a drive by night")
-    if hour < 6.7:
-        return "dawn"
-    if hour >= 17.3:
-        return words.pick("dusk", "at dusk")
-    if hour < 11.0:
-        return words.pick("morning", "in the morning")
-    return words.pick("midday", "noon") if hour < 13.0 else words.pick("afternoon", "in the afternoon")
-
-
-def _sky(c: Conditions, words: _Words) -> str:
-    by_day = 6.7 <= c.hour < 17.3
-    if c.clouds >= 0.9:
-        return words.pick("overcast", "under a grey sky") if by_day else "overcast"
-    if c.clouds >= 0.5:
-        return words.pick("cloudy", "under broken cloud")
-    return words.pick("clear", "sunny", "clear weather") if by_day else words.pick("clear", "dry")
+_DAY = (TimeOfDay.MORNING, TimeOfDay.MIDDAY, TimeOfDay.AFTERNOON)
+_HOURS = {
+    TimeOfDay.NIGHT: ("night", "at night", "a drive by night"),
+    TimeOfDay.DAWN: ("dawn",),
+    TimeOfDay.DUSK: ("dusk", "at dusk"),
+    TimeOfDay.MORNING: ("morning", "in the morning"),
+    TimeOfDay.MIDDAY: ("midday", "noon"),
+    TimeOfDay.AFTERNOON: ("afternoon", "in the afternoon"),
+}
+_DAY_SKIES = {
+    Weather.OVERCAST: ("overcast", "under a grey sky"),
+    Weather.CLOUDY: ("cloudy", "under broken cloud"),
+    Weather.CLEAR: ("clear", "sunny", "clear weather"),
+}
+_SKIES = _DAY_SKIES | {Weather.OVERCAST: ("overcast",), Weather.CLEAR: ("clear", "dry")}
 
 
 def _where(place: Place, words: _Words) -> str:
@@ -185,15 +124,15 @@ def _where(place: Place, words: _Words) -> str:
     }[place]
 
 
-def _action(situation: Situation, words: _Words) -> str:
-    leader = situation.leader.value if situation.leader is not None else ""
-    speed = f"{5 * max(1, round(situation.speed_mps * 3.6 / 5))} km/h"
+def _action(setting: Setting, words: _Words) -> str:
+    leader = setting.leader.value if setting.leader is not None else ""
+    speed = f"{5 * max(1, round(setting.speed_mps * 3.6 / 5))} km/h"
     we = words.pick("the ego vehicle", "the ego car")
-    match situation.doing:
+    match setting.doing:
         case Doing.TURNS_LEFT | Doing.TURNS_RIGHT:
-            return f"{we} {situation.doing}"
+            return f"{we} {setting.doing}"
         case Doing.CHANGES_LEFT | Doing.CHANGES_RIGHT:
-            side = "left" if situation.doing is Doing.CHANGES_LEFT else "right"
+            side = "left" if setting.doing is Doing.CHANGES_LEFT else "right"
             return f"{we} " + words.pick(f"changes to the {side} lane", f"moves over to the {side}")
         case Doing.FOLLOWS:
             return f"{we} follows {_a(leader)} at {words.pick('about', 'some')} {speed}"
@@ -205,14 +144,13 @@ def _action(situation: Situation, words: _Words) -> str:
         case Doing.WAITS:
             if leader:
                 return f"{we} waits behind {_a(leader)}"
-            if situation.light in (Light.RED, Light.YELLOW):
-                return f"{we} waits at {words.pick('the', 'a')} {_COLOURS[situation.light]} light"
+            if setting.light in (LightColour.RED, LightColour.YELLOW):
+                return f"{we} waits at {words.pick('the', 'a')} {setting.light} light"
             return f"{we} {words.pick('waits', 'stands still')}"
     return f"{we} {words.pick('drives', 'goes')} at {words.pick('about', 'some')} {speed}"
 
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
-_COLOURS = {Light.RED: "red", Light.YELLOW: "yellow", Light.GREEN: "green"}
 
 
 def _a(noun: str) -> str:
@@ -222,23 +160,27 @@ def _a(noun: str) -> str:
 def _counted(things: Sequence[Thing], adjective: str = "") -> str:
     """ "two oncoming cars and a bus"."""
     parts = []
-    for kind in Kind:
+    for kind in ObjectKind:
         count = sum(thing.kind is kind for thing in things)
         if count == 1:
             parts.append(_a(f"{adjective}{kind.value}"))
         elif count:
-            parts.append(f"{_NUMBERS[count] if count < len(_NUMBERS) else 'many'} {adjective}{kind.plural}")
+            parts.append(f"{_NUMBERS[count] if count < len(_NUMBERS) else 'many'} {adjective}{_plural(kind)}")
     return _listed(parts)
+
+
+def _plural(kind: ObjectKind) -> str:
+    return f"{kind}{'es' if kind.endswith('s') else 's'}"
 
 
 def _listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}" if parts else ""
 
 
-def _traffic(seen: Sequence[Thing], situation: Situation, words: _Words) -> list[str]:
+def _traffic(seen: Sequence[Thing], setting: Setting, words: _Words) -> list[str]:
     """Vehicles in traffic, by where they are and where they go."""
-    vehicles = [t for t in seen if not t.parked and t.kind is not Kind.PEDESTRIAN]
-    there = {where: [t for t in vehicles if _whereabouts(t, situation) == where] for where in _WHEREABOUTS}
+    vehicles = [t for t in seen if not t.parked and t.kind is not ObjectKind.PEDESTRIAN]
+    there = {where: [t for t in vehicles if _whereabouts(t, setting) == where] for where in _WHEREABOUTS}
     phrases = [
         _counted(things, "oncoming ") if where == "oncoming" else f"{_counted(things)} {words.pick(*ways)}"
         for (where, ways), things in zip(_WHEREABOUTS.items(), there.values(), strict=True)
@@ -246,7 +188,7 @@ def _traffic(seen: Sequence[Thing], situation: Situation, words: _Words) -> list
     ]
     if phrases:
         return [", ".join(phrases)]
-    alone = not seen and situation.leader is None
+    alone = not seen and setting.leader is None
     return [words.pick("no one else nearby", "no other traffic nearby")] if alone else []
 
 
@@ -261,21 +203,21 @@ _WHEREABOUTS = {
 """Where vehicles may be, and how that is said."""
 
 
-def _whereabouts(thing: Thing, situation: Situation) -> str:
+def _whereabouts(thing: Thing, setting: Setting) -> str:
     """One of `_WHEREABOUTS`; where the way bends, none of those ahead is said to drive across it."""
     sector = _sector(thing)
     if sector != "ahead" or np.hypot(*thing.velocity_mps) <= MOVING_MPS:
         return sector
     if np.cos(thing.yaw) < ONCOMING_COS:
         return "oncoming"
-    bends = situation.place is Place.ROUNDABOUT or situation.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT)
+    bends = setting.place is Place.ROUNDABOUT or setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT)
     return "across" if abs(np.cos(thing.yaw)) < ACROSS_COS and not bends else "ahead"
 
 
 def _crosses(thing: Thing) -> bool:
     vx, vy = thing.velocity_mps.tolist()
     walks_across = abs(vy) > WALKING_MPS and abs(vy) > abs(vx)
-    return thing.kind is Kind.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
+    return thing.kind is ObjectKind.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
 
 
 def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
@@ -293,7 +235,7 @@ def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
 
 def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
     """People who do not cross."""
-    people = [t for t in seen if t.kind is Kind.PEDESTRIAN and not _crosses(t)]
+    people = [t for t in seen if t.kind is ObjectKind.PEDESTRIAN and not _crosses(t)]
     if not people:
         return ""
     where = _sides(people)
@@ -303,7 +245,7 @@ def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
     return f"{_counted(people)} {words.pick(f'{walkway} ', '')}{where}"
 
 
-def _parked(seen: Sequence[Thing], words: _Words) -> str:
+def _parked(seen: Sequence[Thing]) -> str:
     cars = [t for t in seen if t.parked]
     if not cars:
         return ""
@@ -315,12 +257,12 @@ def _sides(things: Sequence[Thing]) -> str:
     return f"on the {sides.pop()}" if len(sides) == 1 else BOTH_SIDES
 
 
-def _light(situation: Situation, words: _Words) -> str:
-    colour = _COLOURS.get(situation.light)
-    waits_there = situation.doing is Doing.WAITS and situation.leader is None and colour != "green"
+def _light(setting: Setting, words: _Words) -> str:
+    colour = setting.light
+    waits_there = setting.doing is Doing.WAITS and setting.leader is None and colour is not LightColour.GREEN
     if colour is None or waits_there:
         return ""
     ahead = f"{_a(colour)} traffic light ahead"
-    if situation.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT):  # not the one that it has just passed
+    if setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT):  # not the one that it has just passed
         return ahead
     return words.pick(f"the traffic light is {colour}", f"the light shows {colour}", ahead)

@@ -7,10 +7,11 @@ import shapely
 from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 
+from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting
 from foredrive.scene import Category, Command
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
-from foredrive.towns.labels.captions import SEEN, Doing, Kind, Place, Situation, Thing
+from foredrive.towns.labels.captions import SEEN, Situation, Thing
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
 from foredrive.towns.traffic.expert import Moment
@@ -119,15 +120,22 @@ class Narrator:
         aside_mps = self._aside_speed(moment)
         beside = at - self._line[self._passed]  # the lane beside the route's, while overtaking
         leader, gap_m = self._leader(actors, centre - beside, visibility)
-        return Situation(
-            conditions=self._conditions,
+        now = self._conditions
+        setting = Setting(
+            time_of_day=now.time_of_day,
+            weather=now.weather,
             place=self._places.place(at),
             doing=self._doing(moment, leader, gap_m, aside_mps),
             speed_mps=float(moment.twist_ego[0]),
-            things=things,
             leader=None if leader is None else kind_of(leader),
             light=self._light(moment, T_ego_world, sees),
+            hour=now.hour,
+            clouds=now.clouds,
+            rain_mmph=now.rain_mmph,
+            wetness=now.wetness,
+            visibility_m=now.visibility_m,
         )
+        return Situation(setting, things)
 
     def _leader(
         self,
@@ -181,7 +189,7 @@ class Narrator:
         moment: Moment,
         T_ego_world: Float64[np.ndarray, "4 4"],
         sees: Callable[[Float64[np.ndarray, "3"]], bool],
-    ) -> Light:
+    ) -> LightColour | None:
         """What the next light on the way shows, if its lamps are in view."""
         axle_m = float(self._arc_m[self._passed])
         for lane, begin_m in zip(self._route.lanes, self._begins_m, strict=True):
@@ -191,30 +199,37 @@ class Narrator:
             if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
                 lamps = self._signal_xyz[zone] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
                 in_view = any(np.linalg.norm(lamp) < LAMPS_M and sees(lamp) for lamp in lamps)
-                return Light(int(moment.lights[zone])) if in_view else Light.NONE
-        return Light.NONE
+                return _COLOUR_OF_LIGHT.get(Light(int(moment.lights[zone]))) if in_view else None
+        return None
 
 
-def kind_of(actor: ActorState) -> Kind:
+_COLOUR_OF_LIGHT = {
+    Light.RED: LightColour.RED,
+    Light.YELLOW: LightColour.YELLOW,
+    Light.GREEN: LightColour.GREEN,
+}
+
+
+def kind_of(actor: ActorState) -> ObjectKind:
     """What to call a road user: as it looks, which tells vans from cars."""
     if actor.category is Category.CAR:
         length_m, _, height_m = actor.size_lwh
-        return Kind.VAN if length_m > VAN_LENGTH_M and height_m > VAN_HEIGHT_M else Kind.CAR
+        return ObjectKind.VAN if length_m > VAN_LENGTH_M and height_m > VAN_HEIGHT_M else ObjectKind.CAR
     return _KIND_OF_CATEGORY[actor.category]
 
 
 _KIND_OF_CATEGORY = {
-    Category.TRUCK: Kind.TRUCK,
-    Category.BUS: Kind.BUS,
-    Category.TRAILER: Kind.TRAILER,
-    Category.CONSTRUCTION_VEHICLE: Kind.CONSTRUCTION_VEHICLE,
-    Category.MOTORCYCLE: Kind.MOTORCYCLE,
-    Category.BICYCLE: Kind.CYCLIST,
-    Category.PEDESTRIAN: Kind.PEDESTRIAN,
-    Category.ANIMAL: Kind.ANIMAL,
-    Category.TRAFFIC_CONE: Kind.TRAFFIC_CONE,
-    Category.BARRIER: Kind.BARRIER,
-    Category.OTHER: Kind.OBJECT,
+    Category.TRUCK: ObjectKind.TRUCK,
+    Category.BUS: ObjectKind.BUS,
+    Category.TRAILER: ObjectKind.TRAILER,
+    Category.CONSTRUCTION_VEHICLE: ObjectKind.CONSTRUCTION_VEHICLE,
+    Category.MOTORCYCLE: ObjectKind.MOTORCYCLE,
+    Category.BICYCLE: ObjectKind.CYCLIST,
+    Category.PEDESTRIAN: ObjectKind.PEDESTRIAN,
+    Category.ANIMAL: ObjectKind.ANIMAL,
+    Category.TRAFFIC_CONE: ObjectKind.TRAFFIC_CONE,
+    Category.BARRIER: ObjectKind.BARRIER,
+    Category.OTHER: ObjectKind.OBJECT,
 }
 
 

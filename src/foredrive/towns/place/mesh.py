@@ -73,14 +73,11 @@ def ribbon(
     return quads(corners(left, right), look, None if uvw is None else corners(*uvw))
 
 
-def polygon_cap(
-    polygon: shapely.Polygon, z: float, look: int, up: bool = True, origin: Vector = (0.0, 0.0)
-) -> Mesh:
-    """A level face; texture coordinates are x, y about `origin`."""
+def polygon_cap(polygon: shapely.Polygon, z: float, look: int, up: bool = True) -> Mesh:
+    """A level face; texture coordinates are x, y."""
     xy = polygon_triangles(polygon)
     xyz = np.concatenate([xy, np.full((*xy.shape[:2], 1), z)], axis=-1)
-    uvw = xyz - np.array([*origin, 0.0])
-    return triangles(xyz if up else xyz[:, ::-1], look, uvw if up else uvw[:, ::-1])
+    return triangles(xyz if up else xyz[:, ::-1], look)
 
 
 def polygon_triangles(polygon: shapely.Geometry) -> Float[np.ndarray, "F 3 2"]:
@@ -123,15 +120,11 @@ def walls(
     return quads(corners, look, np.stack([u, v, length[:, None] - u], axis=-1))
 
 
-def prism(
-    polygon: shapely.Polygon, z0: float, z1: float, side_look: int, top_look: int, bottom: bool = True
-) -> Mesh:
+def prism(polygon: shapely.Polygon, z0: float, z1: float, side_look: int, top_look: int) -> Mesh:
     """A polygon without holes, extruded."""
     ring = shapely.get_coordinates(shapely.orient_polygons(polygon).exterior)
-    parts = [walls(ring, z0, z1, side_look), polygon_cap(polygon, z1, top_look)]
-    if bottom:
-        parts.append(polygon_cap(polygon, z0, side_look, up=False))
-    return join(parts)
+    top, bottom = polygon_cap(polygon, z1, top_look), polygon_cap(polygon, z0, side_look, up=False)
+    return join([walls(ring, z0, z1, side_look), top, bottom])
 
 
 def box(lower: Vector, upper: Vector, look: int) -> Mesh:

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.map.town_map import Strip, StripKind, TownMap
+from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.place.looks import ASPHALT_RGB, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
 from foredrive.towns.place.site import Frontage, Site, frontages
@@ -36,7 +36,7 @@ def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[
         for s in np.arange(0.5 * bay + 1.0, along[-1] - 0.5 * bay - 1.0, bay):
             if rng.random() > SHARE_OF_BAYS or np.interp(s, along, width) < KERB_WIDTH_M:
                 continue
-            car = _car(_pose_on(strip, middle, along, s), across, rng)
+            car = _car(_pose_on(middle, along, s), across, rng)
             if not lanes.intersects(footprint(car).buffer(0.05)) and all(
                 not footprint(car).intersects(footprint(other)) for other in cars[-3:]
             ):
@@ -78,7 +78,7 @@ def numbered(cars: list[ActorState]) -> tuple[ActorState, ...]:
 
 
 def _pose_on(
-    strip: Strip, middle: Float[np.ndarray, "N 3"], along: Float[np.ndarray, "N"], s: float
+    middle: Float[np.ndarray, "N 3"], along: Float[np.ndarray, "N"], s: float
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
     """Point, heading and pitch on a strip."""
     at, before, after = (

@@ -17,6 +17,7 @@ from embreex import rtcore_scene
 from jaxtyping import Bool, Float, Float32, UInt32, UInt64
 from numba import types
 
+from foredrive.errors import InputError
 from foredrive.towns.sensing.shading import MISS, Hits
 
 Rays = Float32[np.ndarray, "N 3"]
@@ -24,6 +25,9 @@ Times = Float32[np.ndarray, "_"]
 Scenes = UInt64[np.ndarray, "S"]
 """Handles."""
 
+EMBREE, EMBREEX = 404, "4.4.0"
+"""The release of Embree (major · 100 + minor) that `_Arguments` and the enums come from, and the embreex that
+brings it along."""
 WIDTH = 16
 """Rays of a packet."""
 
@@ -34,6 +38,7 @@ _ROBUST = 1 << 2
 """No leaks along shared edges."""
 _COHERENT = 1 << 16
 _ALIGNMENT = 64
+_VERSION = 0
 
 
 class _Arguments(ctypes.Structure):
@@ -68,6 +73,7 @@ _handle, _int, _uint, _size = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctyp
 for _name, _result, _parameters in (
     ("rtcNewDevice", _handle, (ctypes.c_char_p,)),
     ("rtcGetDeviceError", _int, (_handle,)),
+    ("rtcGetDeviceProperty", ctypes.c_ssize_t, (_handle, _int)),
     ("rtcNewScene", _handle, (_handle,)),
     ("rtcSetSceneFlags", None, (_handle, _int)),
     ("rtcCommitScene", None, (_handle,)),
@@ -92,7 +98,26 @@ _occluded = types.ExternalFunction("rtcOccluded16", _packet_call)
 
 @cache
 def _device() -> int:
-    return int(_lib.rtcNewDevice(None))
+    device = int(_lib.rtcNewDevice(None))
+    check_release(_lib.rtcGetDeviceProperty(device, _VERSION))
+    return device
+
+
+def check_release(version: int) -> None:
+    """Refuse an Embree whose structs may be others than those that are mirrored here.
+
+    Args:
+        version: as `rtcGetDeviceProperty` tells it: major · 10000 + minor · 100 + patch.
+
+    Raises:
+        InputError: it is of another minor release.
+    """
+    if version // 100 != EMBREE:
+        found = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
+        raise InputError(
+            f"towns need the Embree of embreex {EMBREEX}, and the one installed is {found}: "
+            f"pip install 'embreex=={EMBREEX}.*'"
+        )
 
 
 def new_triangles(xyz: Float32[np.ndarray, "V 3"], faces: UInt32[np.ndarray, "F 3"]) -> int:

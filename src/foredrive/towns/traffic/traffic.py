@@ -245,11 +245,11 @@ class Traffic:
         """Poses of all vehicle slots."""
         return vehicle_poses(self.lanes, state.vehicles)
 
-    def actors(self, state: TrafficState, skip_ego: bool = True) -> list[ActorState]:
+    def actors(self, state: TrafficState) -> list[ActorState]:
         """All road users; vehicle 0 is left out where it is the ego vehicle."""
         v = state.vehicles
         kept = v.active.copy()
-        kept[0] &= not (skip_ego and len(state.route) > 0)
+        kept[0] &= len(state.route) == 0
         return [
             *vehicle_actors(v, self.poses(state), motion(self.lanes, v), kept),
             *people_actors(state.people),
