@@ -7,6 +7,7 @@ from foredrive.lazy import on_demand
 if TYPE_CHECKING:
     from foredrive.training.checkpoints import load_weights, save_weights
     from foredrive.training.driveworld_objective import DriveWorldObjective, DriveWorldWeights
+    from foredrive.training.ego_mlp_fit import DrivenStatus, fit_ego_mlp, read_status
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective
@@ -16,16 +17,19 @@ if TYPE_CHECKING:
 __all__ = [
     "DriveWorldObjective",
     "DriveWorldWeights",
+    "DrivenStatus",
     "ImageRays",
     "LossWeights",
     "NemoObjective",
     "PathDemonstrations",
     "PathFit",
     "Schedule",
+    "fit_ego_mlp",
     "fit_path",
     "load_weights",
     "make_fabric",
     "read_metrics",
+    "read_status",
     "save_weights",
     "thinned_rays",
     "train",
@@ -36,6 +40,7 @@ __getattr__ = on_demand(
     {
         "checkpoints": ("load_weights", "save_weights"),
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldWeights"),
+        "ego_mlp_fit": ("DrivenStatus", "fit_ego_mlp", "read_status"),
         "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective"),

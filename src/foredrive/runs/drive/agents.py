@@ -11,7 +11,7 @@ from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
-from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.lessons import Alternating, Disturbed
@@ -124,4 +124,4 @@ def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
     model, clips = run.recipe.model, run.recipe.clips
     past_frames = model.planner_history if model.planner_base == "ego_mlp" else clips.past_frames
-    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, model.planner_target)[1]
+    return fit_baselines(run.logs, clips, run.cache_dir, past_frames, model.planner_target)[1]
