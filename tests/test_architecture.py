@@ -10,8 +10,8 @@ ROOT = Path(foredrive.__file__).parent
 FLOORS = [
     {"geometry"},
     {"scene", "ops"},
-    {"sensors"},
-    {"data", "towns", "rendering", "models", "losses", "metrics", "sets"},
+    {"sensors", "sets"},
+    {"data", "towns", "rendering", "models", "losses", "metrics"},
     {"search", "simulation", "training", "evaluation", "export"},
     {"recipes"},
     {"runs"},
@@ -23,8 +23,6 @@ FORBIDDEN = {
     ("simulation", "models"),
     ("metrics", "data"),
     ("metrics", "models"),
-    ("sets", "data"),
-    ("sets", "models"),
 }
 THIRD_PARTY_ONLY_IN = {"py123d": {"data", "towns"}, "carla": set[str]()}
 """CARLA's client is imported by name in one place, and late: `simulation/carla/client.py`."""

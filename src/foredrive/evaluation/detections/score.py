@@ -10,17 +10,10 @@ from numpy import ndarray
 
 from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
+from foredrive.metrics.gospa import Gospa, gospa, wasserstein_distance
 from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
-from foredrive.sets import (
-    Gospa,
-    PoissonMultiBernoulli,
-    SetNll,
-    UniformPoisson,
-    gospa,
-    object_brier,
-    set_nll,
-    wasserstein_distance,
-)
+from foredrive.metrics.proper_scores import object_brier
+from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
 
 PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
 LOW_CONFIDENCE = 0.1
