@@ -99,6 +99,18 @@ def test_third_party_packages_stay_where_they_belong() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def test_optimisers_step_in_training_alone() -> None:
+    wrong = []
+    for path in ROOT.rglob("*.py"):
+        if path.relative_to(ROOT).parts[0] == "training":
+            continue
+        calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        descends = any(isinstance(call, ast.Attribute) and call.attr == "backward" for call in calls)
+        if descends or any(module.startswith("torch.optim") for module in imported_modules(path)):
+            wrong.append(str(path))
+    assert not wrong, "\n".join(wrong)
+
+
 TOWN_FLOORS = [{"map"}, {"traffic", "place"}, {"sensing"}, {"labels"}]
 """Within towns; traffic knows nothing of looks, and what is beside the folders puts them together."""
 

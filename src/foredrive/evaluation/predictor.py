@@ -1,4 +1,4 @@
-"""What an evaluation asks of a model: a `Predictor` returns a `Prediction`."""
+"""The interface between models and evaluations: a `Predictor` returns a `Prediction`."""
 
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable

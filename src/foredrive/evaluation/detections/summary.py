@@ -35,7 +35,7 @@ Summary = dict[str, float | int | str | None]
 
 @dataclass(frozen=True)
 class ScoreSummary:
-    """Flat figures, and the reliability diagrams they were taken from."""
+    """Flat figures and reliability diagrams."""
 
     figures: Summary
     diagrams: Mapping[str, Reliability]
@@ -56,9 +56,10 @@ def summarise_scores(read: DetectionSet, scores: Sequence[FrameScore], seed: int
 def compare_scores(
     scores: Sequence[FrameScore], others: Sequence[FrameScore], seed: int = 0
 ) -> tuple[BootstrapMean, int]:
-    """Mean of ours minus theirs by frame, over frames where both are finite; how many are not.
+    """Return the mean of ours minus theirs over frames where both are finite, and the number of the others.
 
-    Raises `InputError` if the frames are not the same, or none can be compared.
+    Raises:
+        InputError: if the frames are not the same, or none can be compared.
     """
     if [score.name for score in scores] != [other.name for other in others]:
         raise InputError("two files of detections can be compared on the same frames only")
@@ -116,7 +117,7 @@ def _distances(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.
 
 
 def _precision(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
-    """Average precision by class and threshold, as the data sets define it."""
+    """Return average precision by class and threshold, as the data sets define it."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
     thresholds = NUSCENES_DISTANCES_M if read.upright else COCO_OVERLAPS
@@ -148,7 +149,7 @@ def _reliability(read: DetectionSet, scores: Sequence[FrameScore], rng: np.rando
 
 
 def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
-    """D-ECE at 2 m or overlap 0.5; LaECE's bins for image boxes; existence against associations."""
+    """Return diagrams of hits (at 2 m or overlap 0.5) and of existence against associations."""
     score, hit = _joined(scores, "detections", "score"), _joined(scores, "detections", "hit")
     at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
     diagrams = {"d_ece": reliability(score, hit[at])}
@@ -160,7 +161,7 @@ def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Rel
 
 
 def _calibration(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
-    """D-ECE by class and range, object-level error; LaECE (overlap of hits at 0.5) and LaECE₀ of images."""
+    """Return D-ECE by class and range, object-level error, and LaECE (hits at 0.5), LaECE₀ of image boxes."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
     at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
@@ -185,7 +186,7 @@ def _calibration(read: DetectionSet, scores: Sequence[FrameScore], rng: np.rando
 
 
 def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
-    """Of boxes and their objects in the likeliest associations: proper scores, scale of σ, coverage."""
+    """Return proper scores, scale of σ and coverage of boxes and objects in the likeliest associations."""
     boxes, objects = [], []
     for frame, score in zip(read.frames, scores, strict=True):
         has = np.flatnonzero(score.objects.best >= 0)
@@ -213,7 +214,7 @@ def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.G
 
 
 def _slices(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
-    """What objects cost by class, size, range and visibility, nats an object."""
+    """Return the cost of objects by class, size, range and visibility, nats an object."""
     label = _joined(scores, "objects", "label")
     figures: Summary = _relevance(read, scores)
     size = np.concatenate([_size(frame.objects, read.upright) for frame in read.frames])
@@ -242,7 +243,7 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Gen
 
 
 def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """What an object costs: all alike, and weighted where the truth has weights."""
+    """Return the mean cost of an object, plain and weighted where the truth has weights."""
     cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
     if not np.size(cost):
         return {}
@@ -256,14 +257,14 @@ def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
 
 
 def _range_of_detections_m(frame: Frame) -> Float[ndarray, "M"]:
-    """Over ground; NaN where nobody knows where the ego vehicle is."""
+    """Return distances over ground; NaN where the ego vehicle's place is unknown."""
     if frame.range_m is None:
         return np.full(len(frame.detected.log_existence), np.nan)
     return frame.detected.boxes.mean[:, :2].norm(dim=-1).numpy()
 
 
 def _size(objects: LabelledBoxes, upright: bool) -> Float[ndarray, "N"]:
-    """Length in m, or root of the area in px."""
+    """Return lengths in m, or roots of areas in px."""
     state = objects.state.double().numpy()
     if upright:
         return np.exp(state[:, 3])
