@@ -19,13 +19,14 @@ from torch import Tensor, nn
 from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.collate import stack_records
-from foredrive.evaluation import Benchmark, fit_ego_mlp, read_status
+from foredrive.evaluation import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, ego_motion
 from foredrive.models.planner import PathCorrectionConfig, VolumePlanner
 from foredrive.recipes import find_recipe
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
+from foredrive.training import fit_ego_mlp, read_status
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
 from foredrive.evaluation import ConstantVelocity, Prediction, StandStill, evaluate
-from foredrive.metrics import PROTOCOLS, VoxelPrior
+from foredrive.metrics import PROTOCOLS, OccupancyPrior
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
 
 MakeExample = Callable[..., Example]
@@ -32,7 +32,7 @@ class Oracle:
     def _fingerprint(clip: Clip) -> tuple[float, ...]:
         return tuple(clip.ego_speed_mps[:, clip.now].tolist())
 
-    def predict(self, observed: Clip) -> Prediction:
+    def predict(self, observed: Clip, asked: object) -> Prediction:
         self.seen.append(observed)
         speeds = self._fingerprint(observed)
         if self.breaks_on & set(speeds):
@@ -99,8 +99,8 @@ def test_the_model_never_sees_the_future(make_example: MakeExample) -> None:
 
 def test_figures_do_not_depend_on_the_batches(make_example: MakeExample) -> None:
     class Wrong(Oracle):
-        def predict(self, observed: Clip) -> Prediction:
-            answer = super().predict(observed)
+        def predict(self, observed: Clip, asked: object) -> Prediction:
+            answer = super().predict(observed, asked)
             assert answer.occupancy_logit is not None
             assert answer.plan is not None
             plan = dataclasses.replace(answer.plan, xy=answer.plan.xy + 1.5)
@@ -158,7 +158,7 @@ def test_when_nothing_succeeds_there_is_no_result(make_example: MakeExample) -> 
 
 def test_ctrl_c_is_no_failure(make_example: MakeExample) -> None:
     class Interrupted:
-        def predict(self, observed: Clip) -> Prediction:
+        def predict(self, observed: Clip, asked: object) -> Prediction:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -194,19 +194,19 @@ def test_a_baseline_that_fails_does_not_fail_the_model(make_example: MakeExample
     assert summary["planning.constant_velocity.uniad.frames_counted"] == 0
 
 
-def test_the_best_constant_stands_beside_every_occupancy_figure(make_example: MakeExample) -> None:
+def test_the_occupancy_prior_stands_beside_every_occupancy_figure(make_example: MakeExample) -> None:
     training = make_example(*range(10, 14))
-    prior = VoxelPrior(FRAMES, training.occupancy.spec)
+    prior = OccupancyPrior(FRAMES, training.occupancy.spec)
     now = training.clip.now
     prior.add(training.occupancy[:, now : now + FRAMES])
     ones = [make_example(0), make_example(1)]
     summary = evaluate(Oracle(*ones), ones, prior=prior, **ABOUT).summary
     figures = [k for k in summary if k.startswith("occupancy.") and "best_constant" not in k]
-    for key in [k for k in figures if not k.endswith("copy")]:  # a copy is a rival itself
+    for key in [k for k in figures if not k.endswith("copy")]:  # persistence is a baseline itself
         assert 0 <= summary[f"{key}.best_constant"] < 1, key
     assert 0 < summary["occupancy.above_ground.iou_now.best_constant_threshold"] <= 1
     # The constant is what it says: the prior cut at that threshold, scored on the test set.
-    predicted, _ = prior.best_constant()
+    predicted, _ = prior.best_grid()
     truth = torch.cat([e.occupancy.values[:, now, 0] > 0.5 for e in ones])
     known = torch.cat([e.occupancy.known[:, now] for e in ones])
     both = (predicted[0] & truth & known).sum()
@@ -216,7 +216,7 @@ def test_the_best_constant_stands_beside_every_occupancy_figure(make_example: Ma
 
 def test_mismatched_frames_are_named(make_example: MakeExample) -> None:
     example = make_example(0)
-    prior = VoxelPrior(2, example.occupancy.spec)
+    prior = OccupancyPrior(2, example.occupancy.spec)
     with pytest.raises(InputError, match="prior is for 2 frames, the model predicts 3"):
         evaluate(Oracle(example), [example], prior=prior, **ABOUT)
     short = dataclasses.replace(

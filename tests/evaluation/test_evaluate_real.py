@@ -13,7 +13,7 @@ from foredrive.scene import Clip, VoxelSpec
 
 
 class GoOn:
-    def predict(self, observed: Clip) -> Prediction:
+    def predict(self, observed: Clip, asked: object) -> Prediction:
         return Prediction(plan=ConstantVelocity(6, 0.5).act(observed))
 
 

@@ -53,7 +53,7 @@ def test_what_is_not_a_summary_is_named(tmp_path: Path) -> None:
 
 def test_the_printed_tables(make_example: Callable[..., Example]) -> None:
     class Half:
-        def predict(self, observed: Clip) -> Prediction:
+        def predict(self, observed: Clip, asked: object) -> Prediction:
             plan = ConstantVelocity(6, 0.5).act(observed)
             occupied = make_example(0).occupancy.values[:, observed.now : observed.now + 2, 0]
             return Prediction(occupancy_logit=occupied.expand(len(plan.xy), -1, -1, -1, -1) - 0.5, plan=plan)

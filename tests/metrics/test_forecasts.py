@@ -5,7 +5,7 @@ import math
 import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.metrics import carried_along, count_futures, count_occupancy
+from foredrive.metrics import count_futures, count_occupancy, ego_compensated
 from foredrive.scene import VoxelGrid, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-2.0, -2.0, 0.0), voxel_m=1.0, shape_zyx=(1, 4, 4))
@@ -27,14 +27,14 @@ def labels(*frames: torch.Tensor) -> VoxelGrid:
 def test_driving_on_brings_what_stands_nearer() -> None:
     T = torch.eye(4, dtype=torch.float64)
     T[0, 3] = 1.0  # the vehicle has gone 1 m ahead
-    carried = carried_along(grid((1, 3), (2, 0))[None], T[None], SPEC)[0]
+    carried = ego_compensated(grid((1, 3), (2, 0))[None], T[None], SPEC)[0]
     assert torch.equal(carried, grid((1, 2)))  # what was beside the rear is out of the grid
 
 
 def test_turning_left_turns_what_stands_right() -> None:
     T = matrix_from_yaw(torch.tensor(math.pi / 2), torch.zeros(3)).double()
     ahead_left = grid((2, 3))  # centre at x = 1.5, y = 0.5
-    assert torch.equal(carried_along(ahead_left[None], T[None], SPEC)[0], grid((0, 2)))  # x 0.5, y -1.5
+    assert torch.equal(ego_compensated(ahead_left[None], T[None], SPEC)[0], grid((0, 2)))  # x 0.5, y -1.5
 
 
 def test_the_best_future_is_the_best_as_a_whole() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.metrics.occupancy import (
-    VoxelPrior,
+    OccupancyPrior,
     above_ground,
     count_occupancy,
     flow_errors,
@@ -95,26 +95,26 @@ def test_the_prior_by_hand() -> None:
     occupied[:, 0, 0, 0, 0] = True  # always
     occupied[:2, 0, 0, 0, 1] = True  # half of the time
     occupied[:1, 0, 0, 0, 2] = True  # a quarter
-    prior = VoxelPrior(1, SPEC)
+    prior = OccupancyPrior(1, SPEC)
     prior.add(labels(occupied[:3], torch.ones_like(occupied[:3])))
     prior.add(labels(occupied[3:], torch.ones_like(occupied[3:])))
     torch.testing.assert_close(prior.probability[0, 0, 0], torch.tensor([1.0, 0.5, 0.25, 0.0]))
     # Of seven occupied voxels: {1} has IoU 4 / 7, {1, ½} 6 / 9, {1, ½, ¼} 7 / 12.
-    predicted, threshold = prior.best_constant()
+    predicted, threshold = prior.best_grid()
     assert threshold.tolist() == [0.5]
     assert predicted.nonzero().tolist() == [[0, 0, 0, 0], [0, 0, 0, 1]]
 
 
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000), st.floats(0.02, 0.6), st.booleans())
-def test_no_threshold_beats_the_best_constant_on_its_own_training_set(
+def test_no_threshold_beats_the_best_grid_on_its_own_training_set(
     seed: int, share: float, above: bool
 ) -> None:
     training = random_labels(seed, batch=5, share=share)
     region = above_ground(SPEC) if above else None
-    prior = VoxelPrior(2, SPEC)
+    prior = OccupancyPrior(2, SPEC)
     prior.add(training)
-    predicted, _ = prior.best_constant(region)
+    predicted, _ = prior.best_grid(region)
     best = count_occupancy(predicted.expand(5, -1, -1, -1, -1), training, region).iou.nan_to_num(0.0)
     for threshold in torch.cat([prior.probability.unique(), torch.tensor([0.0, 0.123])]):
         rival = (prior.probability >= threshold).expand(5, -1, -1, -1, -1)
@@ -126,23 +126,23 @@ def test_a_voxel_never_known_is_never_predicted() -> None:
     occupied = torch.ones(1, 1, 3, 4, 4, dtype=torch.bool)
     known = torch.zeros_like(occupied)
     known[0, 0, 0] = True
-    prior = VoxelPrior(1, SPEC)
+    prior = OccupancyPrior(1, SPEC)
     prior.add(labels(occupied, known))
-    predicted, _ = prior.best_constant()
+    predicted, _ = prior.best_grid()
     assert torch.equal(predicted, known[0])
 
 
 def test_a_training_set_without_anything_predicts_nothing() -> None:
-    prior = VoxelPrior(2, SPEC)
+    prior = OccupancyPrior(2, SPEC)
     prior.add(random_labels(0, share=0.0))
-    predicted, threshold = prior.best_constant()
+    predicted, threshold = prior.best_grid()
     assert not predicted.any()
     assert torch.isinf(threshold).all()
 
 
 def test_labels_on_another_grid_are_refused() -> None:
     with pytest.raises(InputError, match="do not fit"):
-        VoxelPrior(3, SPEC).add(random_labels(0, frames=2))
+        OccupancyPrior(3, SPEC).add(random_labels(0, frames=2))
 
 
 def test_flow_errors_by_hand() -> None:

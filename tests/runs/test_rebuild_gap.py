@@ -62,7 +62,7 @@ def test_the_gap_has_both_fits_and_the_agreement(trained: Run, rebuilt: Path, tm
 class Told:
     """Says one thing of bright images and another of dark ones."""
 
-    def predict(self, observed: Clip) -> Prediction:
+    def predict(self, observed: Clip, asked: object) -> Prediction:
         bright = float(observed.images[0, -1].float().mean()) > 100
         occupied = torch.full((1, 1, 2, 16, 16), -1.0)
         occupied[..., : 8 if bright else 4] = 1.0

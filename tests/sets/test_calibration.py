@@ -1,13 +1,14 @@
-"""Calibration, proper scores, conformal boxes and resampling: by hand, and against what they promise."""
+"""Calibration and conformal boxes: by hand, and against what they promise."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, stats
+from scipy import stats
 
-from foredrive.errors import InputError
+from foredrive.metrics.proper_scores import brier
+from foredrive.metrics.reliability import reliability
 from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli, UniformPoisson
 from foredrive.sets.calibration import (
     conformal_factor,
@@ -15,10 +16,7 @@ from foredrive.sets.calibration import (
     fit_existence,
     fit_scale,
     fit_set_calibration,
-    reliability,
 )
-from foredrive.sets.proper_scores import brier, crps_gaussian, crps_laplace, energy_score, object_brier
-from foredrive.sets.resampling import bootstrap_mean
 
 
 def drawn_pairs(
@@ -30,22 +28,6 @@ def drawn_pairs(
     said = BoxDensity(torch.as_tensor(rng.normal(size=(n, 3))), chol, family=family)
     state, _ = BoxDensity(said.mean, factor * chol, family=family).sample(rng)
     return said, LabelledBoxes(torch.zeros(n, dtype=torch.long), state)
-
-
-def test_reliability_by_hand() -> None:
-    """Bins of a half: {0.2, 0.5 (its upper edge)} hit once, {0.9} hit: (2·|0.5 - 0.35| + |1 - 0.9|) / 3."""
-    result = reliability(np.array([0.2, 0.5, 0.9]), np.array([True, False, True]), 2)
-    assert result.count.tolist() == [2, 1]
-    np.testing.assert_allclose(result.confidence, [0.35, 0.9])
-    np.testing.assert_allclose(result.outcome, [0.5, 1.0])
-    assert result.error == pytest.approx(0.4 / 3)
-
-
-def test_bins_without_detections_count_for_nothing() -> None:
-    result = reliability(np.array([0.0, 1.0]), np.array([0.0, 0.7]), 10)
-    assert result.count.tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0, 1]
-    assert result.error == pytest.approx(0.15)
-    assert math.isnan(reliability(np.zeros(0), np.zeros(0)).error)
 
 
 def test_isotonic_existence_by_hand() -> None:
@@ -83,63 +65,6 @@ def test_conformal_boxes_cover_whatever_the_covariances_say() -> None:
     covered = conformal_scores(said[3000:], truth[3000:]) <= q
     assert covered.mean() == pytest.approx(0.9, abs=4 * math.sqrt(2 * 0.09 / 3000))
     assert conformal_factor(said[:5], truth[:5], 0.9) == math.inf
-
-
-def test_crps_is_the_integral_that_defines_it() -> None:
-    for score, cdf in (
-        (crps_gaussian, stats.norm(1.0, 0.7).cdf),
-        (crps_laplace, stats.laplace(1.0, 0.7 / math.sqrt(2)).cdf),
-    ):
-        for value in (-0.5, 1.0, 1.3):
-            below, _ = integrate.quad(lambda x, cdf=cdf: cdf(x) ** 2, -15, value)
-            above, _ = integrate.quad(lambda x, cdf=cdf: (1 - cdf(x)) ** 2, value, 15)
-            got = score(np.array([1.0]), np.array([0.7]), np.array([value]))
-            assert got.item() == pytest.approx(below + above, abs=1e-6)
-
-
-def test_the_energy_score_of_a_number_is_its_crps() -> None:
-    std = torch.full((3, 1, 1), 0.7)
-    said = BoxDensity(torch.ones(3, 1), std)
-    truth = LabelledBoxes(torch.zeros(3, dtype=torch.long), torch.tensor([[-0.5], [1.0], [1.3]]))
-    expected = crps_gaussian(np.ones(3), np.full(3, 0.7), np.array([-0.5, 1.0, 1.3]))
-    got = energy_score(said, truth, np.random.default_rng(3), samples=20_000)
-    np.testing.assert_allclose(got, expected, atol=0.02)
-
-
-def test_bootstrap_draws_whole_sequences() -> None:
-    """Ten sequences of fifty equal frames: the interval is that of ten values, not of five hundred."""
-    rng = np.random.default_rng(4)
-    level = rng.normal(1.0, 1.0, 10)
-    names = [f"s{n}" for n in range(10) for _ in range(50)]
-    result = bootstrap_mean(np.repeat(level, 50), names, rng)
-    assert result.mean == pytest.approx(level.mean())
-    half = 1.96 * level.std() / math.sqrt(10)
-    assert (result.high - result.low) / 2 == pytest.approx(half, rel=0.15)
-    assert result.low < result.mean < result.high
-
-
-def test_p_values_are_small_where_the_mean_is_far_from_0() -> None:
-    rng = np.random.default_rng(5)
-    names = [str(n) for n in range(40)]
-    assert bootstrap_mean(rng.normal(1.0, 1.0, 40), names, rng).p_value < 0.01
-    values = rng.normal(0.0, 1.0, 40)
-    assert bootstrap_mean(values - values.mean(), names, rng).p_value > 0.5
-    few = bootstrap_mean(np.ones(30), ["a", "b", "c"] * 10, rng)
-    assert few.p_value == pytest.approx(2 * 0.5**3, abs=0.05)  # however many frames: all signs alike
-    assert bootstrap_mean(np.zeros(30), ["a", "b", "c"] * 10, rng).p_value == 1.0
-    one = bootstrap_mean(np.ones(3), ["a"] * 3, rng)
-    assert one.mean == 1.0
-    assert math.isnan(one.low)
-    with pytest.raises(InputError, match="finite"):
-        bootstrap_mean(np.array([np.inf]), ["a"], rng)
-
-
-def test_object_level_error_by_hand() -> None:
-    """Two detections of the first object say (0.6, 0.1) on average; nobody speaks of the second."""
-    probability = np.array([[0.9, 0.0], [0.3, 0.2], [0.5, 0.5]])
-    near = np.array([[True, False], [True, False], [False, False]])
-    error = object_brier(probability, near, np.array([0, 1]))
-    np.testing.assert_allclose(error, [0.4**2 + 0.1**2, 1.0])
 
 
 def test_a_detector_is_mended_by_frames_apart() -> None:

@@ -1,8 +1,7 @@
-"""Benchmarks' common ground: arms side by side, over seeds, stored as they come in.
+"""Benchmarks: arms side by side, over seeds, stored after each measurement.
 
-A benchmark is run seed by seed and arm by arm, and its file is written after each. A run that was interrupted
-goes on where it stopped; figures are kept only while the code (commit and changes since), the benchmark's
-configuration and the machine are the same.
+A benchmark runs seed by seed and arm by arm. An interrupted run goes on where it stopped. Figures are kept
+only while the code (commit and changes since), the benchmark's configuration and the machine are the same.
 """
 
 import hashlib
@@ -22,15 +21,15 @@ from foredrive.evaluation.summary import write_json
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Things to compare, all measured by this program on this machine."""
+    """Arms to compare, all measured by this program on this machine."""
 
     question: str
-    """What the figures answer, in one line."""
+    """The question that the figures answer, in one line."""
     arms: Mapping[str, Callable[[int], Mapping[str, float]]]
-    """By name, what is compared: seed → figures by name, units in the names."""
+    """Functions by name: seed → figures by name, units in the names."""
     seeds: tuple[int, ...] = (0, 1, 2)
     config: Mapping[str, Any] | None = None
-    """Whatever the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
+    """Values that the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
 
 
 def run_benchmark(
@@ -41,11 +40,11 @@ def run_benchmark(
     arms: Sequence[str] | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Run what is still missing of a benchmark and return the path of its results, `folder`/NAME.json.
+    """Run the missing measurements of a benchmark; return the path of its results, `folder`/NAME.json.
 
     Args:
         arms: only these; None means all.
-        say: told what happens, one line at a time.
+        say: called with one line about each measurement.
 
     Raises:
         InputError: on an arm that the benchmark does not have.
@@ -77,7 +76,7 @@ def run_benchmark(
 
 
 def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Mean, standard deviation (of a sample), minimum, maximum and number per arm and figure."""
+    """Return mean, standard deviation (of a sample), minimum, maximum and number per arm and figure."""
     found: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         for key, value in run["figures"].items():
@@ -117,7 +116,7 @@ def _report(
 
 
 def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
-    """A digest of all that makes two measurements comparable."""
+    """Return a digest of all facts that make two measurements comparable."""
     parts = {key: value for key, value in origin.items() if key != "command"}
     parts["config"] = dict(benchmark.config or {})
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
@@ -126,7 +125,7 @@ def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
 def _kept_runs(
     path: Path, same: str, benchmark: Benchmark, say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Earlier runs that are still good."""
+    """Return the earlier runs that still hold."""
     if not path.is_file():
         return []
     try:

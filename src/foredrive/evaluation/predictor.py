@@ -1,18 +1,21 @@
-"""What an evaluation asks of whatever it judges."""
+"""The interface between models and evaluations: a `Predictor` returns a `Prediction`."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.scene import Clip, Trajectory
+from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.scene.record import Record
+
+Part = Literal["occupancy_logit", "plan", "flow_mps", "futures", "images"]
+"""A part of a `Prediction`, by the name of its field."""
 
 
 @dataclass(frozen=True)
 class Prediction(Record):
-    """What is said about b clips, for F frames: now, then future key frames. What is None is not judged.
+    """A model's predictions for b clips and F frames: now, then future key frames. None is not judged.
 
     Images may be rendered of fewer frames, R.
     """
@@ -22,21 +25,36 @@ class Prediction(Record):
     plan: Trajectory | None = None
     """[b 1 T] in the ego frame at now."""
     flow_mps: Float[Tensor, "b F 3 Z Y X"] | None = None
-    """Velocity over ground of what is in a voxel, in the ego axes of its frame."""
+    """Velocity over ground of the content of a voxel, in the ego axes of its frame."""
     futures: Bool[Tensor, "b K P Z Y X"] | None = None
-    """Occupancy in K futures drawn by chance, of the P = F - 1 key frames after now."""
+    """Occupancy in K sampled futures, of the P = F - 1 key frames after now."""
     images: Float[Tensor, "b R C 3 h w"] | None = None
     """Rendered views of the clip's cameras, RGB from 0 to 1."""
-    image_known: Bool[Tensor, "b R C h w"] | None = None
-    """Pixels that were rendered; None: all."""
     image_stride: int = 1
-    """Every how many-th pixel along rows and columns was rendered, the first one `image_stride // 2` in."""
+    """One pixel in `image_stride` along rows and columns is rendered, the first at `image_stride // 2`."""
 
 
 @runtime_checkable
 class Predictor(Protocol):
     """A model under evaluation."""
 
-    def predict(self, observed: Clip) -> Prediction:
-        """Predict from a batch of clips that end at now; their driven future is masked."""
+    def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
+        """Predict from a batch of clips that end at now; their driven future is masked.
+
+        Args:
+            observed: of b clips.
+            asked: parts that the metrics need. A part that is not asked for may be left None, and so may a
+                part that the model cannot predict.
+        """
         ...
+
+
+@dataclass(frozen=True)
+class PlannerPredictor:
+    """A planner as a `Predictor`: it predicts a plan and nothing else."""
+
+    planner: Agent
+
+    def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
+        """Return the plan alone."""
+        return Prediction(plan=self.planner.act(observed))

@@ -1,4 +1,4 @@
-"""Where numbers come from: machine, versions, commit, command, memory."""
+"""Provenance of figures: machine, versions, commit, command, memory."""
 
 import hashlib
 import os
@@ -16,11 +16,11 @@ import foredrive
 
 GIB = 1024**3
 CODE = ("--", "src", "pyproject.toml")
-"""What figures depend on, as arguments to git."""
+"""Paths that figures depend on, as arguments to git."""
 
 
 def collect_provenance() -> dict[str, float | int | str | None]:
-    """What has to be known to repeat a measurement, as flat dotted keys."""
+    """Return the facts needed to repeat a measurement, as flat dotted keys."""
     return {
         "machine.cpu": _cpu_model(),
         "machine.cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -35,14 +35,14 @@ def collect_provenance() -> dict[str, float | int | str | None]:
 
 
 def command_line() -> str:
-    """The command this process was started with, without the folder its program lies in."""
+    """Return the command of this process, without the folder of its program."""
     program = Path(sys.argv[0])
     name = f"python -m {program.parent.name}" if program.name == "__main__.py" else program.name
     return " ".join([name, *map(shlex.quote, sys.argv[1:])])
 
 
 def git_commit(checkout: Path) -> str | None:
-    """Commit of a checkout, None if it is none.
+    """Return the commit of a checkout; None for other folders.
 
     Where the code differs from the commit, "+" and a digest of the difference follow: two measurements are of
     the same code if and only if the strings are equal.
@@ -61,9 +61,9 @@ def git_commit(checkout: Path) -> str | None:
 
 
 def peak_rss_gib() -> float:
-    """Highest resident memory this process has had, GiB (worker processes not included)."""
+    """Return the peak resident memory of this process, GiB, without worker processes."""
     status = Path("/proc/self/status")
-    if status.is_file():  # getrusage would also know what the process that started this one had
+    if status.is_file():  # getrusage would count the memory of the parent process, too
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / GIB
@@ -72,7 +72,7 @@ def peak_rss_gib() -> float:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says, None if it cannot be asked."""
+    """Return the output of git, None if it cannot run."""
     try:
         answer = subprocess.run(
             ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=60

@@ -1,4 +1,4 @@
-"""How well a rebuilt scene shows what its sensors saw at times it has not learned from."""
+"""Rebuilt scenes against the images and sweeps that were held out."""
 
 import dataclasses
 import time
@@ -17,7 +17,7 @@ from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
 
 MOVING_MPS = 0.5
-"""From this speed on a vehicle is on its way."""
+"""From this speed on a vehicle counts as moving."""
 
 
 @torch.no_grad()
@@ -28,15 +28,15 @@ def judge_cameras(
     graph: SceneGraph | None = None,
     where: Sequence[Bool[Tensor, "H W"]] | None = None,
 ) -> dict[str, float]:
-    """PSNR and SSIM, mean over images; beside them those of the nearest image that was learned from.
+    """Return PSNR and SSIM, mean over images, and under "nearest." those of the baseline.
 
-    Under "moving." the same over the images that were taken on the way: where a vehicle stands, the image
-    before is nearly the one that is asked for.
+    The baseline shows the nearest learned image of the same camera. Under "moving." are means over the images
+    taken at speed: where a vehicle stands, the image before is nearly the same.
 
     Args:
-        scene: that is judged.
-        views: with images, that it has not seen.
-        learned: what it has seen; the nearest in time of the same camera is the rival.
+        scene: to judge.
+        views: held out, with images.
+        learned: views that the scene was learned from.
         graph: the scene after edits; None: as it was learned.
         where: pixels that count, of each view; None: all.
     """
@@ -51,10 +51,10 @@ def judge_cameras(
         pixels += view.size_hw[0] * view.size_hw[1]
         real = _image(view)
         known = torch.ones_like(real[:, 0], dtype=torch.bool) if where is None else where[number][None]
-        rivals = [other for other in learned if other.sensor == view.sensor]
+        same_camera = [other for other in learned if other.sensor == view.sensor]
         shown = {"": rgb}
-        if rivals:
-            shown["nearest."] = _image(min(rivals, key=lambda other: abs(other.t_s - view.t_s)))
+        if same_camera:
+            shown["nearest."] = _image(min(same_camera, key=lambda other: abs(other.t_s - view.t_s)))
         for prefix, image in shown.items():
             figures = {"psnr_db": psnr_db(image, real, known), "ssim": ssim(image, real, known)}
             for name, value in figures.items():
@@ -81,12 +81,12 @@ def judge_sweeps(
     graph: SceneGraph | None = None,
     where: Sequence[Bool[Tensor, "P"]] | None = None,
 ) -> dict[str, float]:
-    """The figures of `SweepScores`, mean over sweeps.
+    """Return the figures of `SweepScores`, mean over sweeps.
 
     Args:
-        scene: that is judged.
-        views: that it has not seen.
-        drop: beams that are more likely to be lost than not are taken as such; False: all return.
+        scene: to judge.
+        views: held out.
+        drop: whether beams that are likelier lost than not count as lost; False: all return.
         graph: the scene after edits; None: as it was learned.
         where: beams that count, of each view; None: all.
     """

@@ -2,30 +2,22 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import get_args
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.evaluation.predictor import Prediction, Predictor
+from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactory
+from foredrive.evaluation.metrics import METRICS
+from foredrive.evaluation.predictor import Part, PlannerPredictor, Prediction, Predictor
 from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.evaluation.totals import (
-    Figures,
-    FlowTotals,
-    FuturesTotals,
-    ImageTotals,
-    OccupancyTotals,
-    PlanningTotals,
-)
-from foredrive.metrics import Obstacles, VoxelPrior, future_obstacles
-from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.scene import Agent, Clip, Example, Trajectory, VoxelGrid
-
-R = TypeVar("R")
+from foredrive.metrics import OccupancyPrior
+from foredrive.metrics.protocols import STEPS
+from foredrive.scene import Agent, Example, Trajectory
 
 
 @dataclass(frozen=True)
@@ -38,7 +30,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """What an evaluation found."""
+    """The figures of an evaluation, and its failures."""
 
     summary: Figures
     """Flat dotted keys; NaN where nothing could be counted."""
@@ -51,144 +43,130 @@ def evaluate(
     loader: Iterable[Example],
     *,
     frame_dt_s: float,
+    metrics: Sequence[MetricFactory] = METRICS,
     baselines: Mapping[str, Agent] | None = None,
-    prior: VoxelPrior | None = None,
+    prior: OccupancyPrior | None = None,
     command_source: Mapping[str, int] | None = None,
     device: torch.device | str = "cpu",
     on_items: Callable[[int], None] = lambda items: None,
 ) -> EvaluationResult:
-    """Judge a model, and planners it has to beat, on every item of a loader.
+    """Judge a model and its baselines on every item of a loader.
 
     Args:
-        predictor: sees `clip.observed()` only. What it leaves None is not judged.
-        loader: batches. For collisions up to 3 s their clips need boxes of the six key frames after now.
+        predictor: sees `clip.observed()` only, and is asked for the parts that the metrics need. A metric
+            gives no figures where the model leaves one of its parts None.
+        loader: batches.
         frame_dt_s: time between key frames; names the figures of future frames.
-        baselines: planners by name, judged on every item they manage, under `planning.NAME.PROTOCOL`.
-        prior: of the training set, on the model's frames; adds `best_constant` beside every occupancy figure.
+        metrics: started once for the model and once for each baseline.
+        baselines: planners by name, judged by the metrics of plans on every item that they manage. Their keys
+            are `METRIC.BASELINE.KEY`, where the model's are `METRIC.KEY`.
+        prior: of the training set, on the model's frames; stands beside every occupancy figure.
         command_source: how many commands came from a route, the driven future, nowhere.
-        on_items: told the number of items after each batch.
+        on_items: called with the number of items after each batch.
 
-    An item at which the predictor raises an error or says something that is not finite counts as failed; its
-    batch is then tried again item by item. Where the loader raises an InputError and can go on after it, a
-    batch (of its `batch_size`; without one, an item) counts as failed.
+    An item for which the predictor raises an error, or predicts a value that is not finite, counts as failed;
+    its batch is then tried again item by item. Where the loader raises an InputError and can go on after it,
+    a batch (of its `batch_size`; without one, an item) counts as failed.
 
     Raises:
         InputError: if there are no items, or all of them failed.
     """
     started = time.perf_counter()
-    totals = _Totals(frame_dt_s, prior)
-    rivals = {name: _Baseline(planner) for name, planner in (baselines or {}).items()}
-    failures: list[Failure] = []
-    judged = 0
+    context = EvaluationContext(frame_dt_s, prior)
+    model = _Judged(predictor, metrics, context)
+    planners = {
+        name: _Judged(PlannerPredictor(planner), metrics, context, only=frozenset({"plan"}))
+        for name, planner in (baselines or {}).items()
+    }
     with torch.inference_mode():
-        for loaded in _load(loader, failures, on_items):
+        for loaded in _load(loader, model.failures, on_items):
             example = loaded.to(device)
-            obstacles = future_obstacles(example.clip, STEPS, STEP_S)
-            for chosen, prediction in _attempt(predictor.predict, _whole_prediction, example, failures):
-                totals.add(_select(example, chosen), prediction, obstacles[chosen])
-                judged += len(chosen)
-            for rival in rivals.values():
-                rival.add(example, obstacles)
+            for judged in (model, *planners.values()):
+                judged.add(example)
             on_items(len(example.key))
-    if judged == 0:
-        first = f"all {len(failures)} items failed, {failures[0].reason}" if failures else "no items"
+    failed = len(model.failures)
+    if model.items == 0:
+        first = f"all {failed} items failed, {model.failures[0].reason}" if failed else "no items"
         raise InputError(f"there is nothing to evaluate: {first}")
-    summary = totals.figures()
-    for name, rival in rivals.items():
-        summary |= rival.figures(f"planning.{name}")
+    summary = model.figures()
+    for name, judged in planners.items():
+        summary |= judged.figures(f"{name}.") | {f"planning.{name}.failed": len(judged.failures)}
     summary |= _command_figures(command_source or {})
-    summary |= {"items": judged + len(failures), "failed": len(failures)}
+    summary |= {"items": model.items + failed, "failed": failed}
     summary |= {"peak_rss_gib": peak_rss_gib(), "wall_s": time.perf_counter() - started}
-    return EvaluationResult(summary, tuple(failures))
+    return EvaluationResult(summary, tuple(model.failures))
 
 
-class _Baseline:
-    """A planner that is judged beside the model."""
+class _Judged:
+    """A model or baseline, its metrics and its failures.
 
-    def __init__(self, planner: Agent) -> None:
-        self._planner = planner
-        self._totals = PlanningTotals()
-        self._failures: list[Failure] = []
-
-    def add(self, example: Example, obstacles: Obstacles) -> None:
-        """Judge its plans for one batch."""
-        for chosen, plan in _attempt(self._planner.act, _whole_plan, example, self._failures):
-            self._totals.add(plan, example.clip.future[chosen], obstacles[chosen])
-
-    def figures(self, prefix: str) -> Figures:
-        """Its figures and the number of its failures."""
-        return self._totals.figures(prefix) | {f"{prefix}.failed": len(self._failures)}
-
-
-class _Totals:
-    """The sums of everything the model may say; what it says shows with its first prediction."""
-
-    def __init__(self, frame_dt_s: float, prior: VoxelPrior | None) -> None:
-        self._frame_dt_s, self._prior = frame_dt_s, prior
-        self._planning: PlanningTotals | None = None
-        self._occupancy: OccupancyTotals | None = None
-        self._futures: FuturesTotals | None = None
-        self._flow: FlowTotals | None = None
-        self._images: ImageTotals | None = None
-
-    def add(self, example: Example, prediction: Prediction, obstacles: Obstacles) -> None:
-        """Judge one batch."""
-        clip, dt_s = example.clip, self._frame_dt_s
-        if prediction.plan is not None:
-            self._planning = self._planning or PlanningTotals()
-            self._planning.add(prediction.plan, clip.future, obstacles)
-        if prediction.occupancy_logit is not None:
-            frames = prediction.occupancy_logit.shape[1]
-            labels = labels_from_now(example.occupancy, clip, frames)
-            self._occupancy = self._occupancy or OccupancyTotals(labels.spec, frames, dt_s, self._prior)
-            T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
-            self._occupancy.add(prediction.occupancy_logit > 0, labels, T_world_ego)
-        if prediction.futures is not None:
-            count, frames = prediction.futures.shape[1:3]
-            labels = labels_from_now(example.occupancy, clip, frames + 1)[:, 1:]
-            self._futures = self._futures or FuturesTotals(labels.spec, count, frames, dt_s)
-            self._futures.add(prediction.futures, labels)
-        if prediction.flow_mps is not None:
-            frames = prediction.flow_mps.shape[1]
-            self._flow = self._flow or FlowTotals(frames, dt_s)
-            self._flow.add(prediction.flow_mps, labels_from_now(example.flow, clip, frames))
-        if prediction.images is not None:
-            self._images = self._images or ImageTotals(prediction.images.shape[1], dt_s)
-            self._images.add(prediction.images, prediction.image_known, prediction.image_stride, clip)
-
-    def figures(self) -> Figures:
-        parts = (
-            ("occupancy", self._occupancy),
-            ("occupancy", self._futures),
-            ("flow", self._flow),
-            ("image", self._images),
-            ("planning", self._planning),
-        )
-        out: Figures = {}
-        for prefix, part in parts:
-            if part is not None:
-                out |= part.figures(prefix)
-        return out
-
-
-def labels_from_now(labels: VoxelGrid, clip: Clip, frames: int) -> VoxelGrid:
-    """The labels [b T …] of now and the `frames` - 1 key frames after it.
-
-    Raises:
-        InputError: if the clip ends before.
+    Args:
+        only: parts that it predicts, if that is known; metrics of others are not started.
     """
-    now = clip.now
-    if now + frames > clip.t_s.shape[1]:
-        raise InputError(
-            f"{frames} frames from now on are predicted, but the clips hold only {clip.t_s.shape[1] - now}"
-        )
-    return labels[:, now : now + frames]
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        metrics: Sequence[MetricFactory],
+        context: EvaluationContext,
+        only: frozenset[Part] | None = None,
+    ) -> None:
+        self._predictor = predictor
+        started = [start(context) for start in metrics]
+        self._metrics = [metric for metric in started if only is None or metric.needs <= only]
+        self._asked: frozenset[Part] = frozenset().union(*(metric.needs for metric in self._metrics))
+        self._met = [only is not None for _ in self._metrics]
+        """Which metrics give figures: those that were updated, and all of them where `only` is given."""
+        self.failures: list[Failure] = []
+        self.items = 0
+        """That were predicted."""
+
+    def add(self, example: Example) -> None:
+        """Predict and judge one batch."""
+        for chosen, prediction in self._attempt(example):
+            truth = _select(example, chosen)
+            self.items += len(chosen)
+            for number, metric in enumerate(self._metrics):
+                if all(getattr(prediction, part) is not None for part in metric.needs):
+                    metric.update(prediction, truth)
+                    self._met[number] = True
+
+    def figures(self, infix: str = "") -> Figures:
+        """Return the figures of all metrics, `infix` standing between a metric's name and its keys."""
+        return {
+            f"{metric.name}.{infix}{key}": value
+            for metric, met in zip(self._metrics, self._met, strict=True)
+            if met
+            for key, value in metric.result().items()
+        }
+
+    def _attempt(self, example: Example) -> Iterator[tuple[Tensor, Prediction]]:
+        """Yield predictions with the indices of their items, in order; note the failures."""
+        batches = [torch.arange(len(example.key))]
+        while batches:
+            chosen = batches.pop(0)
+            try:
+                observed = _select(example, chosen).clip.observed()
+                prediction = self._predictor.predict(observed, self._asked)
+            except Exception as error:  # whatever a model does wrong, the others are still to be judged
+                if len(chosen) > 1:
+                    batches.extend(chosen[:, None])
+                else:
+                    self.failures.append(Failure(example.key[int(chosen)], _line(error)))
+                continue
+            good = _whole(prediction).cpu()
+            bad = chosen[~good].tolist()
+            self.failures.extend(Failure(example.key[i], "not finite or incomplete") for i in bad)
+            if good.all():
+                yield chosen, prediction
+            elif good.any():
+                yield chosen[good], prediction[good]
 
 
 def _load(
     loader: Iterable[Example], failures: list[Failure], on_items: Callable[[int], None]
 ) -> Iterator[Example]:
-    """The batches that can be loaded."""
+    """Yield the batches that can be loaded; note those that cannot."""
     batches = iter(loader)
     batch_size = getattr(loader, "batch_size", None) or 1
     while True:
@@ -203,61 +181,42 @@ def _load(
         yield batch
 
 
-def _attempt(
-    act: Callable[[Clip], R], whole: Callable[[R], Tensor], example: Example, failures: list[Failure]
-) -> Iterator[tuple[Tensor, R]]:
-    """What `act` says about an example, as (indices of items, result for them), without what failed."""
-    batches = [torch.arange(len(example.key))]
-    while batches:
-        chosen = batches.pop(0)
-        try:
-            result = act(_select(example, chosen).clip.observed())
-        except Exception as error:  # whatever a model does wrong, the others are still to be judged
-            if len(chosen) > 1:
-                batches.extend(chosen[:, None])
-            else:
-                failures.append(Failure(example.key[int(chosen)], _line(error)))
-            continue
-        good = whole(result).cpu()
-        failures.extend(Failure(example.key[i], "not finite or incomplete") for i in chosen[~good].tolist())
-        if good.all():
-            yield chosen, result
-        elif good.any():
-            yield chosen[good], result[good]  # type: ignore[index]
-
-
 def _select(example: Example, chosen: Tensor) -> Example:
-    """Some items of a batch."""
+    """Return some items of a batch."""
     if len(chosen) == len(example.key):
         return example
     return dataclasses.replace(example[chosen], key=tuple(example.key[i] for i in chosen.tolist()))
 
 
-def _whole_plan(plan: Trajectory) -> Bool[Tensor, "b"]:
-    """Which plans are finite and have all their steps."""
-    fine = plan.valid & plan.xy.isfinite().all(dim=-1) & plan.yaw.isfinite()
-    return fine[..., :STEPS].flatten(1).all(dim=-1)
+def _whole(prediction: Prediction) -> Bool[Tensor, "b"]:
+    """Return which of b predictions are finite in all their parts.
 
-
-def _whole_prediction(prediction: Prediction) -> Bool[Tensor, "b"]:
-    """Which predictions are finite in all they say."""
-    said = (prediction.occupancy_logit, prediction.flow_mps, prediction.images)
-    fine = [values.flatten(1).isfinite().all(dim=-1) for values in said if values is not None]
-    if prediction.plan is not None:
-        fine.append(_whole_plan(prediction.plan))
+    Raises:
+        InputError: if all parts are None.
+    """
+    parts = [getattr(prediction, part) for part in get_args(Part)]
+    fine = [_whole_part(part) for part in parts if part is not None]
     if not fine:
         raise InputError("the model predicted nothing")
     return torch.stack(fine).all(dim=0)
 
 
+def _whole_part(part: Trajectory | Tensor) -> Bool[Tensor, "b"]:
+    """Return which of b items are finite; a plan has all steps that are scored, too."""
+    if isinstance(part, Trajectory):
+        fine = part.valid & part.xy.isfinite().all(dim=-1) & part.yaw.isfinite()
+        return fine[..., :STEPS].flatten(1).all(dim=-1)
+    return part.flatten(1).isfinite().all(dim=-1)
+
+
 def _command_figures(counts: Mapping[str, int]) -> Figures:
-    """Where the commands came from: they leak when they are read off the driven future."""
+    """Return where the commands came from: read off the driven future, they leak it."""
     sources = [source for source, count in counts.items() if count]
     out: Figures = {"command_source": sources[0] if len(sources) == 1 else ("mixed" if sources else "none")}
     return out | {f"command_source.{source}": count for source, count in counts.items()}
 
 
 def _line(error: Exception) -> str:
-    """An error in one line."""
+    """Return an error as one line."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0] if lines else ''}".removeprefix("InputError: ")

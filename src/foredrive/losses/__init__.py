@@ -1,11 +1,12 @@
-"""Criteria: pure functions of predictions and labels."""
+"""Losses: pure functions of predictions and truth that training descends."""
 
 from foredrive.losses.occupancy import occupancy_bce, occupancy_loss, scene_class_affinity
-from foredrive.losses.planning import waypoint_loss
+from foredrive.losses.planning import l1_waypoint_loss, waypoint_loss
 from foredrive.losses.reconstruction import l1_loss, perceptual_loss
 
 __all__ = [
     "l1_loss",
+    "l1_waypoint_loss",
     "occupancy_bce",
     "occupancy_loss",
     "perceptual_loss",

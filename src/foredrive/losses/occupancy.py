@@ -14,7 +14,7 @@ def occupancy_bce(
     known: Bool[Tensor, "*b Z Y X"],
     occupied_weight: float = 1.0,
 ) -> Float[Tensor, ""]:
-    """Binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known.
+    """Return the binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known.
 
     `occupied_weight` multiplies the terms of occupied voxels; eq. 10 has 1.
     """
@@ -26,11 +26,11 @@ def occupancy_bce(
 def scene_class_affinity(
     logit: Float[Tensor, "*b Z Y X"], occupied: Float[Tensor, "*b Z Y X"], known: Bool[Tensor, "*b Z Y X"]
 ) -> Float[Tensor, ""]:
-    """Geometric scene-class affinity: −log precision − log recall − log specificity (MonoScene, eq. 4–6).
+    """Return the geometric scene-class affinity −log P − log R − log S (MonoScene, eq. 4–6).
 
     Differentiable precision P = Σp·y/Σp, recall R = Σp·y/Σy, specificity S = Σ(1−p)(1−y)/Σ(1−y) over the
-    known voxels of the batch. A term whose denominator is empty (no occupied voxel, no free one) is left
-    out, where the published code divides by zero.
+    known voxels of the batch. A term with an empty denominator (no occupied voxel, no free one) is left out;
+    the published code divides by zero there.
     """
     p = logit.sigmoid()[known]
     y = occupied[known]
@@ -53,6 +53,6 @@ def occupancy_loss(
     bce_weight: float,
     occupied_weight: float = 1.0,
 ) -> Float[Tensor, ""]:
-    """L_occ = λ_scal·L_scal + λ_BCE·L_BCE (eq. 11; the paper: 10 and 1)."""
+    """Return L_occ = λ_scal·L_scal + λ_BCE·L_BCE (eq. 11; the paper: 10 and 1)."""
     bce = occupancy_bce(logit, occupied, known, occupied_weight)
     return scal_weight * scene_class_affinity(logit, occupied, known) + bce_weight * bce

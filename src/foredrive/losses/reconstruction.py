@@ -12,7 +12,7 @@ ImageFeatures = Callable[[Float[Tensor, "n 3 H W"]], Sequence[Float[Tensor, "n _
 def l1_loss(
     predicted: Float[Tensor, "n 3 H W"], truth: Float[Tensor, "n 3 H W"], valid: Bool[Tensor, "n"]
 ) -> Float[Tensor, ""]:
-    """Mean absolute colour error of the valid images, RGB in [0, 1]; 0 when none is valid."""
+    """Return the mean absolute colour error of the valid images, RGB in [0, 1]; 0 when none is valid."""
     per_image = (predicted - truth).abs().mean(dim=(1, 2, 3))
     return (per_image * valid).sum() / valid.sum().clamp_min(1)
 
@@ -23,7 +23,7 @@ def perceptual_loss(
     valid: Bool[Tensor, "n"],
     features: ImageFeatures,
 ) -> Float[Tensor, ""]:
-    """L1 between network features of the valid images (Johnson et al. 2016), summed over the layers."""
+    """Return L1 between network features of the valid images, summed over layers (Johnson et al. 2016)."""
     if not valid.any():
         return predicted.new_zeros(())
     pairs = zip(features(predicted[valid]), features(truth[valid]), strict=True)

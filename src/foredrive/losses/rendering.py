@@ -1,4 +1,4 @@
-"""What a rendered image and a rendered sweep are asked for (Hess et al., "SplatAD", 2025, §3.5)."""
+"""Losses of rendered images and sweeps (Hess et al., "SplatAD", 2025, §3.5)."""
 
 import torch
 import torch.nn.functional as F
@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 DEPTH_QUANTILE = 0.95
-"""The worst beams are left out: what they met moved, or is thin."""
+"""The worst beams are left out: they met something thin or moving."""
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
@@ -14,13 +14,13 @@ _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 def photometric_loss(
     rendered: Float[Tensor, "3 H W"], real: Float[Tensor, "3 H W"], ssim_share: float = 0.2
 ) -> Float[Tensor, ""]:
-    """(1 - λ) L1 + λ (1 - SSIM), RGB in 0 to 1 (Kerbl et al., 2023, eq. 7); 6 px a side at least."""
+    """Return (1 - λ) L1 + λ (1 - SSIM), RGB in 0 to 1 (Kerbl et al., 2023, eq. 7); 6 px a side at least."""
     l1 = (rendered - real).abs().mean()
     return (1 - ssim_share) * l1 + ssim_share * (1 - _mean_ssim(rendered[None], real[None]))
 
 
 def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Float[Tensor, ""]:
-    """Structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
+    """Return structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
     offset = torch.arange(_SSIM_WINDOW_PX, device=a.device) - _SSIM_WINDOW_PX // 2
     window = torch.softmax(-0.5 * (offset / _SSIM_SIGMA_PX) ** 2, dim=0).to(a)
     stack = torch.cat([a, b, a * a, b * b, a * b], dim=1)  # [1 15 H W]
@@ -36,7 +36,7 @@ def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Floa
 def range_loss(
     rendered_m: Float[Tensor, "P"], real_m: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
 ) -> Float[Tensor, ""]:
-    """Mean absolute error of the beams that returned, without the worst twentieth; 0 if none did."""
+    """Return the mean absolute error of returned beams, without the worst twentieth; 0 without any."""
     error = (rendered_m - real_m).abs()[returned]
     if not len(error):
         return rendered_m.new_zeros(())
@@ -47,17 +47,17 @@ def range_loss(
 def intensity_loss(
     rendered: Float[Tensor, "P"], real: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the beams that returned; 0 if none did."""
+    """Return the mean squared error of the beams that returned; 0 if none did."""
     return ((rendered - real) ** 2 * returned).sum() / returned.sum().clamp_min(1)
 
 
 def drop_loss(drop_logit: Float[Tensor, "P"], returned: Bool[Tensor, "P"]) -> Float[Tensor, ""]:
-    """Binary cross-entropy of whether beams fail to return."""
+    """Return the binary cross-entropy of lost beams."""
     return F.binary_cross_entropy_with_logits(drop_logit, (~returned).to(drop_logit))
 
 
 def line_of_sight_loss(
     alpha_before_hit: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
 ) -> Float[Tensor, ""]:
-    """Mean share of the light that something stops before what the beam met; 0 if none returned."""
+    """Return the mean share of light that is stopped before the beam's hit; 0 if none returned."""
     return (alpha_before_hit * returned).sum() / returned.sum().clamp_min(1)

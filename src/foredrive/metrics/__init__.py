@@ -1,12 +1,12 @@
-"""Open-loop planning protocols, occupancy, image quality: pure functions."""
+"""Metrics: pure functions of predictions and truth, summed up by `foredrive.evaluation`."""
 
-from foredrive.metrics.forecasts import FuturesCounts, carried_along, count_futures
+from foredrive.metrics.forecasts import FuturesCounts, count_futures, ego_compensated
 from foredrive.metrics.images import psnr_db, ssim
 from foredrive.metrics.obstacles import Obstacles, boxes_at_now, future_obstacles
 from foredrive.metrics.occupancy import (
     FlowErrors,
     OccupancyCounts,
-    VoxelPrior,
+    OccupancyPrior,
     above_ground,
     count_occupancy,
     flow_errors,
@@ -21,14 +21,14 @@ __all__ = [
     "ObstacleGrid",
     "Obstacles",
     "OccupancyCounts",
+    "OccupancyPrior",
     "PlanScores",
     "PlanningProtocol",
-    "VoxelPrior",
     "above_ground",
     "boxes_at_now",
-    "carried_along",
     "count_futures",
     "count_occupancy",
+    "ego_compensated",
     "flow_errors",
     "future_obstacles",
     "psnr_db",

@@ -13,7 +13,7 @@ COCO_OVERLAPS = tuple(np.round(np.arange(0.5, 1.0, 0.05), 2).tolist())
 
 
 def overlaps(boxes: Float[ndarray, "M 4"], others: Float[ndarray, "N 4"]) -> Float[ndarray, "M N"]:
-    """Intersection over union of image boxes (x1, y1, x2, y2)."""
+    """Return the intersection over union of image boxes (x1, y1, x2, y2)."""
     low = np.maximum(boxes[:, None, :2], others[:, :2])
     high = np.minimum(boxes[:, None, 2:], others[:, 2:])
     shared = np.clip(high - low, 0.0, None).prod(-1)
@@ -23,22 +23,28 @@ def overlaps(boxes: Float[ndarray, "M 4"], others: Float[ndarray, "N 4"]) -> Flo
 
 
 def match_greedily(
-    score: Float[ndarray, "M"], closeness: Float[ndarray, "M N"], least: float
+    score: Float[ndarray, "M"], closeness: Float[ndarray, "M N"], min_closeness: float
 ) -> Int[ndarray, "M"]:
-    """Object of each detection, or -1: the best scored first, each takes the closest that is left.
+    """Match the detections of one frame, best score first, with the closest object that is left.
 
-    Of one frame. `closeness` is larger for better pairs, -inf between classes; those below `least` are none.
+    Args:
+        score: of detections.
+        closeness: larger for better pairs, -inf between classes.
+        min_closeness: of a pair.
+
+    Returns:
+        The object of each detection; -1: none.
     """
-    return _match_greedily(np.argsort(-score, kind="stable"), closeness, least)
+    return _match_greedily(np.argsort(-score, kind="stable"), closeness, min_closeness)
 
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _match_greedily(order, closeness, least):
+def _match_greedily(order, closeness, min_closeness):
     found = np.full(len(order), -1)
     taken = np.zeros(closeness.shape[1], np.bool_)
     for i in order:
-        closest, best = -1, least
+        closest, best = -1, min_closeness
         for j in range(len(taken)):
             close = closeness[i, j]
             if not taken[j] and (close > best or (closest < 0 and close == best)):
@@ -51,7 +57,7 @@ def _match_greedily(order, closeness, least):
 def precision_recall(
     score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
-    """Precision and recall as the threshold falls, over all frames; precision made to fall with recall."""
+    """Return precision and recall over all frames as the threshold falls; precision is made monotone."""
     order = np.argsort(-score, kind="stable")
     hits = np.cumsum(hit[order])
     precision = hits / np.arange(1, len(score) + 1)
@@ -59,7 +65,7 @@ def precision_recall(
 
 
 def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
-    """Mean of the precision at recall 0, 0.01 … 1, as in COCO; NaN without objects."""
+    """Return COCO's: the mean of the precision at recall 0, 0.01 … 1; NaN without objects."""
     if objects == 0:
         return float("nan")
     precision, recall = precision_recall(score, hit, objects)
@@ -68,7 +74,7 @@ def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], 
 
 
 def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
-    """As in nuScenes: precision above 0.1, averaged over recall above 0.1, over 0.9; NaN without objects."""
+    """Return nuScenes': mean precision above 0.1 over recall above 0.1, over 0.9; NaN without objects."""
     if objects == 0:
         return float("nan")
     if not hit.any():
@@ -81,6 +87,6 @@ def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n
 
 
 def mean_of_valid(values: Sequence[float]) -> float:
-    """Mean over classes that have objects; NaN if none has."""
+    """Return the mean over classes that have objects; NaN if none has."""
     valid = [value for value in values if not np.isnan(value)]
     return float(np.mean(valid)) if valid else float("nan")

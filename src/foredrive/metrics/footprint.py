@@ -1,4 +1,4 @@
-"""Does the ego vehicle, placed along a path, touch any box? On a grid, as most protocols do, or exactly."""
+"""Collisions of an ego vehicle along a path: on a grid, as most protocols count them, or exactly."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,13 +11,13 @@ from foredrive.scene import Boxes
 def rectangle(
     centre: Float[Tensor, "*b 2"], size_lw: Float[Tensor, "*b 2"], yaw: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 4 2"]:
-    """Corners of rectangles seen from above: front-left, front-right, rear-right, rear-left."""
+    """Return corners of rectangles seen from above: front-left, front-right, rear-right, rear-left."""
     signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]).to(size_lw)
     return centre[..., None, :] + _turn(0.5 * signs * size_lw[..., None, :], yaw[..., None])
 
 
 def path_headings(path_xy: Float[Tensor, "b T 2"], rule: str) -> Float[Tensor, "b T"]:
-    """Heading of the ego box at each step of a path that starts at the origin, rad; 0 is the heading at now.
+    """Return headings of the ego box along a path that starts at the origin, rad; 0 is the heading at now.
 
     Args:
         rule: "now": 0. "step": direction of the step that leads there, 0 for a step shorter than 1 m. "path":
@@ -39,9 +39,9 @@ def path_headings(path_xy: Float[Tensor, "b T 2"], rule: str) -> Float[Tensor, "
 def polygon_hits(
     path_xy: Float[Tensor, "b T 2"], heading: Float[Tensor, "b T"], boxes: Boxes, protocol: PlanningProtocol
 ) -> tuple[Bool[Tensor, "b T"], Bool[Tensor, "b T"]]:
-    """Whether the ego rectangle, and whether the path's point, touches any valid box; touching edges count.
+    """Return whether the ego rectangle, and whether the path's point, touches a valid box.
 
-    Two rectangles are apart if and only if an edge direction of one of them separates them.
+    Touching edges count. Two rectangles are apart if and only if an edge direction of one separates them.
     """
     centre, size_lw, yaw = _seen_from_above(boxes)
     direction = torch.stack([heading.cos(), heading.sin()], dim=-1)
@@ -60,10 +60,10 @@ def grid_hits(
     protocol: PlanningProtocol,
     grid: ObstacleGrid,
 ) -> tuple[Bool[Tensor, "b T"], Bool[Tensor, "b T"]]:
-    """Whether a cell of the ego vehicle, and whether the cell of the path's point, is covered by a valid box.
+    """Return whether a valid box covers a cell of the ego vehicle, and whether the cell of the path's point.
 
-    The cells are those that public code draws into images, with its rounding; but instead of drawing, the
-    ego vehicle's cells are tested against the boxes around them.
+    The cells are those that public code draws into images, with its rounding. Instead of drawing, the ego
+    vehicle's cells are tested against the boxes around them.
     """
     quads = _box_quads(boxes, grid)
     path_rc = _to_row_column(path_xy, grid)
@@ -83,11 +83,11 @@ def grid_hits(
 
 
 def cells_in_quads(cells: Int[Tensor, "N P 2"], quads: Int[Tensor, "N 4 2"]) -> Bool[Tensor, "N P"]:
-    """Whether cells (row, column) belong to convex quadrilaterals with whole-numbered corners.
+    """Return whether cells (row, column) belong to convex quadrilaterals with whole-numbered corners.
 
-    The same cells as OpenCV's `fillPoly`: the inside, and the outline by Bresenham's rule, that is, cells
-    less than half a cell off an edge, measured along the axis on which the edge advances less. Of the cells
-    exactly half a cell off, the outline has those that a walk from the edge's lower column has yet to leave.
+    These are the cells of OpenCV's `fillPoly`: the inside, and the outline by Bresenham's rule. The outline
+    holds cells less than half a cell off an edge, measured along the axis on which the edge advances less. Of
+    cells exactly half a cell off, it holds those that a walk from the edge's lower column has yet to leave.
     """
     following = quads.roll(-1, dims=1)
     area = (quads[..., 1] * following[..., 0] - quads[..., 0] * following[..., 1]).sum(dim=1)
@@ -105,9 +105,9 @@ def cells_in_quads(cells: Int[Tensor, "N P 2"], quads: Int[Tensor, "N 4 2"]) -> 
 def _any_covered(
     cells: Int[Tensor, "b T P 2"], quads: Int[Tensor, "b T M 4 2"], valid: Bool[Tensor, "b T M"]
 ) -> Bool[Tensor, "b T"]:
-    """Whether any of the P cells of a step is covered by any valid box.
+    """Return whether a valid box covers any of the P cells of a step.
 
-    Few boxes are near a vehicle: only pairs of ego and box whose extents overlap are looked at closely.
+    Few boxes are near a vehicle: only pairs of ego and box whose extents overlap are tested closely.
     """
     low, high = cells.amin(dim=2)[:, :, None], cells.amax(dim=2)[:, :, None]  # [b, T, 1, 2]
     near = ((quads.amin(dim=3) <= high) & (quads.amax(dim=3) >= low)).all(dim=-1) & valid
@@ -119,7 +119,7 @@ def _any_covered(
 
 
 def _box_quads(boxes: Boxes, grid: ObstacleGrid) -> Int[Tensor, "b T M 4 2"]:
-    """Corners of boxes as grid indices (row, column)."""
+    """Return corners of boxes as grid indices (row, column)."""
     corners = _to_row_column(rectangle(*_seen_from_above(boxes)), grid)
     if grid.corner == "nearest":
         return ((corners + grid.reach_m) / grid.cell_m).round().long()
@@ -127,7 +127,7 @@ def _box_quads(boxes: Boxes, grid: ObstacleGrid) -> Int[Tensor, "b T M 4 2"]:
 
 
 def _ego_template(protocol: PlanningProtocol, grid: ObstacleGrid) -> Float[Tensor, "P 2"]:
-    """Centres (forward, sideways) of the cells inside the ego vehicle when its point is at the origin."""
+    """Return centres (forward, sideways) of the cells inside an ego vehicle whose point is at the origin."""
     length_m, width_m = protocol.ego_size_lw_m
     centres = _first_centre_m(grid) + grid.cell_m * torch.arange(_cells(grid), dtype=torch.float64)
     forward = centres[(centres - protocol.centre_ahead_m).abs() < 0.5 * length_m]
@@ -136,14 +136,14 @@ def _ego_template(protocol: PlanningProtocol, grid: ObstacleGrid) -> Float[Tenso
 
 
 def _seen_from_above(boxes: Boxes) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre, length and width, and yaw of boxes, in double precision."""
+    """Return centre, length and width, and yaw of boxes, in float64."""
     return boxes.centre[..., :2].double(), boxes.size_lwh[..., :2].double(), boxes.yaw.double()
 
 
 def _apart_along(
     yaw: Float[Tensor, "b T *M"], ego: Float[Tensor, "b T 1 4 2"], other: Float[Tensor, "b T M 4 2"]
 ) -> Bool[Tensor, "b T M"]:
-    """Whether the shadows of two rectangles on either axis of a frame turned by `yaw` do not touch."""
+    """Return whether two rectangles are apart along either axis of a frame turned by `yaw`."""
     ego_seen, other_seen = _turn(ego, -yaw[..., None]), _turn(other, -yaw[..., None])
     gap = torch.maximum(
         ego_seen.amin(dim=-2) - other_seen.amax(dim=-2), other_seen.amin(dim=-2) - ego_seen.amax(dim=-2)
@@ -158,7 +158,7 @@ def _turn(xy: Tensor, angle: Tensor) -> Tensor:
 
 
 def _to_row_column(xy: Tensor, grid: ObstacleGrid) -> Tensor:
-    """Ego x, y in the axes of rows (forward) and columns, m."""
+    """Return ego x, y in the axes of rows (forward) and columns, m."""
     return xy if grid.column_axis == "left" else xy * torch.tensor([1.0, -1.0]).to(xy)
 
 

@@ -1,4 +1,4 @@
-"""Forecasts of occupancy: what anybody could say who knows the present, and several futures by chance."""
+"""Forecasts of occupancy: ego-compensated persistence, and several sampled futures."""
 
 import functools
 import itertools
@@ -16,14 +16,15 @@ from foredrive.scene import VoxelGrid, VoxelSpec
 from foredrive.scene.record import Record
 
 
-def carried_along(
+def ego_compensated(
     occupied: Bool[Tensor, "b Z Y X"], T_src_dst: Float64[Tensor, "b 4 4"], spec: VoxelSpec
 ) -> Bool[Tensor, "b Z Y X"]:
-    """Occupancy as it looks from another pose if nothing moves: that of the voxel where each centre lies.
+    """Return the occupancy of a static scene from another pose, by the nearest voxel.
 
     Args:
-        occupied: on the grid in the frame src; what lies outside of it is taken to be free.
+        occupied: on the grid in the frame src; free outside of it.
         T_src_dst: points of the frame dst, in which the result is, -> src.
+        spec: of both grids.
     """
     centres = spec.centres_m(occupied.device).flatten(0, 2).double()
     place = transform_points(T_src_dst, centres.expand(len(occupied), -1, -1))
@@ -36,7 +37,7 @@ def carried_along(
 
 @dataclass(frozen=True)
 class FuturesCounts(Record):
-    """How K futures drawn by chance agree with what happened, and with each other; per frame."""
+    """Agreement of K sampled futures with the labels, and with each other; per frame."""
 
     best: OccupancyCounts
     """Of the future of each item that is the best over all its frames together."""
@@ -58,7 +59,7 @@ class FuturesCounts(Record):
 def count_futures(
     futures: Bool[Tensor, "b K F Z Y X"], labels: VoxelGrid, region: Bool[Tensor, "Z Y X"] | None = None
 ) -> FuturesCounts:
-    """Compare K futures of each item with labels [b F 1 Z Y X] as `count_occupancy` does."""
+    """Compare K sampled futures of each item with labels [b F 1 Z Y X], as `count_occupancy` does."""
     best, mean, spread = [], [], torch.zeros(futures.shape[2], dtype=torch.float64)
     for item, drawn in enumerate(futures):
         label = labels[item : item + 1]
@@ -72,7 +73,7 @@ def count_futures(
 
 
 def _pooled_iou(counts: OccupancyCounts) -> Float[Tensor, ""]:
-    """Over all frames; 0 where nothing was occupied."""
+    """Return the IoU over all frames together; 0 where nothing was occupied."""
     hits = counts.true_positive.sum()
     return hits / (hits + counts.false_positive.sum() + counts.false_negative.sum()).clamp_min(1)
 
@@ -82,7 +83,7 @@ def _total(counts: Sequence[OccupancyCounts]) -> OccupancyCounts:
 
 
 def _disagreement(drawn: Bool[Tensor, "K F Z Y X"]) -> Float64[Tensor, "F"]:
-    """1 - IoU per frame, averaged over pairs of futures; nothing occupied in either is agreement."""
+    """Return 1 - IoU per frame, averaged over pairs of futures; two empty frames agree."""
     pairs = list(itertools.combinations(drawn.flatten(2).unbind(), 2))
     apart = torch.zeros(drawn.shape[1], dtype=torch.float64)
     for one, other in pairs:

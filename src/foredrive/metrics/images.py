@@ -1,4 +1,4 @@
-"""Rendered against real images, where both exist."""
+"""Rendered images against real ones, where both exist."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,7 +8,12 @@ from torch import Tensor
 def psnr_db(
     rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"], known: Bool[Tensor, "n H W"]
 ) -> Float[Tensor, "n"]:
-    """Peak signal-to-noise ratio of each image (RGB, 0 to 1) over its known pixels, dB; NaN without any."""
+    """Return the peak signal-to-noise ratio of each image over its known pixels, dB; NaN without any.
+
+    Args:
+        rendered, real: RGB from 0 to 1.
+        known: pixels that count.
+    """
     from torchmetrics.functional.image import peak_signal_noise_ratio  # takes seconds
 
     scores = [
@@ -21,10 +26,10 @@ def psnr_db(
 def ssim(
     rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"], known: Bool[Tensor, "n H W"]
 ) -> Float[Tensor, "n"]:
-    """Structural similarity of each image (RGB, 0 to 1; Gaussian window, σ = 1.5 px) over its known pixels.
+    """Return the structural similarity of each image over its known pixels; NaN without any.
 
-    The map is taken over whole images, with unknown pixels set to the real image's so that they add nothing
-    to their neighbours' difference, and averaged where pixels are known; NaN where there are none.
+    The window is Gaussian with σ = 1.5 px. Unknown pixels are set to the real image's, so that they add
+    nothing to their neighbours' difference.
     """
     from torchmetrics.functional.image import structural_similarity_index_measure  # takes seconds
 

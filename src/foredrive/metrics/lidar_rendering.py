@@ -1,4 +1,4 @@
-"""Rendered against real sweeps (the figures of NeuRAD and SplatAD)."""
+"""Rendered sweeps against real ones, by the figures of NeuRAD and SplatAD."""
 
 from dataclasses import dataclass
 
@@ -9,19 +9,19 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 NO_POINTS_M = 200.0
-"""How far a cloud without points is taken to be from any point: a lidar's range."""
+"""Distance of an empty cloud from any point: a lidar's range."""
 
 
 @dataclass(frozen=True)
 class SweepScores:
-    """Of one sweep; NaN where there is nothing to judge."""
+    """Scores of one sweep; NaN where there is nothing to judge."""
 
     depth_median_sq_m2: float
     """Median over the beams that returned of the squared error in range."""
     intensity_rmse: float
     """Over the beams that returned."""
     drop_accuracy: float
-    """Share of beams for which it is said rightly whether they return."""
+    """Share of beams whose return, or lack of one, is predicted rightly."""
     chamfer_m2: float
     """Σ of squared distances to the nearest point of the other cloud, both ways, over the number of real
     points."""
@@ -38,7 +38,7 @@ def score_sweep(
     origin: Float[Tensor, "P 3"],
     direction: Float[Tensor, "P 3"],
 ) -> SweepScores:
-    """Compare beam by beam, and the clouds that the beams make.
+    """Score a sweep beam by beam, and as a cloud of points.
 
     Args:
         range_m, intensity, dropped: rendered; ranges of dropped beams count for `depth_median_sq_m2`.
@@ -59,7 +59,7 @@ def score_sweep(
 
 
 def chamfer_m2(cloud_m: Float[Tensor, "N 3"], real_m: Float[Tensor, "M 3"]) -> float:
-    """Σ squared distances to the nearest point, both ways, over M; NaN if M is 0."""
+    """Return Σ squared distances to the nearest point, both ways, over M; NaN if M is 0."""
     if not len(real_m):
         return float("nan")
     if not len(cloud_m):

@@ -1,4 +1,4 @@
-"""Annotated boxes of the future, as an ego vehicle that plans at now sees them."""
+"""Annotated boxes of the future, in the ego frame of the moment of planning."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from foredrive.scene import Boxes, Clip
 from foredrive.scene.record import Record
 
 FRAME_TOLERANCE_S = 0.15
-"""Key frames are not spaced exactly; a frame this close to a step's time stands for it."""
+"""Key frames are not spaced exactly: a frame this close to a step's time stands for it."""
 OBSERVED_S = 1.0
 
 
@@ -33,7 +33,7 @@ class Obstacles(Record):
 
 
 def boxes_at_now(clip: Clip) -> Boxes:
-    """The boxes of every frame of a clip [b T M], moved to the ego frame at now, velocities too."""
+    """Return the boxes of every frame of a clip [b T M] in the ego frame at now, velocities too."""
     now = clip.now
     T_now_ego = inverse_se3(clip.T_world_ego[:, now : now + 1]) @ clip.T_world_ego  # [b, T, 4, 4]
     boxes = clip.boxes
@@ -49,10 +49,10 @@ def boxes_at_now(clip: Clip) -> Boxes:
 
 
 def future_obstacles(clip: Clip, steps: int, step_s: float) -> Obstacles:
-    """The obstacles at `steps` times, `step_s` apart, after now.
+    """Return the obstacles at `steps` times, `step_s` apart, after now.
 
-    A step takes the boxes of the key frame nearest in time; where none lies within 0.15 s, or the frame is
-    not annotated, the step has `annotated` False and no boxes.
+    A step takes the boxes of the key frame nearest in time. Where none lies within 0.15 s, or the frame is
+    not annotated, `annotated` is False and the step has no boxes.
     """
     if clip.t_s.dim() != 2:
         raise InputError(f"expected a batch of clips, got t_s of shape {tuple(clip.t_s.shape)}")
@@ -77,6 +77,6 @@ def future_obstacles(clip: Clip, steps: int, step_s: float) -> Obstacles:
 
 
 def _tracked(boxes: Boxes, track_id: Tensor, valid: Tensor) -> Bool[Tensor, "b T M"]:
-    """Whether each box's track is among the valid ones of `track_id` [b, frames, M]."""
+    """Return whether each box's track is among the valid ones of `track_id` [b, frames, M]."""
     same = boxes.track_id[..., None] == track_id.flatten(1)[:, None, None, :]  # [b, T, M, frames * M]
     return (same & valid.flatten(1)[:, None, None, :]).any(dim=-1) & boxes.valid

@@ -1,7 +1,7 @@
-"""Voxel occupancy against labels that know where they know nothing, and the best constant prediction.
+"""Voxel occupancy and flow against labels, and the occupancy prior.
 
 Counts are summed over a data set before any ratio is taken. Voxels that no beam has seen (`known` False) are
-left out. Height is measured in the ego frame, whose origin lies on the ground under the rear axle: "above
+left out. Height is measured in the ego frame, whose origin lies on the ground under the rear axle. "Above
 ground" are voxels whose centre is more than 0.4 m above its plane z = 0, which on a slope is not quite the
 road.
 """
@@ -21,7 +21,7 @@ MOVING_MPS = 0.5
 
 
 def above_ground(spec: VoxelSpec, height_m: float = ABOVE_GROUND_M) -> Bool[Tensor, "Z Y X"]:
-    """The voxels whose centre lies more than `height_m` above the plane z = 0 of the ego frame."""
+    """Return the voxels whose centre lies more than `height_m` above the plane z = 0 of the ego frame."""
     return spec.centres_m()[..., 2] > height_m
 
 
@@ -42,17 +42,17 @@ class OccupancyCounts(Record):
 
     @property
     def iou(self) -> Float[Tensor, "F"]:
-        """Intersection over union; NaN where nothing was occupied, in truth or prediction."""
+        """Intersection over union; NaN where neither truth nor prediction has an occupied voxel."""
         return self.true_positive / (self.true_positive + self.false_positive + self.false_negative)
 
     @property
     def precision(self) -> Float[Tensor, "F"]:
-        """Share of the voxels predicted occupied that are; NaN where none was predicted."""
+        """Share of occupied voxels among the predicted ones; NaN where none was predicted."""
         return self.true_positive / (self.true_positive + self.false_positive)
 
     @property
     def recall(self) -> Float[Tensor, "F"]:
-        """Share of the occupied voxels that were predicted so; NaN where none is."""
+        """Share of predicted voxels among the occupied ones; NaN where none is occupied."""
         return self.true_positive / (self.true_positive + self.false_negative)
 
 
@@ -71,11 +71,11 @@ def count_occupancy(
     )
 
 
-class VoxelPrior:
-    """How often each voxel was occupied when known, over a training set; a grid per frame (now, the future).
+class OccupancyPrior:
+    """Frequency of occupancy of each voxel where it was known, over a training set; a grid per frame.
 
-    It stands for everything that can be predicted without looking: `best_constant` is the one fixed grid
-    that scores best on the training set, and what it scores on the test set is the number to beat.
+    It is the baseline of a model that looks: `best_grid` is the one fixed grid that scores best on the
+    training set.
     """
 
     def __init__(self, frames: int, spec: VoxelSpec) -> None:
@@ -98,14 +98,14 @@ class VoxelPrior:
         """Relative frequency of occupancy; 0 for a voxel that was never known."""
         return self.occupied / self.known.clamp_min(1)
 
-    def best_constant(
+    def best_grid(
         self, region: Bool[Tensor, "Z Y X"] | None = None
     ) -> tuple[Bool[Tensor, "F Z Y X"], Float[Tensor, "F"]]:
-        """Per frame the grid {probability ≥ threshold} with the best IoU in training, and the threshold.
+        """Return the grid {probability ≥ threshold} of the best IoU in training, and the threshold, by frame.
 
         Exact: lowering the threshold adds voxels in order of probability, each with its own hits and false
-        alarms, so that all thresholds are scored by two cumulative sums. Where the training set had nothing
-        occupied the grid is empty and the threshold infinite.
+        alarms; two cumulative sums score all thresholds. Where the training set had no occupied voxel, the
+        grid is empty and the threshold infinite.
         """
         probability = self.probability
         where = self.known > 0 if region is None else (self.known > 0) & region
@@ -128,7 +128,7 @@ class FlowErrors(Record):
 
     error_mps: Float[Tensor, "F"]
     speed_mps: Float[Tensor, "F"]
-    """What predicting no motion at all would err by."""
+    """Of predicting no motion."""
     voxels: Int[Tensor, "F"]
 
     def __add__(self, other: "FlowErrors") -> "FlowErrors":
@@ -138,7 +138,7 @@ class FlowErrors(Record):
 
 
 def flow_errors(predicted_mps: Float[Tensor, "b F 3 Z Y X"], labels: VoxelGrid) -> FlowErrors:
-    """End-point errors |predicted − true velocity| on known voxels that move at more than 0.5 m/s."""
+    """Sum the end-point errors |predicted − true velocity| over known voxels faster than 0.5 m/s."""
     speed = labels.values.norm(dim=2)
     moving = labels.known & (speed > MOVING_MPS)
     error = (predicted_mps - labels.values).norm(dim=2)

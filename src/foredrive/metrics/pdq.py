@@ -8,14 +8,14 @@ from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr
 
-LEAST = 1e-14
+MIN_PROBABILITY = 1e-14
 """Probabilities of pixels are kept this far from 0 and 1, as in the authors' code."""
 OUTSIDE_STD = 6.0
 """A box reaches no farther than this many standard deviations beyond its edges."""
 
 
 class PdqCounts(NamedTuple):
-    """Of one frame; those of several add up."""
+    """Counts of one frame; those of several add up."""
 
     quality: float
     """Sum over pairs of a positive quality."""
@@ -31,10 +31,10 @@ def pixel_quality(
     boxes: Float[ndarray, "N 4"],
     label: Int[ndarray, "N"],
 ) -> Float[ndarray, "M N"]:
-    """√(spatial quality · label quality) of each pair, in [0, 1]; corners in px, objects filled boxes.
+    """Return √(spatial quality · label quality) of each pair, in [0, 1]; corners in px, objects filled boxes.
 
     A pixel is in a detection with the probability that its middle lies right of x1, left of x2, below y1 and
-    above y2, edges independent and normal. Pairs of boxes that do not meet have none.
+    above y2; edges are independent and normal. Pairs of boxes that do not meet have quality 0.
     """
     quality = np.zeros((len(mean), len(boxes)))
     meets = ((mean[:, None, :2] < boxes[:, 2:]) & (boxes[:, :2] < mean[:, None, 2:])).all(-1)
@@ -45,7 +45,7 @@ def pixel_quality(
 
 
 def count_pdq(quality: Float[ndarray, "M N"]) -> PdqCounts:
-    """The assignment of the largest total quality."""
+    """Count the pairs of the assignment of the largest total quality."""
     i, j = linear_sum_assignment(-quality)
     paired = quality[i, j][quality[i, j] > 0]
     pairs = len(paired)
@@ -53,20 +53,20 @@ def count_pdq(quality: Float[ndarray, "M N"]) -> PdqCounts:
 
 
 def pdq(counts: list[PdqCounts]) -> float:
-    """Mean quality over pairs, false detections and missed objects of all frames; NaN if there are none."""
+    """Return the mean quality over pairs, false detections and missed objects of all frames; NaN if none."""
     total = np.sum(np.array([*counts, (0.0, 0, 0, 0)]), axis=0)
     return float(total[0] / total[1:].sum()) if total[1:].sum() else float("nan")
 
 
 def _spatial_quality(mean: Float[ndarray, "4"], std: Float[ndarray, "4"], box: Float[ndarray, "4"]) -> float:
-    """exp(-(loss of foreground + loss of background)), each a mean over the object's pixels."""
+    """Return exp(-(loss of foreground + loss of background)), each a mean over the object's pixels."""
     along, inside_x = _along(mean[[0, 2]], std[[0, 2]], box[[0, 2]])
     down, inside_y = _along(mean[[1, 3]], std[[1, 3]], box[[1, 3]])
     inside = inside_y[:, None] & inside_x
     pixels = inside.sum()
     if pixels == 0:
         return 0.0
-    covered = np.clip(down[:, None] * along, LEAST, 1 - LEAST)
+    covered = np.clip(down[:, None] * along, MIN_PROBABILITY, 1 - MIN_PROBABILITY)
     loss = np.log(covered[inside]).sum() + np.log1p(-covered[~inside]).sum()
     return float(np.exp(loss / pixels))
 
@@ -74,7 +74,7 @@ def _spatial_quality(mean: Float[ndarray, "4"], std: Float[ndarray, "4"], box: F
 def _along(
     edges: Float[ndarray, "2"], std: Float[ndarray, "2"], box: Float[ndarray, "2"]
 ) -> tuple[Float[ndarray, "n"], ndarray]:
-    """Of each pixel of a row that matters: probability to lie between the edges; whether the object does."""
+    """Return which pixels of a row lie between the edges, as a probability, and which are the object's."""
     low = np.floor(min(edges[0] - OUTSIDE_STD * std[0], box[0]))
     high = np.ceil(max(edges[1] + OUTSIDE_STD * std[1], box[1]))
     middle = np.arange(low, high) + 0.5

@@ -17,9 +17,9 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class PlanScores(Record):
-    """Scores of b plans at 1, 2 and 3 s (H = 3), with masks that say which of them enter a mean.
+    """Scores of b plans at 1, 2 and 3 s (H = 3), and masks of those that enter a mean.
 
-    Where a mask is False the values are 0 and mean nothing.
+    Where a mask is False the values are 0.
     """
 
     l2_m: Float[Tensor, "b H"]
@@ -29,15 +29,15 @@ class PlanScores(Record):
     collision_centre: Float[Tensor, "b H"]
     """The same for the path's point alone ("obj_col")."""
     driven_collision: Float[Tensor, "b H"]
-    """The same for the box of the vehicle that was driven: boxes and paths are not exact."""
+    """The same for the box of the driven vehicle: boxes and paths are not exact."""
     planned: Bool[Tensor, "b"]
-    """Whether the plan has all its steps, finite. One that has not is a failure, not a score."""
+    """Whether the plan has all its steps, finite. Otherwise it is a failure, not a score."""
     complete: Bool[Tensor, "b"]
     """Whether the driven future has all its steps."""
     counted: Bool[Tensor, "b"]
     """Whether the protocol counts the frame."""
     collision_counted: Bool[Tensor, "b"]
-    """Whether its collisions count too: boxes are annotated at now and wherever it was driven."""
+    """Whether its collisions count too: boxes are annotated at now and at every driven step."""
 
 
 def score_plan(
@@ -46,8 +46,8 @@ def score_plan(
     """Score plans [b 1 T] against driven futures [b 1 T] under one protocol.
 
     Args:
-        plan: its first six steps of 0.5 s are scored. Its headings (and those of the driven future) say where
-            the vehicle is when a protocol follows a point ahead of the rear axle.
+        plan: its first six steps of 0.5 s are scored. Its headings (and those of the driven future) place the
+            point ahead of the rear axle that some protocols follow.
         driven: rear-axle path, invalid where the log ends.
         obstacles: boxes at the six steps, see `future_obstacles`.
     """
@@ -83,7 +83,7 @@ def score_plan(
 
 
 def _first_steps(path: Trajectory, what: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions [b 6 2], headings [b 6] and validity [b 6] of a single trajectory, in double precision."""
+    """Return positions [b 6 2], headings [b 6] and validity [b 6] of a single trajectory, in float64."""
     if path.xy.dim() != 4 or path.xy.shape[1] != 1 or path.xy.shape[2] < STEPS:
         raise InputError(f"the {what} must be [b 1 T≥{STEPS} 2], got {tuple(path.xy.shape)}")
     if abs(path.dt_s - STEP_S) > 1e-6:
@@ -92,7 +92,7 @@ def _first_steps(path: Trajectory, what: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _relevant_boxes(obstacles: Obstacles, protocol: PlanningProtocol) -> Boxes:
-    """The boxes the protocol counts, relative to the point it follows."""
+    """Return the boxes that the protocol counts, relative to the point that it follows."""
     boxes = obstacles.boxes
     seen = {
         "anytime": torch.ones_like(boxes.valid),
@@ -107,7 +107,7 @@ def _relevant_boxes(obstacles: Obstacles, protocol: PlanningProtocol) -> Boxes:
 
 
 def _hits(xy: Tensor, yaw: Tensor, boxes: Boxes, protocol: PlanningProtocol) -> tuple[Tensor, Tensor]:
-    """Whether box and point of a vehicle on a rear-axle path [b T 2] touch anything, both [b T]."""
+    """Return whether box and point of a vehicle on a rear-axle path [b T 2] touch a box, both [b T]."""
     lever = torch.stack([yaw.cos() - 1, yaw.sin()], dim=-1)
     path = xy + protocol.point_ahead_m * lever
     heading = path_headings(path, protocol.heading)

@@ -35,9 +35,9 @@ HORIZON_NAMES = ("1s", "2s", "3s")
 
 EGO_SIZE_LW_M = (4.084, 1.85)
 LIDAR_AHEAD_M = 0.985793
-"""How far nuScenes' lidar, whose path most of the protocols follow, rides ahead of the rear axle."""
+"""Distance of nuScenes' lidar ahead of the rear axle; most of the protocols follow its path."""
 EGO_CENTRE_AHEAD_M = 0.5
-"""Where public code puts the vehicle's centre, ahead of the point whose path it follows."""
+"""Distance of the vehicle's centre ahead of the followed point, in public code."""
 
 VEHICLES = frozenset(
     {
@@ -60,16 +60,16 @@ class ObstacleGrid:
     reach_m: float
     """The grid covers ±`reach_m` forward and sideways; ego cells beyond it move to its border."""
     column_axis: Literal["left", "right"]
-    """Which way columns count; rows count forward. It matters because positions are rounded down."""
+    """Direction in which columns count; rows count forward. It matters because positions are rounded down."""
     row_step: Literal["down", "up"]
-    """Which way the plan's forward position is rounded to whole cells; sideways it is rounded down."""
+    """How the plan's forward position is rounded to whole cells; sideways it is rounded down."""
     corner: Literal["nearest", "down"]
     """A box's corners go to the nearest grid line, or down to the cell centre before them."""
 
 
 @dataclass(frozen=True)
 class PlanningProtocol:
-    """Every choice that makes one open-loop protocol what it is."""
+    """The choices that define an open-loop protocol."""
 
     title: str
     l2: Literal["at", "mean"]

@@ -1,4 +1,4 @@
-"""How much of what is found is what was asked for, with neighbours counted once, and how sure that is."""
+"""Precision of retrieval with neighbours counted once, and its interval."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,24 +8,24 @@ from jaxtyping import Bool, Float, Int
 
 
 class Ranking(NamedTuple):
-    """The hits that S sequences have for one question, those close to a better one left out.
+    """Hits of S sequences for one query, without those close to a better one.
 
     Rows are padded to the H hits of the longest with a score of -inf.
     """
 
     score: Float[np.ndarray, "S H"]
     true: Bool[np.ndarray, "S H"]
-    """Whether the hit is what was asked for."""
+    """Whether the hit fits the query."""
     could: Int[np.ndarray, "S"]
-    """How many hits of a sequence could be true at most."""
+    """Maximum number of true hits of a sequence."""
 
 
 def precision_at(
     ranking: Ranking, drawn: Int[np.ndarray, "B S"], ranks: Sequence[int]
 ) -> Float[np.ndarray, "B K"]:
-    """P@K = true hits among the best K / min(K, hits that could be true), of each draw of sequences.
+    """Return P@K = true hits among the best K / min(K, hits that could be true), of each draw of sequences.
 
-    A sequence that is drawn twice counts as two. NaN where nothing could be true.
+    A sequence drawn twice counts as two. NaN where no hit could be true.
     """
     score, true = (of[drawn].reshape(len(drawn), -1) for of in (ranking.score, ranking.true))
     order = np.argsort(-score, axis=1, kind="stable")[:, : max(ranks)]
@@ -36,12 +36,12 @@ def precision_at(
 
 
 def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:
-    """All sequences first, as they are, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
+    """Return all sequences as they are, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
     drawn = np.random.default_rng(seed).integers(sequences, size=(draws, sequences))
     return np.concatenate([np.arange(sequences)[None], drawn])
 
 
 def with_interval(values: Float[np.ndarray, "B"]) -> tuple[float, float, float]:
-    """The value of all sequences, and the 2.5 and 97.5 % quantiles over draws of them (`draw_sequences`)."""
+    """Return the value of all sequences, and its 2.5 and 97.5 % quantiles over `draw_sequences`."""
     low, high = np.nanquantile(values[1:], (0.025, 0.975))
     return float(values[0]), float(low), float(high)

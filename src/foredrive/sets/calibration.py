@@ -1,4 +1,4 @@
-"""Whether probabilities and covariances mean what they say, and what mends them after training."""
+"""Calibration of probabilities of existence and of covariances, after training."""
 
 import dataclasses
 import math
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 from numpy import ndarray
 from scipy.optimize import isotonic_regression
 
@@ -15,42 +15,6 @@ from foredrive.errors import InputError
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes
 from foredrive.sets.likelihood import set_nll
 from foredrive.sets.processes import MultiBernoulli, PoissonMultiBernoulli, PoissonProcess
-
-
-@dataclass(frozen=True)
-class Reliability:
-    """Confidences in bins of equal width, beside what came true."""
-
-    count: Int[ndarray, "bins"]
-    confidence: Float[ndarray, "bins"]
-    """Mean in the bin; NaN if it is empty."""
-    outcome: Float[ndarray, "bins"]
-    """Mean of what should have been predicted: how often it was right, or how well it fitted."""
-
-    @property
-    def error(self) -> float:
-        """Mean |outcome - confidence|, bins weighted by their share; NaN if all are empty.
-
-        D-ECE (Küppers et al. 2020) where outcomes are hits. LaECE of one class (Oksuz et al. 2023) where
-        they are the overlap of hits and 0 elsewhere; LaECE₀ (Kuzucu et al. 2024) where any overlap is a hit.
-        """
-        full = self.count > 0
-        if not full.any():
-            return math.nan
-        gap = np.abs(self.outcome[full] - self.confidence[full])
-        return float((gap * self.count[full]).sum() / self.count.sum())
-
-
-def reliability(
-    confidence: Float[ndarray, "n"], outcome: Shaped[ndarray, "n"], bins: int = 25
-) -> Reliability:
-    """Bin confidences in [0, 1] with their outcomes; a bin holds its upper edge."""
-    which = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
-    count = np.bincount(which, minlength=bins)
-    with np.errstate(invalid="ignore"):
-        mean_confidence = np.bincount(which, confidence, bins) / count
-        mean_outcome = np.bincount(which, outcome.astype(float), bins) / count
-    return Reliability(count, mean_confidence, mean_outcome)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         DriveWorldStage,
         DriveWorldWeights,
     )
+    from foredrive.training.ego_mlp_fit import DrivenStatus, fit_ego_mlp, read_status
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective, NemoStage
@@ -21,6 +22,7 @@ __all__ = [
     "DriveWorldObjective",
     "DriveWorldStage",
     "DriveWorldWeights",
+    "DrivenStatus",
     "ImageRays",
     "LossWeights",
     "NemoObjective",
@@ -28,10 +30,12 @@ __all__ = [
     "PathDemonstrations",
     "PathFit",
     "Schedule",
+    "fit_ego_mlp",
     "fit_path",
     "load_weights",
     "make_fabric",
     "read_metrics",
+    "read_status",
     "save_weights",
     "thinned_rays",
     "train",
@@ -42,6 +46,7 @@ __getattr__ = on_demand(
     {
         "checkpoints": ("load_weights", "save_weights"),
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
+        "ego_mlp_fit": ("DrivenStatus", "fit_ego_mlp", "read_status"),
         "fabric": ("make_fabric",),
         "loop": ("Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective", "NemoStage"),

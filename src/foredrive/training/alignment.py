@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
+from foredrive.losses.contrast import contrast, true_of
 from foredrive.models.image_tower import ImageTower
 from foredrive.models.lidar_clip import LidarEncoder, PointCloud
 from foredrive.ops.precision import computes_bfloat16
@@ -90,26 +91,6 @@ class DistilObjective(nn.Module):
         cosine = F.cosine_similarity(found, target, dim=-1).mean()
         loss = F.mse_loss(found, target) if self.kind == "mse" else 1 - cosine
         return {"loss": loss, "cosine": cosine}
-
-
-def true_of(said: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Tensor, "i t"]:
-    """Of which images which texts are true: those that say nothing that does not hold."""
-    return (~holds).float() @ said.float().T == 0
-
-
-def contrast(
-    logits: Float[Tensor, "n n"], true: Bool[Tensor, "n n"]
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """InfoNCE over rows and columns whose pairs lie on the diagonal; other pairs that are true are left out.
-
-    Returns:
-        The mean loss, and the share of rows whose own text comes first.
-    """
-    own = torch.arange(len(logits), device=logits.device)
-    others = true & ~torch.eye(len(logits), dtype=torch.bool, device=logits.device)
-    logits = logits.masked_fill(others, -torch.inf)
-    loss = (F.cross_entropy(logits, own) + F.cross_entropy(logits.T, own)) / 2
-    return loss, (logits.argmax(dim=1) == own).float().mean()
 
 
 def _jittered(images: UInt8[Tensor, "n 3 H W"], generator: torch.Generator) -> UInt8[Tensor, "n 3 h w"]:

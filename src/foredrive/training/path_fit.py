@@ -2,24 +2,25 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.losses import l1_waypoint_loss
 from foredrive.models.planner import PathCorrection, PathReads
 from foredrive.scene.record import Record
+from foredrive.training.row_fit import RowFit, fit_rows
 
 
 @dataclass(frozen=True)
-class PathFit:
-    """How a `PathCorrection` is fitted: AdamW with a cosine."""
+class PathFit(RowFit):
+    """Length and speed of the fit of a `PathCorrection`, and how many clips it is fitted to."""
 
-    stride_s: float = 1.0
-    """Time between the clips whose volumes are read."""
     steps: int = 1500
     batch_size: int = 64
     lr: float = 1e-3
     weight_decay: float = 0.05
+    stride_s: float = 1.0
+    """Time between the clips whose volumes are read."""
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,11 @@ def fit_path(correction: PathCorrection, shown: PathDemonstrations, fit: PathFit
     values = shown.values.float()
     correction.mean.copy_(values.mean(dim=(0, 1, 2)))
     correction.std.copy_(values.std(dim=(0, 1, 2)) + 1e-3)
-    optimizer = torch.optim.AdamW(correction.parameters(), lr=fit.lr, weight_decay=fit.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)
-    order = torch.Generator().manual_seed(seed)
-    correction.train().requires_grad_(True)  # joint training has left it out
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)  # of dropout
-        for _ in range(fit.steps):
-            chosen = torch.randint(len(shown.told), (min(fit.batch_size, len(shown.told)),), generator=order)
-            batch = shown[chosen]
-            change = correction(PathReads(batch.values, batch.places_m), batch.told)
-            error = (batch.planned_xy + change.cumsum(dim=1) - batch.driven_xy).abs().sum(dim=-1)
-            loss = torch.where(batch.valid, error, 0.0).sum() / batch.valid.sum().clamp_min(1)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-    correction.eval()
+    correction.requires_grad_(True)  # joint training has left it out
+
+    def loss(rows: Tensor) -> Tensor:
+        batch = shown[rows]
+        change = correction(PathReads(batch.values, batch.places_m), batch.told)
+        return l1_waypoint_loss(batch.planned_xy + change.cumsum(dim=1), batch.driven_xy, batch.valid)
+
+    fit_rows(correction, len(shown.told), loss, fit, seed)

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from foredrive.sets import Reliability
+from foredrive.metrics.reliability import Reliability
 from foredrive.view.inline_svg import INK_MARK
 
 TITLES = {

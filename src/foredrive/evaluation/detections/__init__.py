@@ -1,4 +1,4 @@
-"""Files of detections beside truth: read, scored as random finite sets and by the usual metrics, compared."""
+"""Files of detections: read, scored as random finite sets and by the usual metrics, compared."""
 
 from foredrive.evaluation.detections.files import read_detections
 from foredrive.evaluation.detections.frame_file import write_frame_scores

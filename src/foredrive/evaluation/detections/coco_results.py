@@ -37,7 +37,11 @@ Record = Mapping[str, Any]
 def read_coco(
     results: Sequence[Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
 ) -> DetectionSet:
-    """Images of the truth, in its order; crowds are left out. Raises `InputError` that names the record."""
+    """Return the images of the truth, in its order, without crowds.
+
+    Raises:
+        InputError: that names the wrong record.
+    """
     images, categories = _named(truth, "images", truth_path), _named(truth, "categories", truth_path)
     label_of = {category["id"]: n for n, category in enumerate(categories)}
     classes = [str(category.get("name", category["id"])) for category in categories]
@@ -109,7 +113,7 @@ def _frame(
 
 
 def _key(record: Any, name: str) -> int | str | None:
-    """What a record names its image or category by; None if it does not."""
+    """Return the id under `name`; None if the record has none."""
     key = record.get(name) if isinstance(record, dict) else None
     return key if isinstance(key, int | str) else None
 
@@ -140,7 +144,7 @@ def _listed(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
 
 
 def _named(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
-    """Records that each have an id of their own."""
+    """Return records after checking that their ids are unique."""
     records, known = _listed(content, key, path), set()
     for n, record in enumerate(records):
         name = _key(record, "id")

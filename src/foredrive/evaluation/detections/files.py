@@ -1,4 +1,4 @@
-"""Which format files of detections have."""
+"""Reading files of detections of any known format."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
 def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
     """Read detections and truth: two folders of KITTI's text, or JSON of nuScenes or COCO.
 
-    `family` is what box densities are taken to be. Raises `InputError` for what cannot be read, naming it.
+    `family` is that of box densities. Raises `InputError` that names the file which cannot be read.
     """
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)

@@ -1,4 +1,4 @@
-"""Frames' scores as a file that an index takes (`search.scores`)."""
+"""Scores of frames as a file that an index reads (`search.scores`)."""
 
 import json
 import math
@@ -10,9 +10,9 @@ from foredrive.files import atomic_path
 
 
 def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
-    """One JSON object a line: the frame's name as the results have it, its NLL and the NLL's parts, in nats.
+    """Write one JSON object a line: a frame's name as in the results, its NLL and the NLL's parts, in nats.
 
-    What is not finite is written as a text ("inf"), which JSON has no number for.
+    Infinity, which JSON lacks, is written as text ("inf").
     """
     with atomic_path(path) as temporary, temporary.open("w") as file:
         for score in scores:

@@ -1,4 +1,4 @@
-"""What a detector said about frames, beside what is true: the form every file of detections is read into."""
+"""Detections and truth by frame: the form that every file of detections is read into."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli
 
 Family = Literal["gaussian", "laplace"]
 
-LEAST_PROBABILITY = 1e-6
-"""Probabilities in files are kept this far from 0 and 1, which are mostly the rounding of such."""
+MIN_PROBABILITY = 1e-6
+"""Probabilities in files are kept this far from 0 and 1, which are mostly rounded from such."""
 STD_M = (0.5, 0.5, 0.3)
 """Standard deviations of a box centre where a detector states none."""
 STD_LOG_SIZE = 0.15
@@ -24,9 +24,9 @@ STD_OF_SIDE = 0.05
 """Standard deviation of an image box's edge where a detector states none: this share of the side across …"""
 STD_PX = 1.0
 """… and this, in quadrature."""
-LEAST_STD_YAW_RAD = 1e-6
-LARGEST = 1e12
-"""Of numbers in files: beyond it, squares and products lose what they are about."""
+MIN_STD_YAW_RAD = 1e-6
+MAX_NUMBER = 1e12
+"""Of numbers in files: beyond it, squares and products lose their precision."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Frame:
     detected: MultiBernoulli
     objects: LabelledBoxes
     lower: Float[ndarray, "D"]
-    """Region of states in which objects may be that no detection explains."""
+    """Region of the states of objects that no detection explains."""
     upper: Float[ndarray, "D"]
     range_m: Float[ndarray, "N"] | None = None
     """Distance of each object over ground."""
     visibility: Float[ndarray, "N"] | None = None
-    """Of each object, however the data set measures it: lidar points, or a level of occlusion."""
+    """Of each object, as the data set measures it: lidar points, or a level of occlusion."""
     relevance: Float[ndarray, "N"] | None = None
     """Weight of each object, where the truth has one."""
 
@@ -57,9 +57,9 @@ class DetectionSet:
     classes: Sequence[str]
     upright: bool
     counts: dict[str, int]
-    """By name, how often something was assumed or missing."""
+    """Number of assumed or missing values, by name."""
     true_classes: int
-    """The first so many of the classes are the truth's, others are named by detections alone."""
+    """Number of classes of the truth, which come first; detections alone name the others."""
 
 
 def detections_of_file(
@@ -84,13 +84,13 @@ def detections_of_file(
     }
     if yaw is not None and yaw_std is not None:
         checks["a heading that is not finite"] = np.isfinite(yaw)
-        name = f"a standard deviation of its heading below {LEAST_STD_YAW_RAD:g} rad"
-        checks[name] = yaw_std >= LEAST_STD_YAW_RAD
+        name = f"a standard deviation of its heading below {MIN_STD_YAW_RAD:g} rad"
+        checks[name] = yaw_std >= MIN_STD_YAW_RAD
     for fault, fine in checks.items():
         if not fine.all():
             raise InputError(f"{where}: detection {int(np.flatnonzero(~fine)[0])} has {fault}")
-    r = torch.as_tensor(np.clip(score, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
-    share = np.clip(class_probability, LEAST_PROBABILITY, None)
+    r = torch.as_tensor(np.clip(score, MIN_PROBABILITY, 1 - MIN_PROBABILITY))
+    share = np.clip(class_probability, MIN_PROBABILITY, None)
     boxes = BoxDensity(
         mean=torch.as_tensor(mean),
         chol=torch.as_tensor(chol),
@@ -120,7 +120,7 @@ def objects_of_file(
 def _cholesky(
     covariance: Float[ndarray, "M D D"],
 ) -> tuple[Float[ndarray, "M D D"], Bool[ndarray, "M"]]:
-    """Lower factors, and which of the covariances have one; zeros unless all do."""
+    """Return lower factors, and which covariances have one; factors are zeros unless all do."""
     finite = np.isfinite(covariance).all((1, 2))
     try:
         if finite.all():
@@ -138,7 +138,7 @@ def _cholesky(
 def covariances_of(
     records: Sequence[Mapping[str, Any]], default: Float[ndarray, "n D D"], names: Sequence[str]
 ) -> Float[ndarray, "n D D"]:
-    """Covariances as files have them, matrices or variances; the default where there is none."""
+    """Return the covariances in records, given as matrices or variances; the default where there is none."""
     stated = [n for n, record in enumerate(records) if record.get("covariance") is not None]
     covariance = np.array(default)
     if stated:
@@ -151,7 +151,7 @@ def covariances_of(
 def _covariance_matrices(
     values: Sequence[object], dims: int, names: Sequence[str]
 ) -> Float[ndarray, "n D D"]:
-    """All at once if they have the same form, which is much faster, else one after the other."""
+    """Convert all at once if they have one form, which is much faster, else one by one."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -178,7 +178,7 @@ def class_distributions(
     classes: Sequence[str],
     names: Sequence[str],
 ) -> Float[ndarray, "n K"]:
-    """Class probabilities by name as files have them; all on the label where there are none."""
+    """Return the class probabilities in records; all on the label where there are none."""
     share, place = np.zeros((len(records), len(classes))), {name: n for n, name in enumerate(classes)}
     for n, (record, label) in enumerate(zip(records, labels, strict=True)):
         stated = record.get("class_probabilities")
@@ -197,9 +197,9 @@ def class_distributions(
 
 
 def classes_in_order(true: set[str], found: set[str]) -> tuple[list[str], int]:
-    """Of files that do not list them: the truth's, then those of detections alone; how many are the truth's.
+    """Return the truth's classes, then those of detections alone, and the number of the truth's.
 
-    All of them if the truth has none.
+    All are the truth's if it has none.
     """
     return sorted(true) + sorted(found - true), len(true) or len(found)
 
@@ -207,14 +207,14 @@ def classes_in_order(true: set[str], found: set[str]) -> tuple[list[str], int]:
 def around(
     lower: Float[ndarray, "D"], upper: Float[ndarray, "D"], states: Float[ndarray, "N D"]
 ) -> tuple[Float[ndarray, "D"], Float[ndarray, "D"]]:
-    """A region, made larger where states lie outside."""
+    """Return a region, enlarged to hold all states."""
     if len(states) == 0:
         return lower, upper
     return np.minimum(lower, states.min(0)), np.maximum(upper, states.max(0))
 
 
 def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
-    """Finite numbers, none beyond `LARGEST`, that a record of a file must have."""
+    """Return numbers that a record must have: finite, none beyond `MAX_NUMBER`."""
     try:
         value = np.atleast_1d(np.asarray(record[key], dtype=np.float64))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -223,19 +223,19 @@ def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> F
         raise InputError(f"{where} has no {key} of {count} number(s)")
     if not np.isfinite(value).all():
         raise InputError(f"{where} has a {key} that is not finite")
-    if not (np.abs(value) <= LARGEST).all():
-        raise InputError(f"{where} has a {key} beyond {LARGEST:g}")
+    if not (np.abs(value) <= MAX_NUMBER).all():
+        raise InputError(f"{where} has a {key} beyond {MAX_NUMBER:g}")
     return value
 
 
 def all_numbers_of(
     records: Sequence[Mapping[str, Any]], key: str, count: int, names: Sequence[str]
 ) -> Float[ndarray, "n count"]:
-    """`numbers_of` every record."""
+    """Return `numbers_of` every record."""
     try:
         values = np.array([record[key] for record in records], dtype=np.float64)
         shape = (len(records), count) if count > 1 else (len(records),)
-        if values.shape == shape and (np.abs(values) <= LARGEST).all():
+        if values.shape == shape and (np.abs(values) <= MAX_NUMBER).all():
             return values.reshape(-1, count)
     except (KeyError, TypeError, ValueError, OverflowError):
         pass
@@ -244,7 +244,7 @@ def all_numbers_of(
 
 
 def relevance_of(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:
-    """Weights of objects; 1 for those without, None if none has one."""
+    """Return the weights of objects; 1 for those without, None if none has one."""
     if not any("relevance" in record for record in objects):
         return None
     weight = np.ones(len(objects))

@@ -1,4 +1,4 @@
-"""3-D detections in KITTI's text format: a folder of files, one a frame, and one of truth beside it.
+"""3-D detections in KITTI's text format: a folder with a file for each frame, and one of truth.
 
 A line: type, truncation, occlusion, alpha, image box (4), height, width, length (m), x, y, z of the bottom's
 middle (m, camera: right, down, forward), rotation about y (rad), and for detections a score. Boxes are scored
@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import (
-    LARGEST,
+    MAX_NUMBER,
     STD_YAW_RAD,
     DetectionSet,
     Family,
@@ -31,7 +31,7 @@ Line = tuple[str, Float[ndarray, "_"]]
 
 
 def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
-    """Frames of the truth by name. Raises `InputError` that names the line that is wrong."""
+    """Return the frames of the truth by name. Raises `InputError` that names the wrong line."""
     true_paths, paths = sorted(truth.glob("*.txt")), {path.name for path in folder.glob("*.txt")}
     if not true_paths:
         raise InputError(f"{truth}: holds no text files")
@@ -75,7 +75,7 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
 
 
 def _lines(path: Path, fields: int) -> list[Line]:
-    """Type and the numbers after it of each line that is not `DontCare`."""
+    """Return type and numbers of each line that is not `DontCare`."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
@@ -91,8 +91,8 @@ def _lines(path: Path, fields: int) -> list[Line]:
             raise InputError(f"{path}: line {n} has something that is not a number") from error
         if len(values) < fields - 1:
             raise InputError(f"{path}: line {n} has {len(words)} fields, not {fields}")
-        if not (np.abs(values) <= LARGEST).all():
-            raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {LARGEST:g}")
+        if not (np.abs(values) <= MAX_NUMBER).all():
+            raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {MAX_NUMBER:g}")
         lines.append((words[0], values))
     return lines
 

@@ -35,7 +35,7 @@ from foredrive.evaluation.detections.frames import (
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])
-"""Where objects may be: around the ego vehicle, or the middle of the frame's boxes, in m and log m."""
+"""Region of objects: around the ego vehicle, or the middle of the frame's boxes, in m and log m."""
 DEFAULT_COVARIANCE = np.diag(np.square([*STD_M, *[STD_LOG_SIZE] * 3]))
 
 Box = Mapping[str, Any]
@@ -44,7 +44,7 @@ Box = Mapping[str, Any]
 def read_nuscenes(
     results: Mapping[str, Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
 ) -> DetectionSet:
-    """Frames of the truth, in its order. Raises `InputError` that names the record that is wrong."""
+    """Return the frames of the truth, in its order. Raises `InputError` that names the wrong record."""
     found, true = _by_frame(results, path), _by_frame(truth, truth_path)
     unknown = sorted(set(found) - set(true))
     if unknown:
@@ -123,7 +123,7 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
 
 
 def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
-    """Centre and log length, width, height; heading."""
+    """Return centre and log length, width, height; and heading."""
     names = [f"{where}, box {n}" for n in range(len(boxes))]
     centre, size, rotation = (
         all_numbers_of(boxes, key, count, names)
@@ -141,7 +141,7 @@ def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Fl
 
 
 def _ego(true: Sequence[Box], true_state: Float[ndarray, "N 6"], where: str) -> Float[ndarray, "3"] | None:
-    """Where the ego vehicle is, if the truth says: the devkit writes where boxes are from there."""
+    """Return the ego vehicle's place, if the truth has it: the devkit writes boxes relative to it."""
     if not true or "ego_translation" not in true[0]:
         return None
     return true_state[0, :3] - numbers_of(true[0], "ego_translation", 3, f"{where}, box 0")

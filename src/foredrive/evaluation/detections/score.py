@@ -1,4 +1,4 @@
-"""Every frame's set likelihood, its parts, and what detections and objects had to do with each other."""
+"""Scores of frames: set likelihood, its parts, and matches of detections with objects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,33 +10,26 @@ from numpy import ndarray
 
 from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
+from foredrive.metrics.gospa import Gospa, gospa, wasserstein_distance
 from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
-from foredrive.sets import (
-    Gospa,
-    PoissonMultiBernoulli,
-    SetNll,
-    UniformPoisson,
-    gospa,
-    object_brier,
-    set_nll,
-    wasserstein_distance,
-)
+from foredrive.metrics.proper_scores import object_brier
+from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
 
 PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
 LOW_CONFIDENCE = 0.1
-"""Detections no surer than this become the Poisson background (Paper A)."""
+"""Detections of no more confidence become the Poisson background (Paper A)."""
 UNEXPLAINED_PER_FRAME = 1.0
-"""Objects expected beyond that, evenly over classes and the frame's region: no object is impossible."""
+"""Further expected objects, evenly over classes and the frame's region: no object is impossible."""
 NEAR_M, NEAR_OVERLAP = (1.0, 2.0), (0.5, 0.75)
-"""Detections that speak of an object, for object-level calibration."""
+"""Detections near an object, for object-level calibration."""
 GOSPA_CUTOFF_M, GOSPA_CUTOFF_PX = 2.0, 50.0
 GOSPA_CONFIDENCE = 0.5
-"""Detections below it are left out of GOSPA, which knows no probabilities."""
+"""GOSPA has no probabilities: detections below this one are left out of it."""
 
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """What each object of a frame cost, in nats, expected over associations."""
+    """Costs of each object of a frame, in nats, expected over associations."""
 
     label: Int[ndarray, "N"]
     localisation: Float[ndarray, "N"]
@@ -44,38 +37,38 @@ class ObjectScores:
     missed: Float[ndarray, "N"]
     missed_probability: Float[ndarray, "N"]
     best: Int[ndarray, "N"]
-    """Index among the frame's `detected`; -1: background."""
+    """Index of the likeliest detection among the frame's `detected`; -1: background."""
     brier: Float[ndarray, "N"]
-    """`object_brier` of the detections that are not background, mean over thresholds of nearness."""
+    """`object_brier` of detections that are not background, mean over thresholds of nearness."""
 
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """What each detection of a frame said, and what came of it."""
+    """Scores and matches of each detection of a frame."""
 
     label: Int[ndarray, "M"]
     """Likeliest class."""
     score: Float[ndarray, "M"]
-    """Existence, times the probability of that class."""
+    """Existence times the probability of that class."""
     existence: Float[ndarray, "M"]
     has_object: Float[ndarray, "M"]
-    """Probability that it has an object; NaN for those that became background."""
+    """Probability that it has an object; NaN for background."""
     hit: Bool[ndarray, "T M"]
     """Whether it hits an object at each threshold of average precision, by greedy matching."""
     overlap: Float[ndarray, "M"]
-    """With the object it hits at any overlap, else 0; NaN for upright boxes."""
+    """Overlap with the object that it hits, else 0; NaN for upright boxes."""
 
 
 @dataclass(frozen=True)
 class FrameScore:
-    """One frame's likelihood and all it is made of."""
+    """The likelihood of one frame and its parts."""
 
     name: str
     sequence: str
     nll: float
     """+inf where an object or a certain detection is impossible."""
     gap: float
-    """The true value is at most this much less."""
+    """Upper bound on how far the true value lies below `nll`."""
     parts: dict[str, float]
     gospa: Gospa
     pgospa: Gospa
@@ -88,7 +81,7 @@ class FrameScore:
 def score_frames(
     read: DetectionSet, *, k: int = 25, told: Callable[[int], None] | None = None
 ) -> list[FrameScore]:
-    """Score every frame; none is left out. `told` hears how many are done."""
+    """Score every frame. `told` is called with the number of frames that are done."""
     scores = []
     with torch.no_grad():
         for done, frame in enumerate(read.frames, 1):
@@ -99,9 +92,10 @@ def score_frames(
 
 
 def predicted_set(frame: Frame, classes: int, true_classes: int) -> PoissonMultiBernoulli:
-    """A frame's detections as a PMB: unsure ones and a uniform process are its background.
+    """Return a frame's detections as a PMB, with a background of unsure ones and a uniform process.
 
-    The latter is of the first `true_classes` alone: it does not depend on what else a detector names.
+    The uniform process is over the first `true_classes` alone: other classes that a detector names do not
+    change it.
     """
     rate = torch.zeros(classes, dtype=torch.float64)
     rate[:true_classes] = UNEXPLAINED_PER_FRAME / true_classes
@@ -135,7 +129,7 @@ def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
 
 
 def _pdq(frame: Frame, detections: DetectionScores) -> PdqCounts:
-    """Label quality is existence times class probability."""
+    """Count pairs for PDQ; label quality is existence times class probability."""
     boxes = frame.detected.boxes
     std = boxes.chol.square().sum(-1).sqrt().numpy()
     share = detections.existence[:, None] * frame.detected.log_class.exp().numpy()
@@ -172,7 +166,7 @@ def _object_brier(
     detected, label = frame.detected, frame.objects.label.numpy()
     probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[sure]
     thresholds = [-distance for distance in NEAR_M] if upright else NEAR_OVERLAP
-    each = [object_brier(probability, closeness[sure] >= least, label) for least in thresholds]
+    each = [object_brier(probability, closeness[sure] >= nearness, label) for nearness in thresholds]
     return np.mean(each, axis=0)
 
 
@@ -188,13 +182,13 @@ def _detections(
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
     has_object[sure] = 1.0 - result.associations.absent
-    least = [-threshold for threshold in NUSCENES_DISTANCES_M] if upright else COCO_OVERLAPS
-    hit, overlap = np.zeros((len(least), len(label)), bool), np.full(len(label), np.nan)
+    thresholds = [-distance for distance in NUSCENES_DISTANCES_M] if upright else COCO_OVERLAPS
+    hit, overlap = np.zeros((len(thresholds), len(label)), bool), np.full(len(label), np.nan)
     if not upright:
         overlap[:] = 0.0
     true = objects.label.numpy()
     near = np.where(label[:, None] == true, closeness, -np.inf)
-    for t, threshold in enumerate(least):
+    for t, threshold in enumerate(thresholds):
         hit[t] = match_greedily(score, near, threshold) >= 0
     if not upright:
         taken = match_greedily(score, near, np.nextafter(0.0, 1.0))
@@ -204,7 +198,7 @@ def _detections(
 
 
 def _closeness(frame: Frame, upright: bool) -> Float[ndarray, "M N"]:
-    """Minus the distance of centres over ground in m, or the overlap."""
+    """Return minus the distance of centres over ground in m, or the overlap."""
     mean, state = frame.detected.boxes.mean.numpy(), frame.objects.state.numpy()
     if not upright:
         return overlaps(mean, state)
@@ -212,7 +206,7 @@ def _closeness(frame: Frame, upright: bool) -> Float[ndarray, "M N"]:
 
 
 def _gospas(frame: Frame, detections: DetectionScores, upright: bool) -> tuple[Gospa, Gospa]:
-    """GOSPA of what is surer than a half, P-GOSPA of all; likeliest classes must agree."""
+    """Return GOSPA of detections above a half, and P-GOSPA of all; likeliest classes must agree."""
     dims, cutoff = (3, GOSPA_CUTOFF_M) if upright else (4, GOSPA_CUTOFF_PX)
     boxes, objects = frame.detected.boxes, frame.objects
     same = detections.label[:, None] == objects.label.numpy()

@@ -1,6 +1,6 @@
 """Figures over all frames: likelihood, its parts and slices, precision, calibration, proper scores."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,6 +12,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import DetectionSet, Frame
 from foredrive.evaluation.detections.score import PARTS, FrameScore
+from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
 from foredrive.metrics.detection import (
     COCO_OVERLAPS,
     NUSCENES_DISTANCES_M,
@@ -20,21 +21,9 @@ from foredrive.metrics.detection import (
     mean_of_valid,
 )
 from foredrive.metrics.pdq import pdq
-from foredrive.sets import (
-    BootstrapMean,
-    BoxDensity,
-    LabelledBoxes,
-    Reliability,
-    bootstrap_mean,
-    brier,
-    conformal_factor,
-    conformal_scores,
-    crps_gaussian,
-    crps_laplace,
-    energy_score,
-    fit_scale,
-    reliability,
-)
+from foredrive.metrics.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.metrics.reliability import Reliability, reliability
+from foredrive.sets import BoxDensity, LabelledBoxes, conformal_factor, conformal_scores, fit_scale
 
 LENGTHS_M = (0.0, 2.0, 6.0, np.inf)
 SIDES_PX = (0.0, 32.0, 96.0, np.inf)
@@ -46,52 +35,31 @@ Summary = dict[str, float | int | str | None]
 
 @dataclass(frozen=True)
 class ScoreSummary:
-    """Flat figures, and the reliability diagrams they were taken from."""
+    """Flat figures and reliability diagrams."""
 
     figures: Summary
     diagrams: Mapping[str, Reliability]
 
 
 def summarise_scores(read: DetectionSet, scores: Sequence[FrameScore], seed: int = 0) -> ScoreSummary:
-    """Means are per frame over frames of finite likelihood, and those that are not are counted."""
+    """Return the figures of `FIGURES`, and the reliability diagrams.
+
+    Likelihoods are averaged over frames where they are finite; the others are counted.
+    """
     rng = np.random.default_rng(seed)
-    nll = np.array([score.nll for score in scores])
-    finite = np.isfinite(nll)
-    figures: Summary = {
-        "frames": len(scores),
-        "objects": sum(len(score.objects.label) for score in scores),
-        "detections": sum(len(score.detections.label) for score in scores),
-        "pmb_nll.frames_infinite": int((~finite).sum()),
-        **read.counts,
-    }
-    if finite.any():
-        sequences = [score.sequence for score in scores]
-        interval = bootstrap_mean(nll[finite], np.array(sequences)[finite].tolist(), rng)
-        figures["pmb_nll.mean"] = interval.mean
-        figures["pmb_nll.low_95"], figures["pmb_nll.high_95"] = interval.low, interval.high
-        figures["pmb_nll.gap"] = float(np.mean([score.gap for score in scores]))
-        for part in PARTS:
-            values = np.array([score.parts[part] for score in scores])[finite]
-            figures[f"pmb_nll.{part}"] = float(values.mean())
-    for name in ("gospa", "pgospa"):
-        for part in ("distance", "localisation", "existence", "missed", "false"):
-            figures[f"{name}.{part}"] = float(np.mean([getattr(getattr(s, name), part) for s in scores]))
-    figures |= _precision(read, scores)
-    counts = [score.pdq for score in scores if score.pdq is not None]
-    if counts:
-        figures["pdq"] = pdq(counts)
-    diagrams = _diagrams(read, scores)
-    figures |= {f"calibration.{name}": diagram.error for name, diagram in diagrams.items()}
-    figures |= _calibration(read, scores) | _of_pairs(read, scores, rng) | _slices(read, scores)
-    return ScoreSummary(figures, diagrams)
+    figures: Summary = {}
+    for figures_of in FIGURES:
+        figures |= figures_of(read, scores, rng)
+    return ScoreSummary(figures, _diagrams(read, scores))
 
 
 def compare_scores(
     scores: Sequence[FrameScore], others: Sequence[FrameScore], seed: int = 0
 ) -> tuple[BootstrapMean, int]:
-    """Mean of ours minus theirs by frame, over frames where both are finite; how many are not.
+    """Return the mean of ours minus theirs over frames where both are finite, and the number of the others.
 
-    Raises `InputError` if the frames are not the same, or none can be compared.
+    Raises:
+        InputError: if the frames are not the same, or none can be compared.
     """
     if [score.name for score in scores] != [other.name for other in others]:
         raise InputError("two files of detections can be compared on the same frames only")
@@ -108,8 +76,48 @@ def _joined(scores: Sequence[FrameScore], part: str, field: str) -> ndarray:
     return np.concatenate([getattr(getattr(score, part), field) for score in scores], axis=-1)
 
 
-def _precision(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """Average precision by class and threshold, as the data sets define it."""
+def _counts(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Count frames, objects, detections, and what was assumed or missing."""
+    return {
+        "frames": len(scores),
+        "objects": sum(len(score.objects.label) for score in scores),
+        "detections": sum(len(score.detections.label) for score in scores),
+        "pmb_nll.frames_infinite": int((~np.isfinite([score.nll for score in scores])).sum()),
+        **read.counts,
+    }
+
+
+def _likelihood(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Average the likelihood and its parts over frames where it is finite."""
+    nll = np.array([score.nll for score in scores])
+    finite = np.isfinite(nll)
+    if not finite.any():
+        return {}
+    sequences = [score.sequence for score in scores]
+    interval = bootstrap_mean(nll[finite], np.array(sequences)[finite].tolist(), rng)
+    figures: Summary = {
+        "pmb_nll.mean": interval.mean,
+        "pmb_nll.low_95": interval.low,
+        "pmb_nll.high_95": interval.high,
+        "pmb_nll.gap": float(np.mean([score.gap for score in scores])),
+    }
+    for part in PARTS:
+        values = np.array([score.parts[part] for score in scores])[finite]
+        figures[f"pmb_nll.{part}"] = float(values.mean())
+    return figures
+
+
+def _distances(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Average GOSPA and P-GOSPA, and their parts, over frames."""
+    return {
+        f"{name}.{part}": float(np.mean([getattr(getattr(score, name), part) for score in scores]))
+        for name in ("gospa", "pgospa")
+        for part in ("distance", "localisation", "existence", "missed", "false")
+    }
+
+
+def _precision(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Return average precision by class and threshold, as the data sets define it."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
     thresholds = NUSCENES_DISTANCES_M if read.upright else COCO_OVERLAPS
@@ -129,8 +137,19 @@ def _precision(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
     return figures
 
 
+def _pdq(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Return PDQ of image boxes."""
+    counts = [score.pdq for score in scores if score.pdq is not None]
+    return {"pdq": pdq(counts)} if counts else {}
+
+
+def _reliability(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Return the errors of the reliability diagrams."""
+    return {f"calibration.{name}": diagram.error for name, diagram in _diagrams(read, scores).items()}
+
+
 def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
-    """D-ECE at 2 m or overlap 0.5; LaECE's bins for image boxes; existence against associations."""
+    """Return diagrams of hits (at 2 m or overlap 0.5) and of existence against associations."""
     score, hit = _joined(scores, "detections", "score"), _joined(scores, "detections", "hit")
     at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
     diagrams = {"d_ece": reliability(score, hit[at])}
@@ -141,8 +160,8 @@ def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Rel
     return diagrams
 
 
-def _calibration(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """D-ECE by class and range, object-level error; LaECE (overlap of hits at 0.5) and LaECE₀ of images."""
+def _calibration(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Return D-ECE by class and range, object-level error, and LaECE (hits at 0.5), LaECE₀ of image boxes."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
     at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
@@ -167,7 +186,7 @@ def _calibration(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
 
 
 def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
-    """Of boxes and their objects in the likeliest associations: proper scores, scale of σ, coverage."""
+    """Return proper scores, scale of σ and coverage of boxes and objects in the likeliest associations."""
     boxes, objects = [], []
     for frame, score in zip(read.frames, scores, strict=True):
         has = np.flatnonzero(score.objects.best >= 0)
@@ -194,8 +213,8 @@ def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.G
     return figures
 
 
-def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """What objects cost by class, size, range and visibility, nats an object."""
+def _slices(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+    """Return the cost of objects by class, size, range and visibility, nats an object."""
     label = _joined(scores, "objects", "label")
     figures: Summary = _relevance(read, scores)
     size = np.concatenate([_size(frame.objects, read.upright) for frame in read.frames])
@@ -224,7 +243,7 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
 
 
 def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
-    """What an object costs: all alike, and weighted where the truth has weights."""
+    """Return the mean cost of an object, plain and weighted where the truth has weights."""
     cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
     if not np.size(cost):
         return {}
@@ -238,14 +257,14 @@ def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
 
 
 def _range_of_detections_m(frame: Frame) -> Float[ndarray, "M"]:
-    """Over ground; NaN where nobody knows where the ego vehicle is."""
+    """Return distances over ground; NaN where the ego vehicle's place is unknown."""
     if frame.range_m is None:
         return np.full(len(frame.detected.log_existence), np.nan)
     return frame.detected.boxes.mean[:, :2].norm(dim=-1).numpy()
 
 
 def _size(objects: LabelledBoxes, upright: bool) -> Float[ndarray, "N"]:
-    """Length in m, or root of the area in px."""
+    """Return lengths in m, or roots of areas in px."""
     state = objects.state.double().numpy()
     if upright:
         return np.exp(state[:, 3])
@@ -270,3 +289,17 @@ def _stacked_boxes(parts: Sequence[BoxDensity]) -> BoxDensity:
 
 def _stacked_objects(parts: Sequence[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(torch.cat([part.label for part in parts]), torch.cat([part.state for part in parts]))
+
+
+FIGURES: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator], Summary], ...] = (
+    _counts,
+    _likelihood,
+    _distances,
+    _precision,
+    _pdq,
+    _reliability,
+    _calibration,
+    _of_pairs,
+    _slices,
+)
+"""All figures, in the order of a summary; the generator is drawn from in this order, too."""

@@ -12,7 +12,7 @@ from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
-from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.lessons import Alternating, Disturbed
@@ -125,4 +125,4 @@ def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
     planner, clips = run.recipe.planner, run.recipe.clips
     past_frames = clips.past_frames if planner.ego_mlp is None else planner.history
-    return fit_rivals(run.logs, clips, run.cache_dir, past_frames, planner.target)[1]
+    return fit_baselines(run.logs, clips, run.cache_dir, past_frames, planner.target)[1]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.models.agent import PlanningAgent
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
@@ -30,16 +30,16 @@ class AgentPredictor:
         self._generator = torch.Generator().manual_seed(0)
 
     @torch.no_grad()
-    def predict(self, observed: Clip) -> Prediction:
-        """Occupancy and flow now and at the next key frames, the plan, views at now, futures by chance."""
+    def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
+        """Predict the plan, occupancy and flow now and at the next key frames; views and futures if asked."""
         output = self.agent(observed, self.steps)
         decoded, world = output.decoded, self.agent.world_model
         flow = [frame.flow for frame in decoded if frame.flow is not None]
         views = None
-        if self.ray_stride and world.renderer is not None:
+        if "images" in asked and self.ray_stride and world.renderer is not None:
             views = self._views(world.renderer, observed, decoded[0])[:, None]
         futures = None
-        if self.futures and self.steps and world.samples_futures:
+        if "futures" in asked and self.futures and self.steps and world.samples_futures:
             drawn = [
                 world.imagine(output.beliefs[0], self.steps, generator=self._generator)
                 for _ in range(self.futures)

@@ -12,9 +12,16 @@ from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance, evaluate, write_summary
-from foredrive.evaluation.predictor import Prediction, Predictor
-from foredrive.evaluation.totals import COPIES, Figures
+from foredrive.evaluation import (
+    Figures,
+    Part,
+    Prediction,
+    Predictor,
+    collect_provenance,
+    evaluate,
+    write_summary,
+)
+from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, PERSISTENCE
 from foredrive.metrics import psnr_db
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.rendering.rebuilt import RebuiltScene
@@ -28,6 +35,7 @@ from foredrive.scene import Clip, Example, VoxelGrid
 
 GAP = "gap.json"
 REAL, RENDERED, AGREEMENT = "real", "rendered", "agreement"
+ASKED: frozenset[Part] = frozenset({"occupancy_logit", "plan"})
 _SAME_S = 1e-3
 """Times of one exposure differ by less."""
 
@@ -129,7 +137,7 @@ class Comparison:
         for name, clip in ((REAL, example.clip), (RENDERED, rendered)):
             small = dataclasses.replace(example, clip=shrink_images(clip, self._image_hw))
             observed = collate([small]).clip.observed()
-            said = self._predictor.predict(observed)
+            said = self._predictor.predict(observed, ASKED)
             self._said[name].append(Prediction(occupancy_logit=said.occupancy_logit, plan=said.plan))
         shown, real = (clip.images[now].float() / 255 for clip in (rendered, example.clip))
         known = example.clip.image_valid[now][:, None, None].expand(-1, *example.clip.rig.size_hw)
@@ -148,7 +156,8 @@ class Comparison:
             found = evaluate(_Said(iter(said)), truth, frame_dt_s=frame_dt_s).summary
             kinds = (".iou_", ".l2_") if name == AGREEMENT else (".iou_", ".l2_", ".collision_")
             kept = {key: value for key, value in found.items() if any(kind in key for kind in kinds)}
-            out |= {f"{name}.{key}": value for key, value in kept.items() if not key.endswith(COPIES)}
+            persistence = (PERSISTENCE, EGO_COMPENSATED)
+            out |= {f"{name}.{key}": value for key, value in kept.items() if not key.endswith(persistence)}
         return out
 
 
@@ -158,7 +167,7 @@ class _Said:
     def __init__(self, predictions: Iterator[Prediction]) -> None:
         self._predictions = predictions
 
-    def predict(self, observed: Clip) -> Prediction:
+    def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
         """The next one."""
         return next(self._predictions)
 

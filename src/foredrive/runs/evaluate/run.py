@@ -1,4 +1,4 @@
-"""Evaluating a run on logs: the model, the baselines it has to beat, one summary."""
+"""Evaluating a run on logs: the model and its baselines, one summary."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ from foredrive.evaluation import (
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Example, Trajectory
 
@@ -101,7 +101,9 @@ def evaluate_run(
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)
-    prior, ego_mlp = fit_rivals(run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.planner.target)
+    prior, ego_mlp = fit_baselines(
+        run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.planner.target
+    )
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)
@@ -141,7 +143,7 @@ def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspectio
         except InputError:
             continue
         observed = collate([item]).clip.observed()
-        prediction = predictor.predict(observed)
+        prediction = predictor.predict(observed, frozenset({"occupancy_logit", "plan", "images"}))
         assert prediction.occupancy_logit is not None
         assert prediction.plan is not None
         found.append(

@@ -1,28 +1,34 @@
-"""What a trained model has to beat, fitted to the very logs that it was trained on."""
+"""Baselines of a trained model, fitted to the very logs that it was trained on."""
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
-from foredrive.evaluation import fit_ego_mlp, read_training_set
-from foredrive.metrics import VoxelPrior
+from foredrive.evaluation import labels_from_now
+from foredrive.metrics import OccupancyPrior
 from foredrive.models.ego_mlp import EgoMLP
+from foredrive.scene import Clip, Example
+from foredrive.training import DrivenStatus, fit_ego_mlp, read_status
 
 
 @lru_cache(maxsize=1)  # training starts from it, evaluation wants it again, and so does a study's next arm
-def fit_rivals(
+def fit_baselines(
     logs: tuple[LogPath, ...], clips: ClipConfig, cache_dir: Path, past_frames: int, target: bool = False
-) -> tuple[VoxelPrior, EgoMLP]:
-    """The voxel prior of the labels and the MLP that sees ego status alone; reads all clips, without images.
+) -> tuple[OccupancyPrior, EgoMLP]:
+    """Return the occupancy prior of the labels and an ego MLP; reads all clips, without images.
 
     The MLP's seed is always the same: two differ by as much as looking may bring.
 
     Args:
+        logs: of the training set.
+        clips: as the model has them.
+        cache_dir: of labels.
         past_frames: of the ego status.
-        target: whether the ego status knows where the route leads.
+        target: whether the ego status holds where the route leads.
 
     Raises:
         InputError: on logs that cannot be read.
@@ -32,3 +38,32 @@ def fit_rivals(
     prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
     mlp = fit_ego_mlp(status, past_frames=past_frames, dt_s=clips.horizon_dt_s, seed=0, target=target)
     return prior, mlp
+
+
+def read_training_set(
+    loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False
+) -> tuple[OccupancyPrior, DrivenStatus]:
+    """Read the training data of the baselines in one pass; images are not looked at.
+
+    Args:
+        loader: batches.
+        frames: now and future key frames of the occupancy prior.
+        past_frames: of the ego status.
+        target: whether the ego status holds where the route leads.
+
+    Raises:
+        InputError: if there are none.
+    """
+    prior: OccupancyPrior | None = None
+
+    def clips() -> Iterator[Clip]:
+        nonlocal prior
+        for example in loader:
+            labels = labels_from_now(example.occupancy, example.clip, frames)
+            prior = prior or OccupancyPrior(frames, labels.spec)
+            prior.add(labels)
+            yield example.clip
+
+    status = read_status(clips(), past_frames, target=target)
+    assert prior is not None
+    return prior, status

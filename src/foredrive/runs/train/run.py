@@ -15,7 +15,7 @@ from foredrive.models.agent import PlanningAgent
 from foredrive.recipes.config import Recipe, load_recipe, save_recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.path_features import read_paths
 from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
 
@@ -111,7 +111,7 @@ def train_run(
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The very rival it will be judged beside.
         base = agent.planner.ego_mlp
-        _, fitted = fit_rivals(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
+        _, fitted = fit_baselines(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
         base.load_state_dict(fitted.state_dict())
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:

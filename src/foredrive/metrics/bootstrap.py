@@ -1,4 +1,4 @@
-"""How sure a mean over frames is, where frames of one sequence resemble each other."""
+"""Bootstrap interval of a mean over frames, where frames of one sequence resemble each other."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from foredrive.errors import InputError
 
 @dataclass(frozen=True)
 class BootstrapMean:
-    """A mean and the interval that resampled sequences give it."""
+    """A mean and its interval over resampled sequences."""
 
     mean: float
     low: float
@@ -32,12 +32,14 @@ def bootstrap_mean(
     level: float = 0.95,
     resamples: int = 2000,
 ) -> BootstrapMean:
-    """Percentile interval of the mean over frames, by drawing whole sequences with replacement.
+    """Return the percentile interval of the mean over frames, by drawing whole sequences with replacement.
 
-    Of paired differences the p-value tests whether two detectors differ, by a randomisation test (Fisher
+    The p-value of paired differences tests whether two detectors differ, by a randomisation test (Fisher
     1935): resampled means would call any two sequences that agree significant. With one sequence there is
-    nothing to draw from: interval and p-value are NaN. Raises `InputError` without values, or if any is not
-    finite.
+    nothing to draw from, and interval and p-value are NaN.
+
+    Raises:
+        InputError: without values, or if any is not finite.
     """
     if len(values) == 0 or not np.isfinite(values).all():
         raise InputError("a mean needs values, all of them finite")

@@ -11,14 +11,14 @@ from foredrive.sets.boxes import BoxDensity, LabelledBoxes
 
 
 def brier(probability: Float[ndarray, "n"], happened: Bool[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """Squared error of probabilities (Brier 1950)."""
+    """Return the squared error of probabilities (Brier 1950)."""
     return (probability - happened) ** 2
 
 
 def object_brier(
     probability: Float[ndarray, "M K"], near: Bool[ndarray, "M N"], label: Int[ndarray, "N"]
 ) -> Float[ndarray, "N"]:
-    """Squared error of what detections near each object say on average of its class; 1 if there are none.
+    """Return the squared error of the mean class probabilities of detections near each object; 1 without any.
 
     `probability` is that of existence with each class. The mean over objects is the object-level calibration
     error of Park, Sobolewski and Azizan (arXiv 2412.01782), at one threshold of nearness.
@@ -32,9 +32,9 @@ def object_brier(
 def crps_gaussian(
     mean: Float[ndarray, "..."], std: Float[ndarray, "..."], value: Float[ndarray, "..."]
 ) -> Float[ndarray, "..."]:
-    """Continuous ranked probability score of normal predictions (Gneiting and Raftery 2007, eq. 21).
+    """Return the continuous ranked probability score of normal predictions, in the unit of the value.
 
-    In the unit of the value.
+    Gneiting and Raftery (2007), eq. 21.
     """
     z = (value - mean) / std
     density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
@@ -44,7 +44,7 @@ def crps_gaussian(
 def crps_laplace(
     mean: Float[ndarray, "..."], std: Float[ndarray, "..."], value: Float[ndarray, "..."]
 ) -> Float[ndarray, "..."]:
-    """The same of Laplace predictions, which have scale σ/√2."""
+    """Return that of Laplace predictions, which have scale σ/√2."""
     scale = std / math.sqrt(2)
     z = np.abs(value - mean) / scale
     return scale * (z + np.exp(-z) - 0.75)
@@ -53,9 +53,9 @@ def crps_laplace(
 def energy_score(
     boxes: BoxDensity, objects: LabelledBoxes, rng: np.random.Generator, samples: int = 256
 ) -> Float[ndarray, "n"]:
-    """Energy score of the state of box i under density i (Gneiting and Raftery 2007, eq. 22), estimated.
+    """Estimate the energy score of the state of box i under density i (Gneiting and Raftery 2007, eq. 22).
 
-    E|X - y| - ½ E|X - X'| over `samples` draws of either; unbiased. The heading has no part in it.
+    E|X - y| - ½ E|X - X'| over `samples` draws of either; unbiased. Headings are left out.
     """
     repeated = boxes[np.repeat(np.arange(len(boxes.mean)), 2 * samples)]
     shape = (len(boxes.mean), 2, samples, boxes.mean.shape[-1])

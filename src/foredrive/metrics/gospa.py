@@ -38,7 +38,7 @@ def gospa(
     p: float = 2.0,
     existence: Float[ndarray, "M"] | None = None,
 ) -> Gospa:
-    """GOSPA, and P-GOSPA where `existence` is given; everything of power p.
+    """Return GOSPA, or P-GOSPA where `existence` is given; everything of power p.
 
     A pair costs r·d^p + (1 - r)·c^p/2, a detection without an object r·c^p/2, a missed object c^p/2.
     `distance` is that between a detection (its density, for P-GOSPA) and an object; +inf where the two must
@@ -70,9 +70,9 @@ def gospa(
 
 
 def wasserstein_distance(boxes: BoxDensity, objects: LabelledBoxes, dims: int = 3) -> Float[ndarray, "M N"]:
-    """2-Wasserstein distance between a density and a point, over the first `dims` coordinates of the state.
+    """Return the 2-Wasserstein distance between densities and the objects of a frame.
 
-    √(|mean - y|² + tr Σ): what is expected of the squared distance. Objects of one frame.
+    √(|mean - y|² + tr Σ), the root of the expected squared distance, over the first `dims` coordinates.
     """
     with torch.no_grad():
         offset = boxes.mean[:, None, :dims].double() - objects.state[:, :dims].double()

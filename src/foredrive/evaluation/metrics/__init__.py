@@ -1,0 +1,17 @@
+"""The metrics of an evaluation, one file each. A new metric is a file here and a line in `METRICS`."""
+
+from foredrive.evaluation.metric import MetricFactory
+from foredrive.evaluation.metrics.flow import FlowMetric
+from foredrive.evaluation.metrics.futures import FuturesMetric
+from foredrive.evaluation.metrics.images import ImageMetric
+from foredrive.evaluation.metrics.occupancy import OccupancyMetric
+from foredrive.evaluation.metrics.planning import PlanningMetric
+
+METRICS: tuple[MetricFactory, ...] = (
+    OccupancyMetric,
+    FuturesMetric,
+    FlowMetric,
+    ImageMetric,
+    PlanningMetric,
+)
+"""In the order of their figures in a summary."""

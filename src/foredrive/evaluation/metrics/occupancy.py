@@ -1,0 +1,95 @@
+"""Occupancy now and in the future, beside the occupancy prior and persistence."""
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.evaluation.predictor import Part, Prediction
+from foredrive.geometry.se3 import inverse_se3
+from foredrive.metrics import OccupancyCounts, above_ground, count_occupancy, ego_compensated
+from foredrive.scene import Example, VoxelSpec
+
+PERSISTENCE, EGO_COMPENSATED = ".copy", ".carried_copy"
+"""Suffixes of persistence: the predicted present in place of the future, and the same moved along the driven
+path."""
+PRIOR = ".best_constant"
+
+
+class OccupancyMetric:
+    """IoU, precision and recall over all voxels and over those above the ground; IoU alone of persistence.
+
+    Keys: `iou_now`, `above_ground.iou_now.best_constant`, `iou_future_1s.copy` and so on.
+    """
+
+    name = "occupancy"
+    needs: frozenset[Part] = frozenset({"occupancy_logit"})
+
+    def __init__(self, context: EvaluationContext) -> None:
+        self._context = context
+        self._regions: dict[str, Tensor | None] = {}
+        self._priors: dict[str, tuple[Tensor, Tensor]] = {}
+        self._counts: dict[tuple[str, str], OccupancyCounts] = {}
+
+    def update(self, prediction: Prediction, truth: Example) -> None:
+        """Count hits and misses of b clips.
+
+        Raises:
+            InputError: if the clips or the occupancy prior have other frames than the prediction.
+        """
+        assert prediction.occupancy_logit is not None
+        predicted, clip = prediction.occupancy_logit > 0, truth.clip
+        frames = predicted.shape[1]
+        labels = labels_from_now(truth.occupancy, clip, frames)
+        if not self._regions:
+            self._begin(labels.spec, frames)
+        shown = {"": predicted}
+        if frames > 1:
+            T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
+            shown[PERSISTENCE] = predicted[:, :1].expand_as(predicted)
+            shown[EGO_COMPENSATED] = _ego_compensated_frames(predicted[:, 0], T_world_ego, labels.spec)
+        for scope, region in self._regions.items():
+            if scope in self._priors:
+                shown[PRIOR] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
+            for suffix, occupied in shown.items():
+                counts = count_occupancy(occupied, labels, region)
+                key = (scope, suffix)
+                self._counts[key] = self._counts[key] + counts if key in self._counts else counts
+
+    def _begin(self, spec: VoxelSpec, frames: int) -> None:
+        """Prepare what does not change from batch to batch."""
+        prior = self._context.prior
+        if prior is not None and len(prior.occupied) != frames:
+            raise InputError(
+                f"the occupancy prior is for {len(prior.occupied)} frames, the model predicts {frames}"
+            )
+        self._regions = {"": None, "above_ground.": above_ground(spec)}
+        if prior is not None:
+            self._priors = {scope: prior.best_grid(region) for scope, region in self._regions.items()}
+
+    def result(self) -> Figures:
+        """Return the ratios of the sums, and the thresholds at which the prior is cut."""
+        out: Figures = {}
+        for (scope, suffix), counts in self._counts.items():
+            names = self._context.frame_names(len(counts.iou))
+            persists = suffix in (PERSISTENCE, EGO_COMPENSATED)
+            for kind in ("iou",) if persists else ("iou", "precision", "recall"):
+                for name, value in zip(names, getattr(counts, kind).tolist(), strict=True):
+                    if not (persists and name == "now"):
+                        out[f"{scope}{kind}_{name}{suffix}"] = value
+        for scope, (_, thresholds) in self._priors.items():
+            names = self._context.frame_names(len(thresholds))
+            names = self._context.frame_names(len(thresholds))
+            for name, value in zip(names, thresholds.tolist(), strict=True):
+                out[f"{scope}iou_{name}{PRIOR}_threshold"] = value
+        return out
+
+
+def _ego_compensated_frames(
+    now: Bool[Tensor, "b Z Y X"], T_world_ego: Float64[Tensor, "b F 4 4"], spec: VoxelSpec
+) -> Bool[Tensor, "b F Z Y X"]:
+    """Return ego-compensated persistence for each of F driven poses, the first of them now."""
+    T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
+    frames = [ego_compensated(now, T_now_ego[:, k], spec) for k in range(T_world_ego.shape[1])]
+    return torch.stack(frames, dim=1)

@@ -1,0 +1,90 @@
+"""Fitting the ego MLP, which plans from ego status alone."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.losses import l1_waypoint_loss
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_status
+from foredrive.scene import Clip
+from foredrive.scene.record import Record
+from foredrive.training.row_fit import RowFit, fit_rows
+
+EGO_MLP_FIT = RowFit(steps=1000, batch_size=256, lr=1e-3, weight_decay=1e-2)
+
+
+@dataclass(frozen=True)
+class DrivenStatus(Record):
+    """Ego status at now and the driven future of N clips: all that the ego MLP learns from."""
+
+    status: Float[Tensor, "N S"]
+    driven: Float[Tensor, "N T 3"]
+    """x, y, yaw of the rear axle in the ego frame at now."""
+    valid: Bool[Tensor, "N T"]
+
+
+def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False) -> DrivenStatus:
+    """Return ego status and driven future of batches of clips.
+
+    Args:
+        clips: batches.
+        past_frames: of the ego status.
+        target: whether the ego status holds where the route leads.
+
+    Raises:
+        InputError: if there are none.
+    """
+    rows = [_driven_status(clip, past_frames, target) for clip in clips]
+    if not rows:
+        raise InputError("the training set is empty")
+    return DrivenStatus(
+        torch.cat([row.status for row in rows]),
+        torch.cat([row.driven for row in rows]),
+        torch.cat([row.valid for row in rows]),
+    )
+
+
+def _driven_status(clip: Clip, past_frames: int, target: bool) -> DrivenStatus:
+    future = clip.future
+    driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
+    return DrivenStatus(ego_status(clip, past_frames, target=target), driven, future.valid[:, 0])
+
+
+def fit_ego_mlp(
+    data: DrivenStatus,
+    *,
+    past_frames: int,
+    dt_s: float,
+    seed: int,
+    fit: RowFit = EGO_MLP_FIT,
+    target: bool = False,
+) -> EgoMLP:
+    """Fit an ego MLP by L1 on the driven steps. Takes seconds; the same seed gives the same weights."""
+    horizon_steps = data.driven.shape[1]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = EgoMLP(
+            EgoMLPConfig(), past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target
+        )
+    _standardise(model, data)
+
+    def loss(rows: Tensor) -> Tensor:
+        return l1_waypoint_loss(model(data.status[rows]), data.driven[rows], data.valid[rows])
+
+    fit_rows(model, len(data.status), loss, fit, seed)
+    return model
+
+
+def _standardise(model: EgoMLP, data: DrivenStatus) -> None:
+    """Set the means and spreads; columns that hardly vary keep a spread of 1."""
+    whole = data.driven[data.valid.all(dim=-1)].flatten(1)
+    for name, rows in (("status", data.status), ("plan", whole)):
+        if len(rows) < 2:
+            continue
+        std = rows.std(dim=0)
+        getattr(model, f"{name}_mean").copy_(rows.mean(dim=0))
+        getattr(model, f"{name}_std").copy_(torch.where(std > 1e-3, std, torch.ones_like(std)))

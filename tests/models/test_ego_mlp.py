@@ -1,0 +1,42 @@
+"""Ego status: what a vehicle knows of itself."""
+
+import dataclasses
+
+import pytest
+import torch
+from small_drives import drives
+
+from foredrive.errors import InputError
+from foredrive.models.ego_mlp import ego_status
+from foredrive.scene import Command
+
+
+def test_the_ego_status_by_hand() -> None:
+    example = drives(3)
+    clip = example.clip
+    clip.ego_speed_mps[:] = torch.arange(clip.t_s.shape[1])[None].float()
+    clip.ego_speed_valid[0, clip.now - 1] = False
+    clip.command[:] = int(Command.STRAIGHT)
+    status = ego_status(clip, past_frames=2)[0]
+    assert status.shape == (2 * 3 + 3 + 3,)
+    # Two poses before now, in the ego frame at now: behind it.
+    assert status[0] < status[3] < 0
+    assert status[6:9].tolist() == [0.0, 0.0, 2.0]  # speeds, the unknown one 0
+    assert status[9:].tolist() == [0.0, 0.0, 1.0]  # left, right, straight
+    clip.command_valid[:] = False
+    assert ego_status(clip, past_frames=2)[0, 9:].tolist() == [0.0, 0.0, 0.0]
+    torch.testing.assert_close(ego_status(clip, 2), ego_status(clip.observed(), 2))
+    clip.target_xy[:], clip.target_valid[:] = torch.tensor([19.0, -4.0]), True
+    assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 19.0, -4.0, 1.0]
+    clip.target_valid[:] = False
+    assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    with pytest.raises(InputError, match="needs 5 frames before now"):
+        ego_status(clip, past_frames=5)
+
+
+def test_the_status_does_not_depend_on_where_in_the_world_one_is() -> None:
+    clip = drives(1).clip
+    moved = dataclasses.replace(
+        clip, T_world_ego=clip.T_world_ego[:, 0].inverse()[:, None] @ clip.T_world_ego
+    )
+    torch.testing.assert_close(ego_status(clip, 2), ego_status(moved, 2), atol=1e-4, rtol=0)
