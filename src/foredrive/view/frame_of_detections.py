@@ -8,7 +8,7 @@ from matplotlib.patches import Ellipse, Polygon
 from numpy import ndarray
 
 from foredrive.evaluation.detections import Frame, FrameScore
-from foredrive.view.inline_svg import INK_MARK
+from foredrive.view.html import INK_MARK
 
 OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
 FAINTEST = 0.02

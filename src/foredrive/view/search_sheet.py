@@ -1,18 +1,15 @@
 """The hits of a search on one page, as a picture or as HTML, and as a table in the terminal."""
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.search.find import Hit
 from foredrive.search.query import Query
 from foredrive.view import palette
-from foredrive.view.example_panel import figure_html
 from foredrive.view.hit_picture import (
     GAP_PX,
     HEIGHT_PX,
@@ -22,7 +19,8 @@ from foredrive.view.hit_picture import (
     what_is_there,
     why_matched,
 )
-from foredrive.view.report_style import CSS
+from foredrive.view.html import picture, write_page
+from foredrive.view.table import Column, Table, simple_table
 
 DPI = 100
 COLUMNS = 3
@@ -30,7 +28,6 @@ MARGIN_PX, HEAD_PX, TEXT_PX = 16, 54, 62
 CELL_PX = WIDTH_PX + GAP_PX + HEIGHT_PX
 MOST_ON_PICTURE = 60
 TITLE_PT = 15.0
-STYLE = "figcaption { white-space: pre-line; }"
 
 
 def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
@@ -48,9 +45,11 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
         with atomic_path(path) as scratch:
             figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
         return
-    page = search_html(query, hits)
-    with atomic_path(path) as scratch:
-        scratch.write_text(page, encoding="utf-8")
+    shown = [
+        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), why_matched(hit), _told(hit))
+        for number, hit in enumerate(hits, 1)
+    ]
+    write_page(path, "search_sheet.html.j2", title=query_line(query), hits=shown)
 
 
 def check_sheet(path: Path) -> None:
@@ -103,32 +102,16 @@ def draw_search_sheet(query: Query, hits: Sequence[Hit]) -> Figure:
     return figure
 
 
-def search_html(query: Query, hits: Sequence[Hit]) -> str:
-    """The page as text."""
-    cells = "\n".join(
-        figure_html(hit_picture(hit), f"{number}   {hit_name(hit)}\n{why_matched(hit)}\n{_told(hit)}")
-        for number, hit in enumerate(hits, 1)
-    )
-    title = escape(query_line(query))
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{CSS}{STYLE}</style>\n</head>\n<body>\n"
-        f'<h1>{title}</h1>\n<p class="note">{len(hits)} hits; to the right of each camera its lidar from '
-        f'above.</p>\n<div class="grid three">{cells}</div>\n</body>\n</html>\n'
-    )
-
-
 def hits_table(hits: Sequence[Hit]) -> Table:
-    """The hits for a terminal."""
-    table = Table(box=None)
-    for name in ("", "moment and view", "why", "what is there"):
-        table.add_column(name, overflow="fold")
-    for number, hit in enumerate(hits, 1):
-        table.add_row(str(number), hit_name(hit), why_matched(hit), what_is_there(hit))
-    return table
+    """List the hits."""
+    columns = (
+        Column(),
+        *(Column(name, align="left") for name in ("moment and view", "why", "what is there")),
+    )
+    rows = [(n, hit_name(hit), why_matched(hit), what_is_there(hit)) for n, hit in enumerate(hits, 1)]
+    return simple_table(columns, rows)
 
 
-def _told(hit: Hit) -> str:
+def _told(hit: Hit) -> list[str]:
     caption = hit.facts["caption"]
-    return what_is_there(hit) + ("" if caption is None else f"\n{caption}")
+    return [what_is_there(hit)] + ([] if caption is None else [str(caption)])
