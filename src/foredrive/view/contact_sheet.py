@@ -9,18 +9,16 @@ import torch
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from foredrive.data import LogPath
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import command_at
 from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, read_map_patch
-from foredrive.files import atomic_path
 from foredrive.scene import Command, MapKind, MapPatch
 from foredrive.view import palette
+from foredrive.view.sheet import Sheet
 
-DPI = 100
 THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
@@ -36,7 +34,7 @@ HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
 
 
 def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> None:
-    """Write the page as a PNG: a row for each drive, in the order given.
+    """Write a PNG: a row for each drive, in the order given.
 
     Args:
         path: the picture; it appears whole or not at all.
@@ -45,47 +43,29 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
     Raises:
         InputError: on a log that cannot be read.
     """
-    figure = draw_contact_sheet(drives)
-    with atomic_path(path) as scratch:
-        figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
-
-
-def draw_contact_sheet(drives: Sequence[tuple[LogPath, str]]) -> Figure:
-    """The page as a figure."""
     chosen = np.linspace(0, len(drives) - 1, min(len(drives), MOST_ROWS)).round().astype(int).tolist()
     (cell_h, cell_w), row_h = THUMBNAIL_HW, THUMBNAIL_HW[0] + GAP_PX
     width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
     height = HEAD_PX + len(chosen) * row_h
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
-
-    def place(x: int, y: int, w: int, h: int) -> Axes:
-        """Axes at pixels from the upper left corner."""
-        return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
-
+    sheet = Sheet(width, height)
     longest = max(len(drives[index][0].folder.name) for index in chosen)
     name_pt = min(LARGEST_PT, PT_OF_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()
     for row, index in enumerate(chosen):
-        y, (path, caption) = HEAD_PX + row * row_h, drives[index]
-        log = Log(path)
+        y, (drive, caption) = HEAD_PX + row * row_h, drives[index]
+        log = Log(drive)
         commands = _commands(log)
         commanded += commands
-        _write_text(place(2 * GAP_PX, y, TEXT_PX - 2 * GAP_PX, cell_h), log, caption, commands, name_pt)
+        sheet.write(2 * GAP_PX, y, log.path.folder.name, name_pt, weight="bold")
+        sheet.write(2 * GAP_PX, y + 0.2 * cell_h, _told(log, caption, commands), 9.5, palette.FAINT)
         for column, frame in enumerate(_spread(len(log))):
-            _show_front(place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
-        draw_way(place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
+            _show_front(sheet.place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
+        draw_way(sheet.place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
     shown = (
         f"{len(drives)} drives" if len(chosen) == len(drives) else f"{len(chosen)} of {len(drives)} drives"
     )
-    figure.text(
-        2 * GAP_PX / width,
-        1 - HEAD_PX / 2 / height,
-        f"{shown}    commands: {_shares(commanded)}",
-        color=palette.INK,
-        fontsize=14,
-        va="center",
-    )
-    return figure
+    sheet.head(2 * GAP_PX, HEAD_PX, f"{shown}    commands: {_shares(commanded)}", 14.0)
+    sheet.save(path)
 
 
 def _spread(frames: int) -> list[int]:
@@ -109,13 +89,10 @@ def _shares(commands: Counter[str]) -> str:
     return "   ".join(f"{kind} {100 * commands[kind] / total:.0f} %" for kind in kinds)
 
 
-def _write_text(ax: Axes, log: Log, caption: str, commands: Counter[str], name_pt: float) -> None:
-    ax.set_axis_off()
+def _told(log: Log, caption: str, commands: Counter[str]) -> str:
     length_m = float(np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1).sum())
     duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
-    ax.text(0, 1, log.path.folder.name, color=palette.INK, fontsize=name_pt, va="top", weight="bold")
-    told = f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
-    ax.text(0, 0.80, told, color=palette.FAINT, fontsize=9.5, va="top", linespacing=1.5)
+    return f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
 
 
 def _show_front(ax: Axes, log: Log, frame: int) -> None:

@@ -3,10 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from foredrive.errors import InputError
-from foredrive.files import atomic_path
 from foredrive.search.find import Hit
 from foredrive.search.query import Query
 from foredrive.view import palette
@@ -20,14 +17,14 @@ from foredrive.view.hit_picture import (
     why_matched,
 )
 from foredrive.view.html import picture, write_page
+from foredrive.view.sheet import Sheet
 from foredrive.view.table import Column, Table, simple_table
 
-DPI = 100
 COLUMNS = 3
 MARGIN_PX, HEAD_PX, TEXT_PX = 16, 54, 62
 CELL_PX = WIDTH_PX + GAP_PX + HEIGHT_PX
-MOST_ON_PICTURE = 60
-TITLE_PT = 15.0
+LINE_PX = 17
+MAX_ON_PICTURE = 60
 
 
 def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
@@ -41,9 +38,7 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
     """
     check_sheet(path)
     if path.suffix == ".png":
-        figure = draw_search_sheet(query, hits[:MOST_ON_PICTURE])
-        with atomic_path(path) as scratch:
-            figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
+        _write_picture(path, query, hits[:MAX_ON_PICTURE])
         return
     shown = [
         (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), why_matched(hit), _told(hit))
@@ -75,31 +70,22 @@ def query_line(query: Query) -> str:
     return "   ".join(asked)
 
 
-def draw_search_sheet(query: Query, hits: Sequence[Hit]) -> Figure:
-    """The picture as a figure."""
+def _write_picture(path: Path, query: Query, hits: Sequence[Hit]) -> None:
     rows = -(-len(hits) // COLUMNS)
     width = MARGIN_PX + min(len(hits), COLUMNS) * (CELL_PX + MARGIN_PX)
-    height = HEAD_PX + rows * (HEIGHT_PX + TEXT_PX)
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
-    title = query_line(query)
-    size_pt = min(TITLE_PT, 1.15 * width / max(len(title), 1))  # long ones shrink to fit
-    at = 1 - HEAD_PX / 2 / height
-    figure.text(MARGIN_PX / width, at, title, color=palette.INK, fontsize=size_pt, va="center")
+    sheet = Sheet(width, HEAD_PX + rows * (HEIGHT_PX + TEXT_PX))
+    sheet.head(MARGIN_PX, HEAD_PX, query_line(query), 15.0)
     for number, hit in enumerate(hits):
         x = MARGIN_PX + number % COLUMNS * (CELL_PX + MARGIN_PX)
         y = HEAD_PX + number // COLUMNS * (HEIGHT_PX + TEXT_PX)
-        box = (x / width, 1 - (y + HEIGHT_PX) / height, CELL_PX / width, HEIGHT_PX / height)
-        ax = figure.add_axes(box)
+        ax = sheet.place(x, y, CELL_PX, HEIGHT_PX)
         ax.imshow(hit_picture(hit), interpolation="none", aspect="auto")
         ax.set_axis_off()
-        lines = (
-            (f"{number + 1}   {hit_name(hit)}", palette.INK, 10.0),
-            (why_matched(hit), palette.EXPERT, 9.0),
-        )
-        for line, (text, colour, size) in enumerate((*lines, (what_is_there(hit), palette.FAINT, 9.0))):
-            below = 1 - (y + HEIGHT_PX + 4 + 17 * line) / height
-            figure.text(x / width, below, text, color=colour, fontsize=size, va="top")
-    return figure
+        below = y + HEIGHT_PX + 4
+        sheet.write(x, below, f"{number + 1}   {hit_name(hit)}", 10.0)
+        sheet.write(x, below + LINE_PX, why_matched(hit), 9.0, palette.EXPERT)
+        sheet.write(x, below + 2 * LINE_PX, what_is_there(hit), 9.0, palette.FAINT)
+    sheet.save(path)
 
 
 def hits_table(hits: Sequence[Hit]) -> Table:

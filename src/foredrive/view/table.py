@@ -140,7 +140,7 @@ def _rich(table: Table) -> RichTable:
     for place, made in enumerate(shown.columns):
         if place == 0 or made.justify == "right":  # these never wrap
             lines = [line for cell in (made.header, *made.cells) for line in str(cell).split("\n")]
-            made.min_width = max(map(cell_len, lines))
+            made.no_wrap, made.min_width = True, max(map(cell_len, lines))
     return shown
 
 
