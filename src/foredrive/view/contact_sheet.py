@@ -57,7 +57,7 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
         commands = _commands(log)
         commanded += commands
         sheet.write(2 * GAP_PX, y, log.path.folder.name, name_pt, weight="bold")
-        sheet.write(2 * GAP_PX, y + 0.2 * cell_h, _told(log, caption, commands), 9.5, palette.FAINT)
+        sheet.write(2 * GAP_PX, y + cell_h // 5, _told(log, caption, commands), 9.5, palette.FAINT)
         for column, frame in enumerate(_spread(len(log))):
             _show_front(sheet.place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
         draw_way(sheet.place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)

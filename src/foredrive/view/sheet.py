@@ -31,12 +31,12 @@ class Sheet:
         return self.figure.add_axes(box)
 
     def write(
-        self, x: float, y: float, text: str, size_pt: float, colour: str = palette.INK, weight: str = "normal"
+        self, x: int, y: int, text: str, size_pt: float, colour: str = palette.INK, weight: str = "normal"
     ) -> None:
         """Write lines below a point; dollars in them begin no formula."""
         at = (x / self.width, 1 - y / self.height)
         written = self.figure.text(*at, text, color=colour, fontsize=size_pt, va="top", parse_math=False)
-        written.set(linespacing=1.5, weight=weight)
+        written.set(linespacing=1.5 if "\n" in text else 1.2, weight=weight)
 
     def head(self, x: int, height: int, text: str, size_pt: float) -> None:
         """Write a title into the middle of the upper margin; a long one shrinks to fit."""
