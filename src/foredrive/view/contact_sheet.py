@@ -1,4 +1,4 @@
-"""Many drives on one page: of each a few pictures of the front camera and its way through the town."""
+"""Many drives on one sheet: a few images of the front camera, and the path through the town, of each."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
 LARGEST_PT, PT_OF_PX = 12.0, 0.86
-"""All names have one size, such that the longest fits: about as many points as a letter may be wide."""
-MOST_ROWS = 60
-"""Of more drives as many are shown, evenly chosen."""
+"""Names share one size, at which the longest fits: points for each pixel that a letter may be wide."""
+MAX_ROWS = 60
+"""More drives are thinned out evenly to this many."""
 AROUND_M = 30.0
 SMALLEST_M = 50.0
-"""The view from above shows this much on each side of the path, and at least so much to each side."""
+"""Margin of the view from above around the path, and its least half width."""
 MAP_LINES = {MapKind.LANE_BOUNDARY: 0.5, MapKind.ROAD_EDGE: 0.9}
 HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
 
@@ -38,12 +38,12 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
 
     Args:
         path: the picture; it appears whole or not at all.
-        drives: logs, and what to say of each beside its name and what it commands.
+        drives: logs, and a caption for each.
 
     Raises:
         InputError: on a log that cannot be read.
     """
-    chosen = np.linspace(0, len(drives) - 1, min(len(drives), MOST_ROWS)).round().astype(int).tolist()
+    chosen = np.linspace(0, len(drives) - 1, min(len(drives), MAX_ROWS)).round().astype(int).tolist()
     (cell_h, cell_w), row_h = THUMBNAIL_HW, THUMBNAIL_HW[0] + GAP_PX
     width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
     height = HEAD_PX + len(chosen) * row_h
@@ -69,12 +69,12 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
 
 
 def _spread(frames: int) -> list[int]:
-    """Frames from the first to the last, evenly."""
+    """Choose frames evenly from the first to the last."""
     return np.linspace(0, frames - 1, min(frames, THUMBNAILS)).round().astype(int).tolist()
 
 
 def _commands(log: Log) -> Counter[str]:
-    """How many frames have which command."""
+    """Count the frames of each command."""
     found: Counter[str] = Counter()
     for frame in range(len(log)):
         command, _ = command_at(log, frame, log.driven_future(frame, HORIZON_STEPS, HORIZON_DT_S))
@@ -111,7 +111,7 @@ def _show_front(ax: Axes, log: Log, frame: int) -> None:
 
 
 def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
-    """The camera that looks ahead; a bare panel if the log has none."""
+    """Read the image of the camera that looks ahead; return a bare panel if the log has none."""
     cameras = pinhole_cameras(log)
     if cameras:
         image = read_camera(log, frame, next(iter(cameras.values())), THUMBNAIL_HW, with_image=True).image
@@ -121,7 +121,7 @@ def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def draw_way(ax: Axes, log: Log) -> None:
-    """The driven path over the map, north up, a dot at its start."""
+    """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
     low, high = xy.min(axis=0) - AROUND_M, xy.max(axis=0) + AROUND_M
     half = max(float((high - low).max()) / 2, SMALLEST_M)
@@ -144,7 +144,7 @@ def draw_way(ax: Axes, log: Log) -> None:
 
 
 def _every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
-    """The first frame, the last, and those that are `step_m` of driving apart."""
+    """Return the first frame, the last, and those that are `step_m` of driving apart."""
     driven_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=-1))])
     at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
     return sorted({*at.tolist(), len(xy) - 1})

@@ -34,7 +34,7 @@ COMPARISON_KEY = (
 
 @dataclass(frozen=True)
 class ExamplePanel:
-    """What a model made of one example. Records have no leading batch dimension."""
+    """A model's predictions for one example, without leading batch dimension."""
 
     title: str
     example: Example
@@ -47,7 +47,7 @@ class ExamplePanel:
 
     @property
     def spec(self) -> VoxelSpec:
-        """Where the grids lie."""
+        """The grids' place and size."""
         return self.example.occupancy.spec
 
 
@@ -94,7 +94,7 @@ def show_panel(panel: ExamplePanel) -> ShownPanel:
 
 
 def front_camera(clip: Clip) -> int | None:
-    """Of the cameras with an image at now the one that looks ahead most straightly; None if there is none."""
+    """Return the camera with an image at now that looks ahead most straightly; None if there is none."""
     ahead = clip.rig.T_ego_cam[clip.now, :, 0, 2].masked_fill(~clip.image_valid[clip.now], -torch.inf)
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
@@ -102,7 +102,7 @@ def front_camera(clip: Clip) -> int | None:
 def camera_with_paths(
     clip: Clip, index: int, plan: Trajectory | None, width_px: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A camera's image at now with the driven future (green) and the plan (red) on the ground."""
+    """Draw the driven future (green) and the plan (red) on the ground of a camera's image at now."""
     image = clip.images[clip.now, index].permute(1, 2, 0).numpy()
     size_hw = (round(width_px * image.shape[0] / image.shape[1]), width_px)
     camera = Camera.of(clip.rig[clip.now], index).resized(size_hw)
@@ -114,7 +114,7 @@ def camera_with_paths(
 
 
 def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[np.ndarray, "H W 3"]:
-    """The scene from above with the driven future and the plan, legend below."""
+    """Draw the scene from above with the driven future and the plan, legend below."""
     figure = Figure(figsize=(5.6, 6.3), dpi=MAP_PX / 5.6, facecolor=palette.GROUND)
     draw_bev(figure.add_axes((0.125, 0.17, 0.855, 0.76)), clip, reach_m, plan)
     figure.legend(
@@ -133,7 +133,7 @@ def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[n
 
 
 def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Hits, false alarms and misses from above at a key frame after now, with the vehicle for scale."""
+    """Draw hits, false alarms and misses from above, `step` key frames after now."""
     grid, frame = panel.example.occupancy, panel.example.clip.now + step
     columns = draw_comparison(
         panel.occupied[step],
@@ -146,18 +146,18 @@ def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W
 
 
 def volume_picture(panel: ExamplePanel) -> UInt8[np.ndarray, "H W 3"]:
-    """The volume's principal components from above."""
+    """Draw the volume's principal components from above."""
     assert panel.volume is not None
     return with_ego(draw_volume_pca(panel.volume), panel.spec)
 
 
 def predicted_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Predicted occupancy in perspective at a key frame after now."""
+    """Draw predicted occupancy in perspective, `step` key frames after now."""
     return draw_voxels(panel.occupied[step], panel.spec, VOXELS_HW)
 
 
 def labelled_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Occupancy that the lidar saw, in perspective, at a key frame after now."""
+    """Draw occupancy that the lidar saw in perspective, `step` key frames after now."""
     grid, frame = panel.example.occupancy, panel.example.clip.now + step
     return draw_voxels((grid.values[frame, 0] > 0.5) & grid.known[frame], panel.spec, VOXELS_HW)
 
@@ -214,7 +214,7 @@ def _later(panel: ExamplePanel) -> list[Picture]:
 
 
 def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture of columns, enlarged by a whole factor, with the vehicle's outline."""
+    """Enlarge a picture of columns by a whole factor, and draw the vehicle's outline."""
     factor = max(1, round(MAP_PX / columns.shape[0]))
     canvas = Image.fromarray(columns).resize(
         (columns.shape[1] * factor, columns.shape[0] * factor), Image.Resampling.NEAREST

@@ -68,7 +68,7 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
 
 
 def camera_rows(rig: CameraRig) -> list[list[int]]:
-    """Camera indices laid out as around the car: those looking ahead above those looking back.
+    """Lay out camera indices as around the car: those looking ahead above those looking back.
 
     In both rows what lies to the left of the car is on the left.
     """
@@ -81,14 +81,14 @@ def camera_rows(rig: CameraRig) -> list[list[int]]:
 
 
 def _leftness(azimuth: float) -> float:
-    """Grows with how far to the left of the car's axis a camera looks, ahead or back alike."""
+    """Return a number that grows with how far to the left of the car's axis a camera looks."""
     return float(np.sin(azimuth)) if abs(azimuth) > 1e-6 else 0.0
 
 
 def camera_picture(
     clip: Clip, index: int, size_hw: tuple[int, int], with_boxes: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One camera's image at now in the given size, with lidar and boxes; a bare panel if there is none."""
+    """Draw one camera's image at now with lidar and boxes; a bare panel if there is none."""
     now = clip.now
     if bool(clip.image_valid[now, index]):
         image = resize(clip.images[now, index].permute(1, 2, 0).numpy(), size_hw)
@@ -139,7 +139,7 @@ def _show_camera(ax: Axes, clip: Clip, index: int, size_hw: tuple[int, int]) -> 
 
 
 def _range_bar(ax: Axes) -> None:
-    """Colour scale of the lidar's range."""
+    """Draw the colour scale of the lidar's range."""
     shown = LinearSegmentedColormap.from_list(
         "range", palette.RANGE_MAP(np.linspace(*palette.RANGE_SPAN, 64))
     )

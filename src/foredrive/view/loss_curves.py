@@ -67,7 +67,7 @@ def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]])
 
 
 def _running_mean(values: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-    """Mean of the last few values, of those that are numbers."""
+    """Average the last few values, of those that are numbers."""
     number = np.isfinite(values)
     total = np.cumsum(np.where(number, values, 0.0))
     count = np.cumsum(number)

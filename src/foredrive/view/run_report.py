@@ -25,7 +25,7 @@ def report_on_run(
     inspections: Sequence[Inspection],
     failures: Sequence[Failure] = (),
 ) -> ReportData:
-    """Put together what the report of a run on some logs shows; of the failures the first few are named."""
+    """Collect the content of a run's report on some logs; the first few failures are named."""
     losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
     return ReportData(
         title=f"{run.recipe.name} on {_names(logs)}",
@@ -38,7 +38,7 @@ def report_on_run(
 
 
 def inspection_panel(inspection: Inspection) -> ExamplePanel:
-    """One example as the report shows it."""
+    """Make an example's panel."""
     log, _, t_us = inspection.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     return ExamplePanel(
@@ -62,7 +62,7 @@ def _notes(
     failures: Sequence[Failure],
     losses: Losses,
 ) -> list[str]:
-    """What keeps the figures from meaning what they seem to mean."""
+    """List what a reader must know so as not to misread the figures."""
     notes = []
     seen = {log.folder for log in run.logs} & {log.folder for log in logs}
     if seen:

@@ -1,4 +1,4 @@
-"""A page in the browser that asks an index: a grid of hits, conditions, a map of all scenes with a lasso."""
+"""A page in the browser that searches an index: a grid of hits, conditions, a map of scenes with a lasso."""
 
 import functools
 import io
@@ -27,7 +27,7 @@ from foredrive.view.html import render_page
 
 JPEG_QUALITY = 85
 MAX_SHOWN = 60
-"""Of the scenes in a lasso."""
+"""Scenes of a lasso that are shown."""
 Key = tuple[str, str]
 """A moment's key and a view: a row."""
 
@@ -201,7 +201,7 @@ class SearchPage:
         return Done(f"kept as {told['name']}")
 
     def _rows(self, keys: Sequence[Key]) -> list[Hit]:
-        """Rows in the order of their keys, as hits that nothing was compared with."""
+        """Read rows in the order of their keys, as hits without scores."""
         if not keys:
             raise InputError("nothing is chosen")
         where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
@@ -210,7 +210,7 @@ class SearchPage:
 
 
 def query_of(asked: Mapping[str, Any]) -> Query:
-    """A query from the page's fields; empty ones are left out.
+    """Make a query of the page's fields; empty ones are left out.
 
     Raises:
         InputError: they do not make one.

@@ -1,4 +1,4 @@
-"""The hits of a search on one page, as a picture or as HTML, and as a table in the terminal."""
+"""The hits of a search as a picture, as HTML, and as a table."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,7 +48,7 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
 
 
 def check_sheet(path: Path) -> None:
-    """Whether a contact sheet can be written under this name.
+    """Check that a contact sheet can be written under this name.
 
     Raises:
         InputError: it ends neither on .png nor on .html.
@@ -58,7 +58,7 @@ def check_sheet(path: Path) -> None:
 
 
 def query_line(query: Query) -> str:
-    """A query in one line."""
+    """Write a query in one line."""
     asked = [f"“{text}”" for text in (query.text, query.image_text, query.lidar_text) if text]
     asked += [f"like {query.like}"] if query.like else []
     if asked:
