@@ -2,14 +2,12 @@
 
 import dataclasses
 import math
-import re
-from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from html_pages import EVIL, Page, assert_harmless
 from PIL import Image
 
 from foredrive.errors import InputError
@@ -21,51 +19,22 @@ from foredrive.view.example_panel import (
     camera_with_paths,
     comparison_picture,
     front_camera,
-    panel_html,
+    show_panel,
 )
 from foredrive.view.hero import write_hero
 from foredrive.view.loss_curves import draw_loss_curves
-from foredrive.view.report import ReportData, report_html, write_report
-from foredrive.view.summary_tables import full_table, image_table, number, occupancy_table, planning_tables
+from foredrive.view.origin import Origin
+from foredrive.view.report import ReportData, write_report
+from foredrive.view.summary_tables import (
+    full_table,
+    image_table,
+    occupancy_table,
+    planning_overview,
+    planning_table,
+)
+from foredrive.view.table import Cell, Table, number
 
 DASH, TIMES = "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, and the text, of a page."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.cells: list[list[str]] = []
-        self.text = ""
-        self.feed(html)
-        assert self.open == [], f"not closed: {self.open}"
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "img", "br"):
-            self.open.append(tag)
-        if tag == "tr":
-            self.cells.append([])
-        elif tag in ("td", "th"):
-            self.cells[-1].append("")
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-        if self.open and {"td", "th"} & set(self.open):
-            self.cells[-1][-1] += data.strip()
-
-    def row(self, title: str) -> list[str]:
-        (found,) = [row[1:] for row in self.cells if row and row[0] == title]
-        return found
 
 
 @pytest.fixture(scope="module")
@@ -117,10 +86,7 @@ def report(panel: ExamplePanel) -> ReportData:
     lines = [{"step": i, "loss": 3.0 / i, "occ": 2.0 / i, "perc": 0.0} for i in range(1, 40)]
     return ReportData(
         title="A run & more",
-        command="foredrive evaluate runs/a",
-        commit="abc123",
-        machine="2 cores",
-        date="2026-11-21",
+        origin=Origin("foredrive evaluate runs/a", "abc123", "2 cores", "2026-11-21"),
         summary=summary(),
         losses={"pretrain": lines, "finetune": []},
         panels=[panel],
@@ -129,22 +95,34 @@ def report(panel: ExamplePanel) -> ReportData:
 
 
 @pytest.fixture(scope="module")
-def html(report: ReportData) -> str:
-    return report_html(report)
+def html(report: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(path, report)
+    return path.read_text()
 
 
-def references(html: str) -> Iterator[str]:
-    """Everything a browser could fetch."""
-    for _, attributes in Page(html).tags:
-        for name in ("src", "href", "xlink:href", "srcset", "data", "action", "poster"):
-            if attributes.get(name):
-                yield str(attributes[name])
-    yield from re.findall(r"url\(['\"]?([^)'\"]+)", html)
-    yield from re.findall(r"@import\s+['\"]?([^'\";]+)", html)
+def cells_of(table: Table | None) -> list[list[str]]:
+    """A table's rows as text."""
+    assert table is not None
+    return [
+        [
+            number(cell.value if isinstance(cell, Cell) else cell, column.digits)
+            for cell, column in zip(row.cells, table.columns, strict=True)
+        ]
+        for section in table.sections
+        for row in section.rows
+    ]
+
+
+def best_of(table: Table | None) -> int:
+    """How many cells are marked."""
+    assert table is not None
+    rows = [row for section in table.sections for row in section.rows]
+    return sum(isinstance(cell, Cell) and cell.mark == "best" for row in rows for cell in row.cells)
 
 
 def test_the_page_loads_nothing_and_runs_nothing(html: str) -> None:
-    found = list(references(html))
+    found = Page(html).references()
     assert len(found) > 20
     assert all(item.startswith(("data:image/", "#")) for item in found), found
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in Page(html).tags}
@@ -172,6 +150,24 @@ def test_every_part_is_there_and_text_is_escaped(html: str) -> None:
         assert part in page.text, part
 
 
+def test_names_from_outside_run_nothing(report: ReportData, panel: ExamplePanel, tmp_path: Path) -> None:
+    example = panel.example
+    rig = dataclasses.replace(example.clip.rig, names=(EVIL,) * len(example.clip.rig.names))
+    clip = dataclasses.replace(example.clip, rig=rig)
+    figures = {"planning.uniad.l2_avg_m": 1.0, f"planning.{EVIL}.failed": 3, EVIL: EVIL}
+    evil = ReportData(
+        title=EVIL,
+        origin=Origin(EVIL, EVIL, EVIL, EVIL),
+        summary=figures,
+        losses={EVIL: [{"step": 1, EVIL: 2.0}]},
+        panels=[dataclasses.replace(panel, title=EVIL, example=dataclasses.replace(example, clip=clip))],
+        notes=[EVIL],
+    )
+    write_report(tmp_path / "report.html", evil)
+    # title and heading, origin, failures, note, key and value, stage and loss, example, front and 12 cameras
+    assert_harmless((tmp_path / "report.html").read_text(), times=2 + 4 + 1 + 1 + 2 + 2 + 1 + 1 + 12)
+
+
 def test_failures_and_leaking_commands_are_said_first_and_loudly(html: str) -> None:
     start = html[: html.index("In short")]
     assert "<strong>Failed items of this model: 2.</strong>" in start
@@ -180,10 +176,10 @@ def test_failures_and_leaking_commands_are_said_first_and_loudly(html: str) -> N
 
 
 def test_six_cameras_stand_beside_six_rendered_views(panel: ExamplePanel) -> None:
-    alts = [attributes["alt"] for tag, attributes in Page(panel_html(panel)).tags if tag == "img"]
     order = ["front_left", "front", "front_right", "back_left", "back", "back_right"]
-    start = alts.index("front_left")
-    assert alts[start : start + 12] == order * 2
+    cameras = show_panel(panel).cameras
+    assert list(cameras) == ["Camera images", "Rendered from the volume"]
+    assert all([shown.caption for shown in pictures] == order for pictures in cameras.values())
 
 
 def test_pictures_are_images_of_the_size_they_state(html: str) -> None:
@@ -199,65 +195,68 @@ def test_pictures_are_images_of_the_size_they_state(html: str) -> None:
 
 
 def test_planning_tables_show_every_protocol_beside_its_baselines() -> None:
-    page = Page(planning_tables(summary()))
-    for title in ("ST-P3", "UniAD", "VAD", "SparseDrive", "BEV-Planner"):
-        assert page.text.count(title) >= 2
-    models = [row[1:] for row in page.cells if row[0] == "this model"]
-    assert models[0] == ["1.00", DASH] * 5
-    assert models[1] == ["1.00"] * 4 + [DASH] * 4 + ["7", "1", DASH]
-    assert len(models) == 1 + len(PROTOCOLS)
-    assert planning_tables(summary()).count('class="best"') == 5 + 4 * 5  # L2 only, the model's
+    overview, detail = planning_overview(summary()), planning_table(summary())
+    assert overview is not None
+    assert detail is not None
+    titles = ["ST-P3", "UniAD", "VAD", "SparseDrive", "BEV-Planner"]
+    assert [group for group, _ in overview.groups] == ["", *titles]
+    assert [section.title for section in detail.sections] == titles
+    assert cells_of(overview) == [
+        ["this model", *["1.00", DASH] * 5],
+        ["stand still", *["2.00", DASH] * 5],
+    ]
+    assert cells_of(detail)[0] == ["this model", *["1.00"] * 4, *[DASH] * 4, "7", "1", DASH]
+    assert (best_of(overview), best_of(detail)) == (5, 4 * 5)  # L2 only, the model's
 
 
 def test_occupancy_is_shown_against_the_best_constant() -> None:
-    page = Page(occupancy_table(summary()))
-    assert [row[1:] for row in page.cells if row[0] == "now"] == [
-        ["0.600"] * 3 + ["0.120"] * 3 + [f"5.00 {TIMES}"],
-        ["0.300"] * 3 + ["0.120"] * 3 + [f"2.50 {TIMES}"],
+    rows = cells_of(occupancy_table(summary()))
+    assert [row for row in rows if row[0] == "now"] == [
+        ["now", *["0.600"] * 3, *["0.120"] * 3, f"5.00 {TIMES}"],
+        ["now", *["0.300"] * 3, *["0.120"] * 3, f"2.50 {TIMES}"],
     ]
-    assert len([row for row in page.cells if row[0] == "+500 ms"]) == 2
+    assert len([row for row in rows if row[0] == "+500 ms"]) == 2
 
 
 def test_image_quality_now_and_later() -> None:
-    page = Page(image_table(summary()))
-    assert page.row("now") == ["19.25", "0.500"]
-    assert page.row("+500 ms") == ["18.00", DASH]
+    assert cells_of(image_table(summary())) == [["now", "19.25", "0.500"], ["+500 ms", "18.00", DASH]]
 
 
 def test_an_empty_summary_makes_no_tables() -> None:
-    assert planning_tables({}) == occupancy_table({}) == image_table({}) == ""
+    assert {planning_overview({}), planning_table({}), occupancy_table({}), image_table({})} == {None}
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1.23456, "1.235"), (math.nan, "&ndash;"), (None, "&ndash;"), (7, "7"), ("a<b", "a&lt;b")],
+    [(1.23456, "1.235"), (math.nan, DASH), (None, DASH), (-0.0001, "0.000"), (7, "7"), ("a<b", "a<b")],
 )
 def test_figures_as_text(value: float | int | str | None, text: str) -> None:
     assert number(value) == text
 
 
 def test_the_full_table_has_every_key() -> None:
-    page = Page(full_table(summary()))
-    assert {row[0] for row in page.cells} == {"key", *summary()}
+    assert [row[0] for row in cells_of(full_table(summary()))] == sorted(summary())
 
 
 def test_curves_leave_out_what_is_no_loss_and_what_never_was_positive() -> None:
     lines = [{"step": i, "loss": 1.0 / i, "perc": 0.0, "step_s": 0.1} for i in range(1, 9)]
     svg = draw_loss_curves({"pretrain": lines, "finetune": []})
+    assert svg is not None
     assert "pretrain" in svg
     assert ">loss<" in svg
     assert "perc" not in svg
     assert "step_s" not in svg
     assert "finetune" not in svg
     assert "currentColor" in svg
-    assert draw_loss_curves({"finetune": []}) == ""
+    assert draw_loss_curves({"finetune": []}) is None
 
 
-def test_a_log_without_images_gets_its_panel(panel: ExamplePanel) -> None:
+def test_a_log_without_images_gets_its_panel(report: ReportData, panel: ExamplePanel, tmp_path: Path) -> None:
     clip = panel.example.clip
     dark = dataclasses.replace(clip, image_valid=torch.zeros_like(clip.image_valid))
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
-    assert "no camera images" in panel_html(blind)
+    write_report(tmp_path / "report.html", dataclasses.replace(report, panels=[blind]))
+    assert "no camera images" in (tmp_path / "report.html").read_text()
     assert front_camera(dark) is None
 
 

@@ -31,7 +31,7 @@ def test_testing_on_training_logs_is_said(tmp_path: Path) -> None:
     assert fair.notes == []
     assert unfair.notes[0].startswith("1 of the 2 evaluated logs were trained on")
     assert fair.title == "nemo_tiny on a_test/two"
-    assert fair.commit == "not a git checkout"
+    assert fair.origin.commit == "not a git checkout"
     assert fair.losses["pretrain"][0]["loss"] == 2.0
     assert list(fair.losses["finetune"]) == []
 

@@ -12,14 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from html_pages import EVIL, Page, assert_harmless
 from miniature import write_log
 from small_towers import save_clip
 
 from foredrive.data.clip_list import read_clip_list
 from foredrive.runs.search.indexing import index_logs
+from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
+from foredrive.search.query import Query
+from foredrive.search.rows import FACTS
 from foredrive.view.search_page import SearchPage, query_of
+from foredrive.view.search_sheet import write_search_sheet
 
 MOMENTS = 3
 """Half a second apart, each with its whole and two views."""
@@ -99,14 +104,46 @@ def test_the_plane_shows_where_scenes_vary_most(page: SearchPage) -> None:
     assert plane.share == pytest.approx(1.0, abs=1e-5)  # three points always lie in a plane
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium here")
-def test_a_browser_draws_the_grid(page: SearchPage, tmp_path: Path) -> None:
-    url = f"{page.url}/?" + urllib.parse.urlencode({"text": "car", "top": 2, "gap_s": 0.4})
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
+def browse(url: str, profile: Path) -> Page:
+    """The page as a browser leaves it."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
     done = subprocess.run(
         ["chromium", *flags, "--virtual-time-budget=20000", "--dump-dom", url],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
-    assert done.stdout.count("<figure") == 2
-    assert "2 hits, all compared" in done.stdout
-    assert "3 of 3 whole scenes" in done.stdout
+    return Page(done.stdout)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium here")
+def test_the_page_opens_with_scenes(page: SearchPage, tmp_path: Path) -> None:
+    shown = browse(page.url, tmp_path)
+    assert [tag for tag, _ in shown.tags].count("figure") == MOMENTS
+    assert "3 of 3 whole scenes, evenly chosen" in shown.text
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium here")
+def test_a_browser_draws_the_grid(page: SearchPage, tmp_path: Path) -> None:
+    fetch(page, "/queries", {"name": EVIL, "asked": {"text": EVIL}})
+    url = f"{page.url}/?" + urllib.parse.urlencode({"text": f"car {EVIL}", "top": 2, "gap_s": 0.4})
+    shown = browse(url, tmp_path)
+    assert [tag for tag, _ in shown.tags].count("figure") == 2
+    assert "2 hits, all compared" in shown.text
+    assert "3 of 3 whole scenes" in shown.text
+    assert EVIL in shown.text  # the query that was kept
+    assert "svg" not in {tag for tag, _ in shown.tags}
+
+
+def test_names_from_outside_run_nothing_on_a_contact_sheet(tmp_path: Path) -> None:
+    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0}
+    facts |= dict.fromkeys(("log", "folder", "maps_dir", "view", "place", "weather", "caption"), EVIL)
+    query = Query(text=EVIL, where=EVIL)
+    write_search_sheet(tmp_path / "hits.html", query, [Hit(facts, 0.5, {EVIL: 0.5})])
+    # title and heading (text and condition), and of the hit: log, view, score, place, weather, caption
+    assert_harmless((tmp_path / "hits.html").read_text(), times=4 + 6)
+
+
+def test_a_query_with_dollars_is_no_formula(tmp_path: Path) -> None:
+    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0, "folder": "$\\frac$", "maps_dir": ""}
+    hit = Hit(facts, 0.5, {"$\\x$": 1.0})
+    write_search_sheet(tmp_path / "hits.png", Query(text="5 $ or $\\frac$"), [hit])
+    assert (tmp_path / "hits.png").stat().st_size > 1000

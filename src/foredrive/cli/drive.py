@@ -61,10 +61,11 @@ def _drive_rebuilt(suite: "RebuiltSuite", out: Path) -> None:
     from foredrive.runs.drive.rebuilt import drive_rebuilt
     from foredrive.runs.drive.records import summarise
     from foredrive.view.drive_report import score_table, write_drive_report
+    from foredrive.view.table import print_table
 
     with Status("driving") as status:
         drives = drive_rebuilt(suite, out, lambda job: status.update(f"driving; last driven: {job.route}"))
-    Console().print(score_table(summarise(drives)))
+    print_table(score_table(summarise(drives)), Console())
     for met in (drive["threat"] for drive in drives if "threat" in drive):
         print(f"{met['kind']} threat: {met['score']:.1f} of 5")
     print(f"look: {write_drive_report(out)}")
@@ -80,6 +81,7 @@ def _tell(driven: "Driven") -> None:
 
     from foredrive.runs.drive.records import summarise
     from foredrive.view.drive_report import score_table
+    from foredrive.view.table import print_table
 
     if driven.broken:
         told = [f"{job.name} ({reason})" for job, reason in driven.broken.items()]
@@ -91,7 +93,7 @@ def _tell(driven: "Driven") -> None:
         )
     if driven.skipped:
         print(f"{driven.skipped} of {len(driven.drives)} drives were there already")
-    Console().print(score_table(summarise(list(driven.drives.values()))))
+    print_table(score_table(summarise(list(driven.drives.values()))), Console())
 
 
 class _Progress:

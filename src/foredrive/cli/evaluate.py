@@ -35,10 +35,11 @@ def evaluate(
         return
     from rich.console import Console
 
-    from foredrive.evaluation import print_summary, read_summary
+    from foredrive.evaluation import read_summary
     from foredrive.runs import evaluate_run, find_all_logs, inspect_run, open_run
     from foredrive.view.report import write_report
     from foredrive.view.run_report import report_on_run
+    from foredrive.view.summary_tables import print_summary
 
     trained = open_run(run)
     chosen = find_all_logs(logs) if logs else trained.logs
@@ -59,11 +60,12 @@ def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
     from foredrive.runs import open_run
     from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
     from foredrive.view.gap_table import gap_table
+    from foredrive.view.table import print_table
 
     with Progress() as progress:
         bar = progress.add_task("real and rendered")
         figures = measure_gap(
             open_run(run), rebuilt, out, lambda done, of: progress.update(bar, completed=done, total=of)
         )
-    Console().print(gap_table(figures))
+    print_table(gap_table(figures), Console())
     print(f"wrote {out / GAP}")

@@ -42,7 +42,8 @@ def score(
 
     from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
     from foredrive.evaluation.detections import read_detections, summarise_scores, write_frame_scores
-    from foredrive.view.score_report import print_scores, write_score_report
+    from foredrive.view.score_report import score_table, write_score_report
+    from foredrive.view.table import print_table
 
     if worst < 0:
         raise InputError(f"--worst is {worst}: a number of frames is not below 0")
@@ -60,7 +61,7 @@ def score(
     write_score_report(
         out / "report.html", f"{results.name} and the truth, {truth.name}", read, scores, result, worst
     )
-    print_scores(figures, Console())
+    print_table(score_table(figures), Console())
     print(f"wrote {out / 'summary.json'}, {out / 'report.html'} and {out / 'frames.jsonl'}")
 
 

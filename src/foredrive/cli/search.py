@@ -85,11 +85,12 @@ def _tell(index: "FrameIndex", found: "Found") -> None:
     from rich.console import Console
 
     from foredrive.view.search_sheet import hits_table
+    from foredrive.view.table import print_table
 
     rows = index.count()
     if not found.hits:
         print(f"nothing found among {rows} rows of {index.uri}")
         return
-    Console().print(hits_table(found.hits))
+    print_table(hits_table(found.hits), Console())
     how = "all compared" if found.exact else f"{found.compared} compared, the others lie farther off"
     print(f"{len(found.hits)} hits among {rows} rows of {index.uri}; {how}")

@@ -24,23 +24,23 @@ def search_caption(
         towers: The folder of other towers, for which captions were trained; LOG is a folder then.
     """
     from rich.console import Console
-    from rich.table import Table
 
     from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
     from foredrive.runs.search.towers import find_towers
     from foredrive.search.index import FrameIndex
     from foredrive.search.query import parse_like
     from foredrive.search.target import example_views
+    from foredrive.view.table import Column, print_table, simple_table
 
     like = parse_like(moment)
     opened = FrameIndex(index) if towers is None else None
     chosen = find_towers(towers if opened is None else opened.making.towers)
     decoder = load_captions(Path(chosen.name) / CAPTIONS, chosen)
     views, _ = example_views(opened, like, chosen)
-    table = Table("view", "by image", "by lidar")
-    for name, said in caption_views(views, chosen, decoder).items():
-        table.add_row(name, said.by_image or "-", said.by_lidar or "-")
-    Console().print(table)
+    said = caption_views(views, chosen, decoder)
+    rows = [(name, each.by_image or None, each.by_lidar or None) for name, each in said.items()]
+    columns = [Column(title, align="left") for title in ("view", "by image", "by lidar")]
+    print_table(simple_table(columns, rows), Console())
 
 
 def search_train_captions(

@@ -1,4 +1,4 @@
-"""What a page does beside: slow work in a thread of its own, of many wishes the newest alone."""
+"""Slow work of a page in a thread of its own; a newer job replaces an older one of its name."""
 
 import logging
 import threading
@@ -10,13 +10,13 @@ _log = logging.getLogger(__name__)
 
 
 class Background:
-    """One thread that does named jobs. A job that has not begun gives way to a newer one of its name.
+    """One thread that does named jobs. A job that has not begun is replaced by a newer one of its name.
 
-    Of several names the one comes first that has waited longest for its turn, so that none starves while
-    wishes come faster than they can be met. A job that fails is told, and the next one is done.
+    The name that has waited longest for its turn comes first, so that none starves while jobs come faster
+    than they are done. A failure is reported, and the next job is done.
 
     Args:
-        tell: is given the message of a job that failed.
+        tell: called with the message of a job that failed.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -29,7 +29,7 @@ class Background:
         self._thread.start()
 
     def ask(self, name: str, job: Callable[[], None]) -> None:
-        """Have a job done, instead of an older one of this name that has not begun."""
+        """Queue a job in place of an older one of this name that has not begun."""
         with self._changed:
             self._wanted[name] = job
             self._changed.notify_all()
@@ -40,7 +40,7 @@ class Background:
             self._changed.wait_for(lambda: not self._wanted and not self._busy)
 
     def close(self) -> None:
-        """Forget what is wanted, and return once the job under way is done."""
+        """Drop queued jobs, and return once the running one is done."""
         with self._changed:
             self._wanted.clear()
             self._closed = True

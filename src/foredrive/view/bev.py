@@ -63,7 +63,7 @@ def start_bev(ax: Axes, reach_m: float) -> None:
 
 
 def draw_map(ax: Axes, patch: MapPatch) -> None:
-    """Areas filled, lines drawn, in the colour of their kind."""
+    """Draw the map: areas filled, lines in the colour of their kind."""
     for kind in AREA_KINDS:
         outlines = _polylines(patch, kind)
         whole = [line for line in outlines if np.allclose(line[0], line[-1])]  # long outlines come in pieces
@@ -100,7 +100,7 @@ def draw_sweep(ax: Axes, sweep: LidarSweep, reach_m: float) -> None:
 
 
 def draw_boxes(ax: Axes, boxes: Boxes) -> None:
-    """Footprints coloured by category, a thick front edge, and an arrow over one second of motion."""
+    """Draw footprints coloured by category, with a thick front edge and an arrow of one second of motion."""
     kept = boxes[boxes.valid]
     corners = box_corners(kept.centre, kept.size_lwh, kept.yaw)[:, :4, [1, 0]]  # [M 4 (y x)]
     outlines, fronts = list(corners.numpy()), list(corners[:, :2].numpy())
@@ -129,7 +129,7 @@ def draw_boxes(ax: Axes, boxes: Boxes) -> None:
 
 
 def draw_ego(ax: Axes) -> None:
-    """The vehicle's own footprint."""
+    """Draw the ego vehicle's footprint."""
     ax.add_patch(
         Polygon(
             EGO_OUTLINE_XY[:, ::-1], facecolor=palette.EGO, edgecolor=palette.GROUND, alpha=0.95, zorder=4
@@ -138,7 +138,7 @@ def draw_ego(ax: Axes) -> None:
 
 
 def draw_path(ax: Axes, path: Trajectory, colour: str) -> None:
-    """The first alternative of a trajectory from the rear axle on, a dot per valid waypoint."""
+    """Draw a trajectory's first alternative from the rear axle on, with a dot at each valid waypoint."""
     xy = path_points(path).numpy()
     if len(xy) > 1:
         ax.plot(xy[:, 1], xy[:, 0], color=colour, linewidth=2.2, zorder=5, solid_capstyle="round")
@@ -148,13 +148,13 @@ def draw_path(ax: Axes, path: Trajectory, colour: str) -> None:
 
 
 def path_points(path: Trajectory) -> Float[Tensor, "K 3"]:
-    """Origin and valid waypoints of the first alternative, on the ground (z = 0) of the ego frame at now."""
+    """Return origin and valid waypoints of the first alternative, on the ground (z = 0) of the ego frame."""
     xy = path.xy[0][path.valid[0]]
     return torch.nn.functional.pad(torch.cat([torch.zeros_like(xy[:1]), xy]), (0, 1))
 
 
 def legend_handles(clip: Clip, plan: Trajectory | None = None) -> list[Artist]:
-    """What stands for what, for those kinds alone that this clip shows."""
+    """Return a legend of the kinds that this clip shows."""
     now = clip.now
     handles: list[Artist] = [Patch(facecolor=palette.EGO, label="ego vehicle")]
     if bool(clip.future.valid.any()):
@@ -181,7 +181,7 @@ def _moving(boxes: Boxes) -> Bool[Tensor, " M"]:
 
 
 def _polylines(patch: MapPatch, kind: MapKind) -> list[Float[np.ndarray, "V 2"]]:
-    """The (y, x) vertices of every polyline of one kind."""
+    """Return the (y, x) vertices of every polyline of one kind."""
     lines = []
     for index in (patch.kind == kind).nonzero()[:, 0].tolist():
         xy = patch.vertices[index][patch.valid[index]][:, :2]

@@ -1,4 +1,4 @@
-"""Many drives on one page: of each a few pictures of the front camera and its way through the town."""
+"""Many drives on one sheet: a few images of the front camera, and the path through the town, of each."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,92 +9,72 @@ import torch
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from foredrive.data import LogPath
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import command_at
 from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, read_map_patch
-from foredrive.files import atomic_path
 from foredrive.scene import Command, MapKind, MapPatch
 from foredrive.view import palette
+from foredrive.view.sheet import Sheet
 
-DPI = 100
 THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
 LARGEST_PT, PT_OF_PX = 12.0, 0.86
-"""All names have one size, such that the longest fits: about as many points as a letter may be wide."""
-MOST_ROWS = 60
-"""Of more drives as many are shown, evenly chosen."""
+"""Names share one size, at which the longest fits: points for each pixel that a letter may be wide."""
+MAX_ROWS = 60
+"""More drives are thinned out evenly to this many."""
 AROUND_M = 30.0
 SMALLEST_M = 50.0
-"""The view from above shows this much on each side of the path, and at least so much to each side."""
+"""Margin of the view from above around the path, and its least half width."""
 MAP_LINES = {MapKind.LANE_BOUNDARY: 0.5, MapKind.ROAD_EDGE: 0.9}
 HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
 
 
 def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> None:
-    """Write the page as a PNG: a row for each drive, in the order given.
+    """Write a PNG: a row for each drive, in the order given.
 
     Args:
         path: the picture; it appears whole or not at all.
-        drives: logs, and what to say of each beside its name and what it commands.
+        drives: logs, and a caption for each.
 
     Raises:
         InputError: on a log that cannot be read.
     """
-    figure = draw_contact_sheet(drives)
-    with atomic_path(path) as scratch:
-        figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
-
-
-def draw_contact_sheet(drives: Sequence[tuple[LogPath, str]]) -> Figure:
-    """The page as a figure."""
-    chosen = np.linspace(0, len(drives) - 1, min(len(drives), MOST_ROWS)).round().astype(int).tolist()
+    chosen = np.linspace(0, len(drives) - 1, min(len(drives), MAX_ROWS)).round().astype(int).tolist()
     (cell_h, cell_w), row_h = THUMBNAIL_HW, THUMBNAIL_HW[0] + GAP_PX
     width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
     height = HEAD_PX + len(chosen) * row_h
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
-
-    def place(x: int, y: int, w: int, h: int) -> Axes:
-        """Axes at pixels from the upper left corner."""
-        return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
-
+    sheet = Sheet(width, height)
     longest = max(len(drives[index][0].folder.name) for index in chosen)
     name_pt = min(LARGEST_PT, PT_OF_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()
     for row, index in enumerate(chosen):
-        y, (path, caption) = HEAD_PX + row * row_h, drives[index]
-        log = Log(path)
+        y, (drive, caption) = HEAD_PX + row * row_h, drives[index]
+        log = Log(drive)
         commands = _commands(log)
         commanded += commands
-        _write_text(place(2 * GAP_PX, y, TEXT_PX - 2 * GAP_PX, cell_h), log, caption, commands, name_pt)
+        sheet.write(2 * GAP_PX, y, log.path.folder.name, name_pt, weight="bold")
+        sheet.write(2 * GAP_PX, y + cell_h // 5, _told(log, caption, commands), 9.5, palette.FAINT)
         for column, frame in enumerate(_spread(len(log))):
-            _show_front(place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
-        draw_way(place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
+            _show_front(sheet.place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
+        draw_way(sheet.place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
     shown = (
         f"{len(drives)} drives" if len(chosen) == len(drives) else f"{len(chosen)} of {len(drives)} drives"
     )
-    figure.text(
-        2 * GAP_PX / width,
-        1 - HEAD_PX / 2 / height,
-        f"{shown}    commands: {_shares(commanded)}",
-        color=palette.INK,
-        fontsize=14,
-        va="center",
-    )
-    return figure
+    sheet.head(2 * GAP_PX, HEAD_PX, f"{shown}    commands: {_shares(commanded)}", 14.0)
+    sheet.save(path)
 
 
 def _spread(frames: int) -> list[int]:
-    """Frames from the first to the last, evenly."""
+    """Choose frames evenly from the first to the last."""
     return np.linspace(0, frames - 1, min(frames, THUMBNAILS)).round().astype(int).tolist()
 
 
 def _commands(log: Log) -> Counter[str]:
-    """How many frames have which command."""
+    """Count the frames of each command."""
     found: Counter[str] = Counter()
     for frame in range(len(log)):
         command, _ = command_at(log, frame, log.driven_future(frame, HORIZON_STEPS, HORIZON_DT_S))
@@ -109,13 +89,10 @@ def _shares(commands: Counter[str]) -> str:
     return "   ".join(f"{kind} {100 * commands[kind] / total:.0f} %" for kind in kinds)
 
 
-def _write_text(ax: Axes, log: Log, caption: str, commands: Counter[str], name_pt: float) -> None:
-    ax.set_axis_off()
+def _told(log: Log, caption: str, commands: Counter[str]) -> str:
     length_m = float(np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1).sum())
     duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
-    ax.text(0, 1, log.path.folder.name, color=palette.INK, fontsize=name_pt, va="top", weight="bold")
-    told = f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
-    ax.text(0, 0.80, told, color=palette.FAINT, fontsize=9.5, va="top", linespacing=1.5)
+    return f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
 
 
 def _show_front(ax: Axes, log: Log, frame: int) -> None:
@@ -134,7 +111,7 @@ def _show_front(ax: Axes, log: Log, frame: int) -> None:
 
 
 def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
-    """The camera that looks ahead; a bare panel if the log has none."""
+    """Read the image of the camera that looks ahead; return a bare panel if the log has none."""
     cameras = pinhole_cameras(log)
     if cameras:
         image = read_camera(log, frame, next(iter(cameras.values())), THUMBNAIL_HW, with_image=True).image
@@ -144,7 +121,7 @@ def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def draw_way(ax: Axes, log: Log) -> None:
-    """The driven path over the map, north up, a dot at its start."""
+    """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
     low, high = xy.min(axis=0) - AROUND_M, xy.max(axis=0) + AROUND_M
     half = max(float((high - low).max()) / 2, SMALLEST_M)
@@ -167,7 +144,7 @@ def draw_way(ax: Axes, log: Log) -> None:
 
 
 def _every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
-    """The first frame, the last, and those that are `step_m` of driving apart."""
+    """Return the first frame, the last, and those that are `step_m` of driving apart."""
     driven_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=-1))])
     at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
     return sorted({*at.tolist(), len(xy) - 1})

@@ -16,7 +16,7 @@ from foredrive.simulation.scores import InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
-from foredrive.view.inline_svg import INK_MARK
+from foredrive.view.html import INK_MARK
 
 AROUND_M, SMALLEST_M = 25.0, 45.0
 FASTEST_MPS = 14.0

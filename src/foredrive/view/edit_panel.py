@@ -1,4 +1,4 @@
-"""The part of the page that changes a rebuilt scene: a list of edits that can be made, undone and kept."""
+"""The part of the page that edits a rebuilt scene: edits are made, undone and saved."""
 
 import functools
 import threading
@@ -32,7 +32,7 @@ from foredrive.view.rebuilt_video import words_of
 
 NOBODY = "none"
 BESIDE_M = (0.0, 3.0, 0.0)
-"""Where a copy appears: a lane to the left of what it is like."""
+"""A copy's offset from its original: a lane to the left."""
 GIZMO_M = 5.0
 RUNS_KEPT = 4
 
@@ -93,7 +93,7 @@ class EditPanel:
         self._show_chosen()
 
     def replace(self, edits: Sequence[Edit]) -> bool:
-        """Have other edits; returns whether they can be made."""
+        """Replace the edits; return whether they can be made."""
         with self._changing:
             try:
                 edited = apply_edits(self._graph, edits, self._open)
@@ -111,7 +111,7 @@ class EditPanel:
         return True
 
     def add(self, edit: Edit) -> bool:
-        """Make one more edit; returns whether it can be made."""
+        """Make one more edit; return whether it can be made."""
         with self._changing:
             return self.replace([*self.edits, edit])
 

@@ -1,9 +1,7 @@
 """One example of a report: what was seen, what was rendered, predicted and planned."""
 
-import base64
 import io
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import numpy as np
@@ -17,6 +15,7 @@ from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.scene import Clip, Command, Example, Trajectory, VoxelSpec
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points
+from foredrive.view.html import Picture, picture
 from foredrive.view.image_drawing import Camera, draw_path_on_image, resize
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.voxel_drawing import draw_comparison, draw_volume_pca, draw_voxels
@@ -35,7 +34,7 @@ COMPARISON_KEY = (
 
 @dataclass(frozen=True)
 class ExamplePanel:
-    """What a model made of one example. Records have no leading batch dimension."""
+    """A model's predictions for one example, without leading batch dimension."""
 
     title: str
     example: Example
@@ -48,32 +47,54 @@ class ExamplePanel:
 
     @property
     def spec(self) -> VoxelSpec:
-        """Where the grids lie."""
+        """The grids' place and size."""
         return self.example.occupancy.spec
 
 
-def panel_html(panel: ExamplePanel) -> str:
-    """The example as a fragment of HTML with its pictures inside."""
+@dataclass(frozen=True)
+class ShownPanel:
+    """An example's pictures, as the template lays them out."""
+
+    title: str
+    command: str
+    speed: str
+    plan: list[Picture]
+    """The driven future and the plan: in the front camera, and from above."""
+    cameras: dict[str, list[Picture]]
+    """Images, and in the same order what the model renders; empty if the log has none."""
+    camera_columns: Literal["two", "three"]
+    occupancy: list[Picture]
+    """Occupancy at now in perspective, predicted and seen."""
+    above: list[Picture]
+    later: list[Picture]
+    """The imagined key frames, each in its own ego frame: in perspective, and compared from above."""
+    key = COMPARISON_KEY
+    above_ground_m = f"{ABOVE_GROUND_M:g}"
+
+
+def show_panel(panel: ExamplePanel) -> ShownPanel:
+    """Draw an example's pictures."""
     clip = panel.example.clip
-    command = Command(int(clip.command)).name.lower() if bool(clip.command_valid) else "unknown"
-    speed = (
-        f"{float(clip.ego_speed_mps[clip.now]):.1f} m/s"
-        if bool(clip.ego_speed_valid[clip.now])
-        else "unknown"
+    known_command, known_speed = bool(clip.command_valid), bool(clip.ego_speed_valid[clip.now])
+    cameras = _cameras(panel)
+    return ShownPanel(
+        title=panel.title,
+        command=palette.label(Command(int(clip.command))) if known_command else "unknown",
+        speed=f"{float(clip.ego_speed_mps[clip.now]):.1f} m/s" if known_speed else "unknown",
+        plan=_plan(panel),
+        cameras=cameras,
+        camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
+        occupancy=[
+            picture(predicted_voxels(panel, 0), f"Predicted occupancy, {_how_much(panel, 0)}"),
+            picture(labelled_voxels(panel, 0), "Occupancy seen by the lidar, coloured by height"),
+        ],
+        above=_above(panel),
+        later=_later(panel),
     )
-    parts = [
-        f"<h3>{escape(panel.title)}</h3>",
-        f'<p class="note">Command: {command}. Speed: {speed}.</p>',
-        _plan(panel),
-        _cameras(panel),
-        _now(panel),
-        _later(panel),
-    ]
-    return "\n".join(parts)
 
 
 def front_camera(clip: Clip) -> int | None:
-    """Of the cameras with an image at now the one that looks ahead most straightly; None if there is none."""
+    """Return the camera with an image at now that looks ahead most straightly; None if there is none."""
     ahead = clip.rig.T_ego_cam[clip.now, :, 0, 2].masked_fill(~clip.image_valid[clip.now], -torch.inf)
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
@@ -81,7 +102,7 @@ def front_camera(clip: Clip) -> int | None:
 def camera_with_paths(
     clip: Clip, index: int, plan: Trajectory | None, width_px: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A camera's image at now with the driven future (green) and the plan (red) on the ground."""
+    """Draw the driven future (green) and the plan (red) on the ground of a camera's image at now."""
     image = clip.images[clip.now, index].permute(1, 2, 0).numpy()
     size_hw = (round(width_px * image.shape[0] / image.shape[1]), width_px)
     camera = Camera.of(clip.rig[clip.now], index).resized(size_hw)
@@ -93,7 +114,7 @@ def camera_with_paths(
 
 
 def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[np.ndarray, "H W 3"]:
-    """The scene from above with the driven future and the plan, legend below."""
+    """Draw the scene from above with the driven future and the plan, legend below."""
     figure = Figure(figsize=(5.6, 6.3), dpi=MAP_PX / 5.6, facecolor=palette.GROUND)
     draw_bev(figure.add_axes((0.125, 0.17, 0.855, 0.76)), clip, reach_m, plan)
     figure.legend(
@@ -112,7 +133,7 @@ def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[n
 
 
 def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Hits, false alarms and misses from above at a key frame after now, with the vehicle for scale."""
+    """Draw hits, false alarms and misses from above, `step` key frames after now."""
     grid, frame = panel.example.occupancy, panel.example.clip.now + step
     columns = draw_comparison(
         panel.occupied[step],
@@ -125,116 +146,75 @@ def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W
 
 
 def volume_picture(panel: ExamplePanel) -> UInt8[np.ndarray, "H W 3"]:
-    """The volume's principal components from above."""
+    """Draw the volume's principal components from above."""
     assert panel.volume is not None
     return with_ego(draw_volume_pca(panel.volume), panel.spec)
 
 
 def predicted_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Predicted occupancy in perspective at a key frame after now."""
+    """Draw predicted occupancy in perspective, `step` key frames after now."""
     return draw_voxels(panel.occupied[step], panel.spec, VOXELS_HW)
 
 
 def labelled_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Occupancy that the lidar saw, in perspective, at a key frame after now."""
+    """Draw occupancy that the lidar saw in perspective, `step` key frames after now."""
     grid, frame = panel.example.occupancy, panel.example.clip.now + step
     return draw_voxels((grid.values[frame, 0] > 0.5) & grid.known[frame], panel.spec, VOXELS_HW)
 
 
-def figure_html(
-    image: UInt8[np.ndarray, "H W 3"], caption: str, kind: Literal["jpeg", "png"] = "jpeg"
-) -> str:
-    """A figure with the picture inside the page."""
-    buffer = io.BytesIO()
-    options = {"quality": 90, "subsampling": 0} if kind == "jpeg" else {"optimize": True}
-    Image.fromarray(image).save(buffer, format=kind, **options)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    text = escape(caption)
-    return (
-        f'<figure><img alt="{text}" src="data:image/{kind};base64,{data}" '
-        f'width="{image.shape[1]}" height="{image.shape[0]}"><figcaption>{text}</figcaption></figure>'
-    )
-
-
-def _plan(panel: ExamplePanel) -> str:
-    """Where it went and where the model would go: in the front camera and from above."""
+def _plan(panel: ExamplePanel) -> list[Picture]:
     clip, spec = panel.example.clip, panel.spec
-    front = front_camera(clip)
-    ahead = ""
-    if front is not None:
-        picture = camera_with_paths(clip, front, panel.plan, FRONT_WIDTH_PX)
-        ahead = figure_html(picture, f"{clip.rig.names[front]}: driven future (green) and plan (red)")
     reach_m = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
-    above = figure_html(plan_picture(clip, panel.plan, reach_m), "The same from above", "png")
-    return f'<div class="plan">{ahead}{above}</div>'
+    above = picture(plan_picture(clip, panel.plan, reach_m), "The same from above", "png")
+    front = front_camera(clip)
+    if front is None:
+        return [above]
+    caption = f"{clip.rig.names[front]}: driven future (green) and plan (red)"
+    return [picture(camera_with_paths(clip, front, panel.plan, FRONT_WIDTH_PX), caption), above]
 
 
-def _cameras(panel: ExamplePanel) -> str:
-    """Images on the left; on the right, in the same order, what the model renders."""
+def _cameras(panel: ExamplePanel) -> dict[str, list[Picture]]:
     clip = panel.example.clip
     order = [camera for row in camera_rows(clip.rig[clip.now]) for camera in row]
     seen = [camera for camera in order if bool(clip.image_valid[clip.now, camera])]
     if not seen:
-        return '<p class="note">The log has no camera images at this time.</p>'
-    halves = [("Camera images", clip.images[clip.now])]
+        return {}
+    halves = {"Camera images": clip.images[clip.now]}
     if panel.rendered is not None:
-        halves.append(("Rendered from the volume", (panel.rendered.clamp(0, 1) * 255).byte()))
-    columns = "two" if len(seen) in (2, 4) else "three"
-    parts = []
-    for title, images in halves:
-        figures = "".join(figure_html(_as_wide(images[c]), clip.rig.names[c]) for c in seen)
-        parts.append(f'<div><p class="note">{title}</p><div class="grid {columns}">{figures}</div></div>')
-    return f'<div class="grid two">{"".join(parts)}</div>'
+        halves["Rendered from the volume"] = (panel.rendered.clamp(0, 1) * 255).byte()
+    return {
+        title: [picture(_as_wide(images[camera]), clip.rig.names[camera]) for camera in seen]
+        for title, images in halves.items()
+    }
 
 
-def _now(panel: ExamplePanel) -> str:
-    """Occupancy at now in perspective, beside its labels, and from above, beside the volume."""
+def _above(panel: ExamplePanel) -> list[Picture]:
+    """Draw occupancy at now from above, beside the volume."""
     across = f"{panel.spec.shape_zyx[2] * panel.spec.voxel_m:.0f} m across"
-    above = [
-        figure_html(comparison_picture(panel, 0), f"Prediction against lidar from above, {across}", "png")
-    ]
+    above = [picture(comparison_picture(panel, 0), f"Prediction against lidar from above, {across}", "png")]
     if panel.volume is not None:
         caption = f"Volume: PCA to three channels, mean over height, {across}"
-        above.append(figure_html(volume_picture(panel), caption, "png"))
-    return (
-        '<div class="grid two">'
-        + figure_html(predicted_voxels(panel, 0), f"Predicted occupancy, {_how_much(panel, 0)}")
-        + figure_html(labelled_voxels(panel, 0), "Occupancy seen by the lidar, coloured by height")
-        + f'</div><div class="grid three">{"".join(above)}{_comparison_key()}</div>'
-    )
+        above.append(picture(volume_picture(panel), caption, "png"))
+    return above
 
 
 def _how_much(panel: ExamplePanel, step: int) -> str:
-    """What there is to see in a picture of predicted voxels: without any it is black."""
+    """Tell what there is to see in a picture of predicted voxels: without any it is black."""
     return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
 
 
-def _comparison_key() -> str:
-    keys = "".join(f'<li><i style="background:{colour}"></i>{name}</li>' for colour, name in COMPARISON_KEY)
-    return (
-        f'<div><ul class="key">{keys}</ul><p class="note">Columns of known voxels more than '
-        f"{ABOVE_GROUND_M:g} m above the ground; forward is up. The outline is the vehicle.</p></div>"
-    )
-
-
-def _later(panel: ExamplePanel) -> str:
-    """The imagined key frames, each in its own ego frame: in perspective, and compared from above."""
-    steps = range(1, len(panel.occupied))
-    if not steps:
-        return ""
-    clip = panel.example.clip
-    columns = []
-    for step in steps:
+def _later(panel: ExamplePanel) -> list[Picture]:
+    clip, pictures = panel.example.clip, []
+    for step in range(1, len(panel.occupied)):
         when = f"+{float(clip.t_s[clip.now + step]):.1f} s"
         caption = f"Imagined occupancy at {when}, {_how_much(panel, step)}"
-        imagined = figure_html(predicted_voxels(panel, step), caption)
-        compared = figure_html(comparison_picture(panel, step), f"Against lidar at {when}", "png")
-        columns.append(f"<div>{imagined}</div><div>{compared}</div>")
-    return f'<p class="note">Imagined futures</p><div class="later">{"".join(columns)}</div>'
+        pictures.append(picture(predicted_voxels(panel, step), caption))
+        pictures.append(picture(comparison_picture(panel, step), f"Against lidar at {when}", "png"))
+    return pictures
 
 
 def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture of columns, enlarged by a whole factor, with the vehicle's outline."""
+    """Enlarge a picture of columns by a whole factor, and draw the vehicle's outline."""
     factor = max(1, round(MAP_PX / columns.shape[0]))
     canvas = Image.fromarray(columns).resize(
         (columns.shape[1] * factor, columns.shape[0] * factor), Image.Resampling.NEAREST

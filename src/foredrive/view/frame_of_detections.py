@@ -8,18 +8,21 @@ from matplotlib.patches import Ellipse, Polygon
 from numpy import ndarray
 
 from foredrive.evaluation.detections import Frame, FrameScore
-from foredrive.view.inline_svg import INK_MARK
+from foredrive.view.html import INK_MARK
 
 OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
 FAINTEST = 0.02
-"""Detections that exist less are not drawn."""
-MOST_DRAWN = 1000
-"""Of more, only the surest are drawn."""
+"""Detections of a lower probability of existence are not drawn."""
+MAX_DRAWN = 1000
+"""Of more detections only those most likely to exist are drawn."""
 SIGMAS = 2.0
 
 
 def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
-    """Objects, detections as strong as they exist, ellipses of two σ of their centres, likeliest pairs."""
+    """Draw objects, detections with ellipses of two σ of their centres, and likeliest pairs.
+
+    A detection is as opaque as it is likely to exist.
+    """
     figure = Figure(figsize=(5.4, 5.0), layout="constrained")
     axes = figure.subplots()
     boxes = frame.detected.boxes
@@ -29,9 +32,9 @@ def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
     true_yaw = frame.objects.yaw.numpy() if frame.objects.yaw is not None else np.zeros(len(state))
     covariance = (boxes.chol @ boxes.chol.mT).numpy()
     seen = np.flatnonzero(existence >= FAINTEST)
-    if len(seen) > MOST_DRAWN:
-        axes.set_title(f"{MOST_DRAWN:,} surest of {len(seen):,} detections", color=INK_MARK, fontsize=8)
-        seen = seen[np.argsort(-existence[seen], kind="stable")[:MOST_DRAWN]]
+    if len(seen) > MAX_DRAWN:
+        axes.set_title(f"{MAX_DRAWN:,} surest of {len(seen):,} detections", color=INK_MARK, fontsize=8)
+        seen = seen[np.argsort(-existence[seen], kind="stable")[:MAX_DRAWN]]
     for i in seen:
         corners = _corners(mean[i], float(yaw[i]), upright)
         alpha = float(np.sqrt(existence[i]))

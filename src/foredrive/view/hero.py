@@ -58,7 +58,7 @@ def write_hero(path: Path, panel: ExamplePanel) -> None:
 
 
 def occupancy_with_paths(panel: ExamplePanel, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
-    """Predicted occupancy now in perspective, with the vehicle, the driven future and the plan on top."""
+    """Draw predicted occupancy now in perspective, with the vehicle, the driven future and the plan."""
     eye = Eye.behind(panel.spec, size_hw)
     picture = draw_voxels(panel.occupied[0], panel.spec, size_hw, eye)
     large_hw = (size_hw[0] * SUPERSAMPLING, size_hw[1] * SUPERSAMPLING)
@@ -81,7 +81,7 @@ def _draw_path(
 
 
 def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> None:
-    """The vehicle as a box: its rear, right side and top, which an eye behind and to the right of it sees."""
+    """Draw the vehicle as a box: the rear, right side and top that the eye sees."""
     (x0, y0, z0), (x1, y1, z1) = EGO_LOWER_M, EGO_UPPER_M
     faces = (
         (0.62, [(x0, y0, z0), (x0, y1, z0), (x0, y1, z1), (x0, y0, z1)]),
@@ -95,7 +95,7 @@ def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> 
 
 
 def _captioned(picture: UInt8[np.ndarray, "H W 3"], captions: dict[int, str]) -> Figure:
-    """The picture as a figure of the same size, with texts at columns of its upper margin."""
+    """Make a figure of the picture's size, with texts at columns of its upper margin."""
     height, width = picture.shape[:2]
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     figure.figimage(picture)

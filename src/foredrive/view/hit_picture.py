@@ -1,4 +1,4 @@
-"""What a hit of a search looks like: its camera beside its sector's lidar from above, what to say of it."""
+"""A hit of a search in a picture (camera beside lidar from above) and in words."""
 
 import functools
 from pathlib import Path
@@ -17,16 +17,16 @@ from foredrive.search.rows import COUNTS
 from foredrive.view import palette
 
 HEIGHT_PX, WIDTH_PX = 198, 352
-"""Of the camera's picture; the lidar's is as high and square."""
+"""Size of the camera's picture; the lidar's is as high, and square."""
 GAP_PX = 4
 REACH_M = 40.0
-"""The lidar's picture shows this much to each side."""
+"""Half width of the lidar's picture."""
 
 
 def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
-    """Camera and lidar side by side, the same size for every hit; what is not there stays dark.
+    """Draw camera and lidar side by side, the same size for every hit; a missing sensor stays dark.
 
-    Of a whole scene the front camera is shown; a mark at the lidar's edge says where else one looks.
+    A whole scene is shown by its front camera. A mark at the lidar's edge shows where any other view looks.
     """
     canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
     canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
@@ -49,7 +49,7 @@ def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 3"]:
-    """Returns by range, x up, and the vehicle in the middle."""
+    """Draw returns coloured by range, x up, with the vehicle in the middle."""
     hits = sweep[sweep.valid & sweep.returned]
     points, range_m = hits.points_ego.numpy(), hits.range_m.numpy()
     scale = size_px / 2 / REACH_M
@@ -67,17 +67,17 @@ def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 
 
 
 def hit_name(hit: Hit) -> str:
-    """How an example names the hit: LOG@12.5s/VIEW."""
+    """Name the hit as `--like` takes it: LOG@12.5s/VIEW."""
     return f"{hit.facts['log']}@{float(str(hit.facts['t_s'])):.2f}s/{hit.facts['view']}"
 
 
 def why_matched(hit: Hit) -> str:
-    """What the hit was ranked by."""
+    """Write the scores that the hit was ranked by."""
     return "   ".join(f"{name} {score:.3f}" for name, score in hit.scores.items()) or f"{hit.score:.3f}"
 
 
 def what_is_there(hit: Hit) -> str:
-    """Place, weather, speed and objects, as far as they are known."""
+    """List place, weather, speed and objects, as far as they are known."""
     facts = hit.facts
     told = [str(facts[name]) for name in ("place", "time_of_day", "weather") if facts[name] is not None]
     if facts["ego_speed"] is not None:
@@ -91,7 +91,7 @@ def what_is_there(hit: Hit) -> str:
 
 
 def _point(above: Image.Image, azimuth_deg: float) -> None:
-    """Where the sector's middle lies."""
+    """Mark the direction of the sector's middle."""
     middle, along = (
         HEIGHT_PX / 2,
         np.array([-np.sin(np.deg2rad(azimuth_deg)), -np.cos(np.deg2rad(azimuth_deg))]),

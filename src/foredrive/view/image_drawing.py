@@ -33,16 +33,16 @@ class Camera:
 
     @classmethod
     def of(cls, rig: CameraRig, index: int) -> "Camera":
-        """Camera `index` of a rig without leading dimensions."""
+        """Take camera `index` of a rig without leading dimensions."""
         return cls(rig.K[index], rig.T_ego_cam[index], rig.dist[index], rig.size_hw)
 
     def resized(self, size_hw: tuple[int, int]) -> "Camera":
-        """The same camera for images of another size."""
+        """Return the same camera for images of another size."""
         scale = torch.tensor([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0], 1.0])
         return Camera(self.K * scale.to(self.K)[:, None], self.T_ego_cam, self.dist, size_hw)
 
     def from_ego(self, points_ego: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Points in the camera frame."""
+        """Transform points to the camera frame."""
         return transform_points(inverse_se3(self.T_ego_cam).to(points_ego), points_ego)
 
 
@@ -59,7 +59,7 @@ def draw_points_on_image(
     radius_px: float = 0.8,
     alpha: float = 0.6,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The image with a round dot at every point the camera sees, near dots over far ones.
+    """Draw a round dot at every point the camera sees, near dots over far ones.
 
     Hidden points are drawn too: a lidar sees past what a camera sees, and a wrong calibration shows there.
     """
@@ -83,7 +83,7 @@ def draw_points_on_image(
 def draw_boxes_on_image(
     image: UInt8[np.ndarray, "H W 3"], boxes: Boxes, camera: Camera, width_px: float = 1.6
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The image with wire frames coloured by category; the front face is crossed.
+    """Draw boxes as wire frames coloured by category; the front face is crossed.
 
     Args:
         image: RGB of the camera's size.
@@ -111,7 +111,7 @@ def draw_path_on_image(
     colour: str,
     width_m: float = 0.2,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The image with a path on the ground: a ribbon, and a disc at every point but the first."""
+    """Draw a path on the ground: a ribbon, and a disc at every point but the first."""
     if len(path_ego) < 2:
         return image
     turn = torch.linspace(0, 2 * torch.pi, 25)[:-1]
@@ -129,7 +129,7 @@ def draw_path_on_image(
 
 
 def _ribbon(path: Float[Tensor, "T 3"], width_m: float) -> list[Float[Tensor, "4 3"]]:
-    """Quadrilaterals along a path, short enough to be dropped one by one at the near plane."""
+    """Return quadrilaterals along a path, short enough to be dropped one by one at the near plane."""
     pieces = []
     for start, end in pairwise(path):
         along = end - start
@@ -145,7 +145,7 @@ def _ribbon(path: Float[Tensor, "T 3"], width_m: float) -> list[Float[Tensor, "4
 
 
 def _projected_lines(segments_cam: Float[Tensor, "S 2 3"], camera: Camera) -> list[Float[Tensor, "2 2"]]:
-    """Ends (u, v) of what the camera sees of the segments, cut finer where distortion bends them."""
+    """Return the ends (u, v) of the segments' visible parts, cut finer where distortion bends them."""
     seen, kept = _clip_to_view(segments_cam, camera)
     if not bool(kept.any()):
         return []
@@ -162,7 +162,7 @@ def _projected_lines(segments_cam: Float[Tensor, "S 2 3"], camera: Camera) -> li
 def _clip_to_view(
     segments_cam: Float[Tensor, "S 2 3"], camera: Camera
 ) -> tuple[Float[Tensor, "S 2 3"], Tensor]:
-    """Cut segments at the near plane and at the sides of the viewing frustum; which ones are left.
+    """Cut segments at the near plane and at the sides of the viewing frustum; return those left, too.
 
     Cutting in 3-D, before the division by depth, is what keeps an edge that passes beside or behind the
     camera from running across the picture.
@@ -190,7 +190,7 @@ def _draw_lines(
     image: UInt8[np.ndarray, "H W 3"],
     lines: list[tuple[Float[Tensor, "2 2"], tuple[int, int, int], float]],
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Anti-aliased lines: drawn larger with coverage, then averaged down."""
+    """Draw anti-aliased lines: larger with coverage, then averaged down."""
     if not lines:
         return image
     size = (image.shape[1] * SUPERSAMPLING, image.shape[0] * SUPERSAMPLING)

@@ -1,4 +1,4 @@
-"""Futures that a model imagines, beside what happened, as a video: from above and through the cameras."""
+"""A video of imagined futures beside the recorded one: from above and through the cameras."""
 
 import datetime
 from collections.abc import Iterable
@@ -35,7 +35,7 @@ def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: f
 
 
 def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
-    """What happened and every future at one key frame: the front cameras above, occupancy from above below.
+    """Draw the recorded and every imagined future at one key frame: front cameras, and below them occupancy.
 
     Args:
         step: 0 is now.
@@ -74,7 +74,7 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
 
 
 def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
-    """The three cameras that look ahead most: what they saw and, where it can be rendered, would see."""
+    """Draw the three cameras that look ahead most: recorded images, and rendered ones if any."""
     clip = moment.example.clip
     frame = clip.now + step
     order = camera_rows(clip.rig[frame])
@@ -90,7 +90,7 @@ def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarra
 
 
 def _strip(images: Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Images [C 3 h w] side by side, each as wide as a panel."""
+    """Put images [C 3 h w] side by side, each as wide as a panel."""
     height = PANEL_PX * images.shape[2] // images.shape[3]
     gap = np.full((height, GAP_PX, 3), palette.rgb255(palette.GROUND), dtype=np.uint8)
     parts = []

@@ -8,16 +8,14 @@ from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from foredrive.files import atomic_path
 from foredrive.scene import CameraRig, Clip
 from foredrive.view import palette
 from foredrive.view.bev import draw_bev, legend_handles
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_points_on_image, resize
+from foredrive.view.sheet import Sheet
 
-DPI = 100
 CAMERA_WIDTH_PX = 640
 GAP_PX, HEAD_PX, AXIS_PX, LEGEND_PX = 10, 64, 60, 230
 MIN_BEV_PX = 640
@@ -32,13 +30,6 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
         title: name and time of what is shown.
         reach_m: how far the view from above looks in each direction.
     """
-    figure = draw_log_sheet(clip, title, reach_m)
-    with atomic_path(path) as scratch:
-        figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
-
-
-def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
-    """The page as a figure."""
     rig = clip.rig[clip.now]
     rows = camera_rows(rig)
     columns = max((len(row) for row in rows), default=0)
@@ -47,32 +38,20 @@ def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
     body_h = max(len(rows) * (cell_h + GAP_PX) - GAP_PX, MIN_BEV_PX)
     bev_left = GAP_PX + left_w + AXIS_PX
     width, height = bev_left + body_h + LEGEND_PX, HEAD_PX + body_h + AXIS_PX
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
-
-    def place(x: int, y: int, w: int, h: int) -> Axes:
-        """Axes at pixels from the upper left corner."""
-        return figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
-
+    sheet = Sheet(width, height)
     for row, cameras in enumerate(rows):
         inset = (columns - len(cameras)) * (CAMERA_WIDTH_PX + GAP_PX) // 2
         for column, camera in enumerate(cameras):
-            ax = place(
+            ax = sheet.place(
                 GAP_PX + inset + column * (CAMERA_WIDTH_PX + GAP_PX),
                 HEAD_PX + row * (cell_h + GAP_PX),
                 CAMERA_WIDTH_PX,
                 cell_h,
             )
             _show_camera(ax, clip, camera, (cell_h, CAMERA_WIDTH_PX))
-    draw_bev(place(bev_left, HEAD_PX, body_h, body_h), clip, reach_m)
-    figure.text(
-        2 * GAP_PX / width,
-        1 - HEAD_PX / 2 / height,
-        title,
-        color=palette.INK,
-        fontsize=min(17.0, 1.15 * width / max(len(title), 1)),  # long names shrink to fit
-        va="center",
-    )
-    figure.legend(
+    draw_bev(sheet.place(bev_left, HEAD_PX, body_h, body_h), clip, reach_m)
+    sheet.head(2 * GAP_PX, HEAD_PX, title, 17.0)
+    sheet.figure.legend(
         handles=legend_handles(clip),
         loc="upper left",
         bbox_to_anchor=((bev_left + body_h + GAP_PX) / width, 1 - HEAD_PX / height),
@@ -84,12 +63,12 @@ def draw_log_sheet(clip: Clip, title: str, reach_m: float) -> Figure:
     )
     if bool(clip.sweep_valid[clip.now]):
         bar_w = LEGEND_PX - 5 * GAP_PX
-        _range_bar(place(bev_left + body_h + 2 * GAP_PX, HEAD_PX + body_h - 24, bar_w, 12))
-    return figure
+        _range_bar(sheet.place(bev_left + body_h + 2 * GAP_PX, HEAD_PX + body_h - 24, bar_w, 12))
+    sheet.save(path)
 
 
 def camera_rows(rig: CameraRig) -> list[list[int]]:
-    """Camera indices laid out as around the car: those looking ahead above those looking back.
+    """Lay out camera indices as around the car: those looking ahead above those looking back.
 
     In both rows what lies to the left of the car is on the left.
     """
@@ -102,14 +81,14 @@ def camera_rows(rig: CameraRig) -> list[list[int]]:
 
 
 def _leftness(azimuth: float) -> float:
-    """Grows with how far to the left of the car's axis a camera looks, ahead or back alike."""
+    """Return a number that grows with how far to the left of the car's axis a camera looks."""
     return float(np.sin(azimuth)) if abs(azimuth) > 1e-6 else 0.0
 
 
 def camera_picture(
     clip: Clip, index: int, size_hw: tuple[int, int], with_boxes: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One camera's image at now in the given size, with lidar and boxes; a bare panel if there is none."""
+    """Draw one camera's image at now with lidar and boxes; a bare panel if there is none."""
     now = clip.now
     if bool(clip.image_valid[now, index]):
         image = resize(clip.images[now, index].permute(1, 2, 0).numpy(), size_hw)
@@ -160,7 +139,7 @@ def _show_camera(ax: Axes, clip: Clip, index: int, size_hw: tuple[int, int]) -> 
 
 
 def _range_bar(ax: Axes) -> None:
-    """Colour scale of the lidar's range."""
+    """Draw the colour scale of the lidar's range."""
     shown = LinearSegmentedColormap.from_list(
         "range", palette.RANGE_MAP(np.linspace(*palette.RANGE_SPAN, 64))
     )

@@ -1,4 +1,4 @@
-"""One log over time: what was sensed at each of its frames, and what a run makes of it."""
+"""One log over time: each frame's sensor data, and a run's predictions."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from foredrive.runs.evaluate.vision import Observer, Vision
 
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
-"""Labels are made with every clip, but nobody looks at them here."""
+"""Every clip comes with labels, which are not used here."""
 KEPT = 16
 
 
@@ -79,7 +79,7 @@ class LogTimes:
         return len(self._clips)
 
     def nearest(self, t_s: float | None) -> int:
-        """The frame nearest to a time since the log's start, by default to its middle.
+        """Return the frame nearest to a time since the log's start, by default to its middle.
 
         Raises:
             InputError: if the log has no such time.
@@ -90,11 +90,11 @@ class LogTimes:
         return min(range(len(self)), key=lambda index: abs(self.t_s[index] - wanted_s))
 
     def _clip(self, index: int) -> Clip:
-        """What was sensed at a frame: one key frame, without leading dimensions but for it."""
+        """Read a frame as a clip of one key frame, without batch dimension."""
         return self._clips[index].clip
 
     def _vision(self, index: int) -> "Vision | None":
-        """What the run holds to be the case; None without a run, and at frames without enough past."""
+        """Predict with the run; None without a run, and at frames without enough past."""
         if self.observer is None or (seen := self._observed_index[index]) is None:
             return None
         return self.observer.look(collate([self._observed[seen]]).clip.observed())

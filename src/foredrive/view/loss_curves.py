@@ -5,26 +5,29 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from foredrive.view.inline_svg import INK_MARK, inline_svg
+from foredrive.view.html import INK_MARK, inline_svg
 
 COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227", "#e5484d")
 NOT_LOSSES = ("step", "step_s", "lr")
 SMOOTH_STEPS = 15
 LEGEND_COLUMNS = 5
+Losses = Mapping[str, Sequence[Mapping[str, float | int]]]
+"""For each stage the lines of its metrics file: "step" and a value for each loss."""
 
 
-def draw_loss_curves(stages: Mapping[str, Sequence[Mapping[str, float | int]]]) -> str:
-    """SVG with one chart a stage; raw values faint, their running mean strong, on a logarithmic scale.
+def draw_loss_curves(stages: Losses) -> Markup | None:
+    """Draw a chart for each stage: values faint, their running mean strong, on a logarithmic scale.
 
-    Args:
-        stages: per stage the lines of its metrics file: "step" and a value per loss.
+    Returns:
+        SVG, or None if no stage has any lines.
     """
     shown = {name: lines for name, lines in stages.items() if lines}
     if not shown:
-        return ""
+        return None
     figure = Figure(figsize=(5.2 * len(shown), 3.1), layout="constrained")
     axes = figure.subplots(1, len(shown), squeeze=False)[0]
     for ax, (name, lines) in zip(axes, shown.items(), strict=True):
@@ -64,7 +67,7 @@ def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]])
 
 
 def _running_mean(values: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-    """Mean of the last few values, of those that are numbers."""
+    """Average the last few values, of those that are numbers."""
     number = np.isfinite(values)
     total = np.cumsum(np.where(number, values, 0.0))
     count = np.cumsum(number)

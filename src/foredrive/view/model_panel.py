@@ -1,4 +1,4 @@
-"""The part of the page that shows what a model holds to be the case, and renders it from where one looks."""
+"""The part of the page that shows a model's predictions, and renders them from the viewer's eye."""
 
 import math
 import threading
@@ -83,7 +83,7 @@ class ModelPanel:
         return f"imagined, **{k * self._dt_s:g} s** ahead" if k else "observed **now**"
 
     def _render_from(self, event: viser.GuiEvent) -> None:
-        """Render from the eye of whoever pressed the button, and leave the picture there."""
+        """Render from the eye of the client that pressed the button, and leave the picture there."""
         if event.client is None:
             return
         with self._drawing:
@@ -112,7 +112,7 @@ class ModelPanel:
 def pinhole(
     T_ego_cam: Float[np.ndarray, "4 4"], fov_y_rad: float, aspect: float, height_px: int
 ) -> CameraRig:
-    """One ideal camera without leading dimensions, given by its vertical field of view."""
+    """Make an ideal camera without leading dimensions from its vertical field of view."""
     width_px = max(round(aspect * height_px), 1)
     focal = height_px / 2 / float(np.tan(fov_y_rad / 2))
     return CameraRig(

@@ -1,4 +1,4 @@
-"""A page in the browser: where it is served, and how it looks before anything is on it."""
+"""A viser page in the browser: its port, and an empty scene."""
 
 import contextlib
 import errno
@@ -15,7 +15,7 @@ START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
 
 def free_port(host: str, port: int) -> int:
-    """The first port from `port` on that nobody else serves at; any one if `port` is 0.
+    """Return the first free port from `port` on; any one if `port` is 0.
 
     Raises:
         InputError: if there is no such host here, no such port, or none that this user may serve at.
@@ -55,7 +55,7 @@ def open_page(label: str, host: str, port: int) -> viser.ViserServer:
 
 
 def page_url(server: viser.ViserServer) -> str:
-    """Where a page is."""
+    """Return a page's address."""
     return f"http://{server.get_host()}:{server.get_port()}"
 
 

@@ -16,9 +16,9 @@ FAINT = "#8b95a5"
 GRID = "#2b3442"
 
 EXPERT = "#3ddc84"
-"""What was driven."""
+"""The driven path."""
 PLAN = "#ff4d4f"
-"""What the model plans."""
+"""The model's plan."""
 EGO = "#f5f7fa"
 SCENARIO = "#8a78e8"
 

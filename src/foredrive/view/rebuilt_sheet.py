@@ -1,4 +1,4 @@
-"""A rebuilt scene beside what its cameras saw."""
+"""A rebuilt scene beside the recorded images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
 
 ROWS = 4
 WIDTH_IN = 4.0
-"""Of one picture."""
+"""Width of one picture."""
 
 
 @torch.no_grad()

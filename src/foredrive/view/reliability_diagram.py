@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from foredrive.metrics.reliability import Reliability
-from foredrive.view.inline_svg import INK_MARK
+from foredrive.view.html import INK_MARK
 
 TITLES = {
     "d_ece": "Scores and hits (2 m, or overlap 0.5)",

@@ -1,7 +1,7 @@
 """The report of a run that was evaluated."""
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from foredrive.data import LogPath
 from foredrive.evaluation import Failure
@@ -9,8 +9,10 @@ from foredrive.runs import Inspection, Run
 from foredrive.runs.train.run import STAGES
 from foredrive.training import read_metrics
 from foredrive.view.example_panel import ExamplePanel
+from foredrive.view.loss_curves import Losses
+from foredrive.view.origin import Origin
 from foredrive.view.report import ReportData
-from foredrive.view.summary_tables import Summary
+from foredrive.view.table import Summary
 
 OCCUPIED_ABOVE = 0.5
 FAILURES_NAMED = 5
@@ -23,14 +25,11 @@ def report_on_run(
     inspections: Sequence[Inspection],
     failures: Sequence[Failure] = (),
 ) -> ReportData:
-    """Put together what the report of a run on some logs shows; of the failures the first few are named."""
+    """Collect the content of a run's report on some logs; the first few failures are named."""
     losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
     return ReportData(
         title=f"{run.recipe.name} on {_names(logs)}",
-        command=str(summary.get("command")),
-        commit=str(summary.get("commit") or "not a git checkout"),
-        machine=machine_line(summary),
-        date=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        origin=Origin.of(summary, datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
         summary=summary,
         losses=losses,
         panels=[inspection_panel(inspection) for inspection in inspections],
@@ -39,7 +38,7 @@ def report_on_run(
 
 
 def inspection_panel(inspection: Inspection) -> ExamplePanel:
-    """One example as the report shows it."""
+    """Make an example's panel."""
     log, _, t_us = inspection.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     return ExamplePanel(
@@ -52,18 +51,6 @@ def inspection_panel(inspection: Inspection) -> ExamplePanel:
     )
 
 
-def machine_line(summary: Summary) -> str:
-    """The machine of a summary in one line."""
-    parts = [
-        f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
-        f"{summary.get('machine.ram_gib')} GiB",
-        summary.get("machine.gpu"),
-        f"Python {summary.get('version.python')}",
-        f"torch {summary.get('version.torch')}",
-    ]
-    return ", ".join(str(part) for part in parts if part)
-
-
 def _names(logs: Sequence[LogPath]) -> str:
     names = [log.name for log in logs]
     return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more logs"
@@ -73,9 +60,9 @@ def _notes(
     run: Run,
     logs: Sequence[LogPath],
     failures: Sequence[Failure],
-    losses: Mapping[str, Sequence[Mapping[str, float | int]]],
+    losses: Losses,
 ) -> list[str]:
-    """What keeps the figures from meaning what they seem to mean."""
+    """List what a reader must know so as not to misread the figures."""
     notes = []
     seen = {log.folder for log in run.logs} & {log.folder for log in logs}
     if seen:

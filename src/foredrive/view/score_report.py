@@ -1,22 +1,16 @@
 """The report on a file of detections: figures, reliability, and the frames where most likelihood was lost."""
 
-from collections.abc import Mapping, Sequence
-from html import escape, unescape
+from collections.abc import Sequence
 from pathlib import Path
-
-from rich.console import Console
-from rich.table import Table
 
 from foredrive.evaluation.detections import DetectionSet, FrameScore, ScoreSummary
 from foredrive.evaluation.detections.score import PARTS
-from foredrive.files import atomic_path
 from foredrive.view.frame_of_detections import draw_frame
-from foredrive.view.inline_svg import inline_svg
+from foredrive.view.html import inline_svg, write_page
 from foredrive.view.reliability_diagram import draw_reliability
-from foredrive.view.report_style import CSS
-from foredrive.view.summary_tables import full_table, number
+from foredrive.view.summary_tables import full_table
+from foredrive.view.table import Column, Summary, Table, number, simple_table, words
 
-Figures = Mapping[str, float | int | str | None]
 SHOWN = {
     "frames": "Frames",
     "objects": "Objects",
@@ -43,81 +37,44 @@ COMPARED = {
 }
 
 
-def print_scores(figures: Figures, console: Console) -> None:
-    """The figures a reader looks for first."""
+def score_table(figures: Summary) -> Table:
+    """List the figures that a reader looks for first, beside those of the other file if there is one."""
     other = figures.get("against")
-    table = Table(title="Detections as a random finite set", show_header=other is not None)
-    table.add_column(no_wrap=True)
-    for name in ("these",) if other is None else ("these", Path(str(other)).name):
-        table.add_column(name, justify="right")
-    for title, values in _rows(figures):
-        table.add_row(title, *(unescape(value) for value in values))
-    console.print(table)
+    prefixes = ("",) if other is None else ("", "against.")
+    names = ("",) if other is None else ("these", Path(str(other)).name)
+    rows = [
+        (title, *(figures.get(prefix + key) for prefix in prefixes))
+        for key, title in SHOWN.items()
+        if figures.get(key) is not None
+    ]
+    rows += [(title, figures[key], "") for key, title in COMPARED.items() if key in figures]
+    columns = [Column(align="left"), *(Column(name) for name in names)]
+    return simple_table(columns, rows, "Detections as a random finite set")
 
 
 def write_score_report(
     path: Path, title: str, read: DetectionSet, scores: Sequence[FrameScore], result: ScoreSummary, worst: int
 ) -> None:
-    """Write the page: one HTML file with its pictures inside, which loads nothing from anywhere."""
+    """Write the page about a file of detections.
+
+    Args:
+        worst: how many of the frames that lost most likelihood are drawn.
+    """
     ranked = sorted(range(len(scores)), key=lambda n: -scores[n].nll)[:worst]
-    diagrams = [
-        f"<figure>{inline_svg(draw_reliability(name, diagram))}</figure>"
-        for name, diagram in result.diagrams.items()
-    ]
-    pictures = [
-        f"<figure>{inline_svg(draw_frame(read.frames[n], scores[n], read.upright))}"
-        f"<figcaption>{escape(_caption(scores[n]))}</figcaption></figure>"
-        for n in ranked
-    ]
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        _table(result.figures),
-        "<h2>Reliability</h2>",
-        f"<div class='grid two'>{''.join(diagrams)}</div>",
-        "<h2>Where likelihood was lost</h2>",
-        "<p class='note'>Frames ranked by their PMB-NLL. Objects are green, and joined to their likeliest "
-        "detection; red ones have none. Detections are blue, as strong as they exist, with ellipses of two "
-        "standard deviations of the centre.</p>",
-        f"<div class='grid two'>{''.join(pictures)}</div>",
-        f"<details><summary>Every figure</summary>{full_table(result.figures)}</details>",
-    ]
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
-        + "\n".join(parts)
-        + "\n</body>\n</html>\n"
+    write_page(
+        path,
+        "score_report.html.j2",
+        title=title,
+        table=score_table(result.figures),
+        diagrams=[inline_svg(draw_reliability(*diagram)) for diagram in result.diagrams.items()],
+        frames=[
+            (inline_svg(draw_frame(read.frames[n], scores[n], read.upright)), _caption(scores[n]))
+            for n in ranked
+        ],
+        every_figure=full_table(result.figures),
     )
-    with atomic_path(path) as scratch:
-        scratch.write_text(page, encoding="utf-8")
-
-
-def _rows(figures: Figures) -> list[tuple[str, list[str]]]:
-    """Titles with figures, and beside them those of the other file if there is one."""
-    prefixes = ("",) if figures.get("against") is None else ("", "against.")
-    rows = [
-        (title, [number(figures.get(prefix + key)) for prefix in prefixes])
-        for key, title in SHOWN.items()
-        if figures.get(key) is not None
-    ]
-    return rows + [(title, [number(figures[key]), ""]) for key, title in COMPARED.items() if key in figures]
-
-
-def _table(figures: Figures) -> str:
-    other = figures.get("against")
-    head = f"<tr><th></th><th>these</th><th>{escape(Path(str(other)).name)}</th></tr>" if other else ""
-    rows = "".join(
-        f"<tr><th scope='row'>{_indented(title)}</th>"
-        + "".join(f"<td>{value}</td>" for value in values)
-        + "</tr>"
-        for title, values in _rows(figures)
-    )
-    return f"<table>{head}{rows}</table>"
-
-
-def _indented(name: str) -> str:
-    return ("&emsp;" if name.startswith(" ") else "") + escape(name.strip())
 
 
 def _caption(score: FrameScore) -> str:
-    parts = ", ".join(f"{part.replace('_', ' ')} {number(score.parts[part], 1)}" for part in PARTS)
+    parts = ", ".join(f"{words(part)} {number(score.parts[part], 1)}" for part in PARTS)
     return f"{score.name}: {number(score.nll, 1)} nats ({parts})"

@@ -1,14 +1,13 @@
-"""A page in the browser that asks an index: a grid of hits, conditions, a map of all scenes with a lasso."""
+"""A page in the browser that searches an index: a grid of hits, conditions, a map of scenes with a lasso."""
 
 import functools
 import io
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, dataclass, fields
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -24,13 +23,78 @@ from foredrive.search.query import Query
 from foredrive.search.rows import FACTS
 from foredrive.search.tables import quoted_list
 from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
-from foredrive.view.report_style import CSS
+from foredrive.view.html import render_page
 
 JPEG_QUALITY = 85
-MOST_SHOWN = 60
-"""Of the scenes in a lasso."""
+MAX_SHOWN = 60
+"""Scenes of a lasso that are shown."""
 Key = tuple[str, str]
 """A moment's key and a view: a row."""
+
+
+@dataclass(frozen=True)
+class ShownHit:
+    """A hit as the page shows it."""
+
+    key: str
+    name: str
+    why: str
+    there: str
+    caption: str | None
+
+    @classmethod
+    def of(cls, hit: Hit) -> "ShownHit":
+        """Describe a hit."""
+        why = why_matched(hit) if hit.scores else ""
+        caption = hit.facts["caption"]
+        told = None if caption is None else str(caption)
+        return cls(_key(hit.facts), hit_name(hit), why, what_is_there(hit), told)
+
+
+@dataclass(frozen=True)
+class ShownHits:
+    """Hits, and a line on how they were found."""
+
+    hits: list[ShownHit]
+    told: str
+
+
+@dataclass(frozen=True)
+class Point:
+    """A whole scene on the map: where it lies, -1 to 1, and what it can be coloured by."""
+
+    x: float
+    y: float
+    key: str
+    moment: str
+    name: str
+    log: str
+    place: str | None
+    weather: str | None
+    time_of_day: str | None
+
+    @classmethod
+    def of(cls, xy: Sequence[float], row: Mapping[str, Any]) -> "Point":
+        """Place a row of the index."""
+        name = f"{row['log']}@{row['t_s']:.1f}s"
+        facts = (row["log"], row["place"], row["weather"], row["time_of_day"])
+        return cls(xy[0], xy[1], _key(row), row["key"], name, *facts)
+
+
+@dataclass(frozen=True)
+class Map:
+    """All scenes on a plane that shows a share of their variance."""
+
+    points: list[Point]
+    share: float
+    total: int
+
+
+@dataclass(frozen=True)
+class Done:
+    """A line on what was done."""
+
+    told: str
 
 
 class SearchPage:
@@ -99,27 +163,17 @@ class SearchPage:
         except (InputError, ValueError, LookupError, TypeError) as error:
             _send_json(request, {"error": " ".join(str(error).split())}, HTTPStatus.BAD_REQUEST)
 
-    def _find(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def _find(self, asked: Mapping[str, str]) -> ShownHits:
         query = query_of(asked)
         with self._one_at_a_time:
             found = ask(self._index, query, self._towers)
         how = "all compared" if found.exact else f"{found.compared} compared"
-        return {"hits": [_told(hit) for hit in found.hits], "told": f"{len(found.hits)} hits, {how}"}
+        return ShownHits([*map(ShownHit.of, found.hits)], f"{len(found.hits)} hits, {how}")
 
-    def _map(self, _: Mapping[str, str]) -> dict[str, Any]:
+    def _map(self, _: Mapping[str, str]) -> Map:
         plane = project_scenes(self._index)
-        points = [
-            {
-                **row,
-                "x": x,
-                "y": y,
-                "key": _key(row),
-                "moment": row["key"],
-                "name": f"{row['log']}@{row['t_s']:.1f}s",
-            }
-            for (x, y), row in zip(plane.xy.tolist(), plane.rows, strict=True)
-        ]
-        return {"points": points, "share": plane.share, "total": plane.total}
+        scenes = zip(plane.xy.tolist(), plane.rows, strict=True)
+        return Map([Point.of(xy, row) for xy, row in scenes], plane.share, plane.total)
 
     def _picture(self, asked: Mapping[str, str]) -> bytes:
         (hit,) = self._rows([_parse_key(asked["key"])])
@@ -127,30 +181,27 @@ class SearchPage:
         Image.fromarray(hit_picture(hit)).save(buffer, format="jpeg", quality=JPEG_QUALITY)
         return buffer.getvalue()
 
-    def _moments(self, told: Mapping[str, Any]) -> dict[str, Any]:
-        hits = self._rows([_parse_key(key) for key in told["keys"][:MOST_SHOWN]])
-        return {
-            "hits": [_told(hit) for hit in hits],
-            "told": f"{len(told['keys'])} scenes, {len(hits)} shown",
-        }
+    def _moments(self, told: Mapping[str, Any]) -> ShownHits:
+        hits = self._rows([_parse_key(key) for key in told["keys"][:MAX_SHOWN]])
+        return ShownHits([*map(ShownHit.of, hits)], f"{len(told['keys'])} scenes, {len(hits)} shown")
 
-    def _tag(self, told: Mapping[str, Any]) -> dict[str, Any]:
+    def _tag(self, told: Mapping[str, Any]) -> Done:
         name = str(told["tag"]).strip()
         if not name:
             raise InputError("a tag has a name")
         add_tag(self._index.uri, name, [_parse_key(key)[0] for key in told["keys"]])
-        return {"told": f"{len(told['keys'])} moments are tagged {name}"}
+        return Done(f"{len(told['keys'])} moments are tagged {name}")
 
-    def _clips(self, told: Mapping[str, Any]) -> dict[str, Any]:
+    def _clips(self, told: Mapping[str, Any]) -> Mapping[str, object]:
         hits = self._rows([_parse_key(key) for key in told["keys"]])
         return listed_clips(hits, float(told["before"]), float(told["after"]))
 
-    def _save(self, told: Mapping[str, Any]) -> dict[str, Any]:
+    def _save(self, told: Mapping[str, Any]) -> Done:
         save_query(self._index.uri, str(told["name"]), query_of(told["asked"]).to_json())
-        return {"told": f"kept as {told['name']}"}
+        return Done(f"kept as {told['name']}")
 
     def _rows(self, keys: Sequence[Key]) -> list[Hit]:
-        """Rows in the order of their keys, as hits that nothing was compared with."""
+        """Read rows in the order of their keys, as hits without scores."""
         if not keys:
             raise InputError("nothing is chosen")
         where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
@@ -159,7 +210,7 @@ class SearchPage:
 
 
 def query_of(asked: Mapping[str, Any]) -> Query:
-    """A query from the page's fields; empty ones are left out.
+    """Make a query of the page's fields; empty ones are left out.
 
     Raises:
         InputError: they do not make one.
@@ -172,18 +223,8 @@ def query_of(asked: Mapping[str, Any]) -> Query:
 
 @functools.cache
 def page_html() -> str:
-    """The page, with its style inside; it loads nothing from anywhere else."""
-    return files("foredrive.view").joinpath("search_page.html").read_text("utf-8").replace("/*CSS*/", CSS)
-
-
-def _told(hit: Hit) -> dict[str, Any]:
-    return {
-        "key": _key(hit.facts),
-        "name": hit_name(hit),
-        "why": why_matched(hit) if hit.scores else "",
-        "there": what_is_there(hit),
-        "caption": hit.facts["caption"],
-    }
+    """Return the page; it loads nothing from anywhere but this server."""
+    return render_page("search_page.html.j2", title="Foredrive search")
 
 
 def _key(row: Mapping[str, object]) -> str:
@@ -195,8 +236,8 @@ def _parse_key(key: str) -> Key:
     return moment, view
 
 
-def _send_json(request: BaseHTTPRequestHandler, told: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
-    _send(request, "application/json", json.dumps(told).encode(), status)
+def _send_json(request: BaseHTTPRequestHandler, told: object, status: HTTPStatus = HTTPStatus.OK) -> None:
+    _send(request, "application/json", json.dumps(told, default=asdict).encode(), status)
 
 
 def _send(

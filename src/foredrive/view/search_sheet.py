@@ -1,18 +1,12 @@
-"""The hits of a search on one page, as a picture or as HTML, and as a table in the terminal."""
+"""The hits of a search as a picture, as HTML, and as a table."""
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
-from matplotlib.figure import Figure
-from rich.table import Table
-
 from foredrive.errors import InputError
-from foredrive.files import atomic_path
 from foredrive.search.find import Hit
 from foredrive.search.query import Query
 from foredrive.view import palette
-from foredrive.view.example_panel import figure_html
 from foredrive.view.hit_picture import (
     GAP_PX,
     HEIGHT_PX,
@@ -22,15 +16,15 @@ from foredrive.view.hit_picture import (
     what_is_there,
     why_matched,
 )
-from foredrive.view.report_style import CSS
+from foredrive.view.html import picture, write_page
+from foredrive.view.sheet import Sheet
+from foredrive.view.table import Column, Table, simple_table
 
-DPI = 100
 COLUMNS = 3
 MARGIN_PX, HEAD_PX, TEXT_PX = 16, 54, 62
 CELL_PX = WIDTH_PX + GAP_PX + HEIGHT_PX
-MOST_ON_PICTURE = 60
-TITLE_PT = 15.0
-STYLE = "figcaption { white-space: pre-line; }"
+LINE_PX = 17
+MAX_ON_PICTURE = 60
 
 
 def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
@@ -44,17 +38,17 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
     """
     check_sheet(path)
     if path.suffix == ".png":
-        figure = draw_search_sheet(query, hits[:MOST_ON_PICTURE])
-        with atomic_path(path) as scratch:
-            figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")
+        _write_picture(path, query, hits[:MAX_ON_PICTURE])
         return
-    page = search_html(query, hits)
-    with atomic_path(path) as scratch:
-        scratch.write_text(page, encoding="utf-8")
+    shown = [
+        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), why_matched(hit), _told(hit))
+        for number, hit in enumerate(hits, 1)
+    ]
+    write_page(path, "search_sheet.html.j2", title=query_line(query), hits=shown)
 
 
 def check_sheet(path: Path) -> None:
-    """Whether a contact sheet can be written under this name.
+    """Check that a contact sheet can be written under this name.
 
     Raises:
         InputError: it ends neither on .png nor on .html.
@@ -64,7 +58,7 @@ def check_sheet(path: Path) -> None:
 
 
 def query_line(query: Query) -> str:
-    """A query in one line."""
+    """Write a query in one line."""
     asked = [f"“{text}”" for text in (query.text, query.image_text, query.lidar_text) if text]
     asked += [f"like {query.like}"] if query.like else []
     if asked:
@@ -76,59 +70,34 @@ def query_line(query: Query) -> str:
     return "   ".join(asked)
 
 
-def draw_search_sheet(query: Query, hits: Sequence[Hit]) -> Figure:
-    """The picture as a figure."""
+def _write_picture(path: Path, query: Query, hits: Sequence[Hit]) -> None:
     rows = -(-len(hits) // COLUMNS)
     width = MARGIN_PX + min(len(hits), COLUMNS) * (CELL_PX + MARGIN_PX)
-    height = HEAD_PX + rows * (HEIGHT_PX + TEXT_PX)
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=palette.GROUND)
-    title = query_line(query)
-    size_pt = min(TITLE_PT, 1.15 * width / max(len(title), 1))  # long ones shrink to fit
-    at = 1 - HEAD_PX / 2 / height
-    figure.text(MARGIN_PX / width, at, title, color=palette.INK, fontsize=size_pt, va="center")
+    sheet = Sheet(width, HEAD_PX + rows * (HEIGHT_PX + TEXT_PX))
+    sheet.head(MARGIN_PX, HEAD_PX, query_line(query), 15.0)
     for number, hit in enumerate(hits):
         x = MARGIN_PX + number % COLUMNS * (CELL_PX + MARGIN_PX)
         y = HEAD_PX + number // COLUMNS * (HEIGHT_PX + TEXT_PX)
-        box = (x / width, 1 - (y + HEIGHT_PX) / height, CELL_PX / width, HEIGHT_PX / height)
-        ax = figure.add_axes(box)
+        ax = sheet.place(x, y, CELL_PX, HEIGHT_PX)
         ax.imshow(hit_picture(hit), interpolation="none", aspect="auto")
         ax.set_axis_off()
-        lines = (
-            (f"{number + 1}   {hit_name(hit)}", palette.INK, 10.0),
-            (why_matched(hit), palette.EXPERT, 9.0),
-        )
-        for line, (text, colour, size) in enumerate((*lines, (what_is_there(hit), palette.FAINT, 9.0))):
-            below = 1 - (y + HEIGHT_PX + 4 + 17 * line) / height
-            figure.text(x / width, below, text, color=colour, fontsize=size, va="top")
-    return figure
-
-
-def search_html(query: Query, hits: Sequence[Hit]) -> str:
-    """The page as text."""
-    cells = "\n".join(
-        figure_html(hit_picture(hit), f"{number}   {hit_name(hit)}\n{why_matched(hit)}\n{_told(hit)}")
-        for number, hit in enumerate(hits, 1)
-    )
-    title = escape(query_line(query))
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{CSS}{STYLE}</style>\n</head>\n<body>\n"
-        f'<h1>{title}</h1>\n<p class="note">{len(hits)} hits; to the right of each camera its lidar from '
-        f'above.</p>\n<div class="grid three">{cells}</div>\n</body>\n</html>\n'
-    )
+        below = y + HEIGHT_PX + 4
+        sheet.write(x, below, f"{number + 1}   {hit_name(hit)}", 10.0)
+        sheet.write(x, below + LINE_PX, why_matched(hit), 9.0, palette.EXPERT)
+        sheet.write(x, below + 2 * LINE_PX, what_is_there(hit), 9.0, palette.FAINT)
+    sheet.save(path)
 
 
 def hits_table(hits: Sequence[Hit]) -> Table:
-    """The hits for a terminal."""
-    table = Table(box=None)
-    for name in ("", "moment and view", "why", "what is there"):
-        table.add_column(name, overflow="fold")
-    for number, hit in enumerate(hits, 1):
-        table.add_row(str(number), hit_name(hit), why_matched(hit), what_is_there(hit))
-    return table
+    """List the hits."""
+    columns = (
+        Column(),
+        *(Column(name, align="left") for name in ("moment and view", "why", "what is there")),
+    )
+    rows = [(n, hit_name(hit), why_matched(hit), what_is_there(hit)) for n, hit in enumerate(hits, 1)]
+    return simple_table(columns, rows)
 
 
-def _told(hit: Hit) -> str:
+def _told(hit: Hit) -> list[str]:
     caption = hit.facts["caption"]
-    return what_is_there(hit) + ("" if caption is None else f"\n{caption}")
+    return [what_is_there(hit)] + ([] if caption is None else [str(caption)])

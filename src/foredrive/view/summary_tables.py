@@ -1,200 +1,208 @@
-"""Tables of a report, read off a summary's flat dotted keys; a figure that is missing is a dash."""
+"""Tables of a summary's figures; a figure that is missing is a dash, a table without figures is None."""
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Sequence
+
+from rich.console import Console
 
 from foredrive.evaluation.summary import rivals_of_occupancy
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
+from foredrive.view.table import (
+    MISSING,
+    Cell,
+    Column,
+    Row,
+    Section,
+    Summary,
+    Table,
+    Value,
+    number,
+    print_table,
+    simple_table,
+    words,
+)
 
-Figure = float | int | str | None
-Summary = Mapping[str, Figure]
-
-MISSING = "&ndash;"
-RIVALS_NOTE = (
-    '<p class="note">Copy: the predicted present in place of the future. Carried copy: moved by the path '
-    "that was driven, which no model knows. Best and mean of k: futures drawn by chance.</p>"
+ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it."
+BASELINES_NOTE = (
+    "Copy: the predicted present in place of the future. Carried copy: moved by the path that was driven, "
+    "which no model knows. Best and mean of k: futures drawn by chance."
+)
+BEST_NOTE = (
+    "Green: the best of a column. Protocols measure different things: compare within a column, never across."
+)
+INVALID_NOTE = (
+    "Invalid frames have no complete driven future: UniAD's protocol counts what there is of them, the "
+    "others leave them out."
 )
 MODEL = ""
 AGENT_TITLES = {MODEL: "this model", "ego_mlp": "MLP of ego status alone"}
-PROTOCOL_TITLES = {
-    "stp3": "ST-P3",
-    "uniad": "UniAD",
-    "vad": "VAD",
-    "sparsedrive": "SparseDrive",
-    "bevplanner": "BEV-Planner",
-}
 WHENS = (*HORIZON_NAMES, "avg")
-SCOPE_TITLES = {"": "all voxels", "above_ground.": f"more than {ABOVE_GROUND_M:g} m above the ground"}
+SCOPE_TITLES = {"": "all voxels", "above_ground.": "above the ground"}
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
+CONSTANT = "best_constant"
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
 _FLOW = re.compile(r"flow\.epe_moving_(\w+)_mps")
 _IMAGES = re.compile(r"(\w+(?:\.\w+)*)\.psnr_db")
 
 
-def number(value: Figure, digits: int = 3) -> str:
-    """A figure as text: that many digits after the point for floats, a dash for what is missing."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return MISSING
-    if isinstance(value, float):
-        return f"{value:z.{digits}f}"
-    return escape(str(value))
+def print_summary(summary: Summary, console: Console, model: str) -> None:
+    """Print what a reader looks for first."""
+    for make in (occupancy_table, planning_table, flow_table, image_table):
+        if table := make(summary):
+            print_table(table, console)
+    console.print(
+        f"{model}: {number(summary.get('items'))} clips, {number(summary.get('failed'))} failed; "
+        f"commands from: {summary.get('command_source', 'none')}; "
+        f"peak memory {number(summary.get('peak_rss_gib'), 2)} GiB, {number(summary.get('wall_s'), 0)} s",
+        markup=False,
+        highlight=False,
+    )
 
 
 def when_title(name: str) -> str:
-    """`future_500ms` -> +500 ms; `now` stays."""
+    """Write a time as a title: `future_500ms` -> +500 ms; `now` stays."""
     later = re.fullmatch(r"future_(\d+)(ms|s)", name)
     return f"+{later[1]} {later[2]}" if later else name
 
 
-def planning_tables(summary: Summary) -> str:
-    """Averages under all protocols side by side, then every horizon of each; the best value is marked."""
-    found = [match for key in summary if (match := _PLANNING.match(key))]
-    agents = sorted({match[1] or MODEL for match in found}, key=lambda agent: (agent != MODEL, agent))
-    protocols = [name for name in PROTOCOLS if any(match[2] == name for match in found)]
+def planning_overview(summary: Summary) -> Table | None:
+    """Compare agents by their averages under all protocols; the best value of a column is marked."""
+    agents, protocols = _planned(summary)
     if not protocols:
-        return ""
-    averages = [(p, metric) for p in protocols for metric in ("l2_avg_m", "collision_avg_pct")]
-    head = "".join(f'<th class="group" colspan="2">{PROTOCOL_TITLES.get(p, p)}</th>' for p in protocols)
-    overview = (
-        f'<tr><th rowspan="2"></th>{head}</tr><tr>{"<th>L2, m</th><th>coll., %</th>" * len(protocols)}</tr>'
-    )
-    horizons = "".join(f"<th>{when}</th>" for when in WHENS)
-    detail_head = (
-        '<tr><th rowspan="2"></th><th class="group" colspan="4">L2, m</th>'
-        '<th class="group" colspan="4">collision, %</th><th class="group" colspan="3">frames</th></tr>'
-        f"<tr>{horizons * 2}<th>counted</th><th>invalid</th><th>without boxes</th></tr>"
-    )
-    scores = [f"l2_{when}_m" for when in WHENS] + [f"collision_{when}_pct" for when in WHENS]
-    counts = ["frames_counted", "frames_invalid", "frames_without_boxes"]
-    bodies = [
-        _tbody(
-            _planning_rows(summary, agents, [(p, metric) for metric in scores + counts]),
-            PROTOCOL_TITLES.get(p, p),
-            1 + len(scores + counts),
-        )
-        for p in protocols
+        return None
+    scores = [
+        (Column(title, PROTOCOLS[protocol].title, 2), f"{protocol}.{metric}")
+        for protocol in protocols
+        for title, metric in (("L2, m", "l2_avg_m"), ("coll., %", "collision_avg_pct"))
     ]
-    return (
-        _table(overview, _tbody(_planning_rows(summary, agents, averages)))
-        + '<p class="note">Green: the best of a column. Protocols measure different things: compare '
-        "within a column, never across.</p><h3>Every horizon</h3>"
-        + _table(detail_head, "".join(bodies))
-        + '<p class="note">Invalid frames have no complete driven future: UniAD\'s protocol counts what '
-        "there is of them, the others leave them out.</p>"
-    )
+    columns = [Column(align="left"), *(column for column, _ in scores)]
+    rows = _planning_rows(summary, agents, [key for _, key in scores])
+    return Table(columns, [Section(rows)], notes=[BEST_NOTE])
 
 
-def occupancy_table(summary: Summary) -> str:
-    """IoU, precision and recall on known voxels, now and later, beside those of the best constant."""
+def planning_table(summary: Summary) -> Table | None:
+    """Compare agents at every horizon under each protocol; the best value of a column is marked."""
+    agents, protocols = _planned(summary)
+    if not protocols:
+        return None
+    scores = [(Column(when, "L2, m", 2), f"l2_{when}_m") for when in WHENS]
+    scores += [(Column(when, "coll., %", 2), f"collision_{when}_pct") for when in WHENS]
+    scores += [
+        (Column(words(kind), "frames"), f"frames_{kind}") for kind in ("counted", "invalid", "without_boxes")
+    ]
+    sections = [
+        Section(
+            _planning_rows(summary, agents, [f"{protocol}.{key}" for _, key in scores]),
+            PROTOCOLS[protocol].title,
+        )
+        for protocol in protocols
+    ]
+    columns = [Column(align="left"), *(column for column, _ in scores)]
+    return Table(columns, sections, "Planning, open loop", [INVALID_NOTE])
+
+
+def occupancy_table(summary: Summary) -> Table | None:
+    """Compare IoU, precision and recall on known voxels, now and later, with those of baselines."""
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
-        return ""
-    names = "".join(f"<th>{title}</th>" for title in OCCUPANCY_TITLES.values())
-    rivals = {name: title for name, title in rivals_of_occupancy(summary).items() if name != "best_constant"}
-    others = "".join(f'<th rowspan="2">IoU, {title}</th>' for title in rivals.values())
-    head = (
-        '<tr><th rowspan="2"></th><th class="group" colspan="3">this model</th>'
-        '<th class="group" colspan="3">best constant</th><th rowspan="2">IoU ratio</th>'
-        f"{others}</tr><tr>{names * 2}</tr>"
-    )
-    bodies = []
+        return None
+    others = [name for name in rivals_of_occupancy(summary) if name != CONSTANT]
+    columns = [
+        Column(align="left"),
+        *(Column(title, "this model") for title in OCCUPANCY_TITLES.values()),
+        *(Column(title, "best constant") for title in OCCUPANCY_TITLES.values()),
+        Column("IoU ratio"),
+        *(Column(words(name), "baselines' IoU") for name in others),
+    ]
+    sections = []
     for scope, title in SCOPE_TITLES.items():
         rows = []
         for when in whens:
+            iou = f"occupancy.{scope}iou_{when}"
             keys = [f"occupancy.{scope}{metric}_{when}" for metric in OCCUPANCY_TITLES]
-            cells = [_cell(summary.get(key)) for key in keys]
-            cells += [_cell(summary.get(f"{key}.best_constant")) for key in keys]
-            ratio = ratio_to_constant(summary, f"occupancy.{scope}iou_{when}")
-            cells.append(f"<td>{MISSING if ratio is None else f'{ratio:.2f} &times;'}</td>")
-            cells += [_cell(summary.get(f"occupancy.{scope}iou_{when}.{rival}")) for rival in rivals]
-            rows.append(_row(when_title(when), cells))
-        bodies.append(_tbody(rows, title, 8 + len(rivals)))
-    return _table(head, "".join(bodies)) + (RIVALS_NOTE if rivals else "")
+            keys += [f"{key}.{CONSTANT}" for key in keys]
+            ratio = ratio_to_constant(summary, iou)
+            cells = [summary.get(key) for key in keys]
+            cells.append(MISSING if ratio is None else f"{ratio:.2f} \N{MULTIPLICATION SIGN}")
+            cells += [summary.get(f"{iou}.{name}") for name in others]
+            rows.append(Row([when_title(when), *cells]))
+        sections.append(Section(rows, title))
+    notes = [ABOVE_NOTE, BASELINES_NOTE] if others else [ABOVE_NOTE]
+    return Table(columns, sections, "Occupancy on voxels the lidar knows", notes)
 
 
-def flow_table(summary: Summary) -> str:
-    """Errors of predicted flow on voxels that move, now and later, beside those of predicting none."""
-    rows = []
-    for key, value in summary.items():
-        if found := _FLOW.fullmatch(key):
-            rows.append(
-                _row(when_title(found[1]), [_cell(value, 2), _cell(summary.get(f"{key}.no_motion"), 2)])
-            )
-    head = "<tr><th></th><th>error, m/s</th><th>predicting none, m/s</th></tr>"
-    return _table(head, _tbody(rows)) if rows else ""
-
-
-def image_table(summary: Summary) -> str:
-    """PSNR and SSIM of rendered images, now and later."""
-    prefixes = [match[1] for key in summary if (match := _IMAGES.fullmatch(key))]
-    rows = []
-    for prefix in prefixes:
-        when = prefix.rpartition(".")[2]
-        cells = [_cell(summary[f"{prefix}.psnr_db"], 2), _cell(summary.get(f"{prefix}.ssim"))]
-        rows.append(_row(when_title(when) if when.startswith("future") else "now", cells))
-    return _table("<tr><th></th><th>PSNR, dB</th><th>SSIM</th></tr>", _tbody(rows)) if rows else ""
-
-
-def full_table(summary: Summary) -> str:
-    """Every key of the summary, as it stands in summary.json."""
+def flow_table(summary: Summary) -> Table | None:
+    """Compare errors of flow on voxels that move, now and later, with those of predicting none."""
     rows = [
-        f'<tr><td class="text"><code>{escape(key)}</code></td><td>{number(value, 5)}</td></tr>'
-        for key, value in sorted(summary.items())
+        (when_title(found[1]), value, summary.get(f"{key}.no_motion"))
+        for key, value in summary.items()
+        if (found := _FLOW.fullmatch(key))
     ]
-    return _table('<tr><th class="text">key</th><th>value</th></tr>', _tbody(rows))
+    columns = (Column(align="left"), Column("error, m/s", digits=2), Column("predicting none, m/s", digits=2))
+    return simple_table(columns, rows, "Flow on voxels that move") if rows else None
+
+
+def image_table(summary: Summary) -> Table | None:
+    """List PSNR and SSIM of rendered images, now and later."""
+    rows = []
+    for prefix in (match[1] for key in summary if (match := _IMAGES.fullmatch(key))):
+        when = prefix.rpartition(".")[2]
+        when = when_title(when) if when.startswith("future") else "now"
+        rows.append((when, summary[f"{prefix}.psnr_db"], summary.get(f"{prefix}.ssim")))
+    columns = (Column(align="left"), Column("PSNR, dB", digits=2), Column("SSIM"))
+    return simple_table(columns, rows, "Rendered images") if rows else None
+
+
+def full_table(summary: Summary) -> Table:
+    """List every key of the summary, as it stands in summary.json."""
+    return simple_table((Column("key", align="left"), Column("value", digits=5)), sorted(summary.items()))
 
 
 def ratio_to_constant(summary: Summary, key: str) -> float | None:
-    """How many times the best constant's value a model's is."""
-    value, constant = summary.get(key), summary.get(f"{key}.best_constant")
+    """Return how many times the best constant's value a model's is."""
+    value, constant = summary.get(key), summary.get(f"{key}.{CONSTANT}")
     if not isinstance(value, float) or not isinstance(constant, float) or not constant > 0:
         return None
     return value / constant
 
 
-def _planning_rows(summary: Summary, agents: Sequence[str], columns: Sequence[tuple[str, str]]) -> list[str]:
+def _planned(summary: Summary) -> tuple[list[str], list[str]]:
+    """Agents, the model first, and protocols that have planning figures."""
+    found = [match for key in summary if (match := _PLANNING.match(key))]
+    agents = sorted({match[1] or MODEL for match in found}, key=lambda agent: (agent != MODEL, agent))
+    return agents, [name for name in PROTOCOLS if any(match[2] == name for match in found)]
+
+
+def _planning_rows(summary: Summary, agents: Sequence[str], keys: Sequence[str]) -> list[Row]:
     """One row an agent; the best value of every score's column is marked."""
-    table = {
-        (agent, column): summary.get(f"planning.{f'{agent}.' if agent else ''}{column[0]}.{column[1]}")
+    values = {agent: [summary.get(_planning_key(agent, key)) for key in keys] for agent in agents}
+    best = [
+        None if ".frames" in key else _best(column)
+        for key, column in zip(keys, zip(*values.values(), strict=True), strict=True)
+    ]
+    return [
+        Row(
+            [
+                AGENT_TITLES.get(agent, words(agent)),
+                *(
+                    Cell(value, "best" if value is not None and value == least else "")
+                    for value, least in zip(values[agent], best, strict=True)
+                ),
+            ],
+            is_strong=agent == MODEL,
+        )
         for agent in agents
-        for column in columns
-    }
-    best = {}
-    for column in columns:
-        values = [v for agent in agents if isinstance(v := table[agent, column], float) and not math.isnan(v)]
-        differ = len(set(values)) > 1 and not column[1].startswith("frames")
-        best[column] = min(values) if differ else None
-    rows = []
-    for agent in agents:
-        cells = [
-            _cell(
-                table[agent, column],
-                digits=2,
-                best=best[column] is not None and table[agent, column] == best[column],
-            )
-            for column in columns
-        ]
-        rows.append(_row(AGENT_TITLES.get(agent, agent.replace("_", " ")), cells, model=agent == MODEL))
-    return rows
+    ]
 
 
-def _cell(value: Figure, digits: int = 3, best: bool = False) -> str:
-    return f'<td class="best">{number(value, digits)}</td>' if best else f"<td>{number(value, digits)}</td>"
+def _planning_key(agent: str, key: str) -> str:
+    return f"planning.{agent}.{key}" if agent else f"planning.{key}"
 
 
-def _row(title: str, cells: Sequence[str], model: bool = False) -> str:
-    kind = ' class="model"' if model else ""
-    return f'<tr{kind}><th scope="row">{escape(title)}</th>{"".join(cells)}</tr>'
-
-
-def _tbody(rows: Sequence[str], title: str = "", columns: int = 0) -> str:
-    head = f'<tr><th class="text" colspan="{columns}">{escape(title)}</th></tr>' if title else ""
-    return f"<tbody>{head}{''.join(rows)}</tbody>"
-
-
-def _table(head: str, bodies: str) -> str:
-    return f'<div class="scroll"><table><thead>{head}</thead>{bodies}</table></div>'
+def _best(column: Sequence[Value]) -> float | None:
+    """The least of values that differ."""
+    values = {value for value in column if isinstance(value, float) and not math.isnan(value)}
+    return min(values) if len(values) > 1 else None

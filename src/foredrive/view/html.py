@@ -1,0 +1,97 @@
+"""Self-contained pages from the templates beside this file; whatever is put into them is escaped."""
+
+import base64
+import functools
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from PIL import Image
+
+from foredrive.files import atomic_path
+from foredrive.view.table import Cell, Value, number, words
+
+INK_MARK = "#010203"
+"""Drawn wherever the page's own text colour shall be."""
+NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture inside a page."""
+
+    source: str
+    """A data URI."""
+    caption: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A figure that a reader looks for first."""
+
+    name: str
+    value: str
+    unit: str = ""
+    note: str = ""
+
+
+def write_page(path: Path, template: str, **content: object) -> None:
+    """Write one HTML file that loads nothing from anywhere; it appears whole or not at all."""
+    page = render_page(template, **content)
+    with atomic_path(path) as scratch:
+        scratch.write_text(page, encoding="utf-8")
+
+
+def render_page(template: str, **content: object) -> str:
+    """Render a template of this folder, escaping all that is no `Markup`."""
+    return _environment().get_template(template).render(**content)
+
+
+def picture(
+    image: UInt8[np.ndarray, "H W 3"], caption: str, kind: Literal["jpeg", "png"] = "jpeg"
+) -> Picture:
+    """Encode an image for a page."""
+    buffer = io.BytesIO()
+    options = {"quality": 90, "subsampling": 0} if kind == "jpeg" else {"optimize": True}
+    Image.fromarray(image).save(buffer, format=kind, **options)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return Picture(f"data:image/{kind};base64,{data}", caption, image.shape[1], image.shape[0])
+
+
+def inline_svg(figure: Figure) -> Markup:
+    """Draw a figure as SVG of the page's width, in its font and text colour; matplotlib escapes its texts."""
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
+    svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)
+    return Markup(re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg))
+
+
+@functools.cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("foredrive.view"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"number": number, "words": words, "cell": _cell}
+    return environment
+
+
+def _cell(value: Value | Cell) -> Cell:
+    return value if isinstance(value, Cell) else Cell(value)
