@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
@@ -85,6 +86,16 @@ def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -
         assert float(said.xy[0, -1].norm()) < 40
         apart_m = (said.xy - done.xy)[done.valid].norm(dim=-1)  # he does what he says, more or less
         assert apart_m.numel() == 0 or 0 < float(apart_m.max()) < 6
+
+
+@pytest.mark.parametrize("name", ["../../../x", "..", "/x", "a/b", 'x"><svg onload=alert(1)>', "", "a" * 101])
+def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "deep" / "routes.xml", tmp_path / "deep" / "er" / "out"
+    file.parent.mkdir()
+    file.write_text(routes.read_text().replace('id="b"', f"id={quoteattr(name)}"))
+    with pytest.raises(InputError, match=r"route number 2 of .*routes\.xml: a route's id is letters, digits"):
+        drive_suite(DriveSuite("stop", str(file), sensors=False, vehicles=0, people=0), out, workers=1)
+    assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
 def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> None:
