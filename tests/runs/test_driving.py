@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -35,6 +36,9 @@ from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
+
+
+HOSTILE = 'x"><svg onload=alert(1)>'
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +92,7 @@ def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -
         assert apart_m.numel() == 0 or 0 < float(apart_m.max()) < 6
 
 
-@pytest.mark.parametrize("name", ["../../../x", "..", "/x", "a/b", 'x"><svg onload=alert(1)>', "", "a" * 101])
+@pytest.mark.parametrize("name", ["../../../x", "..", "/x", "a/b", HOSTILE, "", "a" * 101])
 def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path, tmp_path: Path) -> None:
     file, out = tmp_path / "deep" / "routes.xml", tmp_path / "deep" / "er" / "out"
     file.parent.mkdir()
@@ -194,3 +198,8 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
         assert (tmp_path / "videos" / f"{job}.webp").stat().st_size > 1000
     with pytest.raises(InputError, match="not a suite"):
         write_drive_report(tmp_path / "videos")
+    drive = json.loads((tmp_path / "drives" / "routea_rep0.json").read_text())
+    drive["events"].append({"kind": "scenario", "what": HOSTILE, "t_s": 0.0, "xy_world": [0.0, 0.0]})
+    (tmp_path / "drives" / f"{HOSTILE}.json").write_text(json.dumps(drive))
+    shutil.copy(tmp_path / "videos" / "routea_rep0.webp", tmp_path / "videos" / f"{HOSTILE}.webp")
+    assert "<svg onload" not in write_drive_report(tmp_path).read_text()

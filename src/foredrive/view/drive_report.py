@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from rich.table import Table
 
@@ -184,7 +185,7 @@ def _drive_row(name: str, drive: Mapping[str, Any]) -> str:
     outside = number(100 * score.outside_lanes, 1) if known else MISSING
     mark = "good" if score.ending is Ending.COMPLETED else "bad"
     return (
-        f'<tr><th scope="row"><a href="#{name}">{escape(name)}</a></th>'
+        f'<tr><th scope="row"><a href="#{escape(name)}">{escape(name)}</a></th>'
         f"<td>{number(drive['length_m'], 0)}</td>"
         f"<td>{number(score.driving_score_1_0, 1)}</td><td>{number(score.driving_score_2_1, 1)}</td>"
         f"<td>{number(100 * score.completion, 0)}</td><td>{outside}</td>"
@@ -217,11 +218,11 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
     if "threat" in drive:
         told += f"<li>{_threat(drive['threat'])}</li>"
     return (
-        f'<h3 id="{name}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'
+        f'<h3 id="{escape(name)}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'
         f"{error}"
         f'<div class="drive"><figure>{inline_svg(draw_way(drive))}</figure>'
         f"<div><figure>{inline_svg(draw_timeline(drive))}</figure><ul>{told}</ul></div>"
-        f'<figure class="film"><img loading="lazy" src="{VIDEOS}/{name}.webp" alt="film of the drive">'
+        f'<figure class="film"><img loading="lazy" src="{VIDEOS}/{quote(name)}.webp" alt="film of the drive">'
         "</figure></div>"
     )
 
@@ -234,7 +235,8 @@ def _threat(met: Mapping[str, Any]) -> str:
 
 
 def _words(name: str) -> str:
-    return str(name).replace("_", " ")
+    """A name with blanks, as text of the page."""
+    return escape(str(name).replace("_", " "))
 
 
 def _order(path: Path) -> tuple[list[int], str]:
