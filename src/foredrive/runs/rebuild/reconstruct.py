@@ -18,7 +18,6 @@ from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
 from foredrive.files import atomic_path
-from foredrive.runs.rebuild.calibration_check import calibration_doubts
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.rendering.initial import initial_scene
@@ -29,6 +28,8 @@ from foredrive.rendering.tracks import Tracks, read_tracks
 from foredrive.rendering.unseen_ground import add_unseen_ground
 from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.runs.folder import held
+from foredrive.runs.rebuild.calibration_check import calibration_doubts
 from foredrive.scene import Clip
 from foredrive.sensors.measured_lidar import measure_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
@@ -86,12 +87,19 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
         cache_dir: for shrunk images; by default in `folder`.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe or log; on a log that cannot be read, that has
-            neither images nor sweeps, or for which there is too little memory.
+        InputError: if `folder` holds a run of another recipe or log, or another process writes to it; on a log
+            that cannot be read, that has neither images nor sweeps, or for which there is too little memory.
     """
     _check_same(recipe, path, folder)
     check_memory(recipe, path)
     material = read_material(recipe, path, (cache_dir or folder / "cache").absolute())
+    with held(folder):
+        return _rebuild(recipe, path, folder, material)
+
+
+def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Material) -> Rebuilt:
+    """Do whatever of a reconstruction is not done yet."""
+    _check_same(recipe, path, folder)
     if not (folder / CONFIG).is_file():
         with atomic_path(folder / LOG) as temporary:
             temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))

@@ -13,6 +13,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.text_encoder import IN_A_PACKAGE
+from foredrive.runs.folder import held
 from foredrive.runs.search.sector_views import LogViews, gather_views
 from foredrive.runs.search.tower_data import (
     CaptionedViews,
@@ -107,20 +108,22 @@ def train_towers(
         The folder of the towers.
 
     Raises:
-        InputError: `folder` holds another run; logs cannot be read or tell nothing.
+        InputError: `folder` holds another run, or another process writes to it; logs cannot be read or
+            tell nothing.
     """
     from foredrive.training import make_fabric  # Fabric takes seconds
 
-    _check_same(folder, recipe, logs, beside)
-    cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
-    if beside is None:
-        views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
-        base: Towers = _train_image(recipe, views, folder, fabric)
-    else:
-        base = find_towers(beside)
-        base = base.base if isinstance(base, LidarTowers) else base
-        views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
-    return _train_lidar(recipe, views, folder, fabric, base)
+    with held(folder):
+        _check_same(folder, recipe, logs, beside)
+        cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
+        if beside is None:
+            views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
+            base: Towers = _train_image(recipe, views, folder, fabric)
+        else:
+            base = find_towers(beside)
+            base = base.base if isinstance(base, LidarTowers) else base
+            views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
+        return _train_lidar(recipe, views, folder, fabric, base)
 
 
 def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabric: "Fabric") -> Towers:

@@ -12,11 +12,12 @@ from foredrive.data import ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
-from foredrive.runs.build import build_agent, build_objective
 from foredrive.recipes.config import AnyStage, Recipe, load_recipe, save_recipe
+from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.folder import held
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.path_features import read_paths
 from foredrive.runs.train.baselines import fit_rivals
+from foredrive.runs.train.path_features import read_paths
 from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
@@ -86,22 +87,32 @@ def train_run(
             pre-trained on many logs, fine-tuned on few, or with another planner.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
+        InputError: if `folder` holds a run of another recipe, other logs or another start, or another process
+            trains it; on logs that
             cannot be read; if `start` has not finished pre-training or its world model has other sizes.
     """
     from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
 
     start = None if start is None else start.absolute()
     run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
-    started_before = (folder / CONFIG).is_file()
-    if started_before:
+    if (folder / CONFIG).is_file():
         _check_same(open_run(folder), run)
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
     pretrained = None if start is None else _pretrained(start)
-    if not started_before:  # only now: logs that cannot be read must not make a run
-        _write(run)
-    fabric = make_fabric(recipe.precision)
-    fabric.launch()
+    with held(folder):  # only now: logs that cannot be read must not make a run
+        if (folder / CONFIG).is_file():
+            _check_same(open_run(folder), run)
+        else:
+            _write(run)
+        fabric = make_fabric(recipe.precision)
+        fabric.launch()
+        _train_stages(run, dataset, pretrained, fabric)
+    return run
+
+
+def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
+    """Whatever of a run is not finished yet, in order."""
+    recipe, folder = run.recipe, run.folder
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
     if pretrained is not None:
@@ -116,7 +127,6 @@ def train_run(
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:
         _fit_path(run, recipe.path, agent, fabric)
-    return run
 
 
 def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent, fabric: "Fabric") -> None:
