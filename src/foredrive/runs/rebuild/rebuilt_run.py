@@ -12,13 +12,14 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe
-from foredrive.runs.rebuild.reconstruct import CONFIG, LOG, VEHICLE, WEIGHTS
 from foredrive.rendering.edits import Edit, Edited, apply_edits
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.vehicle import Vehicle, load_vehicle
+from foredrive.runs.folder import CONFIG, LOG, WEIGHTS
+from foredrive.runs.rebuild.reconstruct import VEHICLE
 from foredrive.training.checkpoints import load_weights
 
 
