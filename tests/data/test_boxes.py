@@ -36,6 +36,17 @@ def test_boxes_are_in_the_ego_frame_of_their_frame(flat_log: Path) -> None:
     assert boxes.category.tolist() == [Category.CAR, Category.TRUCK]
 
 
+def test_a_log_without_a_single_box_has_no_boxes_at_any_frame(flat_log: Path, tmp_path: Path) -> None:
+    path = copy_of(flat_log, tmp_path)
+    file = path.folder / f"{BOXES}.arrow"
+    for column in ("bounding_box_se3", "track_token", "label", "velocity_3d"):
+        rewrite_column(file, f"{BOXES}.{column}", lambda rows: [[] for _ in rows])
+    boxes = read_boxes(Log(path), 20)
+    assert boxes is not None
+    assert boxes.centre.shape == (0, 3)
+    assert boxes.category.tolist() == []
+
+
 def test_headings_and_velocities_turn_with_the_ego_vehicle(flat_log: Path, tmp_path: Path) -> None:
     path = copy_of(flat_log, tmp_path)
     quarter_left = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]

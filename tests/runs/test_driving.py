@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
@@ -34,6 +36,9 @@ from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
+
+
+HOSTILE = 'x"><svg onload=alert(1)>'
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +90,16 @@ def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -
         assert float(said.xy[0, -1].norm()) < 40
         apart_m = (said.xy - done.xy)[done.valid].norm(dim=-1)  # he does what he says, more or less
         assert apart_m.numel() == 0 or 0 < float(apart_m.max()) < 6
+
+
+@pytest.mark.parametrize("name", ["../../../x", "..", "/x", "a/b", HOSTILE, "", "a" * 101])
+def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "deep" / "routes.xml", tmp_path / "deep" / "er" / "out"
+    file.parent.mkdir()
+    file.write_text(routes.read_text().replace('id="b"', f"id={quoteattr(name)}"))
+    with pytest.raises(InputError, match=r"route number 2 of .*routes\.xml: a route's id is letters, digits"):
+        drive_suite(DriveSuite("stop", str(file), sensors=False, vehicles=0, people=0), out, workers=1)
+    assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
 def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> None:
@@ -183,3 +198,8 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
         assert (tmp_path / "videos" / f"{job}.webp").stat().st_size > 1000
     with pytest.raises(InputError, match="not a suite"):
         write_drive_report(tmp_path / "videos")
+    drive = json.loads((tmp_path / "drives" / "routea_rep0.json").read_text())
+    drive["events"].append({"kind": "scenario", "what": HOSTILE, "t_s": 0.0, "xy_world": [0.0, 0.0]})
+    (tmp_path / "drives" / f"{HOSTILE}.json").write_text(json.dumps(drive))
+    shutil.copy(tmp_path / "videos" / "routea_rep0.webp", tmp_path / "videos" / f"{HOSTILE}.webp")
+    assert "<svg onload" not in write_drive_report(tmp_path).read_text()

@@ -12,7 +12,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation import EvaluationResult, read_summary
 from foredrive.metrics import PROTOCOLS
 from foredrive.runs import Inspection, Run, evaluate_run, inspect_run
-from foredrive.runs.train.run import WEIGHTS
+from foredrive.runs.folder import WEIGHTS
 from foredrive.view.report import write_report
 from foredrive.view.run_report import report_on_run
 

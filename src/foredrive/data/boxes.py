@@ -144,7 +144,8 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     if log.metadata.dataset != DATASET:
         logged[(logged == 0).all(-1)] = np.nan  # what py123d's parsers write when they do not know
     difference = _track_velocity(track_id, t_s, box[:, :3])
-    R_world_box = Rotation.from_quat(box[:, 3:7], scalar_first=True).as_matrix().reshape(-1, 3, 3)
+    quaternion = box[:, 3:7].copy()  # scipy refuses an empty array that is read-only
+    R_world_box = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
     if log.metadata.dataset in _BACKWARDS:
         R_world_box = R_world_box @ np.diag([-1.0, -1.0, 1.0])
     return Tracks(

@@ -10,13 +10,13 @@ from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.parser.av2.av2_map_parser import Av2MapParser
 from py123d.parser.av2.av2_sensor_parser import Av2SensorLogParser
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
-from py123d.parser.pandaset.pandaset_parser import PandasetLogParser
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.av2_partial import Av2PartialParser
 from foredrive.data.kitti_object import KittiObjectParser
 from foredrive.data.logs import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
+from foredrive.data.pandaset import PandasetLogParser
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 

@@ -7,6 +7,7 @@ from py123d.datatypes import Lidar, LidarMergedMetadata, LidarMetadata, Modality
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor
 
+import foredrive.data.pandaset  # noqa: F401  (a log may refer to raw sweeps, which are pickles)
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
 from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +22,22 @@ SHORT_10, OF = "town05-short-10", "town05-short"
 
 @dataclass(frozen=True, eq=False)
 class RouteWaypoints:
-    """A route as it is given: W points to pass, in the world frame (right-handed, m)."""
+    """A route as it is given: W points to pass, in the world frame (right-handed, m).
+
+    Raises:
+        InputError: its id cannot name a file.
+    """
 
     id: str
+    """Names the files of its drives: letters, digits, dots, dashes and underscores."""
     town: str
     xyz_m: Float64[np.ndarray, "W 3"]
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w-][\w.-]{0,99}", self.id):
+            raise InputError(
+                f"a route's id is letters, digits, dots, dashes and underscores, got {self.id!r}"
+            )
 
 
 def route_set_names() -> tuple[str, ...]:
@@ -105,4 +117,7 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
         raise InputError(f"{where} has a waypoint without numbers for x, y and z: {error}") from None
     if not all(map(math.isfinite, np.ravel(xyz).tolist())):
         raise InputError(f"{where} has a waypoint that is not finite")
-    return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0])
+    try:
+        return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0])
+    except InputError as error:
+        raise InputError(f"route number {number + 1} of {path}: {error}") from None

@@ -16,6 +16,7 @@ from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs.drive.agents import make_driver, needs_of
 from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
+from foredrive.runs.folder import held
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenRun,
     edited_scene,
@@ -86,15 +87,16 @@ def drive_rebuilt(
     opened = open_rebuilt(Path(suite.run))
     edits = [] if suite.edits is None else load_edits(Path(suite.edits))
     jobs = jobs_of(suite, opened, past_frames)
-    _claim(suite, out)
-    drives = []
-    for job in jobs:
-        file = out / DRIVES / f"{job.route}.json"
-        if not file.is_file():
-            write_json(file, _drive_one(job, suite, opened, edits, past_frames, out))
-        drives.append(read_drive(file))
-        tick(job)
-    write_summary(out / SUMMARY, summarise(drives) | _threat_figures(drives))
+    with held(out):
+        _claim(suite, out)
+        drives = []
+        for job in jobs:
+            file = out / DRIVES / f"{job.route}.json"
+            if not file.is_file():
+                write_json(file, _drive_one(job, suite, opened, edits, past_frames, out))
+            drives.append(read_drive(file))
+            tick(job)
+        write_summary(out / SUMMARY, summarise(drives) | _threat_figures(drives))
     return drives
 
 

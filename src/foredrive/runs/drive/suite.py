@@ -23,6 +23,7 @@ from foredrive.files import atomic_path
 from foredrive.runs.drive.agents import make_driver, needs_of
 from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
 from foredrive.runs.fan_out import fan_out, reason
+from foredrive.runs.folder import held
 from foredrive.simulation.drive import Pace, drive_route
 from foredrive.simulation.drive_log import drive_log, key_frame
 from foredrive.simulation.lessons import Alternating, Disturbed
@@ -111,9 +112,23 @@ def drive_suite(
         tick: told of each drive as it is done with, None if it broke.
 
     Raises:
-        InputError: there is no such driver or set of routes, or the folder holds another suite.
+        InputError: there is no such driver or set of routes, or the folder holds another suite, or another
+            process drives into it.
         OSError: the disk is full.
     """
+    needs_of(suite.driver)
+    load_route_set(suite.routes)
+    with held(out):
+        return _drive_rest(suite, out, workers, on_ray, tick)
+
+
+def _drive_rest(
+    suite: DriveSuite,
+    out: Path,
+    workers: int,
+    on_ray: bool,
+    tick: Callable[[DriveJob, dict[str, Any] | None], None],
+) -> Driven:
     claim(suite, out)
     routes = load_route_set(suite.routes)
     jobs = [DriveJob(route.id, n) for n in range(suite.repetitions) for route in routes]

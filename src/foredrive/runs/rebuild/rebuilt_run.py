@@ -18,7 +18,8 @@ from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.vehicle import Vehicle, load_vehicle
-from foredrive.runs.rebuild.reconstruct import CONFIG, LOG, VEHICLE, WEIGHTS
+from foredrive.runs.folder import CONFIG, LOG, WEIGHTS
+from foredrive.runs.rebuild.reconstruct import VEHICLE
 from foredrive.training.checkpoints import load_weights
 
 

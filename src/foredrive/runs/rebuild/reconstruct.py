@@ -28,6 +28,7 @@ from foredrive.rendering.tracks import Tracks, read_tracks
 from foredrive.rendering.unseen_ground import add_unseen_ground
 from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.runs.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
 from foredrive.runs.rebuild.calibration_check import calibration_doubts
 from foredrive.scene import Clip
 from foredrive.sensors.measured_lidar import measure_lidar
@@ -35,7 +36,6 @@ from foredrive.training.checkpoints import load_weights, save_weights
 from foredrive.training.loop import read_metrics
 from foredrive.training.rebuilding import Seen, rebuild
 
-CONFIG, LOG, WEIGHTS, SUMMARY = "config.yaml", "log.json", "model.safetensors", "summary.json"
 VEHICLE = "vehicle.json"
 """Where the log's vehicle drove and what it carried: a scene is looked at without its log."""
 GAUSSIANS = "static.ply"
@@ -86,16 +86,19 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
         cache_dir: for shrunk images; by default in `folder`.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe or log; on a log that cannot be read, that has
-            neither images nor sweeps, or for which there is too little memory.
+        InputError: if `folder` holds a run of another recipe or log, or another process writes to it; on a
+            log that cannot be read, has neither images nor sweeps, or needs more memory than there is.
     """
-    _check_same(recipe, path, folder)
+    claim = _folder_of(recipe, path, folder)
+    claim.check()
     check_memory(recipe, path)
     material = read_material(recipe, path, (cache_dir or folder / "cache").absolute())
-    if not (folder / CONFIG).is_file():
-        with atomic_path(folder / LOG) as temporary:
-            temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))
-        save_recipe(recipe, folder / CONFIG)
+    with claim.claimed():
+        return _rebuild(recipe, path, folder, material)
+
+
+def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Material) -> Rebuilt:
+    """Do whatever of a reconstruction is not done yet."""
     save_vehicle(material.vehicle, folder / VEHICLE)
     scene = begin(recipe, material)
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
@@ -257,14 +260,21 @@ def _summary(
     }
 
 
-def _check_same(recipe: RebuildRecipe, path: LogPath, folder: Path) -> None:
-    if not (folder / CONFIG).is_file():
-        return
-    if load_values(RebuildRecipe, folder / CONFIG) != recipe:
-        raise InputError(f"{folder}: holds a run with another recipe; choose another folder")
-    try:
-        same = json.loads((folder / LOG).read_text())["folder"] == str(path.folder)
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
-    if not same:
-        raise InputError(f"{folder}: holds a run of another log; choose another folder")
+def _folder_of(recipe: RebuildRecipe, path: LogPath, folder: Path) -> RunFolder:
+    other_recipe, other_log = "a run with another recipe", "a run of another log"
+
+    def read() -> dict[str, object] | None:
+        if not (folder / CONFIG).is_file():
+            return None
+        there = load_values(RebuildRecipe, folder / CONFIG)
+        try:
+            return {other_recipe: there, other_log: json.loads((folder / LOG).read_text())["folder"]}
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+
+    def write() -> None:
+        with atomic_path(folder / LOG) as temporary:
+            temporary.write_text(json.dumps({"folder": str(path.folder), "maps_dir": str(path.maps_dir)}))
+        save_recipe(recipe, folder / CONFIG)
+
+    return RunFolder(folder, {other_recipe: recipe, other_log: str(path.folder)}, read, write)

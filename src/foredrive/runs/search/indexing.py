@@ -16,6 +16,7 @@ import torch
 from foredrive.data.logs import Log, LogPath
 from foredrive.errors import InputError
 from foredrive.runs.fan_out import fan_out, reason
+from foredrive.runs.folder import held
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedding import embed_frames
 from foredrive.search.index import FrameIndex, Making, Part, Scores
@@ -75,36 +76,38 @@ def index_logs(
         tick: told how many of the moments are done.
 
     Raises:
-        InputError: the index was made by other towers or with another stride; the stride is not above 0.
+        InputError: the index was made by other towers or with another stride, or another process
+            writes to it; the stride is not above 0.
         OSError: the disk is full or refuses.
     """
     if stride_s <= 0:
         raise InputError(f"a stride of {stride_s:g} s: moments lie apart by more than 0 s")
     tower = find_towers(towers)
-    index = FrameIndex.make(uri, Making(tower.name, tower.fingerprint, tower.dim, stride_s))
-    failed: dict[str, str] = {}
-    jobs = _plan(logs, index, failed)
-    there = index.parts()
-    todo = [job for job in jobs if job.part not in there]
-    total = sum(len(job.frames) for job in todo)
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(embed_part, towers=towers, threads=threads)
-    writer, done = IndexWriter(index), 0
-    tick(0, total)
     here = workers == 1 and not on_ray  # a process of its own would first have to load the towers
-    results = _one_by_one(todo, work) if here else fan_out(todo, work, workers, on_ray=on_ray)
-    with contextlib.closing(results), writer:
-        for job, result in results:
-            if isinstance(result, BaseException):
-                why = reason(job.part.log, result)
-                failed[job.part.log] = f"frames {job.part.first} to {job.part.last}: {why}"
-            else:
-                writer.add(job.part, result)
-            done += len(job.frames)
-            tick(done, total)
-    scored = index.set_scores(scores) if scores else 0
-    if writer.rows or scored:
-        index.optimise()
+    embed = _one_by_one if here else functools.partial(fan_out, workers=workers, on_ray=on_ray)
+    with contextlib.nullcontext() if "://" in uri else held(Path(uri)):
+        index = FrameIndex.make(uri, Making(tower.name, tower.fingerprint, tower.dim, stride_s))
+        failed: dict[str, str] = {}
+        jobs = _plan(logs, index, failed)
+        there = index.parts()
+        todo = [job for job in jobs if job.part not in there]
+        total = sum(len(job.frames) for job in todo)
+        writer, done = IndexWriter(index), 0
+        tick(0, total)
+        with contextlib.closing(embed(todo, work)) as results, writer:
+            for job, result in results:
+                if isinstance(result, BaseException):
+                    why = reason(job.part.log, result)
+                    failed[job.part.log] = f"frames {job.part.first} to {job.part.last}: {why}"
+                else:
+                    writer.add(job.part, result)
+                done += len(job.frames)
+                tick(done, total)
+        scored = index.set_scores(scores) if scores else 0
+        if writer.rows or scored:
+            index.optimise()
     whole = {job.part.log for job in jobs} - failed.keys()
     return Indexed(len(whole), writer.rows, len(jobs) - len(todo), failed, scored)
 

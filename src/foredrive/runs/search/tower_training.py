@@ -13,6 +13,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.text_encoder import IN_A_PACKAGE
+from foredrive.runs.folder import RECIPE, RunFolder
 from foredrive.runs.search.sector_views import LogViews, gather_views
 from foredrive.runs.search.tower_data import (
     CaptionedViews,
@@ -41,7 +42,6 @@ from foredrive.training.alignment import ContrastObjective, DistilObjective
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-RECIPE = "recipe.json"
 IMAGE_STAGE, LIDAR_STAGE = "image", "lidar"
 TOWERS = "towers"
 
@@ -107,20 +107,21 @@ def train_towers(
         The folder of the towers.
 
     Raises:
-        InputError: `folder` holds another run; logs cannot be read or tell nothing.
+        InputError: `folder` holds another run, or another process writes to it; logs cannot be read or
+            tell nothing.
     """
     from foredrive.training import make_fabric  # Fabric takes seconds
 
-    _check_same(folder, recipe, logs, beside)
-    cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
-    if beside is None:
-        views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
-        base: Towers = _train_image(recipe, views, folder, fabric)
-    else:
-        base = find_towers(beside)
-        base = base.base if isinstance(base, LidarTowers) else base
-        views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
-    return _train_lidar(recipe, views, folder, fabric, base)
+    with _folder_of(folder, recipe, logs, beside).claimed():
+        cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
+        if beside is None:
+            views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
+            base: Towers = _train_image(recipe, views, folder, fabric)
+        else:
+            base = find_towers(beside)
+            base = base.base if isinstance(base, LidarTowers) else base
+            views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
+        return _train_lidar(recipe, views, folder, fabric, base)
 
 
 def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabric: "Fabric") -> Towers:
@@ -179,19 +180,24 @@ def _told(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
     return {"recipe": asdict(recipe), "logs": logs, "views": sum(map(len, views))}
 
 
-def _check_same(folder: Path, recipe: TowerRecipe, logs: Sequence[LogPath], beside: str | None) -> None:
-    """Write down what is asked for, or compare it with what was asked for before."""
+def _folder_of(folder: Path, recipe: TowerRecipe, logs: Sequence[LogPath], beside: str | None) -> RunFolder:
     file = folder / RECIPE
     asked = {"recipe": asdict(recipe), "logs": [str(log.folder) for log in logs], "beside": beside}
-    wanted = json.loads(json.dumps(asked))
-    if not file.is_file():
+    noted: dict[str, object] = json.loads(json.dumps(asked))
+
+    def named(values: dict[str, object]) -> dict[str, object]:
+        return {f"a run with another {what}": values.get(what) for what in noted}
+
+    def read() -> dict[str, object] | None:
+        if not file.is_file():
+            return None
+        try:
+            return named(json.loads(file.read_text()))
+        except (OSError, ValueError, AttributeError) as error:
+            raise InputError(f"{file}: cannot be read: {error}") from error
+
+    def write() -> None:
         with atomic_path(file) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1))
-        return
-    try:
-        there = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from error
-    for what in wanted:
-        if there.get(what) != wanted[what]:
-            raise InputError(f"{folder}: holds a run with another {what}; choose another folder")
+            temporary.write_text(json.dumps(noted, indent=1))
+
+    return RunFolder(folder, named(noted), read, write)

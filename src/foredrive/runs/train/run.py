@@ -14,6 +14,7 @@ from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes.config import Recipe, load_recipe, save_recipe
 from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.path_features import read_paths
@@ -22,7 +23,6 @@ from foredrive.training import PathFit, fit_path, load_weights, save_weights, tr
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 STAGES = ("pretrain", "finetune")
 PATH = "path"
 
@@ -86,22 +86,28 @@ def train_run(
             pre-trained on many logs, fine-tuned on few, or with another planner.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe, other logs or another start; on logs that
+        InputError: if `folder` holds a run of another recipe, other logs or another start, or another process
+            trains it; on logs that
             cannot be read; if `start` has not finished pre-training or its world model has other sizes.
     """
     from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
 
     start = None if start is None else start.absolute()
     run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
-    started_before = (folder / CONFIG).is_file()
-    if started_before:
-        _check_same(open_run(folder), run)
+    claim = _folder_of(run)
+    claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
     pretrained = None if start is None else _pretrained(start)
-    if not started_before:  # only now: logs that cannot be read must not make a run
-        _write(run)
-    fabric = make_fabric(recipe.precision)
-    fabric.launch()
+    with claim.claimed():  # only now: logs that cannot be read must not make a run
+        fabric = make_fabric(recipe.precision)
+        fabric.launch()
+        _train_stages(run, dataset, pretrained, fabric)
+    return run
+
+
+def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
+    """Whatever of a run is not finished yet, in order."""
+    recipe, folder = run.recipe, run.folder
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
     if pretrained is not None:
@@ -116,7 +122,6 @@ def train_run(
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:
         _fit_path(run, recipe.path, agent, fabric)
-    return run
 
 
 def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric") -> None:
@@ -184,11 +189,15 @@ def _read_log(entry: dict[str, Any]) -> LogPath:
     return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts)
 
 
-def _check_same(there: Run, wanted: Run) -> None:
-    for what, same in (
-        ("another recipe", there.recipe == wanted.recipe),
-        ("other logs", there.logs == wanted.logs),
-        ("another start", there.start == wanted.start),
-    ):
-        if not same:
-            raise InputError(f"{there.folder}: holds a run with {what}; choose another folder")
+def _folder_of(run: Run) -> RunFolder:
+    def asked(of: Run) -> dict[str, object]:
+        return {
+            "a run with another recipe": of.recipe,
+            "a run with other logs": of.logs,
+            "a run with another start": of.start,
+        }
+
+    def read() -> dict[str, object] | None:
+        return asked(open_run(run.folder)) if (run.folder / CONFIG).is_file() else None
+
+    return RunFolder(run.folder, asked(run), read, lambda: _write(run))
