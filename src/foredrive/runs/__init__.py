@@ -1,0 +1,34 @@
+"""Train, evaluate, drive, rebuild and search: modules are built from recipes here, and results are kept in folders."""
+
+from typing import TYPE_CHECKING
+
+from foredrive.lazy import on_demand
+
+if TYPE_CHECKING:
+    from foredrive.runs.demo import DemoSize, full_demo, quick_demo, run_demo
+    from foredrive.runs.evaluate.run import Inspection, evaluate_run, inspect_run
+    from foredrive.runs.train.run import Run, find_all_logs, load_agent, open_run, train_run
+
+__all__ = [
+    "DemoSize",
+    "Inspection",
+    "Run",
+    "evaluate_run",
+    "find_all_logs",
+    "full_demo",
+    "inspect_run",
+    "load_agent",
+    "open_run",
+    "quick_demo",
+    "run_demo",
+    "train_run",
+]
+
+__getattr__ = on_demand(
+    __name__,
+    {
+        "demo": ("DemoSize", "full_demo", "quick_demo", "run_demo"),
+        "evaluate.run": ("Inspection", "evaluate_run", "inspect_run"),
+        "train.run": ("Run", "find_all_logs", "load_agent", "open_run", "train_run"),
+    },
+)

@@ -1,0 +1,1 @@
+"""Closed-loop drives over suites of routes, and recording drives through towns."""

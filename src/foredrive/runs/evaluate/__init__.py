@@ -1,0 +1,1 @@
+"""Evaluate a run on logs, and look at what it predicts."""

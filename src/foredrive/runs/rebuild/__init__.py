@@ -1,0 +1,1 @@
+"""Rebuild logs as scenes that can be rendered."""

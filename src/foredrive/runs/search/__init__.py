@@ -1,0 +1,1 @@
+"""Train towers, index logs and ask the index."""
