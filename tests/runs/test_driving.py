@@ -10,10 +10,11 @@ import torch
 
 from foredrive.cli.main import main
 from foredrive.data.clips import ClipConfig, ClipDataset
-from foredrive.data.logs import LogPath, find_logs
+from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.runs.drive.agents import needs_of
+from foredrive.runs.drive.records import read_drive, score_of
 from foredrive.runs.drive.suite import (
     DriveJob,
     Driven,
@@ -22,7 +23,6 @@ from foredrive.runs.drive.suite import (
     drive_suite,
     scenario_of,
 )
-from foredrive.runs.drive.records import read_drive, score_of
 from foredrive.scene import VoxelSpec
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route

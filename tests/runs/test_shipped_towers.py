@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.common.tower_quality import embed_all
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.data.logs import Log
-from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
 from foredrive.runs.drive.recording import record_plan
+from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
 from foredrive.runs.search.searching import ask
 from foredrive.runs.search.sector_views import gather_views
-from benchmarks.common.tower_quality import embed_all
 from foredrive.runs.search.towers import EMBEDDED, SHIPPED, find_towers
 from foredrive.search.embedding import read_views
 from foredrive.search.index import FrameIndex

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.arguments import OptionalPath, SomePaths, check_out_folder, check_run
+from foredrive.data.log_paths import find_all_logs
 
 
 def train(
@@ -27,10 +28,15 @@ def train(
             occupancy that towns record, seen or not. The run is evaluated by the same.
         start: Another run's folder: take its pre-trained weights and go straight on to fine-tuning.
     """
+    check_out_folder(out)
+    if start is not None:
+        check_run(start)
+    found = find_all_logs(logs)
+
     from foredrive.recipes import find_recipe, labelled_by
-    from foredrive.runs import find_all_logs, train_run
+    from foredrive.runs import train_run
 
     chosen = labelled_by(find_recipe(recipe), occupancy)
-    run = train_run(chosen, find_all_logs(logs), out, cache, start)
+    run = train_run(chosen, found, out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

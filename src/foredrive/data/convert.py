@@ -15,7 +15,7 @@ from py123d.parser.pandaset.pandaset_parser import PandasetLogParser
 from foredrive.data.arrow_files import reading
 from foredrive.data.av2_partial import Av2PartialParser
 from foredrive.data.kitti_object import KittiObjectParser
-from foredrive.data.logs import LogPath
+from foredrive.data.log_paths import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.errors import InputError
 from foredrive.files import atomic_path

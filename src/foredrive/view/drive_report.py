@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from foredrive.data.logs import LogPath
+from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path

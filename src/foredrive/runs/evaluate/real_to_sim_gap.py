@@ -17,13 +17,13 @@ from foredrive.evaluation.predictor import Prediction, Predictor
 from foredrive.evaluation.totals import COPIES, Figures
 from foredrive.metrics import psnr_db
 from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.runs.open_clips import open_clips
+from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.views import CameraView
 from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.open_clips import open_clips
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log, rebuilt_cameras
 from foredrive.runs.rebuild.reconstruct import read_material
 from foredrive.runs.train.run import Run, load_agent
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.views import CameraView
 from foredrive.scene import Clip, Example, VoxelGrid
 
 GAP = "gap.json"

@@ -18,7 +18,6 @@ from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
 from foredrive.files import atomic_path
-from foredrive.runs.rebuild.calibration_check import calibration_doubts
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
 from foredrive.rendering.initial import initial_scene
@@ -29,6 +28,7 @@ from foredrive.rendering.tracks import Tracks, read_tracks
 from foredrive.rendering.unseen_ground import add_unseen_ground
 from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.runs.rebuild.calibration_check import calibration_doubts
 from foredrive.scene import Clip
 from foredrive.sensors.measured_lidar import measure_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
