@@ -19,7 +19,7 @@ from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import Driven, DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
-from foredrive.runs.train.run import find_all_logs, train_run
+from foredrive.runs.train.run import train_run
 from foredrive.towns.campaign import Campaign, plan_drives
 
 WORK = work_folder(Path("runs/drive_nemo"))

@@ -10,7 +10,8 @@ import numpy as np
 
 from benchmarks.common.traffic_audit import Audit
 from foredrive.evaluation import Benchmark
-from foredrive.towns.map.town_map import TOWNS, load_town_map
+from foredrive.towns.map.names import TOWNS
+from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.expert import Drive
 from foredrive.towns.traffic.traffic import Traffic
 

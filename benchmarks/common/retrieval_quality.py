@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.data.setting import Place
 from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
 from foredrive.runs.search.sector_views import LogViews, Row

@@ -7,7 +7,8 @@ import pytest
 
 from benchmarks.common.traffic_audit import Audit
 from foredrive.scene import Category
-from foredrive.towns.map.town_map import TOWNS, TownMap
+from foredrive.towns.map.names import TOWNS
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.expert import Drive
 from foredrive.towns.traffic.traffic import Traffic
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from torch._utils import ExceptionWrapper
 
+import foredrive
 from foredrive.cli import main as program
 from foredrive.cli.main import main
 from foredrive.errors import InputError
@@ -151,7 +152,7 @@ def test_an_unknown_verb_is_told_the_known_ones(capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize("verb", list(program.VERBS))
 def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main([verb, "--help"])
+        main([*verb.split(), "--help"])
     assert ended.value.code == 0
     said = capsys.readouterr().out
     function = program.VERBS[verb]
@@ -177,29 +178,99 @@ def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
     [
         (["view", "{tmp}/none", "--save", "{tmp}/x.png"], "{tmp}/none: no such folder"),
         (["view", "{tmp}", "--save", "{tmp}/x.png"], "{tmp}: no 123D log here"),
-        (["train", "nemo_huge", "--logs", "{tmp}", "--out", "{tmp}/run"], "there are: nemo_tiny, "),
         (["train", "nemo_tiny", "--logs", "{tmp}/none", "--out", "{tmp}/run"], "{tmp}/none: no such folder"),
         (["record", "--town", "Town9", "--out", "{tmp}/out"], "one of Town01, Town02, Town03"),
         (["evaluate", "{tmp}"], "{tmp}: not a run folder"),
         (["imagine", "{tmp}", "{tmp}", "--out", "{tmp}/x.avi"], "{tmp}/x.avi: videos end on .mp4"),
         (["convert", "pandaset", "{tmp}/none", "--out", "{tmp}/out"], "{tmp}/none: no such folder"),
+        (
+            ["convert", "kitti-object", "{tmp}", "--out", "{file}"],
+            "--out {file}: there is a file of that name",
+        ),
+        (["reconstruct", "{tmp}", "--out", "{file}"], "--out {file}: there is a file of that name"),
         (["convert", "lyft", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
     ],
 )
 def test_each_verb_names_what_it_cannot_use(
     args: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([a.format(tmp=tmp_path) for a in args]) == 2
+    file = Path(__file__)
+    assert main([a.format(tmp=tmp_path, file=file) for a in args]) == 2
     err = capsys.readouterr().err
     assert err.startswith("foredrive: ")
     assert err.count("\n") == 1
-    assert said.format(tmp=tmp_path) in err
+    assert said.format(tmp=tmp_path, file=file) in err
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
-HEAVY = {"torch", "ray", "py123d", "numba", "matplotlib", "torchmetrics", "lightning_fabric", "transformers"}
+RECORD, RENDER = "record --town Town01 --out {tmp}/out", "render {tmp} --out {tmp}/x.webp"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (f"{RECORD} --image-size 0 0", "--image-size is 0 0: sides are 1 to 16384 px"),
+        (f"{RECORD} --image-size -4 256", "--image-size is -4 256: sides are 1 to 16384 px"),
+        (f"{RECORD} --seed -1", "--seed is -1: a number of 0 or more is needed"),
+        (f"{RECORD} --seconds nan", "--seconds is nan: a number above 0 is needed"),
+        (f"{RECORD} --workers -2", "--workers is -2: a number of 0 or more is needed"),
+        (f"{RECORD} --conditions none rain", "--conditions none stands alone, got none rain"),
+        (f"{RECORD} --conditions hail", "no conditions are named hail; there are clear, morning,"),
+        ("reconstruct {tmp} --out {tmp}/out --image-size 0 0", "--image-size is 0 0: sides are"),
+        ("view {tmp} --reach inf", "--reach is inf: a number above 0 is needed"),
+        ("view {tmp} --reach -5", "--reach is -5: a number above 0 is needed"),
+        ("view {tmp} --t nan", "--t is nan: a finite number is needed"),
+        (f"{RENDER} --shift-left nan", "--shift-left is nan: a number from -100 to 100 is needed"),
+        (f"{RENDER} --shift-left 1e30", "--shift-left is 1e+30: a number from -100 to 100 is needed"),
+        (f"{RENDER} --rate-hz 0", "--rate-hz is 0: a number above 0 is needed"),
+        ("search rain --before -5 --after -9", "--before is -5: a number of 0 or more is needed"),
+        ("search rain --before 0 --after 0", "--before and --after are 0: such a clip is empty"),
+        ("drive --agent stop --out {tmp}/out --period 0", "--period is 0: a number above 0 is needed"),
+        ("drive --agent stop --out {tmp}/out --image-size 0 9", "--image-size is 0 9: sides are"),
+    ],
+)
+def test_numbers_that_there_cannot_be_are_refused(
+    line: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.format(tmp=tmp_path).split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"foredrive: {said}")
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"foredrive {foredrive.__version__}\n"
+
+
+def test_verbs_of_search_have_one_spelling(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["search-index", "logs"])
+    assert ended.value.code == 2
+    assert "Unrecognized options: search-index" in capsys.readouterr().err
+
+
+def test_an_unknown_recipe_is_told_the_known_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "sync.arrow").touch()  # looks like a log
+    assert main(["train", "nemo_huge", "--logs", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
+    assert "there are: nemo_tiny, " in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+HEAVY = {
+    "torch",
+    "ray",
+    "py123d.datatypes",
+    "numba",
+    "scipy",
+    "matplotlib",
+    "torchmetrics",
+    "lightning_fabric",
+    "transformers",
+}
 """What takes long to import."""
-LOGS = {"torch", "ray", "py123d", "numba"}  # py123d brings Ray along
+LOGS = {"torch", "py123d.datatypes", "numba", "scipy"}  # py123d.api would bring Ray along
 
 
 def heavy_after(*steps: str) -> list[set[str]]:
@@ -207,11 +278,11 @@ def heavy_after(*steps: str) -> list[set[str]]:
     told = f"\nprint(*({HEAVY} & set(sys.modules)), file=sys.stderr)\n"
     code = "import sys\n" + told.join([*steps, ""])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return [set(line.split()) for line in done.stderr.splitlines()]
+    return [set(line.split()) for line in done.stderr.splitlines() if not line.startswith("foredrive: ")]
 
 
 def test_help_waits_for_nothing_heavy() -> None:
-    commands = [["--help"], *([verb, "--help"] for verb in program.VERBS)]
+    commands = [["--help"], ["--version"], *([*verb.split(), "--help"] for verb in program.VERBS)]
     helped = "from foredrive.cli.main import main\n" + "\n".join(
         f"try:\n    main({command})\nexcept SystemExit:\n    pass" for command in commands
     )
@@ -219,18 +290,40 @@ def test_help_waits_for_nothing_heavy() -> None:
 
 
 def test_verbs_wait_for_nothing_they_do_not_use() -> None:
-    bench, convert, record, view, evaluate = heavy_after(
+    bench, convert, record, view, recipes, evaluate = heavy_after(
         "import foredrive.evaluation.bench",
         "import foredrive.data.convert",
         "import foredrive.runs.drive.recording",
         "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_times",
+        "import foredrive.recipes.known",
         "import foredrive.runs.evaluate.run, foredrive.view.run_report",
     )
     assert bench == {"torch"}
     assert convert <= LOGS
     assert record <= LOGS
     assert view <= LOGS | {"matplotlib"}
-    assert "lightning_fabric" not in evaluate
+    assert not {"ray", "transformers", "lightning_fabric"} & recipes
+    assert not {"ray", "transformers", "lightning_fabric"} & evaluate
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "view {tmp}/none",
+        "train nemo_tiny --logs {tmp}/none --out {tmp}/run",
+        "evaluate {tmp}/none",
+        "reconstruct {tmp}/none --out {tmp}/run",
+        "drive --agent stop --in {tmp}/none --out {tmp}/run",
+        "search rain --index {tmp}/none",
+        "search index {tmp}/none",
+        "convert pandaset {tmp}/none --out {tmp}/out",
+        "record --town Town9 --out {tmp}/out",
+        "score {tmp}/none --truth {tmp}/none",
+    ],
+)
+def test_a_wrong_argument_is_told_before_anything_heavy_is_imported(line: str, tmp_path: Path) -> None:
+    args = line.format(tmp=tmp_path).split()
+    assert heavy_after(f"from foredrive.cli.main import main\nassert main({args}) == 2")[-1] == set()
 
 
 def test_it_runs_as_a_module_and_passes_its_exit_code_on(tmp_path: Path) -> None:

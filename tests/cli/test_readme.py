@@ -32,4 +32,4 @@ def test_a_command_is_understood(command: str, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(program, "VERBS", {name: only_called(name) for name in program.VERBS})
     assert program.main(shlex.split(command)) == 0
     verb, then = shlex.split(command)[:2]
-    assert called == [f"{verb}-{then}" if f"{verb}-{then}" in program.VERBS else verb]
+    assert called == [f"{verb} {then}" if f"{verb} {then}" in program.VERBS else verb]

@@ -12,8 +12,9 @@ from arrow_surgery import rewrite_column, rewrite_metadata
 from py123d.datatypes.detections.box_detection_label import BOX_DETECTION_LABEL_REGISTRY
 
 from foredrive.data.boxes import category_of, read_boxes
+from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.log_writer import LABEL_OF_CATEGORY
-from foredrive.data.logs import Log, LogPath, find_logs
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.scene import Category
 

@@ -10,7 +10,8 @@ from arrow_surgery import rewrite_column
 
 from foredrive.data.labels import BOX_MARGIN_M, LabelStore, VoxelLabels, make_labels, voxel_labels
 from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log, find_logs
+from foredrive.data.log_paths import find_logs
+from foredrive.data.logs import Log
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
 SPEC = VoxelSpec((-20.0, -10.0, -0.75), 0.5, (8, 40, 80))

@@ -12,8 +12,9 @@ from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
 from py123d.datatypes import LidarID
 
 from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.log_paths import find_logs
 from foredrive.data.log_writer import Frame, FullOccupancy, LogWriter
-from foredrive.data.logs import Log, find_logs
+from foredrive.data.logs import Log
 from foredrive.data.modalities import occupancy_metadata, pack_occupancy, unpack_beams, unpack_occupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec

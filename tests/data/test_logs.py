@@ -10,7 +10,8 @@ import synthetic_log as world
 import torch
 from arrow_surgery import rewrite_column
 
-from foredrive.data.logs import Log, LogPath, find_logs
+from foredrive.data.log_paths import LogPath, find_logs
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 
 

@@ -14,8 +14,9 @@ from py123d.datatypes import (
     TrafficLightStatus,
 )
 
+from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import FullOccupancy, LogWriter
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.logs import Log
 from foredrive.data.recorded import (
     read_caption,
     read_occupancy,

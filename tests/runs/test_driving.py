@@ -12,7 +12,7 @@ import torch
 
 from foredrive.cli.main import main
 from foredrive.data.clips import ClipConfig, ClipDataset
-from foredrive.data.logs import LogPath, find_logs
+from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.runs.drive.agents import needs_of

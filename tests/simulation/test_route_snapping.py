@@ -19,7 +19,8 @@ from foredrive.simulation.route_sets import (
 )
 from foredrive.simulation.routes import DriveRoute, RouteOption, route_line, snap_route
 from foredrive.simulation.training_routes import KINDS
-from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, load_town_map
+from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 
 XML = """<?xml version='1.0'?>

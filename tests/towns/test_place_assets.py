@@ -5,7 +5,8 @@ import pytest
 
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
-from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, TownMap
+from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.actor_looks import MeshLooks
 from foredrive.towns.place.actor_meshes import PEOPLE, SHAPES_OF_KIND, VEHICLES
 from foredrive.towns.place.assets import AssetSet, asset_set_of, assets_of

@@ -18,8 +18,9 @@ from py123d.geometry import Point2D
 from foredrive.data import ClipConfig, ClipDataset, find_logs
 from foredrive.data.boxes import read_boxes
 from foredrive.data.labels import make_labels
+from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_caption, read_setting, read_traffic_lights, read_visibility
 from foredrive.data.recorded_labels import recorded_labels

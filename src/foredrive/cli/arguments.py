@@ -1,10 +1,84 @@
-"""Kinds of arguments that several verbs take."""
+"""Kinds of arguments that several verbs take, and checks that need nothing heavy imported."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from foredrive.errors import InputError
+
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 SomePaths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]")]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE [KEY=VALUE ...]")]
+ImageSize = Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")]
+
+Number = float | int
+
+RUN_CONFIG = "config.yaml"
+"""What folders of runs have, and those of logs do not."""
+LARGEST_IMAGE_PX = 16_384
+
+
+def check_number(
+    flag: str,
+    value: Number | None,
+    *,
+    above: Number | None = None,
+    low: Number | None = None,
+    high: Number = math.inf,
+) -> None:
+    """Check a flag's number; None, where it was left out, is in order.
+
+    Args:
+        flag: as the command line has it.
+        value: what was given.
+        above: the number is larger than this.
+        low: the number is at least this.
+        high: the number is at most this.
+
+    Raises:
+        InputError: it is outside of the range, infinite or not a number.
+    """
+    if value is None:
+        return
+    wanted = "a finite number"
+    if above is not None:
+        wanted = f"a number above {above:g}"
+    elif low is not None and high < math.inf:
+        wanted = f"a number from {low:g} to {high:g}"
+    elif low is not None:
+        wanted = f"a number of {low:g} or more"
+    fits = (above is None or value > above) and (low is None or value >= low) and value <= high
+    if not (math.isfinite(value) and fits):
+        raise InputError(f"{flag} is {value:g}: {wanted} is needed")
+
+
+def check_image_size(size: tuple[int, int] | None) -> None:
+    """Check --image-size. Raises `InputError` where there can be no such image."""
+    if size is not None and not all(0 < side <= LARGEST_IMAGE_PX for side in size):
+        raise InputError(f"--image-size is {size[0]} {size[1]}: sides are 1 to {LARGEST_IMAGE_PX} px")
+
+
+def check_out_folder(folder: Path | None) -> None:
+    """Check that --out can be a folder. Raises `InputError` where it is a file."""
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: there is a file of that name; a folder is needed")
+
+
+def check_run(folder: Path) -> None:
+    """Check that a folder holds a run. Raises `InputError` where it does not."""
+    if not (folder / RUN_CONFIG).is_file():
+        raise InputError(f"{folder}: not a run folder (no {RUN_CONFIG})")
+
+
+def check_rebuilt(folder: Path) -> None:
+    """Check that a folder holds a reconstruction. Raises `InputError` where it does not."""
+    if not (folder / RUN_CONFIG).is_file():
+        raise InputError(f"{folder}: not the folder of a reconstruction (no {RUN_CONFIG})")
+
+
+def check_file(path: Path | None) -> None:
+    """Check that there is a file to be read. Raises `InputError` where there is none."""
+    if path is not None and not path.is_file():
+        raise InputError(f"{path}: no such file")

@@ -5,6 +5,9 @@ from typing import Annotated
 
 import tyro
 
+from foredrive.cli.arguments import check_out_folder
+from foredrive.errors import InputError
+
 
 def convert(
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")],
@@ -19,6 +22,10 @@ def convert(
         source: Folder of one raw log, or of many.
         out: 123D data root to write to.
     """
+    check_out_folder(out)
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder")
+
     from foredrive.data.convert import convert as convert_logs
 
     for log in convert_logs(source, dataset, out):

@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, check_out_folder
 
 EXAMPLES, QUICK_EXAMPLES = 4, 1
 
@@ -16,6 +16,8 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
             demo has finished is not done again.
         quick: Hardly any data or training: shows in about a minute that everything works.
     """
+    check_out_folder(out)
+
     from rich.console import Console
 
     from foredrive.evaluation import read_summary

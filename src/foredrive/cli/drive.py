@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from foredrive.cli.arguments import check_out_folder
 from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
 from foredrive.errors import InputError
 
@@ -35,6 +36,9 @@ def drive(
             pupil:RUN, a run and the expert by turns.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
+    check_out_folder(out)
+    for options in (planning, towns, rebuilt):
+        options.check()
     driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     in_log = rebuilt.suite(driver, planning)
     if in_log is not None:

@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import (
+    ImageSize,
+    OptionalPath,
+    check_file,
+    check_image_size,
+    check_number,
+    check_rebuilt,
+)
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,6 +34,11 @@ class Planning:
     sensors: bool = True
     period: Annotated[float, tyro.conf.arg(metavar="S")] = 0.5
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1
+
+    def check(self) -> None:
+        """Raises `InputError` for times that there cannot be."""
+        check_number("--period", self.period, above=0)
+        check_number("--latency", self.latency, low=0)
 
 
 @dataclass(frozen=True)
@@ -52,12 +64,21 @@ class InTowns:
     repetitions: int = 1
     seed: int = 0
     conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256)
+    image_size: ImageSize = (144, 256)
     vehicles: int = 30
     people: int = 20
     scenarios: bool = True
     workers: int = 0
     ray: bool = False
+
+    def check(self) -> None:
+        """Raises `InputError` for numbers that there cannot be."""
+        check_number("--repetitions", self.repetitions, low=1)
+        check_number("--seed", self.seed, low=0)
+        check_image_size(self.image_size)
+        check_number("--vehicles", self.vehicles, low=0)
+        check_number("--people", self.people, low=0)
+        check_number("--workers", self.workers, low=0)
 
     def suite(self, driver: str, planning: Planning) -> "DriveSuite":
         """The drives that are asked for."""
@@ -95,6 +116,14 @@ class InRebuilt:
     start: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = ()
     threat: tuple[Literal["stationary", "frontal", "side"], ...] = ()
     edits: OptionalPath = None
+
+    def check(self) -> None:
+        """Raises `InputError` for files that are not there, and times that there cannot be."""
+        if self.rebuilt is not None:
+            check_rebuilt(self.rebuilt)
+        for start in self.start:
+            check_number("--start", start)
+        check_file(self.edits)
 
     def suite(self, driver: str, planning: Planning) -> "RebuiltSuite | None":
         """The drives that are asked for, if they are in a rebuilt log.

@@ -5,7 +5,15 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.arguments import (
+    OptionalPath,
+    SomePaths,
+    check_number,
+    check_out_folder,
+    check_rebuilt,
+    check_run,
+)
+from foredrive.data.log_paths import find_all_logs
 
 
 def evaluate(
@@ -30,19 +38,25 @@ def evaluate(
         batch_size: Clips judged at once.
         rebuilt: Folder of a reconstruction whose log is still there; writes gap.json.
     """
+    check_run(run)
+    check_number("--examples", examples, low=0)
+    check_out_folder(out)
     if rebuilt is not None:
+        check_rebuilt(rebuilt)
         _evaluate_gap(run, rebuilt, out or run)
         return
+    named = find_all_logs(logs)
+
     from rich.console import Console
 
     from foredrive.evaluation import read_summary
-    from foredrive.runs import evaluate_run, find_all_logs, inspect_run, open_run
+    from foredrive.runs import evaluate_run, inspect_run, open_run
     from foredrive.view.report import write_report
     from foredrive.view.run_report import report_on_run
     from foredrive.view.summary_tables import print_summary
 
     trained = open_run(run)
-    chosen = find_all_logs(logs) if logs else trained.logs
+    chosen = named or trained.logs
     folder = out or run
     result = evaluate_run(trained, chosen, folder, batch_size)
     summary = read_summary(folder / "summary.json")

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.arguments import OptionalPath, SomePaths, check_number, check_out_folder, check_run
+from foredrive.data.log_paths import find_all_logs
 
 
 def export(
@@ -23,12 +24,17 @@ def export(
         logs: 123D logs, splits or data roots to compare on; by default those it was trained on.
         clips: How many clips are compared.
     """
-    from foredrive.runs import find_all_logs, open_run
+    check_run(run)
+    check_number("--clips", clips, low=1)
+    check_out_folder(out)
+    named = find_all_logs(logs)
+
+    from foredrive.runs import open_run
     from foredrive.runs.export import export_run
 
     trained = open_run(run)
     folder = out or run / "export"
-    facts = export_run(trained, find_all_logs(logs) if logs else trained.logs, folder, clips)
+    facts = export_run(trained, named or trained.logs, folder, clips)
     for name, latency in facts["latency_ms"].items():
         print(f"{name}: {latency['median']:.1f} ms a clip (90 % below {latency['p90']:.1f} ms)")
         for output, difference in facts["largest_difference"].get(name, {}).items():

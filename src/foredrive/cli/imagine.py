@@ -5,6 +5,9 @@ from typing import Annotated
 
 import tyro
 
+from foredrive.cli.arguments import check_number, check_run
+from foredrive.data.log_paths import find_one_log
+
 
 def imagine(
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
@@ -26,18 +29,20 @@ def imagine(
         samples: How many futures are drawn from a model that knows chance; one that does not has one.
         moments: From how many times of the log.
     """
-    from foredrive.data import find_logs
-    from foredrive.errors import InputError
-    from foredrive.runs import open_run
-    from foredrive.runs.evaluate.imagination import imagine_run
-    from foredrive.view.imagination_video import write_imagination_video
     from foredrive.view.video import check_video
 
     check_video(out)
-    logs = find_logs(log)
-    if len(logs) > 1:
-        raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
+    check_number("--seconds", seconds, above=0)
+    check_number("--samples", samples, low=1)
+    check_number("--moments", moments, low=1)
+    found = find_one_log(log)
+    check_run(run)
+
+    from foredrive.runs import open_run
+    from foredrive.runs.evaluate.imagination import imagine_run
+    from foredrive.view.imagination_video import write_imagination_video
+
     opened = open_run(run)
-    seen = imagine_run(opened, logs[0], seconds=seconds, samples=samples, moments=moments)
+    seen = imagine_run(opened, found, seconds=seconds, samples=samples, moments=moments)
     count = write_imagination_video(out, seen, opened.recipe.clips.frame_dt_s)
     print(f"wrote {out}: {count} frames of {opened.recipe.clips.frame_dt_s:g} s")

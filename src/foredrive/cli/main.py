@@ -9,6 +9,7 @@ from typing import Any
 
 import tyro
 
+import foredrive
 from foredrive.cli.bench import bench
 from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
@@ -40,11 +41,11 @@ VERBS: dict[str, Callable[..., Any]] = {
     "drive": drive,
     "score": score,
     "search": search,
-    "search-index": search_index,
-    "search-page": search_page,
-    "search-train": search_train,
-    "search-caption": search_caption,
-    "search-train-captions": search_train_captions,
+    "search index": search_index,
+    "search page": search_page,
+    "search train": search_train,
+    "search caption": search_caption,
+    "search train-captions": search_train_captions,
     "reconstruct": reconstruct,
     "render": render,
     "imagine": imagine,
@@ -53,7 +54,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "bench": bench,
 }
 DESCRIPTION = (
-    "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly."
+    "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly. "
+    "--version says which version this is."
 )
 # OpenMP threads that spin while they wait would take the cores from kernels and data workers.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -82,8 +84,11 @@ def main(args: Sequence[str] | None = None) -> int:
     in SystemExit(2), `--help` in SystemExit(0).
     """
     args = sys.argv[1:] if args is None else list(args)
-    if "-".join(args[:2]) in VERBS:  # such as `search index`
-        args = ["-".join(args[:2]), *args[2:]]
+    if args == ["--version"]:
+        print(f"foredrive {foredrive.__version__}")
+        return 0
+    if " ".join(args[:2]) in VERBS:  # such as `search index`
+        args = [" ".join(args[:2]), *args[2:]]
     interrupt = LastingInterrupt()
     try:
         with interrupt:

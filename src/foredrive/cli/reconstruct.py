@@ -1,11 +1,13 @@
 """`foredrive reconstruct`."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, Settings
+from foredrive.cli.arguments import ImageSize, OptionalPath, Settings, check_image_size, check_out_folder
+from foredrive.data.log_paths import find_one_log
 
 
 def reconstruct(
@@ -14,7 +16,7 @@ def reconstruct(
     method: Literal["gaussians"] = "gaussians",
     recipe: str = "gaussians_tiny",
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
-    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None,
+    image_size: ImageSize | None = None,
     cache: OptionalPath = None,
     set: Settings = (),  # noqa: A002: the flag's name
 ) -> None:
@@ -36,27 +38,26 @@ def reconstruct(
         set: Entries of the recipe to replace, such as schedule.steps=2000; `foredrive recipes RECIPE` prints
             them all.
     """
-    import dataclasses
+    check_image_size(image_size)
+    check_out_folder(out)
+    found = find_one_log(log)
 
-    from foredrive.data import find_logs
-    from foredrive.errors import InputError
     from foredrive.recipes.gaussians import find_rebuild_recipe
     from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
     from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
-    logs = find_logs(log)
-    if len(logs) > 1:
-        raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
     chosen = find_rebuild_recipe(recipe, set)
     if cameras:
         chosen = dataclasses.replace(chosen, cameras=cameras)
     if image_size is not None:
         chosen = dataclasses.replace(chosen, image_hw=image_size)
-    run = rebuild_log(chosen, logs[0], out, cache)
+    run = rebuild_log(chosen, found, out, cache)
     if run.held_out.cameras:
-        title = f"{logs[0].name}, frames that were held out"
+        title = f"{found.name}, frames that were held out"
         write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
-    print(f"rebuilt {logs[0].name} by {method}: {out}")
+    if not run.held_out.cameras and not run.held_out.sweeps:
+        print(f"{found.name} is too short for a frame to be held out: the scene is judged on nothing")
+    print(f"rebuilt {found.name} by {method}: {out}")
     for name in (
         *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),
         *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder
 from foredrive.errors import InputError
+from foredrive.towns.map.names import check_town
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 SHEET = "contact_sheet.png"
 FAILURES_SHOWN = 3
+NO_CONDITIONS = "none"
 Range = Annotated[str, tyro.conf.arg(metavar="N|FIRST..LAST")]
 
 
@@ -29,7 +32,7 @@ def record(
     seed: int = 0,
     seeds: Annotated[str | None, tyro.conf.arg(metavar="N|FIRST..LAST")] = None,
     rate: Annotated[float, tyro.conf.arg(metavar="HZ")] = 10.0,
-    image_size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (144, 256),
+    image_size: ImageSize = (144, 256),
     vehicles: Range = "30",
     people: Range = "20",
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
@@ -57,15 +60,27 @@ def record(
         workers: How many drives are recorded at a time; 0 is one for each core.
         ray: Record on Ray: on the cluster at RAY_ADDRESS, or on one started here.
     """
+    check_number("--seconds", seconds, above=0)
+    check_number("--seed", seed, low=0)
+    check_number("--rate", rate, above=0)
+    check_image_size(image_size)
+    check_number("--workers", workers, low=0)
+    check_out_folder(out)
+    between = _range("vehicles", vehicles), _range("people", people)
+    some_seeds = (seed,) if seeds is None else _seeds(seeds)
+    weather = _conditions(conditions)
+    for name in town:
+        check_town(name)
+
     from foredrive.runs.drive.recording import record_drives, record_plan
     from foredrive.towns.campaign import Campaign, plan_drives
 
     campaign = Campaign(
         towns=town,
-        seeds=(seed,) if seeds is None else _seeds(seeds),
-        conditions=conditions,
-        vehicles=_range("vehicles", vehicles),
-        people=_range("people", people),
+        seeds=some_seeds,
+        conditions=weather,
+        vehicles=between[0],
+        people=between[1],
         seconds=seconds,
         rate_hz=rate,
     )
@@ -119,6 +134,19 @@ def _seeds(text: str) -> tuple[int, ...] | int:
     """A range of seeds, or how many."""
     first, last = _range("seeds", text)
     return tuple(range(first, last + 1)) if ".." in text else first
+
+
+def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names of conditions, checked; "none" stands for none at all."""
+    from foredrive.towns.conditions import ANY_CONDITIONS, find_conditions
+
+    if names in ((NO_CONDITIONS,), (ANY_CONDITIONS,)):
+        return () if names == (NO_CONDITIONS,) else names
+    for name in names:
+        if name in (NO_CONDITIONS, ANY_CONDITIONS):
+            raise InputError(f"--conditions {name} stands alone, got {' '.join(names)}")
+        find_conditions(name)
+    return names
 
 
 def _range(what: str, text: str) -> tuple[int, int]:

@@ -5,7 +5,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, check_file, check_number, check_rebuilt
+
+LARGEST_SHIFT_M = 100.0
 
 
 def render(
@@ -42,14 +44,22 @@ def render(
         seconds: Length of the film, s; by default until the log's end.
         rate_hz: Frames a second, shown in real time; by default as many as the log has.
     """
+    from foredrive.view.video import check_video
+
+    check_video(out)
+    check_number("--shift-left", shift_left, low=-LARGEST_SHIFT_M, high=LARGEST_SHIFT_M)
+    check_number("--start", start)
+    check_number("--seconds", seconds, above=0)
+    check_number("--rate-hz", rate_hz, above=0)
+    check_file(edits)
+    check_rebuilt(run)
+
     from foredrive.rendering.edits import load_edits
     from foredrive.rendering.edits import save_edits as write_edits
     from foredrive.runs.rebuild.film import edits_from_words, plan_shooting
     from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
     from foredrive.view.rebuilt_video import write_rebuilt_video
-    from foredrive.view.video import check_video
 
-    check_video(out)
     opened = open_rebuilt(run)
     shooting = plan_shooting(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
     known = [] if edits is None else load_edits(edits)

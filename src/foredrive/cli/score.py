@@ -1,11 +1,12 @@
 """`foredrive score`."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,7 +37,13 @@ def score(
         k: Best associations that are listed where there are too many to be summed.
         worst: How many of the frames that lost most likelihood the report draws.
     """
-    import time
+    for path in (results, truth, *(() if against is None else (against,))):
+        if not path.exists():
+            raise InputError(f"{path}: No such file or directory")
+    check_number("--k", k, low=1)
+    check_out_folder(out)
+    if worst < 0:
+        raise InputError(f"--worst is {worst}: a number of frames is not below 0")
 
     from rich.console import Console
 
@@ -45,8 +52,6 @@ def score(
     from foredrive.view.score_report import score_table, write_score_report
     from foredrive.view.table import print_table
 
-    if worst < 0:
-        raise InputError(f"--worst is {worst}: a number of frames is not below 0")
     started = time.perf_counter()
     read = read_detections(results, truth, family)
     scores = _scored(read, k, results)

@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from foredrive.cli.search_options import Among, Choose, LookFor, Name, Place, Then, as_query
+from foredrive.cli.arguments import check_number
+from foredrive.cli.search_options import Among, Choose, LookFor, Name, Place, Then, as_query, check_index
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,17 +36,22 @@ def search(
         saved: Ask the query that was kept under this name, whatever else says what to look for.
         untag: Take this tag away from whatever has it; nothing is looked for.
     """
+    hits.check()
+    check_index(index)
+    asked = as_query(query, condition, ranking) if saved is None and untag is None else None
+
     from foredrive.runs.search.searching import ask
     from foredrive.search.index import FrameIndex
     from foredrive.search.kept import remove_tag
 
-    hits.check()
     opened = FrameIndex(index)
     if untag is not None:
         remove_tag(index, untag)
         print(f"nothing is tagged {untag} any more")
         return
-    asked = as_query(query, condition, ranking) if saved is None else _saved(index, saved)
+    if saved is not None:
+        asked = _saved(index, saved)
+    assert asked is not None
     found = ask(opened, asked, towers, ensemble=not query.plain)
     _tell(opened, found)
     hits.do(index, asked, found)
@@ -60,6 +66,9 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
         host: Where the page is served; other machines see it at 0.0.0.0.
         port: The page's port.
     """
+    check_number("--port", port, low=1, high=65535)
+    check_index(index)
+
     from foredrive.search.index import FrameIndex
     from foredrive.view.search_page import SearchPage
 

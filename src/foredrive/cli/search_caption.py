@@ -5,9 +5,10 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import SomePaths
+from foredrive.cli.arguments import SomePaths, check_number, check_out_folder
 from foredrive.cli.search import INDEX
-from foredrive.cli.search_options import Name, Place
+from foredrive.cli.search_options import Name, Place, check_index
+from foredrive.data.log_paths import find_all_logs
 
 
 def search_caption(
@@ -23,6 +24,9 @@ def search_caption(
         index: The index that knows the log by name, and by default the towers.
         towers: The folder of other towers, for which captions were trained; LOG is a folder then.
     """
+    if towers is None:
+        check_index(index)
+
     from rich.console import Console
 
     from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
@@ -59,9 +63,14 @@ def search_train_captions(
         epochs: How often it looks at each.
         seed: Of weights and of the order of data.
     """
-    from foredrive.runs import find_all_logs
+    check_number("--stride", stride, above=0)
+    check_number("--epochs", epochs, low=1)
+    check_number("--seed", seed, low=0)
+    check_out_folder(out)
+    found = find_all_logs(logs)
+
     from foredrive.runs.search.captioning import train_captions
     from foredrive.training import Schedule
 
     schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)
-    print(f"wrote {train_captions(find_all_logs(logs), towers, out, schedule, stride)}")
+    print(f"wrote {train_captions(found, towers, out, schedule, stride)}")

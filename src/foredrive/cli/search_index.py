@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, SomePaths
+from foredrive.cli.arguments import OptionalPath, SomePaths, check_file, check_number, check_out_folder
 from foredrive.cli.search import INDEX
 from foredrive.cli.search_options import Place, Seconds
+from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,11 +44,14 @@ def search_index(
         scores: Per-frame scores of detections, one JSON object a line (docs/search.md); moments that are in
             the index are given them too.
     """
-    from foredrive.runs import find_all_logs
+    check_number("--stride", stride, above=0)
+    check_number("--workers", workers, low=0)
+    check_file(scores)
+    found = find_all_logs(logs)
+
     from foredrive.runs.search.indexing import index_logs
     from foredrive.search.scores import read_scores
 
-    found = find_all_logs(logs)
     told = None if scores is None else read_scores(scores)
     with _progress() as tick:
         cores = len(os.sched_getaffinity(0))
@@ -80,11 +84,16 @@ def search_train(
         lidar_steps: Steps of the lidar tower; by default 10 epochs.
         seed: Of weights and of the order of data.
     """
-    from foredrive.runs import find_all_logs
+    check_number("--image-steps", image_steps, low=1)
+    check_number("--lidar-steps", lidar_steps, low=1)
+    check_number("--seed", seed, low=0)
+    check_out_folder(out)
+    found = find_all_logs(logs)
+
     from foredrive.runs.search.tower_training import embedded_recipe, train_towers
 
     recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
-    towers = train_towers(recipe, find_all_logs(logs), out, cache, beside)
+    towers = train_towers(recipe, found, out, cache, beside)
     print(f"next: foredrive search index LOGS --towers {towers}")
 
 

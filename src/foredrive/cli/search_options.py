@@ -1,11 +1,13 @@
 """What `foredrive search` is asked for, and what comes of its hits, in groups of options."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import OptionalPath, check_number
+from foredrive.errors import InputError
 
 if TYPE_CHECKING:
     from foredrive.search.find import Found
@@ -15,6 +17,12 @@ Place = Annotated[str, tyro.conf.arg(metavar="PATH|URL")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 Seconds = Annotated[float, tyro.conf.arg(metavar="SECONDS")]
+
+
+def check_index(place: str) -> None:
+    """Check that there may be an index. Raises `InputError` where a local folder is not there."""
+    if "://" not in place and not Path(place).is_dir():
+        raise InputError(f"{place}: no index here; foredrive search index LOGS --index {place} makes one")
 
 
 @dataclass(frozen=True)
@@ -102,10 +110,12 @@ class Then:
 
     def check(self) -> None:
         """Raises `InputError` for what cannot be written, before anything is looked for."""
-        from foredrive.view.search_sheet import check_sheet
-
-        if self.out is not None:
-            check_sheet(self.out)
+        check_number("--before", self.before, low=0)
+        check_number("--after", self.after, low=0)
+        if not self.before + self.after > 0:
+            raise InputError("--before and --after are 0: such a clip is empty")
+        if self.out is not None and self.out.suffix not in (".png", ".html"):
+            raise InputError(f"{self.out}: a contact sheet ends on .png or .html")
 
     def do(self, index: str, query: "Query", found: "Found") -> None:
         """Keep, tag and write."""

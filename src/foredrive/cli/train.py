@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, Settings, SomePaths
+from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run
+from foredrive.data.log_paths import find_all_logs
 
 
 def train(
@@ -30,10 +31,15 @@ def train(
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
             prints them all.
     """
+    check_out_folder(out)
+    if start is not None:
+        check_run(start)
+    found = find_all_logs(logs)
+
     from foredrive.recipes import find_recipe, labelled_by
-    from foredrive.runs import find_all_logs, train_run
+    from foredrive.runs import train_run
 
     chosen = labelled_by(find_recipe(recipe, set), occupancy)
-    run = train_run(chosen, find_all_logs(logs), out, cache, start)
+    run = train_run(chosen, found, out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

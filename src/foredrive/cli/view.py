@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath
+from foredrive.cli.arguments import RUN_CONFIG, OptionalPath, check_file, check_number, check_run
+from foredrive.data.log_paths import find_one_log
+from foredrive.errors import InputError
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
 
 EDITS = "edits.json"
-RUN_CONFIG = "config.yaml"
-"""What folders of runs have, and those of logs do not."""
 
 
 def view(
@@ -41,11 +41,10 @@ def view(
         host: Where the page is served; other machines see it at 0.0.0.0.
         port: The page's port; the next free one if it is taken.
     """
-    from foredrive.data import find_logs
-    from foredrive.errors import InputError
-    from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
-    from foredrive.view.log_times import LogTimes
-
+    check_number("--t", t)
+    check_number("--reach", reach, above=0)
+    check_number("--port", port, low=1, high=65535)
+    check_file(edits)
     if (log / RUN_CONFIG).is_file():
         if run is not None or save is not None:
             raise InputError(f"{log}: --run and --save are for logs; `foredrive render` films rebuilt ones")
@@ -53,12 +52,16 @@ def view(
         return
     if edits is not None:
         raise InputError(f"{log}: --edits are for the folder of a reconstruction")
-    logs = find_logs(log)
-    if len(logs) > 1:
-        raise InputError(f"{log}: holds {len(logs)} logs; name one, such as {logs[0].folder}")
+    found = find_one_log(log)
     if save is not None and run is not None:
         raise InputError("--save draws the log alone; leave out --run, or --save for the page")
-    times = LogTimes(logs[0], CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    if run is not None:
+        check_run(run)
+
+    from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
+    from foredrive.view.log_times import LogTimes
+
+    times = LogTimes(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
     index = times.nearest(t)
     if save is not None:
         title = f"{times.name}    t = {times.t_s[index]:.2f} s"

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,12 +30,14 @@ def reading(file: Path, what: str) -> Iterator[None]:
         if error.errno in _REFUSES_WRITING:
             raise
         raise InputError(_said(file, what, error)) from error
-    except (pa.ArrowException, ValueError, LookupError, AssertionError) as error:
+    except (pa.ArrowException, ValueError, LookupError, AssertionError, EOFError, zlib.error) as error:
         raise InputError(_said(file, what, error)) from error
 
 
 def _said(file: Path, what: str, error: Exception) -> str:
     reason = str(error).strip().splitlines()
+    if isinstance(error, KeyError):
+        reason = [f"{error} is unknown or missing"]
     return f"{file}: cannot read {what}: {reason[0] if reason else type(error).__name__}"
 
 

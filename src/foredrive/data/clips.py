@@ -16,7 +16,8 @@ from foredrive.data.commands import command_at, target_at
 from foredrive.data.image_store import ImageStore
 from foredrive.data.labels import LabelStore, VoxelLabels
 from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_taught_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels

@@ -14,7 +14,7 @@ from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 from foredrive.data.arrow_files import reading
 from foredrive.data.av2_partial import Av2PartialParser
 from foredrive.data.kitti_object import KittiObjectParser
-from foredrive.data.logs import LogPath
+from foredrive.data.log_paths import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.data.pandaset import PandasetLogParser
 from foredrive.errors import InputError

@@ -12,7 +12,8 @@ from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.image_store import ImageStore
 from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import log_so3

@@ -1,8 +1,6 @@
-"""Finding 123D logs and opening one: its key times, ego poses and what it holds."""
+"""An opened 123D log: its key times, ego poses and what it holds."""
 
 import functools
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,77 +12,13 @@ from py123d.datatypes import EgoStateSE3Metadata, ModalityType
 from scipy.spatial.transform import Rotation, Slerp
 
 from foredrive.data.arrow_files import check_whole, column_array, fixed_lists, pose_matrices, reading
-from foredrive.data.clip_list import read_clip_list
+from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.scene import Trajectory
 
 _EGO = ModalityType.EGO_STATE_SE3.serialize()
-_SEARCH_DEPTH = 3
 _LONGEST_GAP_S = 1.0
 """Ego poses further apart than this are not interpolated between."""
-
-
-@dataclass(frozen=True)
-class LogPath:
-    """Where a log lies, and the folder of the maps that go with it (it may not exist)."""
-
-    folder: Path
-    maps_dir: Path
-    parts_s: tuple[tuple[float, float], ...] = ()
-    """Which parts of it are meant, s since its start, ends left out; none: all of it."""
-
-    @property
-    def name(self) -> str:
-        """split/name: unique within a data root."""
-        return f"{self.folder.parent.name}/{self.folder.name}"
-
-
-def find_logs(path: Path) -> list[LogPath]:
-    """All 123D logs at `path`: a data root (with logs/SPLIT/NAME), a split's folder, one log's folder, or a
-    list of clips (`clip_list`), whose logs come with the parts that it names.
-
-    Raises:
-        InputError: if there is none.
-    """
-    path = Path(path).absolute()
-    if path.is_file():
-        return _listed_logs(path)
-    if not path.is_dir():
-        raise InputError(f"{path}: no such folder")
-    folders = sorted(_log_folders(path, _SEARCH_DEPTH))
-    if not folders:
-        raise InputError(f"{path}: no 123D log here (a log is a folder with a sync.arrow)")
-    return [LogPath(folder, folder.parents[2] / "maps") for folder in folders]
-
-
-def _listed_logs(path: Path) -> list[LogPath]:
-    parts: dict[tuple[Path, Path], list[tuple[float, float]]] = {}
-    for clip in read_clip_list(path):
-        parts.setdefault((clip.folder, clip.maps_dir), []).append((clip.start_s, clip.end_s))
-    for folder, _ in parts:
-        if not (folder / "sync.arrow").is_file():
-            raise InputError(f"{path}: the log {folder} is not there")
-    return [LogPath(folder, maps_dir, _united(spans)) for (folder, maps_dir), spans in parts.items()]
-
-
-def _united(spans: list[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Spans in the order of time, those that touch as one."""
-    out: list[tuple[float, float]] = []
-    for start, end in sorted(spans):
-        if out and start <= out[-1][1]:
-            out[-1] = (out[-1][0], max(out[-1][1], end))
-        else:
-            out.append((start, end))
-    return tuple(out)
-
-
-def _log_folders(path: Path, depth: int) -> Iterator[Path]:
-    if (path / "sync.arrow").is_file():
-        yield path
-    elif depth > 0:
-        for below in path.iterdir():
-            if below.is_dir() and not below.name.startswith("."):
-                yield from _log_folders(below, depth - 1)
 
 
 class Log:

@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
-from transformers import ResNetBackbone, ResNetConfig
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -54,6 +53,8 @@ class ImageBackbone(nn.Module):
     """
 
     def __init__(self, config: BackboneConfig, *, channels: int, fetch: bool = True) -> None:
+        from transformers import ResNetBackbone, ResNetConfig  # takes seconds, and recipes need it not
+
         super().__init__()
         self.checkpoint = config.checkpoint
         self.pretrained = False
@@ -73,6 +74,8 @@ class ImageBackbone(nn.Module):
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])
 
     def _load(self, weights: str, stages: Sequence[str]) -> None:
+        from transformers import ResNetBackbone
+
         try:
             self.resnet = ResNetBackbone.from_pretrained(weights, out_features=list(stages))
             self.pretrained = True

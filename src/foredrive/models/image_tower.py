@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
-from transformers import ResNetBackbone, ResNetConfig
 
 from foredrive.models.attention_pool import AttentionPool
 from foredrive.models.backbone import normalise_images
@@ -21,6 +20,8 @@ class ImageTower(nn.Module):
     """
 
     def __init__(self, *, widths: Sequence[int], depths: Sequence[int], heads: int, dim: int) -> None:
+        from transformers import ResNetBackbone, ResNetConfig  # takes seconds
+
         super().__init__()
         last = f"stage{len(widths)}"
         self.resnet = ResNetBackbone(

@@ -7,14 +7,13 @@ from foredrive.lazy import on_demand
 if TYPE_CHECKING:
     from foredrive.runs.demo import DemoSize, full_demo, quick_demo, run_demo
     from foredrive.runs.evaluate.run import Inspection, evaluate_run, inspect_run
-    from foredrive.runs.train.run import Run, find_all_logs, load_agent, open_run, train_run
+    from foredrive.runs.train.run import Run, load_agent, open_run, train_run
 
 __all__ = [
     "DemoSize",
     "Inspection",
     "Run",
     "evaluate_run",
-    "find_all_logs",
     "full_demo",
     "inspect_run",
     "load_agent",
@@ -29,6 +28,6 @@ __getattr__ = on_demand(
     {
         "demo": ("DemoSize", "full_demo", "quick_demo", "run_demo"),
         "evaluate.run": ("Inspection", "evaluate_run", "inspect_run"),
-        "train.run": ("Run", "find_all_logs", "load_agent", "open_run", "train_run"),
+        "train.run": ("Run", "load_agent", "open_run", "train_run"),
     },
 )

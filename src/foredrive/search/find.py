@@ -13,7 +13,7 @@ from foredrive.search.diversity import facility_location, k_centre
 from foredrive.search.embedding import mean_direction
 from foredrive.search.index import EXACT_UP_TO, FrameIndex
 from foredrive.search.kept import where_tagged
-from foredrive.search.query import Query
+from foredrive.search.query import ANY_SECTOR, ANY_VIEW, Query
 from foredrive.search.rows import FACTS
 from foredrive.search.tables import quoted
 from foredrive.search.target import Target
@@ -111,9 +111,16 @@ def _check(query: Query, target: Target | None) -> None:
         raise InputError(f"the example has no {' and no '.join(needs)} to compare with")
 
 
+def _check_view(index: FrameIndex, query: Query) -> None:
+    if not index.count(query.where_view) and index.count():
+        there = sorted(set(index.select(None, ["view"])["view"].to_pylist()))
+        raise InputError(f"no view {query.view}; there are {', '.join((ANY_VIEW, ANY_SECTOR, *there))}")
+
+
 def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str | None:
     conditions = [f"({query.where})"] if query.where else []
     if query.where_view is not None:
+        _check_view(index, query)
         conditions.append(query.where_view)
     if query.tag is not None:
         conditions.append(where_tagged(index.uri, query.tag))

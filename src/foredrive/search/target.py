@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from foredrive.data.cameras import CameraFrame, find_camera, pinhole_cameras, read_camera, told_cameras
 from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log, LogPath, find_logs
+from foredrive.data.log_paths import LogPath, find_logs
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.search.embedding import View, embed_views, mean_direction, read_views
 from foredrive.search.index import FrameIndex

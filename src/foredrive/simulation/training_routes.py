@@ -15,7 +15,8 @@ import numpy as np
 from foredrive.errors import InputError
 from foredrive.simulation.route_sets import SHIPPED, RouteWaypoints, shipped_sets, write_shipped
 from foredrive.simulation.routes import DriveRoute, RouteOption, snap_route
-from foredrive.towns.map.town_map import TEST_TOWNS, TOWNS, load_town_map
+from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.fleet import find_starts
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import Route, draw_route

@@ -9,7 +9,7 @@ import numpy as np
 
 from foredrive.errors import InputError
 from foredrive.scene import Command
-from foredrive.towns.conditions import CONDITIONS, find_conditions
+from foredrive.towns.conditions import ANY_CONDITIONS, CONDITIONS, find_conditions
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import FASTEST_HZ, Crowd
 from foredrive.towns.traffic.expert import SETTLE_S, Drive, plan_route
@@ -17,7 +17,6 @@ from foredrive.towns.traffic.fleet import find_starts
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.towns.traffic.traffic import Traffic
 
-ANY_CONDITIONS = "any"
 SEEDS_PER_DRIVE = 8
 TRIES_PER_DRIVE = 4
 """How many routes are drawn for each drive that is recorded, where seeds may be chosen, and how many of them

@@ -80,6 +80,8 @@ CONDITIONS = {
     "night_fog": Conditions(hour=4.0, clouds=0.9, wetness=0.2, visibility_m=120.0),
 }
 """By the names the command line knows."""
+ANY_CONDITIONS = "any"
+"""Stands for all of them, dealt out evenly."""
 
 
 def find_conditions(name: str) -> Conditions:

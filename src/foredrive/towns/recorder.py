@@ -13,8 +13,8 @@ from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from rich.progress import track
 
+from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
-from foredrive.data.logs import LogPath
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
 from foredrive.ops.threads import one_ahead
@@ -31,7 +31,8 @@ from foredrive.towns.labels.semantics import (
 )
 from foredrive.towns.labels.situation import Narrator
 from foredrive.towns.labels.visibility import is_seen
-from foredrive.towns.map.town_map import MAP_FOLDER, TEST_TOWNS, TownMap, load_town_map
+from foredrive.towns.map.names import TEST_TOWNS
+from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive, Moment

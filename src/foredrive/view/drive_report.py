@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from foredrive.data.logs import LogPath
+from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, read_drive, score_of

@@ -11,7 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.geometry.boxes import box_corners
 from foredrive.scene import Boxes
 from foredrive.simulation.observation import FRAME_DT_S

@@ -9,7 +9,8 @@ from PIL import Image, ImageDraw
 
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.scene import Category, LidarSweep
 from foredrive.search.find import Hit

@@ -13,7 +13,8 @@ from pathlib import Path
 import torch
 
 from foredrive.data.cameras import pinhole_cameras
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.towns.campaign import DrivePlan

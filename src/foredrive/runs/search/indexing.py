@@ -13,7 +13,8 @@ import numpy as np
 import pyarrow as pa
 import torch
 
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import held

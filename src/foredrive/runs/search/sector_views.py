@@ -13,7 +13,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from foredrive.data.collate import stack_records
-from foredrive.data.logs import Log, LogPath
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.lidar_clip import PointCloud

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from foredrive.data import ClipDataset, LogPath, collate, find_logs
+from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
@@ -45,11 +45,6 @@ class Run:
             if (self.folder / stage / WEIGHTS).is_file():
                 return self.folder / stage / WEIGHTS
         raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
-
-
-def find_all_logs(paths: Sequence[Path]) -> tuple[LogPath, ...]:
-    """The logs at several places, each once."""
-    return tuple({log.folder: log for path in paths for log in find_logs(path)}.values())
 
 
 def open_run(folder: Path) -> Run:

@@ -20,13 +20,10 @@ from py123d.parser.opendrive.utils.stop_zone_helper import create_stop_zones_fro
 from py123d.parser.opendrive.xodr_parser.opendrive import XODR
 from py123d.parser.opendrive.xodr_parser.reference import XODRReferenceLine
 
-from foredrive.errors import InputError
 from foredrive.towns.map.junction_heights import level_junction
+from foredrive.towns.map.names import check_town
 
 MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
-TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD")
-TEST_TOWNS = ("Town05",)
-"""Held out, as in the papers; all others are for training."""
 SAMPLE_SPACING_M = 1.0
 CONNECTION_TOLERANCE_M = 0.1
 MIN_MARKING_M = 0.1
@@ -191,8 +188,7 @@ def load_town_map(name: str) -> TownMap:
     Raises:
         InputError: there is no such town.
     """
-    if name not in TOWNS:
-        raise InputError(f"unknown town {name!r}: one of {', '.join(TOWNS)}")
+    check_town(name)
     xodr = XODR.parse_from_file(MAP_FOLDER / f"{name}.xodr.gz")
     roads, _, helpers, _, objects, centre_marks, signals = collect_element_helpers(
         xodr, SAMPLE_SPACING_M, CONNECTION_TOLERANCE_M

@@ -3,7 +3,7 @@
 import enum
 from dataclasses import dataclass, fields
 
-from foredrive.towns.map.town_map import TEST_TOWNS
+from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.towns.place.looks import WallKind, WindowKind
 
 Rgb = tuple[float, float, float]

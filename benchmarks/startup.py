@@ -1,0 +1,69 @@
+"""How much CPU the program takes before it helps: help, a wrong argument, a verb's own work.
+
+Each command is a process of its own, started several times; its CPU seconds (user and system, all of its
+threads) are counted, the least of them: `foredrive bench startup`.
+
+A verb's own work begins when its modules are imported, which the arms called "begin" do. Nothing is below
+"import torch", which most verbs need.
+"""
+
+import resource
+import subprocess
+import sys
+
+from foredrive.evaluation import Benchmark
+
+REPETITIONS = 3
+NOWHERE = "/nonexistent"
+LINES = {
+    "--help": "--help",
+    "--version": "--version",
+    "search --help": "search --help",
+    "record --help": "record --help",
+    "wrong: view": f"view {NOWHERE}",
+    "wrong: record": f"record --town Town99 --out {NOWHERE}",
+    "wrong: train": f"train nemo_tiny --logs {NOWHERE} --out {NOWHERE}",
+    "wrong: search": f"search rain --index {NOWHERE}",
+    "wrong: reconstruct": f"reconstruct {NOWHERE} --out {NOWHERE}",
+    "wrong: drive": f"drive --agent stop --in {NOWHERE} --out {NOWHERE}",
+}
+IMPORTS = {
+    "import torch": "torch",
+    "begin: view": "foredrive.view.log_sheet, foredrive.view.log_times",
+    "begin: convert": "foredrive.data.convert",
+    "begin: record": "foredrive.runs.drive.recording, foredrive.towns.campaign",
+    "begin: train": "foredrive.recipes, foredrive.runs.train.run",
+    "begin: evaluate": "foredrive.runs.evaluate.run, foredrive.view.run_report",
+    "begin: reconstruct": "foredrive.runs.rebuild.reconstruct",
+    "begin: drive": "foredrive.runs.drive.suite",
+    "begin: search": "foredrive.runs.search.searching",
+}
+
+
+def _cpu_s(command: list[str]) -> dict[str, float]:
+    taken = []
+    for _ in range(REPETITIONS + 1):  # the first writes bytecode
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, check=False, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        taken.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return {"cpu_s": min(taken[1:]), "most_cpu_s": max(taken[1:])}
+
+
+def _line(line: str) -> dict[str, float]:
+    return _cpu_s([sys.executable, "-m", "foredrive", *line.split()])
+
+
+def _import(modules: str) -> dict[str, float]:
+    return _cpu_s([sys.executable, "-c", f"import {modules}"])
+
+
+BENCHMARK = Benchmark(
+    question="How much CPU passes until the program helps, refuses a wrong argument, begins a verb's work?",
+    arms={
+        **{name: lambda seed, line=line: _line(line) for name, line in LINES.items()},
+        **{name: lambda seed, modules=modules: _import(modules) for name, modules in IMPORTS.items()},
+    },
+    seeds=(0,),
+    config={"repetitions": REPETITIONS, "lines": LINES, "imports": IMPORTS},
+)
