@@ -1,4 +1,4 @@
-"""A rebuilt scene as nodes that the browser draws by itself: what stands, and actors in frames that move."""
+"""A rebuilt scene as nodes that the browser draws: the static background, and actors in moving frames."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from foredrive.view import palette
 from foredrive.view.splat_nodes import show_splats, thinned
 
 ROOT = "/scene"
-"""The scene's frame; all beside it are in the ego frame at the time shown."""
+"""The scene's frame; nodes beside it are in the ego frame at the time shown."""
 MOST_SPLATS = 400_000
-"""More are thinned out: at 32 bytes each these are 13 MB that a browser has to fetch and to sort."""
+"""More splats are thinned out: at 32 bytes each, these are 13 MB for a browser to fetch and sort."""
 AWAY_M = (0.0, 0.0, -1e6)
-"""Where is put what is not to be seen: the browser draws splats of nodes that are invisible all the same."""
+"""Where hidden splats are moved to: the browser draws those of invisible nodes all the same."""
 HERE_M = (0.0, 0.0, 0.0)
 FACE_OPACITY, CHOSEN_OPACITY = 0.06, 0.35
 PLACES = 16
@@ -39,7 +39,7 @@ class _ActorNode:
     edges: viser.LineSegmentsHandle
     label: viser.LabelHandle
     own: Gaussians
-    """What its splats show, before it was thinned out."""
+    """The Gaussians before they were thinned out."""
 
 
 class RebuiltNodes:
@@ -61,7 +61,7 @@ class RebuiltNodes:
     ) -> None:
         self._scene, self._on_click = scene, on_click
         self.share = min(1.0, MOST_SPLATS / max(len(graph.actor), 1))
-        """Of the Gaussians that are drawn."""
+        """Of all Gaussians, the share that is drawn."""
         self.layers = {"splats": True, "boxes": True, "ids": True}
         self._root = scene.add_frame(ROOT, show_axes=False)
         standing = thinned(graph.of_actor(STATIC), self.share, way_m[:: -(-len(way_m) // PLACES)])
@@ -70,7 +70,7 @@ class RebuiltNodes:
         self._chosen: int | None = None
 
     def show(self, graph: SceneGraph, T_scene_ego: Float[Tensor, "4 4"], t_s: float) -> None:
-        """Draw the scene as it is at a time, seen from the ego vehicle; what is a node already only moves."""
+        """Draw the scene at a time, seen from the ego vehicle; existing nodes only move."""
         _place(self._root, inverse_se3(T_scene_ego))
         ids = graph.tracks.track_id.tolist()
         for gone in self._actors.keys() - set(ids):
@@ -92,18 +92,18 @@ class RebuiltNodes:
         self.show_layers()
 
     def choose(self, track_id: int | None) -> None:
-        """Make one actor stand out."""
+        """Highlight one actor."""
         self._chosen = track_id
         self.show_layers()
 
     def move(self, track_id: int, wxyz: np.ndarray, position: np.ndarray) -> None:
-        """Put an actor elsewhere in the scene, until it is shown again."""
+        """Move an actor in the scene, until it is shown again."""
         if track_id in self._actors:
             frame = self._actors[track_id].frame
             frame.wxyz, frame.position = wxyz, position
 
     def show_layers(self) -> None:
-        """Show what `layers` says."""
+        """Show the layers that are switched on."""
         splats_at = HERE_M if self.layers["splats"] else AWAY_M
         if self._standing is not None:
             self._standing.position = splats_at
@@ -116,8 +116,9 @@ class RebuiltNodes:
             node.label.visible = self.layers["ids"] or chosen
 
     def nudge(self) -> None:
-        """Have browsers sort splats anew, by a movement that nobody sees: of several nodes that come at once
-        they show the first alone, until something moves.
+        """Make browsers sort splats anew by an invisible movement.
+
+        Of several nodes that arrive at once they show only the first until something moves.
         """
         self._root.position = self._root.position + np.array([0.0, 0.0, NUDGE_M])
 

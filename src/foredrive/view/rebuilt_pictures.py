@@ -1,4 +1,4 @@
-"""What sensors see of a rebuilt scene: rendered in the background, put where it is looked at."""
+"""Sensors' pictures of a rebuilt scene, rendered in the background."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -22,13 +22,13 @@ from foredrive.view.rebuilt_video import Colour, sweep_colours
 from foredrive.view.scene_nodes import FRUSTUM_M, POINT_M, clear
 
 OWN_HEIGHT_PX = 360
-"""Of the picture from the reader's eye."""
+"""Size of the picture from the reader's eye."""
 LIDAR, CAMERAS = "/lidar", "/cameras"
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What is rendered: a scene after edits, at a time."""
+    """A scene after edits, at a time."""
 
     edited: Edited
     t_s: float
@@ -58,20 +58,20 @@ class RebuiltPictures:
         self.colour.on_update(lambda _: self._ask_lidar())
 
     def show(self, edited: Edited, t_s: float) -> None:
-        """Ask for pictures of a moment; those of moments before that are not begun yet are never made."""
+        """Ask for pictures of a moment; queued ones of earlier moments are dropped."""
         self._moment = Moment(edited, t_s)
         self._ask_lidar()
         for camera, name in enumerate(self._run.vehicle.rig.names):
             self._background.ask(name, partial(self._show_camera, camera, self._moment))
 
     def show_layers(self) -> None:
-        """Show what `layers` says."""
+        """Show the layers that are switched on."""
         for name in (LIDAR, CAMERAS):
             if (node := self._server.scene.get_handle_by_name(name)) is not None:
                 node.visible = self.layers[name[1:]]
 
     def ask_own_view(self, client: viser.ClientHandle) -> None:
-        """Ask for what one reader's eye sees now, as the background of the reader's page."""
+        """Render from one reader's eye, as the background of that reader's page."""
         self._background.ask(f"client {client.client_id}", partial(self._show_own_view, client))
 
     def _ask_lidar(self) -> None:

@@ -1,4 +1,4 @@
-"""A drive through a rebuilt log as a film: the cameras, and below them what the lidar sees, from above."""
+"""A drive through a rebuilt log as a film: the cameras, and below them the lidar from above."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -27,19 +27,19 @@ ONE_CAMERA_PX, CAMERA_PX = 480, 320
 """Width of a camera's picture where it is alone in its row, and where it is not."""
 GAP_PX, TITLE_PX = 8, 26
 ABOVE_HW = (0.5, 0.35)
-"""Height of the view from above, and where the vehicle is that drives to the right, in units of its width."""
+"""Height of the view from above, and the place of the vehicle (it drives to the right), in its widths."""
 ABOVE_M = 100.0
 """Width of the view from above."""
 LOW_M, HIGH_M = -0.5, 4.0
 """Ends of the scale of heights over the ground."""
 MOST_EDITS = 3
-"""Named in a caption."""
+"""Actors that a caption names."""
 
 
 def write_rebuilt_video(
     path: Path, run: OpenRun, edits: list[Edit], shooting: Shooting, colour: Colour
 ) -> None:
-    """Film a run in real time, and beside it what edits make of it, where there are any.
+    """Film a run in real time, and beside it the run after edits, if there are any.
 
     Raises:
         InputError: on edits that cannot be made, or a path that is not one of a video.
@@ -64,7 +64,7 @@ def write_rebuilt_video(
 
 
 def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, colour: Colour) -> Image.Image:
-    """One frame: shots of the same time side by side, each under its caption.
+    """Draw a frame: shots of the same time side by side, each under its caption.
 
     Args:
         shots: with captions.
@@ -86,14 +86,14 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
 
 
 def caption_of(edits: Sequence[Edit]) -> str:
-    """What was changed, in words."""
+    """Describe edits."""
     words = [words_of(edit) for edit in edits[:MOST_EDITS]]
     more = len(edits) - MOST_EDITS
     return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
 
 
 def words_of(edit: Edit) -> str:
-    """What an edit changes."""
+    """Describe an edit."""
     if isinstance(edit, Remove):
         return f"without {edit.actor}"
     if isinstance(edit, Move):
@@ -127,7 +127,7 @@ def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
 
 
 def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
-    """Returns in the colour of what they say, low ones first, and outlines of the actors with their ids."""
+    """Draw coloured returns, low ones first, and outlines of the actors with their ids."""
     twice = 2  # drawn larger and shrunk: PIL's lines have no smooth edges
     height_px = round(ABOVE_HW[0] * width_px)
     scale = twice * width_px / ABOVE_M
@@ -163,7 +163,7 @@ def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) 
 
 
 def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of returns by their height over the ground, or by how bright they are."""
+    """Colour returns by their height over the ground, or by their intensity."""
     if colour == "height":
         share = (sweep.points_ego[:, 2].numpy() - LOW_M) / (HIGH_M - LOW_M)
         mapped = palette.HEIGHT_MAP(share.clip(0, 1))

@@ -1,4 +1,4 @@
-"""A rebuilt log in the browser: over time, from anywhere, and changed."""
+"""A rebuilt log in the browser: over time, from any viewpoint, with edits."""
 
 import threading
 import time
@@ -17,11 +17,11 @@ from foredrive.view.rebuilt_pictures import RebuiltPictures
 from foredrive.view.scene_nodes import show_ego
 
 STEP_S = 0.1
-"""Of the slider, and of playing, which is in real time."""
+"""Step of the slider, and of playing in real time."""
 FAR_M = 5000.0
-"""What is farther is not drawn by the browser: the sky is some two kilometres away."""
+"""The browser's far plane: the sky is some two kilometres away."""
 NUDGES_S = (2.0, 6.0)
-"""How long after the last step splats are sorted anew for someone who has come."""
+"""Delay after the last step until splats are sorted anew for a new client."""
 NOTE_S = 8.0
 
 
@@ -63,7 +63,7 @@ class RebuiltViewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The page's address."""
         return page_url(self.server)
 
     def show(self, t_s: float) -> None:
@@ -71,7 +71,7 @@ class RebuiltViewer:
         self.time_s.value = t_s  # calls `show_now`, unless it is there already
 
     def show_now(self) -> None:
-        """Draw the scene as it is now; what sensors see follows."""
+        """Draw the scene as it is now; the sensors' pictures follow."""
         with self._showing, self.server.atomic():
             t_s, edited = float(self.time_s.value), self.edits.edited
             ego = self.run.vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu())
@@ -81,7 +81,7 @@ class RebuiltViewer:
             self._show_own_views()
 
     def play(self) -> None:
-        """Go through the log in real time while "play" is ticked on the page; does not return."""
+        """Step through the log in real time while "play" is ticked on the page; does not return."""
         first_s, last_s = float(self.run.vehicle.t_s[0]), float(self.run.vehicle.t_s[-1])
         while True:
             began_s = time.monotonic()
@@ -91,7 +91,7 @@ class RebuiltViewer:
             time.sleep(max(STEP_S - (time.monotonic() - began_s), 0.01))
 
     def tell(self, message: str) -> None:
-        """Show a message to everybody who looks."""
+        """Show a message to every client."""
         for client in self.server.get_clients().values():
             client.add_notification("", message, auto_close_seconds=NOTE_S)
 

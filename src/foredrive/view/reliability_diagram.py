@@ -1,4 +1,4 @@
-"""Confidence beside what came true."""
+"""Confidence beside the share of detections that were right."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,7 +13,7 @@ TITLES = {
 
 
 def draw_reliability(name: str, diagram: Reliability) -> Figure:
-    """Points on the diagonal are calibrated; bars have the share of detections in each bin."""
+    """Draw outcome over confidence, calibrated on the diagonal; bars show each bin's share."""
     figure = Figure(figsize=(4.6, 4.0), layout="constrained")
     axes = figure.subplots()
     full = diagram.count > 0

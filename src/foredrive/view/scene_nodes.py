@@ -1,4 +1,4 @@
-"""What was sensed, as nodes of a 3-D scene: points, boxes, map, cameras, paths. All in the ego frame at now.
+"""Nodes of a 3-D scene: points, boxes, map, cameras, paths. All in the ego frame at now.
 
 Every function replaces what it drew before under its own name, and takes it away if there is nothing to draw.
 """
@@ -19,11 +19,11 @@ POINT_M = 0.06
 FRUSTUM_M = 1.2
 EGO_HEIGHT_M = 1.5
 PATH_LIFT_M = 0.15
-"""Paths lie on the road, and would be half sunk in it."""
+"""Height of paths, which would be half sunk in the road."""
 
 
 def show_lidar(scene: viser.SceneApi, clip: Clip) -> None:
-    """Returns, near ones bright."""
+    """Draw returns, near ones bright."""
     sweep = clip.sweeps[clip.now]
     returned = sweep.returned & sweep.valid
     if not bool(returned.any()):
@@ -39,7 +39,7 @@ def show_lidar(scene: viser.SceneApi, clip: Clip) -> None:
 
 
 def show_boxes(scene: viser.SceneApi, clip: Clip) -> None:
-    """Wire frames in the colours of their kinds, a cross on the front of each."""
+    """Draw wire frames in the colours of their kinds, a cross on the front of each."""
     boxes = clip.boxes[clip.now]
     boxes = boxes[boxes.valid]
     edges = torch.tensor([*EDGES, (0, 5), (1, 4)])  # corners 0, 1, 5, 4 are the front
@@ -50,7 +50,7 @@ def show_boxes(scene: viser.SceneApi, clip: Clip) -> None:
 
 
 def show_map(scene: viser.SceneApi, clip: Clip) -> None:
-    """Polylines in the colours of their kinds."""
+    """Draw polylines in the colours of their kinds."""
     if clip.map is None:
         return clear(scene, "/map")
     both = clip.map.valid[:, 1:] & clip.map.valid[:, :-1]
@@ -62,7 +62,7 @@ def show_map(scene: viser.SceneApi, clip: Clip) -> None:
 
 
 def show_cameras(scene: viser.SceneApi, clip: Clip) -> None:
-    """Every camera with an image as a frustum with the image in it; lens distortion is not drawn."""
+    """Draw every camera with an image as a frustum with the image in it, without lens distortion."""
     rig, now = clip.rig[clip.now], clip.now
     height, width = rig.size_hw
     for c, name in enumerate(rig.names):
@@ -86,7 +86,7 @@ def show_cameras(scene: viser.SceneApi, clip: Clip) -> None:
 
 
 def show_path(scene: viser.SceneApi, name: str, path: Trajectory, colour: str) -> None:
-    """A trajectory's first alternative from the rear axle on, a ball per valid waypoint."""
+    """Draw a trajectory's first alternative from the rear axle on, a ball at each valid waypoint."""
     points = path_points(path) + torch.tensor([0.0, 0.0, PATH_LIFT_M])
     if len(points) < 2:
         return clear(scene, f"/{name}")
@@ -99,7 +99,7 @@ def show_path(scene: viser.SceneApi, name: str, path: Trajectory, colour: str) -
 
 
 def show_ego(scene: viser.SceneApi) -> None:
-    """The vehicle itself, as a prism over its footprint."""
+    """Draw the ego vehicle as a prism over its footprint."""
     count = len(EGO_OUTLINE_XY)
     bottom = np.column_stack([EGO_OUTLINE_XY, np.full(count, 0.25)])
     top = np.column_stack([EGO_OUTLINE_XY, np.full(count, EGO_HEIGHT_M)])

@@ -1,4 +1,4 @@
-"""Gaussians as nodes of a 3-D scene that the browser draws by itself: their albedo, without the decoders."""
+"""Gaussians as nodes of a 3-D scene that the browser draws: their albedo, without the decoders."""
 
 import numpy as np
 import torch
@@ -9,15 +9,15 @@ from torch import Tensor
 from foredrive.rendering.gaussians import Gaussians
 
 LARGEST_M = 200.0
-"""Standard deviations are held below: the browser keeps variances in half precision, which ends at 65504."""
+"""Bound of standard deviations: the browser keeps variances in half precision, which ends at 65504."""
 FAINTEST = 1 / 255
-"""What is less opaque at its centre is never seen."""
+"""Gaussians that are less opaque at their centre are not seen."""
 NEAREST_M = 5.0
-"""What is nearer to where it is looked at from does not count more."""
+"""Gaussians nearer to the viewpoint than this count no more."""
 
 
 def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -> Gaussians:
-    """A share of Gaussians: those that cover most, by opacity and largest section, and can be seen at all.
+    """Choose the visible Gaussians that cover most, by opacity and largest section.
 
     Args:
         gaussians: in any frame.

@@ -17,7 +17,7 @@ MP4, WEBP = ".mp4", ".webp"
 
 
 def check_video(path: Path) -> None:
-    """Whether a video can be written under this name.
+    """Check that a video can be written under this name.
 
     Raises:
         InputError: it ends on anything but .mp4 and .webp, or for MP4 there is no PyAV.

@@ -1,4 +1,4 @@
-"""A log in the browser, in 3-D and over time, and what a run makes of it."""
+"""A log in the browser, in 3-D and over time, with a run's predictions."""
 
 import threading
 import time
@@ -38,7 +38,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The page's address."""
         return page_url(self.server)
 
     def show(self, index: int) -> None:
@@ -75,7 +75,7 @@ class Viewer:
         self.show(min(max(self._frame.value + change, 0), len(self.times) - 1))
 
     def _draw(self) -> None:
-        """Draw the frame that is wanted by now: of many that were passed over in haste only the last."""
+        """Draw the newest frame that was asked for; those passed over are dropped."""
         with self._drawing:
             index = min(self._frame.value, len(self.times) - 1)
             if index == self._drawn:

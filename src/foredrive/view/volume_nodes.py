@@ -1,4 +1,4 @@
-"""What a model holds to be the case, as nodes of a 3-D scene: cubes of occupancy, arrows of flow."""
+"""A model's predictions as nodes of a 3-D scene: cubes of occupancy, arrows of flow."""
 
 from typing import Literal
 
@@ -16,7 +16,7 @@ from foredrive.view.scene_nodes import clear
 from foredrive.view.voxel_drawing import height_colours, pca_colours
 
 FILL = 0.94
-"""Edge of a drawn cube over that of its voxel, so that single ones can be told apart."""
+"""Edge of a drawn cube over that of its voxel: neighbours stay apart."""
 MOVES_M = 0.25
 """Shorter arrows are not drawn."""
 ARROW_WIDTH, HEAD_SHARE = 3.0, 0.3
@@ -33,7 +33,7 @@ _CUBE_FACES = np.array(
 def shown_voxels(
     vision: Vision, k: int, spec: VoxelSpec, above: float, lowest_m: float
 ) -> Bool[Tensor, "Z Y X"]:
-    """Voxels of frame k that are occupied with a probability of more than `above`.
+    """Select voxels of frame k that are occupied with a probability of more than `above`.
 
     Args:
         lowest_m: height in the ego frame below which voxel centres are left out: the road hides much.
@@ -50,7 +50,7 @@ def show_occupancy(
     shown: Bool[Tensor, "Z Y X"],
     colour_by: Literal["height", "features"],
 ) -> None:
-    """Voxels of frame k as cubes in the ego frame now, where the model thinks that they will be."""
+    """Draw voxels of frame k as cubes in the ego frame now, where the model expects them."""
     colours: UInt8[np.ndarray, "Z Y X 3"] = (
         height_colours(spec) if colour_by == "height" else pca_colours(vision.volume[k], shown)
     )
@@ -98,7 +98,7 @@ def show_flow(
 
 
 def arrows(start: Float[Tensor, "N 3"], end: Float[Tensor, "N 3"]) -> Float[Tensor, "N3 2 3"]:
-    """Segments of N arrows whose heads lie flat: three to each, its shaft first."""
+    """Return three segments for each of N arrows with flat heads, the shaft first."""
     along = end - start
     across = torch.stack([-along[:, 1], along[:, 0], torch.zeros_like(along[:, 0])], dim=-1)
     back = end - HEAD_SHARE * along

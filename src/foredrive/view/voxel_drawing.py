@@ -31,7 +31,7 @@ class Eye:
 
     @classmethod
     def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Eye":
-        """Above and behind the vehicle; the grid fills a picture of that shape, its corners just outside."""
+        """Place it above and behind the vehicle, so that the grid fills a picture of that shape."""
         reach = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
         low, high = np.array(spec.lower_m), np.array(spec.upper_m)
         middle = (low + high) / 2
@@ -43,7 +43,7 @@ class Eye:
         return cls(position, target, 1.45 * float(limits.min()))
 
     def axes(self) -> Float[np.ndarray, "3 3"]:
-        """Rows: right, down, forward in the ego frame."""
+        """Return the rows right, down and forward in the ego frame."""
         forward = np.subtract(self.target_m, self.position_m)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -51,7 +51,7 @@ class Eye:
         return np.stack([right, np.cross(forward, right), forward])
 
     def project(self, points: Float[np.ndarray, "N 3"], size_hw: tuple[int, int]) -> Float[np.ndarray, "N 2"]:
-        """Pixel coordinates of points in front of the eye."""
+        """Project points in front of the eye to pixels."""
         local = (points - np.array(self.position_m)) @ self.axes().T
         scale = self.focal * size_hw[0]
         return local[:, :2] / local[:, 2:] * scale + np.array([size_hw[1] / 2, size_hw[0] / 2])
@@ -64,7 +64,7 @@ def draw_voxels(
     eye: Eye | None = None,
     colours: UInt8[np.ndarray, "Z Y X 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Occupied voxels as lit cubes with shadows, cast ray by ray through the grid.
+    """Draw occupied voxels as lit cubes with shadows, cast ray by ray through the grid.
 
     Args:
         occupied: what is drawn.
@@ -83,7 +83,7 @@ def draw_voxels(
 
 
 def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
-    """Dark and low to bright and high, the same in every picture: -0.5 m to 4 m above the ego ground."""
+    """Colour heights from dark (-0.5 m over the ego ground) to bright (4 m), the same in every picture."""
     z = spec.lower_m[2] + (np.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
     rgb = palette.HEIGHT_MAP(0.12 + 0.88 * np.clip((z + 0.5) / 4.5, 0, 1))[:, :3]
     return np.broadcast_to((rgb * 255).astype(np.uint8)[:, None, None], (*spec.shape_zyx, 3))
@@ -96,7 +96,7 @@ def draw_comparison(
     spec: VoxelSpec,
     above_m: float,
 ) -> UInt8[np.ndarray, "X Y 3"]:
-    """From above, one pixel a column: hits, false alarms, misses, known free and unknown columns.
+    """Draw hits, false alarms, misses, known free and unknown columns from above, one pixel a column.
 
     Only known voxels whose centre is higher than `above_m` in the ego frame count: the road would hide
     everything else. Forward points up, left points left.
@@ -116,7 +116,7 @@ def draw_comparison(
 
 
 def draw_volume_pca(volume: Float[Tensor, "D Z Y X"]) -> UInt8[np.ndarray, "X Y 3"]:
-    """Features as colours (NeMo, Fig. 3): PCA of the D channels to three, then the mean over height.
+    """Draw features as colours (NeMo, Fig. 3): PCA of the D channels to three, then the mean over height.
 
     Each channel is stretched from its 1st to its 99th percentile.
     """
@@ -127,7 +127,7 @@ def draw_volume_pca(volume: Float[Tensor, "D Z Y X"]) -> UInt8[np.ndarray, "X Y 
 def pca_colours(
     volume: Float[Tensor, "D Z Y X"], shown: Bool[Tensor, "Z Y X"]
 ) -> UInt8[np.ndarray, "Z Y X 3"]:
-    """Features of every voxel as a colour: PCA over the voxels that are shown, each channel stretched.
+    """Colour every voxel by its features: PCA over the voxels that are shown, each channel stretched.
 
     With fewer than three of them there is nothing to tell apart, and all are grey.
     """
@@ -138,7 +138,7 @@ def pca_colours(
 
 
 def _principal(features: Float[Tensor, "D *n"]) -> Float[Tensor, "3 *n"]:
-    """The three principal components of D channels, of fixed sign, so that colours repeat."""
+    """Return the three principal components of D channels, of fixed sign, so that colours repeat."""
     flat = features.float().flatten(1)
     centred = flat - flat.mean(1, keepdim=True)
     _, vectors = torch.linalg.eigh(centred @ centred.T / centred.shape[1])
@@ -148,7 +148,7 @@ def _principal(features: Float[Tensor, "D *n"]) -> Float[Tensor, "3 *n"]:
 
 
 def _stretched(channels: Float[Tensor, "3 *n"]) -> UInt8[Tensor, "3 *n"]:
-    """Each channel from its 1st to its 99th percentile to 0 to 255."""
+    """Stretch each channel from its 1st and 99th percentile to 0 and 255."""
     flat = channels.flatten(1)
     low, high = (torch.from_numpy(np.percentile(flat.numpy(), q, axis=1)).float() for q in (1, 99))
     unit = ((flat - low[:, None]) / (high - low).clamp_min(1e-12)[:, None]).clamp(0, 1)
@@ -163,7 +163,7 @@ def _from_above(rows: UInt8[Tensor, "Y X 3"]) -> UInt8[np.ndarray, "X Y 3"]:
 @numba.njit(cache=True, error_model="numpy")
 @no_type_check  # numba infers the types, and wants the bare function
 def _march(occupied, origin, direction, cell, step, to_next, per_cell):
-    """First occupied voxel along a ray (Amanatides & Woo, 1987); the last four arguments are scratch.
+    """Find a ray's first occupied voxel (Amanatides & Woo, 1987); the last four arguments are scratch.
 
     Returns the distance in voxels (-1: none) and the axis of the face that was entered (-1: the ray starts
     inside); `cell` is left at the voxel's x, y, z.
