@@ -1,10 +1,8 @@
 """The report on a suite of closed-loop drives: scores, and each drive with its way, its speed and a film."""
 
-import json
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from rich.table import Table
@@ -13,10 +11,12 @@ from foredrive.data.logs import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, read_drive, score_of
+from foredrive.runs.drive.records import read_drive, suite_title
+from foredrive.runs.folder import DRIVES, SUMMARY
+from foredrive.simulation.drive_record import DriveRecord, ThreatMet
 from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
-from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events
+from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.inline_svg import inline_svg
 from foredrive.view.report_style import CSS
@@ -69,21 +69,20 @@ def write_drive_report(out: Path) -> Path:
     """
     if not (out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
-    suite = json.loads((out / SUITE).read_text())
+    title = suite_title(out)
     drives = {path.stem: read_drive(path) for path in sorted((out / DRIVES).glob("*.json"), key=_order)}
     for name, drive in drives.items():
         film = out / VIDEOS / f"{name}.webp"
         if not film.is_file():
-            write_drive_video(film, LogPath(out / drive["log"], out / "maps"), drive)
-    page = _page(suite, read_summary(out / SUMMARY), drives)
+            write_drive_video(film, LogPath(out / drive.log, out / "maps"), drive)
+    page = _page(title, read_summary(out / SUMMARY), drives)
     with atomic_path(out / REPORT) as scratch:
         scratch.write_text(page, encoding="utf-8")
     return out / REPORT
 
 
-def _page(suite: Mapping[str, Any], summary: Summary, drives: Mapping[str, Mapping[str, Any]]) -> str:
-    title = f"{Path(suite['driver']).name} on {Path(suite['routes']).stem}"
-    worst_first = sorted(drives, key=lambda name: float(drives[name]["driving_score_1_0"]))
+def _page(title: str, summary: Summary, drives: Mapping[str, DriveRecord]) -> str:
+    worst_first = sorted(drives, key=lambda name: drives[name].driving_score_1_0)
     parts = [
         f"<h1>{escape(title)}</h1>",
         _run(summary),
@@ -168,7 +167,7 @@ def _legend(summary: Summary) -> str:
     )
 
 
-def _drive_table(drives: Mapping[str, Mapping[str, Any]]) -> str:
+def _drive_table(drives: Mapping[str, DriveRecord]) -> str:
     head = (
         '<tr><th scope="row">drive</th><th>length, m</th><th>score 1.0</th><th>score 2.1</th>'
         "<th>completion, %</th><th>outside lanes, %</th><th>time, s</th>"
@@ -178,15 +177,15 @@ def _drive_table(drives: Mapping[str, Mapping[str, Any]]) -> str:
     return f'<div class="scroll"><table>{head}{"".join(rows)}</table></div>'
 
 
-def _drive_row(name: str, drive: Mapping[str, Any]) -> str:
-    score = score_of(dict(drive))
+def _drive_row(name: str, drive: DriveRecord) -> str:
+    score = drive.score
     wrong = ", ".join(_words(infraction.kind) for infraction in score.infractions)
-    known = drive.get("lanes_known", True)
+    known = drive.lanes_known
     outside = number(100 * score.outside_lanes, 1) if known else MISSING
     mark = "good" if score.ending is Ending.COMPLETED else "bad"
     return (
         f'<tr><th scope="row"><a href="#{escape(name)}">{escape(name)}</a></th>'
-        f"<td>{number(drive['length_m'], 0)}</td>"
+        f"<td>{number(drive.length_m, 0)}</td>"
         f"<td>{number(score.driving_score_1_0, 1)}</td><td>{number(score.driving_score_2_1, 1)}</td>"
         f"<td>{number(100 * score.completion, 0)}</td><td>{outside}</td>"
         f'<td>{number(score.duration_s, 0)}</td><td class="text {mark}">{_words(score.ending)}</td>'
@@ -200,9 +199,9 @@ def _told(infraction: Infraction) -> str:
     return detail if detail.startswith(what) else f"{what} {detail}"
 
 
-def _drive(name: str, drive: Mapping[str, Any]) -> str:
-    score = score_of(dict(drive))
-    error = f'<p class="alert">{escape(drive["error"])}</p>' if drive["error"] else ""
+def _drive(name: str, drive: DriveRecord) -> str:
+    score = drive.score
+    error = f'<p class="alert">{escape(drive.error)}</p>' if drive.error else ""
     lines = [
         (
             infraction.t_s,
@@ -211,14 +210,15 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
         for infraction in score.infractions
     ]
     lines += [
-        (event["t_s"], f"scenario {place}: {_words(event['what'])}")
-        for place, event in enumerate(scenario_events(drive), start=1)
+        (event.t_s, f"scenario {place}: {_words(event.what)}")
+        for place, event in enumerate(drive.scenario_events, start=1)
     ]
     told = "".join(f"<li>{t_s:.1f} s: {text}</li>" for t_s, text in sorted(lines))
-    if "threat" in drive:
-        told += f"<li>{_threat(drive['threat'])}</li>"
+    if drive.threat is not None:
+        told += f"<li>{_threat(drive.threat)}</li>"
     return (
-        f'<h3 id="{escape(name)}">{escape(name)}: {number(score.driving_score_1_0, 1)}, {_words(score.ending)}</h3>'
+        f'<h3 id="{escape(name)}">{escape(name)}: {number(score.driving_score_1_0, 1)}, '
+        f"{_words(score.ending)}</h3>"
         f"{error}"
         f'<div class="drive"><figure>{inline_svg(draw_way(drive))}</figure>'
         f"<div><figure>{inline_svg(draw_timeline(drive))}</figure><ul>{told}</ul></div>"
@@ -227,11 +227,11 @@ def _drive(name: str, drive: Mapping[str, Any]) -> str:
     )
 
 
-def _threat(met: Mapping[str, Any]) -> str:
+def _threat(met: ThreatMet) -> str:
     """What came of a threat, in a line."""
-    hit = "not hit" if met["impact_mps"] is None else f"hit at {met['impact_mps']:.1f} m/s"
-    by_the_log = f"{met['reference_mps']:.1f} m/s by who goes on as the log did"
-    return f"<b>{_words(met['kind'])} threat</b>: {hit} ({by_the_log}), score {met['score']:.1f} of 5"
+    hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
+    by_the_log = f"{met.reference_mps:.1f} m/s by who goes on as the log did"
+    return f"<b>{_words(met.kind)} threat</b>: {hit} ({by_the_log}), score {met.score:.1f} of 5"
 
 
 def _words(name: str) -> str:
