@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.common.study import work_folder
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark
+from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
@@ -27,7 +28,7 @@ FIGURES = (
 
 def scores(seed: int, name: str) -> Mapping[str, float]:
     """The figures of one repetition of a set of routes."""
-    suite = DriveSuite("expert", SETS[name], seed=seed, sensors=False)
+    suite = DriveSuite("expert", TownRoutes(SETS[name], seed=seed), sensors=False)
     driven = drive_suite(suite, WORK / f"{name}_seed{seed}", workers=len(os.sched_getaffinity(0)))
     if driven.broken:
         job, why = next(iter(driven.broken.items()))

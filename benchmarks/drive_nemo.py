@@ -15,6 +15,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation import Benchmark, read_summary
 from foredrive.recipes import find_recipe
+from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import Driven, DriveSuite, drive_suite
@@ -42,7 +43,7 @@ def _driven(suite: DriveSuite, out: Path) -> Driven:
 def _lessons() -> tuple[LogPath, ...]:
     folders = [WORK / "lessons" / name for name in LESSONS]
     for name, folder in zip(LESSONS, folders, strict=True):
-        _driven(DriveSuite("disturbed", name), folder)
+        _driven(DriveSuite("disturbed", TownRoutes(name)), folder)
     return find_all_logs(folders)
 
 
@@ -50,7 +51,7 @@ def _scores(driver: str, name: str, seed: int) -> dict[str, float]:
     """Of the repetition of each set that the seed stands for."""
     figures = {}
     for short, routes in JUDGED.items():
-        suite = DriveSuite(driver, routes, seed=seed, sensors=False)
+        suite = DriveSuite(driver, TownRoutes(routes, seed=seed), sensors=False)
         summary = summarise(
             list(_driven(suite, WORK / "drives" / f"{name}_{short}_seed{seed}").drives.values())
         )

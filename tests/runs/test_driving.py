@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -16,20 +17,14 @@ from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.runs.drive.agents import needs_of
-from foredrive.runs.drive.records import read_drive, score_of
-from foredrive.runs.drive.suite import (
-    DriveJob,
-    Driven,
-    DriveSuite,
-    claim,
-    drive_suite,
-    scenario_of,
-)
+from foredrive.runs.drive.in_towns import TownRoutes, job_of
+from foredrive.runs.drive.records import read_drive
+from foredrive.runs.drive.suite import DriveJob, Driven, DriveSuite, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route
 from foredrive.simulation.scenarios.places import scenarios_on
-from foredrive.simulation.scores import Ending
+from foredrive.simulation.scores import Ending, RouteScore
 from foredrive.simulation.town import grow
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
@@ -56,9 +51,14 @@ def routes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def changed(suite: DriveSuite, **fields: Any) -> DriveSuite:
+    """The suite over other routes, or under other circumstances."""
+    return dataclasses.replace(suite, source=dataclasses.replace(suite.source, **fields))
+
+
 @pytest.fixture(scope="module")
 def suite(routes: Path) -> DriveSuite:
-    return DriveSuite("constant-velocity", str(routes), image_hw=(18, 32), vehicles=4, people=2)
+    return DriveSuite("constant-velocity", TownRoutes(str(routes), image_hw=(18, 32), vehicles=4, people=2))
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +72,8 @@ def driven(suite: DriveSuite, out: Path) -> Driven:
 
 
 def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -> None:
-    suite = DriveSuite(
-        "disturbed", str(routes), seed=5, conditions="any", sensors=False, vehicles=4, people=2
-    )
+    source = TownRoutes(str(routes), seed=5, conditions="any", vehicles=4, people=2)
+    suite = DriveSuite("disturbed", source, sensors=False)
     driven = drive_suite(suite, tmp_path, workers=1)
     logs = find_logs(tmp_path)
     taught, was_driven = (
@@ -98,20 +97,22 @@ def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path,
     file.parent.mkdir()
     file.write_text(routes.read_text().replace('id="b"', f"id={quoteattr(name)}"))
     with pytest.raises(InputError, match=r"route number 2 of .*routes\.xml: a route's id is letters, digits"):
-        drive_suite(DriveSuite("stop", str(file), sensors=False, vehicles=0, people=0), out, workers=1)
+        drive_suite(
+            DriveSuite("stop", TownRoutes(str(file), vehicles=0, people=0), sensors=False), out, workers=1
+        )
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
 def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> None:
-    assert list(driven.drives) == [DriveJob("a", 0), DriveJob("b", 0)]
+    assert list(driven.drives) == [job_of("a", 0), job_of("b", 0)]
     assert (driven.skipped, driven.broken) == (0, {})
     for job, kept in driven.drives.items():
         assert read_drive(out / "drives" / f"{job.name}.json") == kept
-        score = score_of(kept)
+        score = kept.score
         assert (score.route, score.ending) == (job.route, Ending.COMPLETED)
-        assert kept["length_m"] == pytest.approx(14.0, abs=0.5)
+        assert kept.length_m == pytest.approx(14.0, abs=0.5)
         dataset = ClipDataset(
-            [LogPath(out / kept["log"], out / "maps")], ClipConfig(1, 1, (18, 32), VOXELS), None
+            [LogPath(out / kept.log, out / "maps")], ClipConfig(1, 1, (18, 32), VOXELS), None
         )
         example = dataset[len(dataset) - 1]
         assert len(dataset.camera_names) == 6
@@ -121,7 +122,7 @@ def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> Non
     summary = read_summary(out / "summary.json")
     assert (summary["routes"], summary["drives"], summary["failed"]) == (2, 2, 0)
     assert summary["scenarios.cut_in"] == 0  # routes are too short for any
-    mean = np.mean([score_of(kept).driving_score_1_0 for kept in driven.drives.values()])
+    mean = np.mean([kept.score.driving_score_1_0 for kept in driven.drives.values()])
     assert summary["driving_score_1_0"] == pytest.approx(mean)
 
 
@@ -130,12 +131,12 @@ def test_scenarios_are_those_of_the_drives_seed(suite: DriveSuite) -> None:
     lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
     ends = graph.position(np.full(2, lane), np.array([5.0, graph.length_m[lane] - 5.0]))
     route = snap_route(RouteWaypoints("straight", "Town02", ends))
-    first, second = (scenario_of(suite, route, repetition) for repetition in (0, 1))
+    first, second = (suite.source.scenario_of(route, repetition, suite) for repetition in (0, 1))
     expected = scenarios_on(route, grow("Town02", 1), 1)
     assert [(s.kind, s.at_m) for s in second.scenarios] == [(s.kind, s.at_m) for s in expected]
     assert len(first.scenarios) >= 1
-    without = scenario_of(dataclasses.replace(suite, scenarios=False), route, 0)
-    assert without.scenarios == ()
+    without = changed(suite, scenarios=False)
+    assert without.source.scenario_of(route, 0, without).scenarios == ()
 
 
 def test_what_lies_there_is_not_driven_again(driven: Driven, suite: DriveSuite, out: Path) -> None:
@@ -143,15 +144,45 @@ def test_what_lies_there_is_not_driven_again(driven: Driven, suite: DriveSuite, 
     told: list[DriveJob] = []
     again = drive_suite(suite, out, workers=1, tick=lambda job, drive: told.append(job))
     assert again.skipped == 1
-    assert told == [DriveJob("a", 0), DriveJob("b", 0)]
+    assert told == [job_of("a", 0), job_of("b", 0)]
     for job, kept in driven.drives.items():
-        changed = {"wall_s", "act_s"}  # what the computer took
-        assert all(again.drives[job][key] == kept[key] for key in kept.keys() - changed)
+        taken = {"wall_s": kept.wall_s, "act_s": kept.act_s}  # by the computer
+        assert dataclasses.replace(again.drives[job], **taken) == kept
+
+
+def test_files_of_suites_and_drives_stay_what_they_were(driven: Driven, out: Path) -> None:
+    """Folders of before go on, and are read by who knows their keys."""
+    suite = json.loads((out / "suite.json").read_text())
+    fields = "driver routes repetitions seed conditions sensors image_hw vehicles people scenarios"
+    assert set(suite) == {*fields.split(), "period_s", "latency_s"}
+    assert suite["image_hw"] == [18, 32]
+    drive = json.loads((out / "drives" / "routea_rep0.json").read_text())
+    fields = "town length_m score driving_score_1_0 driving_score_2_1 error events comfort nearest_s act_s"
+    assert set(drive) == {*fields.split(), "route_xy", "track", "wall_s", "log", "lanes_known"}
+    assert set(drive["score"]) == {field.name for field in dataclasses.fields(RouteScore)}
+    assert drive["score"]["ending"] == "completed"
+    del drive["lanes_known"]  # towns left it out
+    (out / "old.json").write_text(json.dumps(drive))
+    assert read_drive(out / "old.json") == driven.drives[job_of("a", 0)]
+
+
+def test_a_carla_server_is_reached_by_the_verb(
+    routes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No server runs here: the drives go as far as to ask for one."""
+    command = ["drive", "--agent", "stop", "--routes", str(routes), "--no-sensors", "--out", str(tmp_path)]
+    assert main([*command, "--carla", "localhost:1"]) == 2
+    assert "CARLA" in capsys.readouterr().err
+    suite = json.loads((tmp_path / "suite.json").read_text())
+    assert (suite["carla"], suite["routes"], suite["scenarios"]) == ("localhost:1", str(routes), False)
+    for server in ("localhost:x", ":2000"):
+        assert main([*command, "--carla", server]) == 2
+        assert "a CARLA server is named HOST:PORT" in capsys.readouterr().err
 
 
 def test_a_folder_holds_one_suite(driven: Driven, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another suite"):
-        drive_suite(dataclasses.replace(suite, seed=1), out, workers=1)
+        drive_suite(changed(suite, seed=1), out, workers=1)
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="nobody knows"):
@@ -161,19 +192,25 @@ def test_a_folder_holds_one_suite(driven: Driven, suite: DriveSuite, out: Path, 
         drive_suite(suite, out, workers=1)
 
 
+def claim(suite: DriveSuite, out: Path) -> None:
+    with folder_of(suite, out).claimed():
+        pass
+
+
 def test_a_folder_is_claimed_by_what_can_be_driven(suite: DriveSuite, tmp_path: Path) -> None:
-    for wrong in ({"routes": "nothing.xml"}, {"driver": "nobody"}):
-        with pytest.raises(InputError, match=wrong.get("routes", "no such driver")):
-            claim(dataclasses.replace(suite, **wrong), tmp_path / "new")
+    unknown = changed(suite, routes="nothing.xml"), dataclasses.replace(suite, driver="nobody")
+    for wrong, named in zip(unknown, (r"nothing\.xml", "no such driver"), strict=True):
+        with pytest.raises(InputError, match=named):
+            drive_suite(wrong, tmp_path / "new")
     assert not (tmp_path / "new").exists()
     claim(suite, tmp_path)
-    other = dataclasses.replace(suite, seed=1, repetitions=2)
+    other = changed(suite, seed=1, repetitions=2)
     claim(other, tmp_path)  # nothing has been driven yet
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="another suite"):
         claim(suite, tmp_path)
-    claim(dataclasses.replace(other, repetitions=1), tmp_path)
+    claim(changed(other, repetitions=1), tmp_path)
     assert json.loads((tmp_path / "suite.json").read_text())["repetitions"] == 2
 
 

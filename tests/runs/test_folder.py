@@ -12,6 +12,7 @@ from miniature import miniature
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.runs import folder, train_run
+from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.folder import RunFolder, held
 from foredrive.runs.search.indexing import index_logs
@@ -46,7 +47,7 @@ def test_a_second_process_is_refused_by_everything_that_goes_on(
     run = tmp_path / "run"
     for second in (
         lambda: train_run(miniature(), [log], run),
-        lambda: drive_suite(DriveSuite("stop", "town05-short"), run, workers=1),
+        lambda: drive_suite(DriveSuite("stop", TownRoutes("town05-short")), run, workers=1),
         lambda: train_towers(embedded_recipe(), [log], run),
         lambda: index_logs([log], str(run), "embedded", 1.0, 1),
     ):

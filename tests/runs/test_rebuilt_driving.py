@@ -15,8 +15,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs import Run, evaluate_run
-from foredrive.runs.drive.rebuilt import REPLAY, RebuiltSuite, drive_rebuilt
-from foredrive.runs.drive.records import score_of
+from foredrive.runs.drive.in_rebuilt import REPLAY, RebuiltRoutes
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.scene import Renderer, VoxelSpec
@@ -37,7 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def out(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drives")
-    drive_rebuilt(RebuiltSuite(REPLAY, str(run)), folder)
+    drive_suite(DriveSuite(REPLAY, RebuiltRoutes(str(run))), folder)
     return folder
 
 
@@ -80,22 +80,23 @@ def test_a_drive_is_kept_and_is_a_log_like_any_other(out: Path) -> None:
 def test_a_trained_run_drives_and_is_judged_on_what_was_driven(
     trained: Run, run: Path, out: Path, tmp_path: Path
 ) -> None:
-    (drive,) = drive_rebuilt(RebuiltSuite(str(trained.folder), str(run)), tmp_path / "drives")
-    assert drive["error"] == ""
-    assert drive["score"]["duration_s"] > 1
+    suite = DriveSuite(str(trained.folder), RebuiltRoutes(str(run)))
+    (drive,) = drive_suite(suite, tmp_path / "drives").drives.values()
+    assert drive.error == ""
+    assert drive.score.duration_s > 1
     result = evaluate_run(trained, find_logs(out), tmp_path / "judged", views=False)
     assert result.failures == ()
     assert result.summary["command_source"] == "route"
 
 
 def test_what_lies_there_is_not_driven_again(run: Path, out: Path) -> None:
-    suite = RebuiltSuite(REPLAY, str(run))
+    suite = DriveSuite(REPLAY, RebuiltRoutes(str(run)))
     file = out / "drives" / "from0.5s.json"
     before = file.stat().st_mtime_ns
-    drive_rebuilt(suite, out)
+    drive_suite(suite, out)
     assert file.stat().st_mtime_ns == before
     with pytest.raises(InputError, match="another suite"):
-        drive_rebuilt(dataclasses.replace(suite, driver="stop"), out)
+        drive_suite(dataclasses.replace(suite, driver="stop"), out)
 
 
 def test_a_report_has_the_drive_and_its_film(out: Path) -> None:
@@ -120,10 +121,11 @@ def test_the_verb_drives_against_a_threat(
 
 
 def test_scores_of_threats_stand_in_the_summary(run: Path, tmp_path: Path) -> None:
-    suite = RebuiltSuite(REPLAY, str(run), threats=(Threat.STATIONARY,), sensors=False)
-    (drive,) = drive_rebuilt(suite, tmp_path)
-    assert drive["threat"]["reference_mps"] == pytest.approx(world.EGO_SPEED_MPS, abs=0.1)
-    assert drive["threat"]["impact_mps"] == pytest.approx(world.EGO_SPEED_MPS, abs=0.5)
+    suite = DriveSuite(REPLAY, RebuiltRoutes(str(run), threats=(Threat.STATIONARY,)), sensors=False)
+    (drive,) = drive_suite(suite, tmp_path).drives.values()
+    assert drive.threat is not None
+    assert drive.threat.reference_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.1)
+    assert drive.threat.impact_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.5)
     assert read_summary(tmp_path / "summary.json")["threats.stationary.collision_share"] == 1.0
-    assert score_of(drive).infractions[0].kind == "collision_vehicle"
-    assert LogPath(tmp_path / drive["log"], tmp_path / "maps").folder.is_dir()
+    assert drive.score.infractions[0].kind == "collision_vehicle"
+    assert LogPath(tmp_path / drive.log, tmp_path / "maps").folder.is_dir()

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
+from foredrive.scene import BicycleState
 from foredrive.simulation.comfort import comfort_of
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
+from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
-from foredrive.scene import Trajectory
+from foredrive.scene import BicycleState, Trajectory
 from foredrive.simulation.controller import Following, follow
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, step
+from foredrive.simulation.dynamics import EGO, STEP_S, step
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.smooth_path import fit_path
 

@@ -17,9 +17,9 @@ from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.vehicle import Vehicle
-from foredrive.scene import Agent, CameraRig, Category
+from foredrive.scene import Agent, BicycleState, CameraRig, Category
 from foredrive.simulation.drive import Drive, drive_route
-from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.rebuilt import STRUCK, RebuiltScenario, RebuiltSimulator

@@ -6,8 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from foredrive.scene import Command, Event
-from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.scene import BicycleState, Command, Event
+from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.lane_rules import LaneRules, RuleState, stop_lines
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
 from foredrive.simulation.route_progress import Progress, RouteLine

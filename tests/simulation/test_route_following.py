@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from foredrive.scene import Trajectory
+from foredrive.scene import BicycleState, Trajectory
 from foredrive.simulation.controller import Following, follow
-from foredrive.simulation.dynamics import STEP_S, BicycleState, step
+from foredrive.simulation.dynamics import STEP_S, step
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -11,8 +11,8 @@ from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.runs.drive.rebuilt import RebuiltSuite
-    from foredrive.runs.drive.suite import DriveJob, Driven, DriveSuite
+    from foredrive.runs.drive.suite import DriveJob, Driven
+    from foredrive.simulation.drive_record import DriveRecord
 
 FAILURES_SHOWN = 3
 
@@ -27,7 +27,8 @@ def drive(
     """Drive routes in closed loop and score them as CARLA's leaderboards 1.0 and 2.1 do.
 
     Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
-    With --in a log that was rebuilt is driven in instead of towns, along the way it drove itself.
+    With --in a rebuilt log is driven in instead of towns, along the way it drove itself; with --carla
+    the towns are those of a CARLA server.
 
     Args:
         agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or ego-mlp:RUN, the
@@ -39,39 +40,16 @@ def drive(
     check_out_folder(out)
     for options in (planning, towns, rebuilt):
         options.check()
-    driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    in_log = rebuilt.suite(driver, planning)
-    if in_log is not None:
-        _drive_rebuilt(in_log, out)
-    else:
-        _drive(towns.suite(driver, planning), out, towns.workers or len(os.sched_getaffinity(0)), towns.ray)
-
-
-def _drive(suite: "DriveSuite", out: Path, workers: int, on_ray: bool) -> None:
-    from foredrive.runs.drive.suite import claim, drive_suite
+    from foredrive.runs.drive.suite import DriveSuite, drive_suite
     from foredrive.view.drive_report import write_drive_report
 
-    claim(suite, out)
-    with _Progress(suite) as progress:
-        driven = drive_suite(suite, out, workers, on_ray=on_ray, tick=progress.tick)
+    driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    source = rebuilt.source() or towns.source()
+    suite = DriveSuite(driver, source, planning.sensors, planning.period, planning.latency)
+    workers = towns.workers or len(os.sched_getaffinity(0))
+    with _Progress(len(suite.jobs())) as progress:
+        driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)
     _tell(driven)
-    print(f"look: {write_drive_report(out)}")
-
-
-def _drive_rebuilt(suite: "RebuiltSuite", out: Path) -> None:
-    from rich.console import Console
-    from rich.status import Status
-
-    from foredrive.runs.drive.rebuilt import drive_rebuilt
-    from foredrive.runs.drive.records import summarise
-    from foredrive.view.drive_report import score_table, write_drive_report
-    from foredrive.view.table import print_table
-
-    with Status("driving") as status:
-        drives = drive_rebuilt(suite, out, lambda job: status.update(f"driving; last driven: {job.route}"))
-    print_table(score_table(summarise(drives)), Console())
-    for met in (drive["threat"] for drive in drives if "threat" in drive):
-        print(f"{met['kind']} threat: {met['score']:.1f} of 5")
     print(f"look: {write_drive_report(out)}")
 
 
@@ -98,12 +76,14 @@ def _tell(driven: "Driven") -> None:
     if driven.skipped:
         print(f"{driven.skipped} of {len(driven.drives)} drives were there already")
     print_table(score_table(summarise(list(driven.drives.values()))), Console())
+    for met in (drive.threat for drive in driven.drives.values() if drive.threat):
+        print(f"{met.kind} threat: {met.score:.1f} of 5")
 
 
 class _Progress:
     """A bar over all drives, with the mean driving score so far."""
 
-    def __init__(self, suite: "DriveSuite") -> None:
+    def __init__(self, total: int) -> None:
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -113,11 +93,8 @@ class _Progress:
             TimeRemainingColumn,
         )
 
-        from foredrive.simulation.route_sets import load_route_set
-
         columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
         self._progress = Progress("driving", *columns, TextColumn("{task.fields[score]}"))
-        total = suite.repetitions * len(load_route_set(suite.routes))
         self._bar = self._progress.add_task("", total=total, score="")
         self._scores: list[float] = []
 
@@ -128,9 +105,9 @@ class _Progress:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def tick(self, job: "DriveJob", drive: dict[str, Any] | None) -> None:
+    def tick(self, job: "DriveJob", drive: "DriveRecord | None") -> None:
         """One drive is done with."""
         if drive is not None:
-            self._scores.append(drive["driving_score_1_0"])
+            self._scores.append(drive.driving_score_1_0)
         mean = f"score {sum(self._scores) / len(self._scores):.1f}" if self._scores else ""
         self._progress.update(self._bar, advance=1, score=mean)

@@ -17,8 +17,9 @@ from foredrive.cli.arguments import (
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.runs.drive.rebuilt import RebuiltSuite
-    from foredrive.runs.drive.suite import DriveSuite
+    from foredrive.runs.drive.in_carla import CarlaRoutes
+    from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+    from foredrive.runs.drive.in_towns import TownRoutes
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class InTowns:
     """Routes through towns.
 
     Args:
+        carla: Drive on a CARLA server instead of the embedded towns, one drive at a time, without scenarios.
         routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for lessons in
             the other towns training-short and training-long.
         repetitions: How often each route is driven, every time among other traffic.
@@ -61,6 +63,7 @@ class InTowns:
     """
 
     routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short"
+    carla: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
     repetitions: int = 1
     seed: int = 0
     conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
@@ -80,24 +83,25 @@ class InTowns:
         check_number("--people", self.people, low=0)
         check_number("--workers", self.workers, low=0)
 
-    def suite(self, driver: str, planning: Planning) -> "DriveSuite":
-        """The drives that are asked for."""
-        from foredrive.runs.drive.suite import DriveSuite
+    def source(self) -> "TownRoutes | CarlaRoutes":
+        """What is to be driven."""
+        from foredrive.runs.drive.in_towns import TownRoutes
 
-        return DriveSuite(
-            driver=driver,
+        routes = TownRoutes(
             routes=self.routes,
             repetitions=self.repetitions,
             seed=self.seed,
             conditions=self.conditions,
-            sensors=planning.sensors,
             image_hw=self.image_size,
             vehicles=self.vehicles,
             people=self.people,
-            scenarios=self.scenarios,
-            period_s=planning.period,
-            latency_s=planning.latency,
+            scenarios=self.scenarios and self.carla is None,
         )
+        if self.carla is None:
+            return routes
+        from foredrive.runs.drive.in_carla import CarlaRoutes
+
+        return CarlaRoutes(self.carla, routes)
 
 
 @dataclass(frozen=True)
@@ -125,8 +129,8 @@ class InRebuilt:
             check_number("--start", start)
         check_file(self.edits)
 
-    def suite(self, driver: str, planning: Planning) -> "RebuiltSuite | None":
-        """The drives that are asked for, if they are in a rebuilt log.
+    def source(self) -> "RebuiltRoutes | None":
+        """What is to be driven, if it is in a rebuilt log.
 
         Raises:
             InputError: what is for rebuilt logs is asked for without one.
@@ -135,16 +139,12 @@ class InRebuilt:
             if self.start or self.threat or self.edits is not None:
                 raise InputError("--start, --threat and --edits are for drives in rebuilt logs (--in RUN)")
             return None
-        from foredrive.runs.drive.rebuilt import RebuiltSuite
+        from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
         from foredrive.simulation.threats import Threat
 
-        return RebuiltSuite(
-            driver=driver,
+        return RebuiltRoutes(
             run=str(Path(self.rebuilt).absolute()),
             starts_s=self.start,
             threats=tuple(map(Threat, self.threat)),
             edits=None if self.edits is None else str(self.edits.absolute()),
-            sensors=planning.sensors,
-            period_s=planning.period,
-            latency_s=planning.latency,
         )

@@ -1,6 +1,10 @@
 """Many jobs at once, over processes or over Ray; what one of them fails of takes none of the others with it.
 
 An interruption reaches every worker, and what they have half written is cleared away before it is raised.
+
+Local work runs on the standard library's process pool: Ray would start a cluster of processes for two
+workers, and loky ends its workers by killing them, so that half-written files would stay. Ray serves
+clusters.
 """
 
 import _thread

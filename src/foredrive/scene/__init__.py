@@ -8,6 +8,7 @@ from foredrive.scene.map_patch import MapKind, MapPatch
 from foredrive.scene.protocols import (
     Agent,
     Belief,
+    BicycleState,
     Control,
     Decoded,
     Event,
@@ -16,6 +17,7 @@ from foredrive.scene.protocols import (
     RenderedRays,
     Renderer,
     Simulator,
+    Standing,
     Step,
     Task,
     WorldModel,
@@ -28,6 +30,7 @@ from foredrive.scene.voxels import VoxelGrid, VoxelSpec
 __all__ = [
     "Agent",
     "Belief",
+    "BicycleState",
     "Boxes",
     "CameraRig",
     "Category",
@@ -47,6 +50,7 @@ __all__ = [
     "RenderedRays",
     "Renderer",
     "Simulator",
+    "Standing",
     "Step",
     "Task",
     "Trajectory",

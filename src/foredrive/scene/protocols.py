@@ -198,15 +198,52 @@ class Step:
     done: bool
 
 
+@dataclass(frozen=True)
+class BicycleState:
+    """The ego vehicle at one time, in the world frame seen from above."""
+
+    x_m: float
+    """Middle of the rear axle."""
+    y_m: float
+    yaw_rad: float
+    """In [-π, π]."""
+    speed_mps: float
+    """Never negative: nobody reverses."""
+    steering_rad: float = 0.0
+    """Front-wheel angle, positive to the left."""
+    acceleration_mps2: float = 0.0
+    """Of the speed, as engine and brakes have it now; 0 while the vehicle stands."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far a drive has come."""
+
+    completion: float
+    """Share of the route, 0 to 1."""
+    outside_lanes: float
+    """Share of the way driven outside of the lanes or against them, 0 to 1."""
+    driven_m: float
+
+
+@runtime_checkable
 class Simulator(Protocol):
-    """A world that answers: a town, a rebuilt log, CARLA."""
+    """A world to drive a route in: a town, a rebuilt log, CARLA."""
 
     def reset(self, scenario: Any) -> Clip:
-        """Start a scenario and return the first observation."""
+        """Start a drive and return its first key frame."""
         ...
 
     def step(self, control: Control) -> Step:
-        """Advance by one simulation step."""
+        """Drive on for one simulation step; an event's kind tells why a drive is over."""
+        ...
+
+    def ego(self) -> BicycleState:
+        """The ego vehicle now."""
+        ...
+
+    def standing(self) -> Standing:
+        """How far the drive has come."""
         ...
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from foredrive.scene import Category, Event
-from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.scene import BicycleState, Category, Event
+from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, touched
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.world import World

@@ -9,7 +9,8 @@ from jaxtyping import Float64
 from scipy.signal import savgol_filter
 
 from foredrive.errors import InputError
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, Vehicle, yaw_rate_radps
+from foredrive.scene import BicycleState
+from foredrive.simulation.dynamics import EGO, STEP_S, Vehicle, yaw_rate_radps
 
 ACCELERATION_S, JERK_S = 0.8, 1.5
 """Derivatives are those of quadratics over this much time (Savitzky & Golay 1964), as nuPlan takes them."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foredrive.scene import Control
-from foredrive.simulation.dynamics import EGO, BicycleState, Vehicle
+from foredrive.scene import BicycleState, Control
+from foredrive.simulation.dynamics import EGO, Vehicle
 from foredrive.simulation.plans import Plan
 
 RETURN_M, RETURN_S = 2.5, 0.5

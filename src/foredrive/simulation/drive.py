@@ -4,52 +4,19 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from foredrive.data.collate import stack_records
 from foredrive.errors import InputError
-from foredrive.scene import Agent, Clip, Control, Event, Step
+from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator
 from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
 from foredrive.simulation.controller import Following, follow
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
+from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.plans import Plan, fixed_in_world
 from foredrive.simulation.scores import Ending, RouteScore, infraction_of
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
-
-
-@dataclass(frozen=True)
-class Standing:
-    """How far a drive has come."""
-
-    completion: float
-    """Share of the route, 0 to 1."""
-    outside_lanes: float
-    """Share of the way driven outside of the lanes or against them, 0 to 1."""
-    driven_m: float
-
-
-@runtime_checkable
-class RoadSimulator(Protocol):
-    """A `Simulator` of drives along routes."""
-
-    def reset(self, scenario: Any) -> Clip:
-        """Start a drive and return its first key frame."""
-        ...
-
-    def step(self, control: Control) -> Step:
-        """Drive on for `STEP_S`; an event tells by its kind, an `Ending`, why the drive is over."""
-        ...
-
-    def ego(self) -> BicycleState:
-        """The ego vehicle now."""
-        ...
-
-    def standing(self) -> Standing:
-        """How far the drive has come."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -95,7 +62,7 @@ class Drive:
 
 
 def drive_route(
-    simulator: RoadSimulator,
+    simulator: Simulator,
     scenario: object,
     agent: Agent,
     *,

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.log_writer import Frame, LogWriter
-from foredrive.scene import CameraRig, Trajectory
-from foredrive.simulation.dynamics import BicycleState, yaw_rate_radps
+from foredrive.scene import BicycleState, CameraRig, Trajectory
+from foredrive.simulation.carla.simulator import CarlaSimulator
+from foredrive.simulation.dynamics import yaw_rate_radps
 from foredrive.simulation.observation import KeyFrame
 from foredrive.simulation.rebuilt import RebuiltSimulator
 from foredrive.simulation.town import TownScenario, TownSimulator
@@ -55,6 +56,12 @@ def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Fra
         taught=None if taught is None else taught[0],
         traffic_lights=lights_of_lanes(load_town_map(simulator.scenario.town), lights),
     )
+
+
+def carla_key_frame(simulator: CarlaSimulator, scenario: TownScenario) -> Frame:
+    """The same of a drive on a server of CARLA, whose lights are not logged."""
+    names = () if scenario.sensors is None else scenario.sensors.rig.names
+    return _frame(simulator.state.frames[-1], simulator.state.ego, names)
 
 
 def rebuilt_key_frame(simulator: RebuiltSimulator) -> Frame:

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from foredrive.errors import InputError
-from foredrive.scene import Control
+from foredrive.scene import BicycleState, Control
 
 STEP_S = 0.05
 """The simulation runs at 20 Hz."""
@@ -36,23 +36,6 @@ class Vehicle:
 
 
 EGO = Vehicle()
-
-
-@dataclass(frozen=True)
-class BicycleState:
-    """The ego vehicle at one time, in the world frame seen from above."""
-
-    x_m: float
-    """Middle of the rear axle."""
-    y_m: float
-    yaw_rad: float
-    """In [-π, π]."""
-    speed_mps: float
-    """Never negative: nobody reverses."""
-    steering_rad: float = 0.0
-    """Front-wheel angle, positive to the left."""
-    acceleration_mps2: float = 0.0
-    """Of the speed, as engine and brakes have it now; 0 while the vehicle stands."""
 
 
 def step(state: BicycleState, control: Control, dt_s: float = STEP_S, vehicle: Vehicle = EGO) -> BicycleState:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.scene import Event
-from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.scene import BicycleState, Event
+from foredrive.simulation.dynamics import EGO
 from foredrive.towns.map.town_map import StopZoneKind, TownMap
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.near_lanes import LEVEL_M, NearLanes

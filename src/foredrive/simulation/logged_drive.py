@@ -9,7 +9,8 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.rendering.vehicle import Vehicle
-from foredrive.simulation.dynamics import EGO, BicycleState
+from foredrive.scene import BicycleState
+from foredrive.simulation.dynamics import EGO
 
 SPEED_OVER_S = 0.2
 """Speeds are those over twice as long: logged poses tremble."""

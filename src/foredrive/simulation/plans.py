@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from scipy.interpolate import PchipInterpolator
 
 from foredrive.errors import InputError
-from foredrive.scene import Trajectory
-from foredrive.simulation.dynamics import EGO, BicycleState, Vehicle
+from foredrive.scene import BicycleState, Trajectory
+from foredrive.simulation.dynamics import EGO, Vehicle
 from foredrive.simulation.smooth_path import Path, fit_path
 
 STANDS_M = 0.25

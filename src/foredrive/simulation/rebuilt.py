@@ -10,10 +10,9 @@ from jaxtyping import Float64
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
 from foredrive.rendering.tracks import Tracks, boxes_at
-from foredrive.scene import Clip, Control, Event, Renderer, Step
+from foredrive.scene import BicycleState, Clip, Control, Event, Renderer, Standing, Step
 from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
-from foredrive.simulation.drive import Standing
-from foredrive.simulation.dynamics import STEP_S, BicycleState, step, yaw_rate_radps
+from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images

@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.errors import InputError
-from foredrive.scene import Clip, Control, Event, Step
+from foredrive.scene import BicycleState, Clip, Control, Event, Standing, Step
 from foredrive.simulation.collisions import CollisionSense, Contacts
-from foredrive.simulation.drive import Standing
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState, step, yaw_rate_radps
+from foredrive.simulation.dynamics import EGO, STEP_S, step, yaw_rate_radps
 from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users

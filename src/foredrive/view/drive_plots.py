@@ -1,6 +1,6 @@
 """Figures of one closed-loop drive: where it went, and how fast."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from foredrive.simulation.drive_record import DriveRecord
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.scores import InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
@@ -36,12 +37,12 @@ LETTERS = {
 """By which infractions are marked in the figures."""
 
 
-def draw_way(drive: Mapping[str, Any]) -> Figure:
+def draw_way(drive: DriveRecord) -> Figure:
     """The route over the town's lanes, if there is a town, the way driven coloured by speed; north is up.
     Infractions and scenarios are marked."""
     figure = Figure(figsize=(4.6, 4.6))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    route, track = np.array(drive["route_xy"]), np.array(drive["track"]["xy"])
+    route, track = np.array(drive.route_xy), np.array(drive.track.xy)
     everything = np.concatenate([route, track])
     low, high = everything.min(axis=0) - AROUND_M, everything.max(axis=0) + AROUND_M
     centre, half = 0.5 * (low + high), max(SMALLEST_M, 0.5 * float((high - low).max()))
@@ -50,14 +51,14 @@ def draw_way(drive: Mapping[str, Any]) -> Figure:
     ax.set_aspect("equal")
     ax.set_xticks([])
     ax.set_yticks([])
-    if drive["town"] is not None:
-        _draw_lanes(ax, drive["town"], centre, half)
+    if drive.town is not None:
+        _draw_lanes(ax, drive.town, centre, half)
     ax.plot(*route.T, color=palette.FAINT, linewidth=6.0, alpha=0.5, solid_capstyle="round", zorder=2)
     ax.plot(*route[-1], "o", color=palette.EXPERT, markersize=9, markerfacecolor="none", zorder=4)
     if len(track) > 1:
         pieces = LineCollection(
             list(np.stack([track[:-1], track[1:]], axis=1)),
-            array=np.array(drive["track"]["speed_mps"][1:]),
+            array=np.array(drive.track.speed_mps[1:]),
             cmap=SPEED_MAP,
             norm=Normalize(DARKEST * FASTEST_MPS, FASTEST_MPS),
             linewidth=2.4,
@@ -75,16 +76,16 @@ def draw_way(drive: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_timeline(drive: Mapping[str, Any]) -> Figure:
+def draw_timeline(drive: DriveRecord) -> Figure:
     """Speed over time, with what happened and what went wrong, and where others came near."""
     figure = Figure(figsize=(7.6, 2.3))
     ax = figure.add_axes((0.07, 0.22, 0.92, 0.70))
-    t_s, speed = drive["track"]["t_s"], drive["track"]["speed_mps"]
+    t_s, speed = drive.track.t_s, drive.track.speed_mps
     ax.fill_between(t_s, speed, color="#4c8be0", alpha=0.25, linewidth=0)
     ax.plot(t_s, speed, color="#4c8be0", linewidth=1.6)
     top = max(6.0, 1.25 * max(speed, default=0.0))
-    ax.set(xlim=(0.0, max(float(drive["score"]["duration_s"]), 1.0)), ylim=(0.0, top))
-    for t0, t1 in _near(drive["nearest_s"]):
+    ax.set(xlim=(0.0, max(drive.score.duration_s, 1.0)), ylim=(0.0, top))
+    for t0, t1 in _near(drive.nearest_s):
         ax.axvspan(t0, t1, color="#e0a458", alpha=0.3, linewidth=0)
     for at_s, _, text, style in _marks(drive):
         ax.axvline(at_s, color=style["bbox"]["facecolor"], linewidth=1.4)
@@ -111,20 +112,15 @@ def _draw_lanes(ax: Axes, town: str, centre: Float[np.ndarray, "2"], half: float
     ax.add_collection(LineCollection(lines, color="#465266", linewidth=0.5, zorder=1.1))
 
 
-def scenario_events(drive: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Where scenarios began, in the order in which they did: they are numbered by it."""
-    return [event for event in drive["events"] if event["kind"] == "scenario"]
-
-
-def _marks(drive: Mapping[str, Any]) -> list[tuple[float, Sequence[float], str, dict[str, Any]]]:
+def _marks(drive: DriveRecord) -> list[tuple[float, Sequence[float], str, dict[str, Any]]]:
     """When, where, what to write and how for all that is marked; infractions come last, on top."""
     marks = [
-        (event["t_s"], event["xy_world"], str(number), _style("square", palette.SCENARIO))
-        for number, event in enumerate(scenario_events(drive), start=1)
+        (event.t_s, event.xy_world, str(number), _style("square", palette.SCENARIO))
+        for number, event in enumerate(drive.scenario_events, start=1)
     ]
     return marks + [
-        (each["t_s"], each["xy_world"], LETTERS[InfractionKind(each["kind"])], _style("circle", palette.PLAN))
-        for each in drive["score"]["infractions"]
+        (each.t_s, each.xy_world, LETTERS[each.kind], _style("circle", palette.PLAN))
+        for each in drive.score.infractions
     ]
 
 

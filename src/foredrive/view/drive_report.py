@@ -1,10 +1,8 @@
 """The report on a suite of closed-loop drives: scores, and each drive with its way, its speed and a film."""
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -12,11 +10,13 @@ from markupsafe import Markup
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
-from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, read_drive, score_of
+from foredrive.runs.drive.records import read_drive, suite_title
+from foredrive.runs.folder import DRIVES, SUMMARY
+from foredrive.simulation.drive_record import DriveRecord, ThreatMet
 from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
-from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way, scenario_events
+from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.html import Tile, inline_svg, write_page
 from foredrive.view.origin import Origin
@@ -100,18 +100,18 @@ def write_drive_report(out: Path) -> Path:
     """
     if not (out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
-    suite = json.loads((out / SUITE).read_text())
+    title = suite_title(out)
     drives = {path.stem: read_drive(path) for path in sorted((out / DRIVES).glob("*.json"), key=_order)}
     for name, drive in drives.items():
         film = out / VIDEOS / f"{name}.webp"
         if not film.is_file():
-            write_drive_video(film, LogPath(out / drive["log"], out / "maps"), drive)
+            write_drive_video(film, LogPath(out / drive.log, out / "maps"), drive)
     summary = read_summary(out / SUMMARY)
-    worst_first = sorted(drives, key=lambda name: float(drives[name]["driving_score_1_0"]))
+    worst_first = sorted(drives, key=lambda name: drives[name].driving_score_1_0)
     write_page(
         out / REPORT,
         "drive_report.html.j2",
-        title=f"{Path(suite['driver']).name} on {Path(suite['routes']).stem}",
+        title=title,
         origin=Origin.of(summary),
         tiles=_tiles(summary),
         endings=_counted(summary, "endings", Ending),
@@ -171,7 +171,7 @@ def _counted(summary: Summary, what: str, kinds: Iterable[str]) -> str:
     return ", ".join(f"{number(count)} {words(kind)}" for kind, count in counts.items() if count)
 
 
-def _drive_table(drives: Mapping[str, Mapping[str, Any]]) -> Table:
+def _drive_table(drives: Mapping[str, DriveRecord]) -> Table:
     columns = (
         Column("drive", align="left"),
         Column("length, m", digits=0),
@@ -186,15 +186,15 @@ def _drive_table(drives: Mapping[str, Mapping[str, Any]]) -> Table:
     return simple_table(columns, [_drive_row(name, drive) for name, drive in drives.items()])
 
 
-def _drive_row(name: str, drive: Mapping[str, Any]) -> list[Value | Cell]:
-    score = score_of(dict(drive))
+def _drive_row(name: str, drive: DriveRecord) -> list[Value | Cell]:
+    score = drive.score
     return [
         Cell(name, link=name),
-        drive["length_m"],
+        drive.length_m,
         score.driving_score_1_0,
         score.driving_score_2_1,
         100 * score.completion,
-        100 * score.outside_lanes if drive.get("lanes_known", True) else None,
+        100 * score.outside_lanes if drive.lanes_known else None,
         score.duration_s,
         Cell(words(score.ending), "good" if score.ending is Ending.COMPLETED else "bad"),
         ", ".join(words(infraction.kind) for infraction in score.infractions),
@@ -207,21 +207,21 @@ def _told(infraction: Infraction) -> str:
     return detail if detail.startswith(what) else f"{what} {detail}"
 
 
-def _show_drive(name: str, drive: Mapping[str, Any]) -> ShownDrive:
-    score = score_of(dict(drive))
+def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
+    score = drive.score
     happenings = [Happening(each.t_s, words(each.kind), _told(each)) for each in score.infractions]
     happenings += [
-        Happening(event["t_s"], f"scenario {place}", words(event["what"]))
-        for place, event in enumerate(scenario_events(drive), start=1)
+        Happening(event.t_s, f"scenario {place}", words(event.what))
+        for place, event in enumerate(drive.scenario_events, start=1)
     ]
     happenings.sort(key=lambda each: each.t_s or 0.0)
-    if "threat" in drive:
-        happenings.append(_threat(drive["threat"]))
+    if drive.threat is not None:
+        happenings.append(_threat(drive.threat))
     return ShownDrive(
         name=name,
         score=number(score.driving_score_1_0, 1),
         ending=words(score.ending),
-        error=drive["error"],
+        error=drive.error,
         way=inline_svg(draw_way(drive)),
         timeline=inline_svg(draw_timeline(drive)),
         happenings=happenings,
@@ -229,12 +229,12 @@ def _show_drive(name: str, drive: Mapping[str, Any]) -> ShownDrive:
     )
 
 
-def _threat(met: Mapping[str, Any]) -> Happening:
+def _threat(met: ThreatMet) -> Happening:
     """Tell what came of a threat."""
-    hit = "not hit" if met["impact_mps"] is None else f"hit at {met['impact_mps']:.1f} m/s"
-    by_the_log = f"{met['reference_mps']:.1f} m/s by who goes on as the log did"
-    text = f"{hit} ({by_the_log}), score {met['score']:.1f} of 5"
-    return Happening(None, f"{words(met['kind'])} threat", text)
+    hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
+    by_the_log = f"{met.reference_mps:.1f} m/s by who goes on as the log did"
+    text = f"{hit} ({by_the_log}), score {met.score:.1f} of 5"
+    return Happening(None, f"{words(met.kind)} threat", text)
 
 
 def _order(path: Path) -> tuple[list[int], str]:

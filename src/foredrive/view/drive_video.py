@@ -1,9 +1,7 @@
 """A closed-loop drive as an animated picture: what the front cameras saw, and the scene from above."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,11 +13,11 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.geometry.boxes import box_corners
 from foredrive.scene import Boxes
+from foredrive.simulation.drive_record import DriveRecord
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
-from foredrive.view.drive_plots import scenario_events
 from foredrive.view.video import write_video
 
 FASTER = 2.0
@@ -36,7 +34,7 @@ TOLD_S = 6.0
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
 
 
-def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> None:
+def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
     """Write an animated WebP, which browsers play: a frame for each key frame, twice as fast as life.
 
     Args:
@@ -48,10 +46,8 @@ def write_drive_video(path: Path, log: LogPath, drive: Mapping[str, Any]) -> Non
     write_video(path, frames, FRAME_DT_S / FASTER)
 
 
-def _frame(log: Log, index: int, drive: Mapping[str, Any]) -> Image.Image:
-    above = from_above(
-        drive["town"], np.array(drive["route_xy"]), log.T_world_ego[index], read_boxes(log, index)
-    )
+def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
+    above = from_above(drive.town, np.array(drive.route_xy), log.T_world_ego[index], read_boxes(log, index))
     _caption(ImageDraw.Draw(above), log, index, drive)
     cameras = pinhole_cameras(log)
     shown = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None]
@@ -106,17 +102,18 @@ def from_above(
     return image.resize(ABOVE_WH, Image.Resampling.BOX)
 
 
-def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: Mapping[str, Any]) -> None:
+def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: DriveRecord) -> None:
     t_s = float(log.t_us[index] - log.t_us[0]) * 1e-6
     font = ImageFont.load_default(size=16)
     pen.text((10, 8), f"{t_s:.1f} s   {log.speed_mps[index]:.1f} m/s", fill=palette.INK, font=font)
-    begun = [each for each in scenario_events(drive) if 0.0 <= t_s - each["t_s"] < TOLD_S]
+    begun = [each for each in drive.scenario_events if 0.0 <= t_s - each.t_s < TOLD_S]
     for each in begun[-1:]:
-        text = each["what"].replace("_", " ")
+        text = each.what.replace("_", " ")
         pen.text((ABOVE_WH[0] - 10, 8), text, fill=palette.SCENARIO, font=font, anchor="ra")
-    wrong = [each for each in drive["score"]["infractions"] if each["t_s"] <= t_s + 1e-6]
-    for line, each in enumerate(wrong[-4:]):
-        text = f"{each['t_s']:.1f} s  {each['kind'].replace('_', ' ')} {each['what']}"
+    wrong = [infraction for infraction in drive.score.infractions if infraction.t_s <= t_s + 1e-6]
+    for line, infraction in enumerate(wrong[-4:]):
+        kind = infraction.kind.replace("_", " ")
+        text = f"{infraction.t_s:.1f} s  {kind} {infraction.what}"
         pen.text((10, 34 + 22 * line), text, fill=palette.PLAN, font=font)
 
 

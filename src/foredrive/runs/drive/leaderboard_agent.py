@@ -12,7 +12,7 @@ from typing import Any
 
 from foredrive.files import atomic_path
 from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.drive.suite import DriveSuite
+from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.leaderboard import LeaderboardDriver
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
@@ -54,7 +54,7 @@ class ForedriveAgent(_AutonomousAgent):
         driver, self._route_name = driver_of(path_to_conf_file)
         needs, self._t_s = needs_of(driver), 0.0
         agent = make_driver(driver, lambda: self._t_s)
-        rig = camera_rig(DriveSuite.image_hw) if needs.cameras else None
+        rig = camera_rig(TownRoutes.image_hw) if needs.cameras else None
         self._driver = LeaderboardDriver(agent, rig, roof_lidar() if needs.lidar else None, needs.past_frames)
         self._make_control = import_carla().VehicleControl
         self._has_route = False

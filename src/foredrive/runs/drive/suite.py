@@ -1,4 +1,4 @@
-"""Drives of one driver over a set of routes, over processes or over Ray; each is kept as it ends.
+"""Drives of one driver over what a source offers; each is kept as it ends.
 
 A suite is a folder: drives/NAME.json is all that came of a drive, logs/ has it as a 123D log, summary.json
 has the scores. What lies there is not driven again.
@@ -9,87 +9,123 @@ import dataclasses
 import functools
 import json
 import time
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
+from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import write_json, write_summary
+from foredrive.evaluation.summary import write_summary
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.drive.records import DRIVES, SUITE, SUMMARY, kept_of, read_drive, summarise
+from foredrive.runs.drive.records import read_drive, summarise, write_drive
 from foredrive.runs.fan_out import fan_out, reason
-from foredrive.runs.folder import held
-from foredrive.simulation.drive import Pace, drive_route
-from foredrive.simulation.drive_log import drive_log, key_frame
-from foredrive.simulation.lessons import Alternating, Disturbed
-from foredrive.simulation.route_sets import load_route_set
-from foredrive.simulation.routes import DriveRoute, snap_route
-from foredrive.simulation.scenarios.places import scenarios_on
-from foredrive.simulation.scores import timeout_s
-from foredrive.simulation.town import TownScenario, TownSimulator, grow
-from foredrive.towns.campaign import ANY_CONDITIONS
-from foredrive.towns.conditions import CONDITIONS, find_conditions
-from foredrive.towns.recorder import Crowd
-from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-
-
-@dataclass(frozen=True)
-class DriveSuite:
-    """Who drives what, and under which circumstances."""
-
-    driver: str
-    """See `drivers.needs_of`."""
-    routes: str
-    """A set that comes with the package, or a CARLA route file."""
-    repetitions: int = 1
-    seed: int = 0
-    """Of the place and the traffic in the first repetition; the next has the next."""
-    conditions: str | None = None
-    """A name, or `ANY_CONDITIONS`: drawn for each drive; None draws bright daylight from the seed."""
-    sensors: bool = True
-    """Drives of drivers that need none are logged with cameras and lidar all the same."""
-    image_hw: tuple[int, int] = (144, 256)
-    vehicles: int = Crowd.vehicles
-    people: int = Crowd.people
-    scenarios: bool = True
-    """Whether others brake, cut in, run lights and step out on the way, as the seed decides."""
-    period_s: float = Pace.period_s
-    latency_s: float = Pace.latency_s
-
-    def __post_init__(self) -> None:
-        Pace(self.period_s, self.latency_s)
-        if self.repetitions < 1:
-            raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
-        if self.conditions not in (None, ANY_CONDITIONS, *CONDITIONS):
-            there_are = ", ".join((ANY_CONDITIONS, *CONDITIONS))
-            raise InputError(f"no conditions are named {self.conditions}; there are {there_are}")
+from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
+from foredrive.scene import Agent, Simulator
+from foredrive.simulation.drive import Drive, Pace, drive_route
+from foredrive.simulation.drive_record import DriveRecord, ThreatMet, record_of
+from foredrive.training.interrupts import start_fork_server
 
 
 @dataclass(frozen=True)
 class DriveJob:
     """One drive of a suite."""
 
+    name: str
+    """Of the drive's files."""
     route: str
-    """Its id in the set."""
-    repetition: int
+    repetition: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """All that one drive takes, set up."""
+
+    simulator: Simulator
+    scenario: object
+    """What the simulator is reset to."""
+    agent: Agent
+    route_xyz: Float64[np.ndarray, "N 3"]
+    length_m: float
+    """Of the route."""
+    log: LogWriter
+    frame: Callable[[], Frame]
+    """What is logged of the latest key frame."""
+    town: str | None = None
+    """Whose lanes lie below; None: there is no map."""
+    lanes_known: bool = True
+    judge: Callable[[Drive], ThreatMet | None] = lambda drive: None
+    """What the drive is worth beside its score."""
+
+
+@runtime_checkable
+class Source(Protocol):
+    """A kind of world to drive in: it offers drives and sets each up."""
 
     @property
-    def name(self) -> str:
-        """Of the drive's files."""
-        return f"route{self.route}_rep{self.repetition}"
+    def in_turn(self) -> bool:
+        """Whether drives follow each other in this process, since they share something large."""
+        ...
+
+    @property
+    def grows(self) -> tuple[str, ...]:
+        """Fields of which more may be asked for later, in the same folder."""
+        ...
+
+    def noted(self) -> Mapping[str, object]:
+        """The fields, for JSON; "routes" names what is driven."""
+        ...
+
+    def jobs(self, driver: str) -> Sequence[DriveJob]:
+        """The drives. Raises InputError if there are none, or there is no such driver."""
+        ...
+
+    def stage(self, job: DriveJob, suite: "DriveSuite", out: Path) -> AbstractContextManager[Stage]:
+        """Set a drive up; its log is whole when the context ends. Raises InputError if that cannot be."""
+        ...
+
+
+@dataclass(frozen=True)
+class DriveSuite:
+    """Who drives what, and how it plans."""
+
+    driver: str
+    """See `agents.needs_of`."""
+    source: Source
+    sensors: bool = True
+    """Drives of drivers that need none are logged with cameras and lidar all the same."""
+    period_s: float = Pace.period_s
+    latency_s: float = Pace.latency_s
+
+    def __post_init__(self) -> None:
+        Pace(self.period_s, self.latency_s)
+
+    def jobs(self) -> Sequence[DriveJob]:
+        """The drives.
+
+        Raises:
+            InputError: there is no such driver, or nothing to drive.
+        """
+        return self.source.jobs(self.driver)
+
+    def noted(self) -> dict[str, object]:
+        """As the suite's file has it."""
+        of_all = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        del of_all["source"]
+        noted: dict[str, object] = json.loads(json.dumps({**of_all, **self.source.noted()}))
+        return noted
 
 
 @dataclass(frozen=True)
 class Driven:
     """What came of a suite."""
 
-    drives: dict[DriveJob, dict[str, Any]]
+    drives: dict[DriveJob, DriveRecord]
     """What was kept of each drive."""
     skipped: int
     """How many lay there before."""
@@ -100,147 +136,119 @@ class Driven:
 def drive_suite(
     suite: DriveSuite,
     out: Path,
-    workers: int,
+    workers: int = 1,
     *,
     on_ray: bool = False,
-    tick: Callable[[DriveJob, dict[str, Any] | None], None] = lambda job, drive: None,
+    tick: Callable[[DriveJob, DriveRecord | None], None] = lambda job, drive: None,
 ) -> Driven:
     """Drive all that does not lie in the folder yet, and write the summary once all are there.
 
     Args:
-        workers: drives at a time; on Ray as for `fan_out.fan_out`.
+        workers: drives at a time, of a source that allows it; on Ray as for `fan_out.fan_out`.
         tick: told of each drive as it is done with, None if it broke.
 
     Raises:
-        InputError: there is no such driver or set of routes, or the folder holds another suite, or another
-            process drives into it.
+        InputError: there is no such driver or nothing to drive; the folder holds another suite, or another
+            process drives into it; a drive of a source that goes in turn cannot be set up.
         OSError: the disk is full.
     """
-    needs_of(suite.driver)
-    load_route_set(suite.routes)
-    with held(out):
-        return _drive_rest(suite, out, workers, on_ray, tick)
-
-
-def _drive_rest(
-    suite: DriveSuite,
-    out: Path,
-    workers: int,
-    on_ray: bool,
-    tick: Callable[[DriveJob, dict[str, Any] | None], None],
-) -> Driven:
-    claim(suite, out)
-    routes = load_route_set(suite.routes)
-    jobs = [DriveJob(route.id, n) for n in range(suite.repetitions) for route in routes]
-    drives, broken = {}, {}
-    for job in jobs:
-        if _file(out, job).is_file():
-            drives[job] = read_drive(_file(out, job))
-            tick(job, drives[job])
-    skipped = len(drives)
-    threads = max(1, torch.get_num_threads() // workers)
+    jobs, in_turn = suite.jobs(), suite.source.in_turn
+    threads = None if in_turn else max(1, torch.get_num_threads() // workers)
     work = functools.partial(drive_one, suite=suite, out=out, threads=threads)
-    todo = [job for job in jobs if job not in drives]
-    with contextlib.closing(fan_out(todo, work, workers, on_ray=on_ray)) as results:
-        for job, result in results:
-            if isinstance(result, BaseException):
-                broken[job] = reason(job.name, result)
-                tick(job, None)
-            else:
-                drives[job] = result
-                tick(job, result)
-    driven = Driven({job: drives[job] for job in jobs if job in drives}, skipped, broken)
-    if not broken:  # a mean over what happened to work would be none of the suite
-        write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
+    drives, broken = dict[DriveJob, DriveRecord](), dict[DriveJob, str]()
+    with folder_of(suite, out).claimed():
+        for job in jobs:
+            if _file(out, job).is_file():
+                drives[job] = read_drive(_file(out, job))
+                tick(job, drives[job])
+        skipped = len(drives)
+        todo = [job for job in jobs if job not in drives]
+        if not in_turn:
+            start_fork_server(preload=type(suite.source).__module__)  # what it imports is shared by workers
+        results = _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray)
+        with contextlib.closing(results):
+            for job, result in results:
+                if isinstance(result, BaseException):
+                    broken[job] = reason(job.name, result)
+                    tick(job, None)
+                else:
+                    drives[job] = result
+                    tick(job, result)
+        driven = Driven({job: drives[job] for job in jobs if job in drives}, skipped, broken)
+        if not broken:  # a mean over what happened to work would be none of the suite
+            write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
     return driven
 
 
-def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int) -> dict[str, Any]:
+def _in_turn(
+    jobs: Iterable[DriveJob], work: Callable[[DriveJob], DriveRecord]
+) -> Generator[tuple[DriveJob, DriveRecord | BaseException], None, None]:
+    for job in jobs:
+        yield job, work(job)
+
+
+def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None = None) -> DriveRecord:
     """Drive one route once; its files are there when this returns."""
-    torch.set_num_threads(threads)
+    if threads is not None:
+        torch.set_num_threads(threads)
     began = time.perf_counter()
-    route = snap_route(next(r for r in load_route_set(suite.routes) if r.id == job.route))
-    simulator, scenario = TownSimulator(), scenario_of(suite, route, job.repetition)
-    lot = _lot(scenario.seed, job.route)
-    agent = make_driver(suite.driver, lambda: simulator.state.t_s, simulator, lot)
-    with drive_log(scenario, out, job.name) as log:
-
-        def write_frame() -> None:
-            taught = agent.teacher.plan() if isinstance(agent, Disturbed | Alternating) else None
-            log.write(key_frame(simulator, taught))
-
+    with suite.source.stage(job, suite, out) as stage:
         drive = drive_route(
-            simulator,
-            scenario,
-            agent,
+            stage.simulator,
+            stage.scenario,
+            stage.agent,
             route=job.route,
             repetition=job.repetition,
             pace=Pace(suite.period_s, suite.latency_s),
-            on_frame=write_frame,
+            on_frame=lambda: stage.log.write(stage.frame()),
         )
-    wall_s = time.perf_counter() - began
-    kept = kept_of(drive, route.xyz, route.length_m, route.town, wall_s) | {
-        "log": str(log.folder.relative_to(out))
-    }
-    write_json(_file(out, job), kept)
+    record = record_of(
+        drive,
+        stage.route_xyz,
+        stage.length_m,
+        town=stage.town,
+        log=str(stage.log.folder.relative_to(out)),
+        wall_s=time.perf_counter() - began,
+        threat=stage.judge(drive),
+        lanes_known=stage.lanes_known,
+    )
+    write_drive(_file(out, job), record)
     return read_drive(_file(out, job))
 
 
-def scenario_of(suite: DriveSuite, route: DriveRoute, repetition: int) -> TownScenario:
-    """The circumstances of one drive."""
-    needs = needs_of(suite.driver)
-    seen = needs.lidar or suite.sensors
-    seed = suite.seed + repetition
-    name = suite.conditions
-    if name == ANY_CONDITIONS:
-        name = list(CONDITIONS)[_lot(seed, route.id) % len(CONDITIONS)]
-    happens = scenarios_on(route, grow(route.town, seed), seed) if suite.scenarios else ()
-    return TownScenario(
-        town=route.town,
-        route_xyz=route.xyz,
-        seed=seed,
-        lanes=route.lanes,
-        crowd=Crowd(suite.vehicles, suite.people),
-        conditions=None if name is None else find_conditions(name),
-        sensors=SensorSuite(camera_rig(suite.image_hw), roof_lidar()) if seen else None,
-        past_frames=needs.past_frames,
-        limit_s=timeout_s(route.length_m),
-        scenarios=happens,
-    )
+def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
+    """The folder of a suite: another's while it holds drives of it."""
+    path, wanted, grows = out / SUITE, suite.noted(), suite.source.grows
+    what = "the drives of another suite"
 
+    def fixed(noted: Mapping[str, object]) -> dict[str, object]:
+        return {key: value for key, value in noted.items() if key not in grows}
 
-def _lot(seed: int, route: str) -> int:
-    """A number drawn for a drive, always the same."""
-    return zlib.crc32(f"{seed} {route}".encode())
-
-
-def claim(suite: DriveSuite, out: Path) -> None:
-    """Note in a folder whose it is, once it is known that there is something to drive.
-
-    Raises:
-        InputError: it is another's, or there is no such driver or set of routes.
-    """
-    needs_of(suite.driver)
-    load_route_set(suite.routes)
-    wanted = json.loads(json.dumps(dataclasses.asdict(suite)))
-    path = out / SUITE
-    if any((out / DRIVES).glob("*.json")):
-        there = _read_suite(path)
-        if there is None:
+    def noted_there() -> dict[str, object] | None:
+        if not any((out / DRIVES).glob("*.json")):
+            return None
+        try:
+            there = json.loads(path.read_text())
+        except (OSError, ValueError):
+            there = None
+        if not isinstance(there, dict) or not there.keys() >= set(grows):
             raise InputError(f"{out}: holds drives that nobody knows the suite of; choose another folder")
-        if {**there, "repetitions": 0} != {**wanted, "repetitions": 0}:
-            raise InputError(f"{out}: holds the drives of another suite; choose another folder")
-        wanted["repetitions"] = max(there["repetitions"], suite.repetitions)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+        return there
 
+    def read() -> dict[str, object] | None:
+        there = noted_there()
+        return None if there is None else {what: fixed(there)}
 
-def _read_suite(path: Path) -> dict[str, Any] | None:
-    try:
-        there = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return there if isinstance(there, dict) and isinstance(there.get("repetitions"), int) else None
+    def write() -> None:
+        there, note = noted_there() or {}, dict(wanted)
+        for key in grows:
+            before, now = there.get(key), note[key]
+            if isinstance(before, int) and isinstance(now, int):
+                note[key] = max(before, now)
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(note, indent=1) + "\n")
+
+    return RunFolder(out, {what: fixed(wanted)}, read, write, grows=True)
 
 
 def _file(out: Path, job: DriveJob) -> Path:

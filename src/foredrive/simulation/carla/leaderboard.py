@@ -16,7 +16,7 @@ from torch import Tensor
 
 from foredrive.data.collate import stack_records
 from foredrive.errors import InputError
-from foredrive.scene import Agent, CameraRig, Clip
+from foredrive.scene import Agent, BicycleState, CameraRig, Clip
 from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
 from foredrive.simulation.carla.frames import ego_in_actor, pose_of, yaw_of_compass
@@ -30,7 +30,7 @@ from foredrive.simulation.carla.localization import (
 )
 from foredrive.simulation.carla.sensors import camera_specs, image_of, lidar_spec, mounting, sweep_of
 from foredrive.simulation.controller import Following, follow
-from foredrive.simulation.dynamics import STEP_S, BicycleState
+from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_progress import Progress

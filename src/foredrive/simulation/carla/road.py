@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int
 
-from foredrive.scene import Event
+from foredrive.scene import BicycleState, Event
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.frames import matrix_of
-from foredrive.simulation.dynamics import BicycleState
 from foredrive.simulation.lane_rules import (
     LINE_MARGIN_M,
     OUTSIDE_BY_M,

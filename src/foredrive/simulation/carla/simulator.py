@@ -1,4 +1,4 @@
-"""CARLA as a simulator (`simulation.drive.RoadSimulator`): scenarios, steps and events as those of a town."""
+"""CARLA as a simulator (`scene.Simulator`): scenarios, steps and events as those of a town."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.scene import Boxes, Clip, Control, Event, LidarSweep, Step
+from foredrive.scene import BicycleState, Boxes, Clip, Control, Event, LidarSweep, Standing, Step
 from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla import sensors as carla_sensors
 from foredrive.simulation.carla.actors import Contact, actor_state, collision
@@ -23,8 +23,7 @@ from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of
 from foredrive.simulation.carla.road import CarlaRoad
 from foredrive.simulation.carla.session import TRAFFIC_PORT, Receiver, Session
 from foredrive.simulation.carla.weather import weather_of
-from foredrive.simulation.drive import Standing
-from foredrive.simulation.dynamics import EGO, STEP_S, BicycleState
+from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.lane_rules import RuleState, left_lanes
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.route_progress import Progress, RouteLine, first_step
