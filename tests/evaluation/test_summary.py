@@ -6,26 +6,17 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from foredrive.errors import InputError
 from foredrive.evaluation import (
-    ConstantVelocity,
-    StandStill,
-    evaluate,
-    print_summary,
     read_summary,
     write_summary,
 )
-from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.provenance import collect_provenance, command_line, git_commit, peak_rss_gib
-from foredrive.metrics import PROTOCOLS
-from foredrive.scene import Clip, Example
 
 
 def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
@@ -49,31 +40,6 @@ def test_what_is_not_a_summary_is_named(tmp_path: Path) -> None:
     for name in ("half.json", "list.json", "missing.json"):
         with pytest.raises(InputError, match=name):
             read_summary(tmp_path / name)
-
-
-def test_the_printed_tables(make_example: Callable[..., Example]) -> None:
-    class Half:
-        def predict(self, observed: Clip, asked: object) -> Prediction:
-            plan = ConstantVelocity(6, 0.5).act(observed)
-            occupied = make_example(0).occupancy.values[:, observed.now : observed.now + 2, 0]
-            return Prediction(occupancy_logit=occupied.expand(len(plan.xy), -1, -1, -1, -1) - 0.5, plan=plan)
-
-    baselines = {"stand_still": StandStill(6, 0.5), "constant_velocity": ConstantVelocity(6, 0.5)}
-    summary = evaluate(Half(), [make_example(0, 1)], frame_dt_s=0.5, baselines=baselines).summary
-    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    print_summary(summary, console, model="nemo_tiny")
-    text = console.export_text()
-    console.file.close()
-    assert max(len(line) for line in text.splitlines()) <= 120
-    assert "…" not in text  # nothing cut off
-    for protocol in PROTOCOLS.values():
-        assert len(re.findall(rf"{protocol.title}\s+nemo_tiny", text)) == 1
-    assert text.count("stand still") == text.count("constant velocity") == len(PROTOCOLS)
-    cells = next(line for line in text.splitlines() if "UniAD" in line).split()
-    expected = [summary[f"planning.uniad.l2_{h}_m"] for h in ("1s", "2s", "3s", "avg")]
-    assert cells == ["UniAD", "nemo_tiny", *(f"{value:.2f}" for value in expected), *["0.00"] * 4, "2", "0"]
-    assert "above ground" in text
-    assert "in 500ms" in text
 
 
 def test_provenance_is_complete_and_flat() -> None:

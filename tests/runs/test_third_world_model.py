@@ -19,7 +19,8 @@ from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
 from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
 from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, drive_one
+from foredrive.runs.drive.in_towns import TownRoutes, job_of
+from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
@@ -159,6 +160,7 @@ def test_it_drives(run: Run, tmp_path: Path) -> None:
     points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
     routes = tmp_path / "one.xml"
     routes.write_text(f'<routes><route id="a" town="Town02">{points}</route></routes>')
-    suite = DriveSuite(str(run.folder), str(routes), image_hw=(18, 32), vehicles=2, people=0)
-    drive = drive_one(DriveJob("a", 0), suite, tmp_path / "drives", threads=1)
-    assert drive
+    source = TownRoutes(str(routes), image_hw=(18, 32), vehicles=2, people=0)
+    drive = drive_one(job_of("a", 0), DriveSuite(str(run.folder), source), tmp_path / "drives")
+    assert not drive.error
+    assert len(drive.act_s) > 0

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from foredrive.evaluation.predictor import Part, Prediction, Predictor
     from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
     from foredrive.evaluation.run import EvaluationResult, Failure, evaluate
-    from foredrive.evaluation.summary import print_summary, read_summary, write_summary
+    from foredrive.evaluation.summary import read_summary, write_summary
 
 __all__ = [
     "METRICS",
@@ -32,7 +32,6 @@ __all__ = [
     "evaluate",
     "labels_from_now",
     "peak_rss_gib",
-    "print_summary",
     "read_summary",
     "run_benchmark",
     "write_summary",
@@ -48,6 +47,6 @@ __getattr__ = on_demand(
         "predictor": ("Part", "Prediction", "Predictor"),
         "provenance": ("collect_provenance", "peak_rss_gib"),
         "run": ("EvaluationResult", "Failure", "evaluate"),
-        "summary": ("print_summary", "read_summary", "write_summary"),
+        "summary": ("read_summary", "write_summary"),
     },
 )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from foredrive.evaluation.summary import rivals_of_occupancy
+from foredrive.evaluation.summary import occupancy_baselines
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (
@@ -109,7 +109,7 @@ def occupancy_table(summary: Summary) -> Table | None:
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
         return None
-    others = [name for name in rivals_of_occupancy(summary) if name != CONSTANT]
+    others = [name for name in occupancy_baselines(summary) if name != CONSTANT]
     columns = [
         Column(align="left"),
         *(Column(title, "this model") for title in OCCUPANCY_TITLES.values()),
