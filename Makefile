@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo test lint format clean
+.PHONY: install demo test quick test-slow lint format clean
 
 install: $(STAMP)
 
@@ -26,8 +26,21 @@ format: install
 	$(BIN)/ruff format .
 
 # Files of tests side by side on up to four cores, each in a process with one thread.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Folders of tests without processes, towns and training.
+QUICK := $(addprefix tests/, geometry scene losses metrics sensors sets evaluation data recipes models search) \
+	$(wildcard tests/test_*.py)
+
 test: install lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
+
+# Units only, for the inner loop.
+quick: install
+	$(PYTEST) -m "not slow" $(QUICK)
+
+# The studies that `make test` leaves out.
+test-slow: install
+	$(PYTEST) -m slow
 
 clean:
 	rm -rf .venv runs build dist

@@ -1,25 +1,37 @@
-"""Fixtures that several folders of tests share; Triton's interpreter."""
+"""Fixtures that several folders of tests share; Triton's interpreter; Ctrl-C in the background.
+
+What takes seconds to import is imported by the fixtures that need it, so that tests of one folder start soon.
+"""
 
 import functools
 import math
 import os
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
-from miniature import miniature, write_log
 
-from foredrive.data import LogPath
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.runs import Run, train_run
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
-from foredrive.towns.conditions import Conditions
-from foredrive.towns.map.town_map import TownMap, load_town_map
-from foredrive.towns.world import World
+
+if TYPE_CHECKING:
+    from foredrive.data import LogPath
+    from foredrive.runs import Run
+    from foredrive.towns.map.town_map import TownMap
+    from foredrive.towns.world import World
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # for tests/ops; Triton reads it when something imports it first
+
+# A shell that runs `make test &` has SIGINT ignored. All processes below inherit that, also those that tests
+# start and interrupt. With a handler here they start with the default.
+_IN_MAIN_THREAD = threading.current_thread() is threading.main_thread()
+if _IN_MAIN_THREAD and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -119,27 +131,38 @@ def make_example() -> Callable[..., Example]:
 
 
 @pytest.fixture(scope="session")
-def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+def log(tmp_path_factory: pytest.TempPathFactory) -> "LogPath":
+    from miniature import write_log
+
     return write_log(tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture(scope="session")
-def trained(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def trained(log: "LogPath", tmp_path_factory: pytest.TempPathFactory) -> "Run":
     """A run that was never interrupted."""
+    from miniature import miniature
+
+    from foredrive.runs import train_run
+
     return train_run(miniature(), [log], tmp_path_factory.mktemp("runs") / "trained")
 
 
 @pytest.fixture(scope="session")
-def town_of() -> Callable[[str], TownMap]:
+def town_of() -> "Callable[[str], TownMap]":
     """The map of a town by its name; all of them together take some tens of MB."""
+    from foredrive.towns.map.town_map import load_town_map
+
     return functools.cache(load_town_map)
 
 
 @pytest.fixture(scope="session")
-def town02(town_of: Callable[[str], TownMap]) -> TownMap:
+def town02(town_of: "Callable[[str], TownMap]") -> "TownMap":
     return town_of("Town02")
 
 
 @pytest.fixture(scope="session")
-def world02(town02: TownMap) -> World:
+def world02(town02: "TownMap") -> "World":
+    from foredrive.towns.conditions import Conditions
+    from foredrive.towns.world import World
+
     return World(town02, seed=3, conditions=Conditions(hour=12.0))

@@ -49,6 +49,7 @@ def points_m(view: SweepView) -> torch.Tensor:
     return transform_points(view.T_scene_ego, view.beams.points_ego[view.beams.returned])
 
 
+@pytest.mark.slow
 def test_from_beside_the_same_town_is_seen(truth: TownTruth) -> None:
     driven, beside = truth.seen(4), truth.seen(4, [ShiftEgo((0.0, 2.0, 0.0))])
     T = inverse_se3(driven.cameras[0].T_scene_cam) @ beside.cameras[0].T_scene_cam

@@ -13,10 +13,13 @@ from foredrive.towns.traffic.expert import Drive
 from foredrive.towns.traffic.traffic import Traffic
 
 DT_S = 0.1
+EVERY_TIME = ("Town02", "Town10HD")
 SECONDS = dict.fromkeys(TOWNS, 8.0) | dict.fromkeys(("Town03", "Town04", "Town05", "Town06"), 5.0)
 
 
-@pytest.mark.parametrize("town", TOWNS)
+@pytest.mark.parametrize(
+    "town", [pytest.param(town, marks=[] if town in EVERY_TIME else pytest.mark.slow) for town in TOWNS]
+)
 def test_nothing_goes_wrong(town: str, town_of: Callable[[str], TownMap]) -> None:
     town_map, seconds = town_of(town), SECONDS[town]
     traffic = Traffic(town_map, seed=5, vehicle_count=30, people_count=15)

@@ -1,15 +1,13 @@
-"""The program with a recipe of seconds, and a log and a run that tests read and none changes."""
+"""The program with a recipe of seconds."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from miniature import miniature, write_log
+from miniature import miniature
 
 from foredrive.cli.main import main
-from foredrive.data import LogPath
 from foredrive.recipes import RECIPES
-from foredrive.runs import Run, train_run
 
 
 @pytest.fixture
@@ -25,13 +23,3 @@ def foredrive(
         return code, capsys.readouterr().err
 
     return run
-
-
-@pytest.fixture(scope="session")
-def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
-    return write_log(tmp_path_factory.mktemp("logs"))
-
-
-@pytest.fixture(scope="session")
-def trained(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return train_run(miniature(), [log], tmp_path_factory.mktemp("runs") / "trained")

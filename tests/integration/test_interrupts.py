@@ -37,7 +37,8 @@ Sign = Callable[[], bool]
 
 def start(*args: str | Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-W", "error", "-c", PROGRAM, *map(str, args)]
-    environment = os.environ | {"PYTHONPATH": f"{TESTS}:{TESTS / 'data'}"}
+    path = os.pathsep.join([str(TESTS), str(TESTS / "data"), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
     return subprocess.Popen(
         command, stdout=-1, stderr=-1, text=True, env=environment, start_new_session=True, cwd=TESTS
     )
