@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, Clip, Control, Event, Step
 from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
