@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.common.measuring import held_mib
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
 from foredrive.evaluation import Benchmark
 from foredrive.recipes import find_recipe

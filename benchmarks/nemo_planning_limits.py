@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.evaluation import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss

@@ -26,7 +26,7 @@ import pyarrow as pa
 import torch
 
 from benchmarks.common.measuring import held_mib, measure
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
 from foredrive.evaluation import Benchmark, peak_rss_gib
 from foredrive.models.lidar_clip import PointCloud

@@ -4,6 +4,7 @@ import importlib
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,8 @@ import pytest
 def test_what_a_package_offers_is_there(package: str) -> None:
     module = importlib.import_module(f"foredrive.{package}")
     assert all(getattr(module, name) is not None for name in module.__all__)
+    modules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
+    assert not modules & set(module.__all__)  # such a name would become the module once that is imported
     with pytest.raises(AttributeError, match=f"foredrive.{package}' has no attribute 'no_such_thing'"):
         _ = module.no_such_thing
 

@@ -10,7 +10,7 @@ from small_towers import SMALL, WORDS, save_tokenizer
 from transformers import BertConfig, BertModel
 
 from foredrive.data import LogPath
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.search.towers import find_towers

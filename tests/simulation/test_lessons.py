@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.simulation.lessons import STEERED_SHARE, STEERS_RAD, Alternating, Disturbed
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, LidarSweep
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.restarts import Restarting, is_free_ahead

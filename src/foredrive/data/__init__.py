@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from foredrive.lazy import defer_imports, on_demand
 
 if TYPE_CHECKING:
+    from foredrive.data.batches import collate
     from foredrive.data.clips import ClipConfig, ClipDataset
-    from foredrive.data.collate import collate
     from foredrive.data.log_paths import LogPath, find_all_logs, find_logs, find_one_log
 
 __all__ = ["ClipConfig", "ClipDataset", "LogPath", "collate", "find_all_logs", "find_logs", "find_one_log"]
@@ -14,8 +14,8 @@ __all__ = ["ClipConfig", "ClipDataset", "LogPath", "collate", "find_all_logs", "
 __getattr__ = on_demand(
     __name__,
     {
+        "batches": ("collate",),
         "clips": ("ClipConfig", "ClipDataset"),
-        "collate": ("collate",),
         "log_paths": ("LogPath", "find_all_logs", "find_logs", "find_one_log"),
     },
 )

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
+from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes, read_boxes
-from foredrive.data.collate import stack_records
 from foredrive.data.lidar import empty_sweep
 from foredrive.data.logs import Log
 from foredrive.scene import CameraRig, Clip, LidarSweep, MapPatch, Trajectory

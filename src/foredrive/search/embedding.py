@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.data.batches import stack_records
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.collate import stack_records
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_caption, read_setting

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator
 from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of

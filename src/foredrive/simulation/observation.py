@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, UInt8
 from torch import Tensor
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.data.lidar import empty_sweep
 from foredrive.scene import Boxes, CameraRig, Clip, Command, LidarSweep, Trajectory
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch.utils.data import Dataset
 
 from foredrive.data import LogPath
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.caption_decoder import PAD, CaptionDecoder

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError

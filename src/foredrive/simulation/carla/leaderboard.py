@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
 
-from foredrive.data.collate import stack_records
+from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, CameraRig, Clip
 from foredrive.sensors import SpinningLidar
