@@ -46,7 +46,7 @@ class PlannerConfig:
     pool: tuple[int, int, int]
     """Block of voxels (z, y, x) that shares a key and a value in the attention within the future volume."""
     future: Literal["attention", "concatenation", "none"] = "attention"
-    """How the predicted next volume is combined with the present one."""
+    """Combination of the predicted next volume with the present one."""
     history: int = 0
     """Number of key frames before now whose pose and speed enter the query. In the paper only the speed at
     now does, which does not reveal braking."""

@@ -97,7 +97,7 @@ class Unrolled:
 
 
 class DriveWorld(nn.Module):
-    """A `WorldModel`. Beliefs of later frames are in their own ego frames; volumes are not warped.
+    """A `WorldModel`. Beliefs of later frames are in the ego frames of those frames; volumes are not warped.
 
     Args:
         config: sizes.
@@ -209,8 +209,8 @@ class DriveWorld(nn.Module):
 
     def decode(self, belief: Belief) -> Decoded:
         """Decode occupancy, flow and the action of the policy."""
-        # One convolution for both heads in the memory layout of the volume. Two linear layers make a step 10
-        # % slower.
+        # One convolution for both heads, in the memory layout of the volume: two linear layers over voxels
+        # would make a step a tenth longer.
         heads = (self.occupancy, self.flow)
         weight = torch.cat([head.weight for head in heads])[:, :, None, None, None]
         read = conv3d(belief.volume, weight, torch.cat([head.bias for head in heads])).float()

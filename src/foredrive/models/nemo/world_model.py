@@ -42,8 +42,8 @@ class NemoConfig:
     occupancy_hidden: int
     """Width of the occupancy MLP f_occ."""
     occupied_prior: float = 0.02
-    """Initial output of f_occ. It is small because most space is free and an opaque volume would hide what is
-    behind."""
+    """Initial occupancy probability of f_occ. It is small because most space is free and an opaque volume
+    would hide what is behind."""
     kind: Literal["nemo"] = "nemo"
 
 
