@@ -3,8 +3,8 @@
 A camera is tested in two ways. Lidar points should look the same from the vehicle's position some metres
 later; this holds if depth, poses and camera fit together. And where lidar sees one object in front of
 another, the image should have an edge (Levinson & Thrun, "Automatic online calibration of cameras and
-lasers", RSS 2013). Both scores are highest at the true calibration and drop within half a degree or a
-decimetre.
+lasers", RSS 2013). Both scores are highest at the true calibration. They are lower at an error of half a
+degree or a decimetre.
 """
 
 import dataclasses

@@ -25,7 +25,7 @@ Offset = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Move:
-    """Move an actor at all times by an offset and a rotation in its own frame."""
+    """An edit that moves an actor at all times by an offset and a rotation in its own frame."""
 
     actor: int
     offset_m: Offset = (0.0, 0.0, 0.0)
@@ -35,7 +35,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Remove:
-    """Remove an actor."""
+    """An edit that removes an actor."""
 
     actor: int
     kind: Literal["remove"] = "remove"
@@ -43,7 +43,7 @@ class Remove:
 
 @dataclass(frozen=True)
 class Duplicate:
-    """Add a copy of an actor at another place."""
+    """An edit that adds a copy of an actor at another place."""
 
     actor: int
     copy: int
@@ -55,7 +55,7 @@ class Duplicate:
 
 @dataclass(frozen=True)
 class Insert:
-    """Add an actor of another run. It follows the path of an actor of this scene, with an offset."""
+    """An edit that adds an actor of another run, on the path of an actor of this scene, with an offset."""
 
     run: str
     """Folder of the other run."""
@@ -72,7 +72,7 @@ class Insert:
 
 @dataclass(frozen=True)
 class Send:
-    """Add a copy of an actor that drives straight at constant velocity, at all times."""
+    """An edit that adds a copy of an actor, which drives straight at constant velocity at all times."""
 
     actor: int
     copy: int
@@ -89,7 +89,7 @@ class Send:
 
 @dataclass(frozen=True)
 class ShiftEgo:
-    """Move the ego vehicle and its sensors at all times, by an offset in its own frame."""
+    """An edit that moves the ego vehicle and its sensors at all times, by an offset in its own frame."""
 
     offset_m: Offset
     yaw_rad: float = 0.0

@@ -36,7 +36,7 @@ _FLATTEST_M = 0.03
 
 @dataclass(frozen=True)
 class InitialSize:
-    """Numbers and looks of the initial Gaussians of a scene."""
+    """Numbers and appearance of the initial Gaussians of a scene."""
 
     lidar_points: int
     """Maximum number of static lidar points that a camera saw."""
@@ -76,8 +76,8 @@ def initial_scene(
     """Build Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
     Lidar points that no camera saw are coloured like points near them and lie flat on their surface, because
-    only a few beams would constrain their size in training. Points of mirrored actors (`Tracks.mirrored`) are
-    used on both sides. Without sweeps, points at any range along pixels replace all others.
+    only a few beams would constrain their size in training. Points of symmetric actors (`Tracks.mirrored`)
+    are used on both sides. Without sweeps, points at any range along pixels replace all others.
 
     Args:
         cameras: training views, with images.
@@ -117,7 +117,7 @@ def _actor(
     size: InitialSize,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Build an actor from its lidar points, on both sides if it is mirrored, and random points in its box."""
+    """Build an actor from its lidar points (on both sides if symmetric) and random points in its box."""
     points = like_neighbours(some_points(points, size.actor_points_most, generator))
     part = _gaussians(points, size, size.opacity, by_neighbours=True)
     if both_sides:

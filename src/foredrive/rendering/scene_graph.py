@@ -13,7 +13,7 @@ from foredrive.rendering.tracks import Tracks, states_at
 from foredrive.scene.record import Record
 
 STATIC = -1
-"""Row number that stands for no actor."""
+"""Row number of the static part, which belongs to no actor."""
 _MIRROR_XYZ = (1.0, -1.0, 1.0)
 _MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
 """Mirroring y turns a rotation by θ about the axis a into one by θ about (-aₓ, a_y, -a_z)."""

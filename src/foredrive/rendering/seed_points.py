@@ -233,7 +233,7 @@ def _colours(xyz: Float[Tensor, "N 3"], view: CameraView) -> tuple[Bool[Tensor, 
 
 
 def _pixels_apart_rad(view: CameraView, drawn: int | float) -> float:
-    """Return the mean angle between `drawn` random pixels of an image."""
+    """Return the mean angular spacing (rad) of `drawn` random pixels of an image."""
     height, width = view.size_hw
     return (height * width / max(drawn, 1.0)) ** 0.5 / float(view.K[0, 0])
 

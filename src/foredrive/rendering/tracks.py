@@ -42,7 +42,7 @@ class Tracks(Record):
     """Key times in ascending order, the same for all actors."""
     T_scene_actor: Float[Tensor, "A K 4 4"]
     present: Bool[Tensor, "A K"]
-    """Whether an actor is present. Poses are undefined where it is not."""
+    """True where an actor is present. Elsewhere its poses are undefined."""
 
     def __len__(self) -> int:
         return len(self.track_id)

@@ -11,7 +11,7 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class Gaussians(Record):
-    """N Gaussians in the frame of a scene (or of an actor), in optimiser parameters (Kerbl et al., 2023)."""
+    """N Gaussians in the frame of a scene or an actor, as unconstrained parameters (Kerbl et al., 2023)."""
 
     mean_m: Float[Tensor, "N 3"]
     quaternion: Float[Tensor, "N 4"]
