@@ -94,7 +94,7 @@ class DistilObjective(nn.Module):
 
 
 def _jittered(images: UInt8[Tensor, "n 3 H W"], generator: torch.Generator) -> UInt8[Tensor, "n 3 h w"]:
-    """Crop all images of the batch alike and mirror each with probability 1/2."""
+    """Crop all images of the batch equally and mirror each with probability 1/2."""
     height, width = images.shape[-2:]
     kept_h, kept_w = height - round(CROP_SHARE * height), width - round(CROP_SHARE * width)
     top = int(torch.randint(height - kept_h + 1, (1,), generator=generator))

@@ -51,7 +51,7 @@ class DriveWorldStage:
     schedule: Schedule
     weights: DriveWorldWeights
     temporal: bool = True
-    """Train on time. If False, each frame's occupancy is learned from that frame only."""
+    """Train the latent dynamics. If False, each frame's occupancy is learned from that frame only."""
     statics_of: Literal["random", "now"] = "random"
     """Frame whose statics all frames are decoded with: a random one, as in the paper's pre-training, or the
     present one, as in use."""

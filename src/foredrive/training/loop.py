@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metric
 
 @runtime_checkable
 class Batch(Protocol):
-    """The input of an objective. Records move to devices as they are."""
+    """The input of an objective. It is a record that can be moved to a device."""
 
     @property
     def key(self) -> tuple[str, ...]:

@@ -174,7 +174,7 @@ def _progress() -> Progress:
 
 
 class _Trainer:
-    """The state and steps of a training."""
+    """A trainer that runs one step at a time."""
 
     def __init__(self, scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, optimizer: Adam) -> None:
         self.scene, self.seen, self.schedule, self.optimizer = scene, seen, schedule, optimizer
