@@ -12,7 +12,7 @@ from foredrive.scene import CameraRig, Clip, Frames, last_frames
 
 
 class GraphInputs(NamedTuple):
-    """The inputs of a vehicle: T key frames (now is last) of C cameras, in a batch of one."""
+    """The inputs of the graph: T key frames (now is last) of C cameras, in a batch of one."""
 
     images: UInt8[Tensor, "1 T C 3 H W"]
     image_valid: Bool[Tensor, "1 T C"]
