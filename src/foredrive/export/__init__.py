@@ -1,1 +1,1 @@
-"""A trained agent as one graph of plain tensors, for runtimes that know nothing of this package."""
+"""Export of a trained agent as one graph of plain tensors, for runtimes without this package."""

@@ -1,4 +1,4 @@
-"""What is exported: an agent's way from images to plan and occupancy, with plain tensors at both ends."""
+"""The exported graph: an agent from images to plan and occupancy, with plain tensors at both ends."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from foredrive.scene import CameraRig, Clip, Frames, last_frames
 
 
 class GraphInputs(NamedTuple):
-    """What a vehicle feeds in: T key frames, now last, of C cameras; a batch of one."""
+    """The inputs of the graph: T key frames (now is last) of C cameras, in a batch of one."""
 
     images: UInt8[Tensor, "1 T C 3 H W"]
     image_valid: Bool[Tensor, "1 T C"]
@@ -55,7 +55,7 @@ class GraphInputs(NamedTuple):
 
 
 class GraphOutputs(NamedTuple):
-    """What comes out; F counts now and the imagined key frames."""
+    """The outputs of the graph. F counts now and the imagined key frames."""
 
     waypoints_xy: Float[Tensor, "1 S 2"]
     waypoints_yaw: Float[Tensor, "1 S"]
@@ -92,12 +92,12 @@ MEANING = {
 
 
 class AgentGraph(nn.Module):
-    """An agent between plain tensors: no step depends on the values of the data, so that it can be traced.
+    """An agent between plain tensors. No step depends on the values of the data, so it can be traced.
 
     Args:
         agent: in evaluation mode.
-        camera_names, image_hw: of the images that will come.
-        steps: how many key frames are imagined.
+        camera_names, image_hw: names and size of the images.
+        steps: number of imagined key frames.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class AgentGraph(nn.Module):
         frame_speed_mps: Float[Tensor, "1 T"],
         frame_speed_valid: Bool[Tensor, "1 T"],
     ) -> dict[str, Tensor]:
-        """As `PlanningAgent.forward`: the fields of `GraphOutputs`; `MEANING` says what all of them are."""
+        """Run the agent as `PlanningAgent.forward` does. `MEANING` describes all inputs and outputs."""
         model, planner = self.agent.world_model, self.agent.planner
         rig = CameraRig(
             K=K,

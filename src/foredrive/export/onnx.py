@@ -1,4 +1,4 @@
-"""From an exported program to an ONNX model: what PyTorch's own exporter has no translation for.
+"""Conversion of an exported program to ONNX, with the operators that PyTorch's exporter cannot translate.
 
 Needs the extra `export` (onnx, onnxscript, onnxruntime).
 """
@@ -14,9 +14,9 @@ from onnxscript import opset20 as op
 from torch.export import ExportedProgram
 
 OPSET = 20
-"""The first whose GridSample reads volumes."""
+"""The first opset whose GridSample reads volumes."""
 NOISY_LOGGER = "torch.onnx._internal.exporter._registration"
-"""It tells of the operators of torchvision where that is not installed."""
+"""Logger that reports torchvision's operators as missing if it is not installed."""
 
 
 def write_onnx(
@@ -28,7 +28,7 @@ def write_onnx(
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # of its own making
+            warnings.simplefilter("ignore", FutureWarning)  # from the exporter itself
             model = torch.onnx.export(
                 program,
                 dynamo=True,
@@ -36,7 +36,7 @@ def write_onnx(
                 input_names=list(input_names),
                 output_names=list(output_names),
                 custom_translation_table=TRANSLATIONS,
-                optimize=False,  # it takes minutes, and onnxruntime does it again
+                optimize=False,  # takes minutes, and onnxruntime optimises again
                 verbose=False,
             )
     finally:
@@ -54,7 +54,7 @@ def _grid_sampler_3d(
 
 
 def _adaptive_avg_pool3d(self: Any, output_size: Sequence[int]) -> Any:
-    """Means over windows ⌊i·n/m⌋ to ⌈(i+1)·n/m⌉, one axis after the other."""
+    """Average over windows ⌊i·n/m⌋ to ⌈(i+1)·n/m⌉, one axis after the other."""
     sizes = [int(size) for size in self.shape]
     for axis, windows in enumerate(output_size, start=len(sizes) - 3):
         bounds = [(i * sizes[axis] // windows, -(-(i + 1) * sizes[axis] // windows)) for i in range(windows)]
@@ -64,7 +64,7 @@ def _adaptive_avg_pool3d(self: Any, output_size: Sequence[int]) -> Any:
 
 
 def _cummax(self: Any, dim: int) -> tuple[Any, Any]:
-    """Values and where they are, the later of equals, as PyTorch has it."""
+    """Return values and their indices, with the last index of equal values, as in PyTorch."""
     steps = [_slice(self, dim, k, k + 1) for k in range(int(self.shape[dim]))]
     values, places = [steps[0]], [op.CastLike(op.Sub(steps[0], steps[0]), _ints(0))]
     for k, step in enumerate(steps[1:], start=1):
@@ -84,7 +84,7 @@ def _attention(
     scale: float | None = None,
     enable_gqa: bool = False,
 ) -> Any:
-    """softmax(Q Kᵀ / √d + mask) V for any number of leading dimensions; PyTorch's exporter knows two.
+    """Return softmax(Q Kᵀ / √d + mask) V with any number of leading dimensions; PyTorch exports only two.
 
     The mask is added: 0 where attention is allowed, -∞ elsewhere, as `nn.MultiheadAttention` gives it.
     """

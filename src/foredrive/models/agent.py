@@ -1,4 +1,4 @@
-"""Something that drives: a world model, and the planner on top of it."""
+"""A driving agent: a world model with a planner on top."""
 
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
@@ -15,16 +15,16 @@ W = TypeVar("W", bound=WorldModel)
 
 
 class AgentOutput(NamedTuple):
-    """Everything an agent says about a clip."""
+    """The output of an agent for one clip."""
 
     beliefs: list[Belief]
-    """Now, then the imagined key frames."""
+    """The belief about now, then those of the imagined key frames."""
     decoded: list[Decoded]
     plan: Trajectory
 
 
 class PlanningAgent(nn.Module, Generic[W]):
-    """An `Agent` over any world model: plans from the volume at now and the one imagined next (NeMo §3.3)."""
+    """An `Agent` over any world model. It plans from the volumes at now and at the next step (NeMo §3.3)."""
 
     def __init__(self, world_model: W, planner: VolumePlanner) -> None:
         super().__init__()
@@ -32,18 +32,18 @@ class PlanningAgent(nn.Module, Generic[W]):
         self.planner = planner
 
     def forward(self, clip: Clip, steps: int) -> AgentOutput:
-        """Observe, imagine `steps` key frames and whatever the planner looks at, plan."""
+        """Observe the clip, imagine `steps` key frames (and those the planner needs), and plan."""
         beliefs = self.foresee(clip, max(steps, self.planner.looks_ahead))
         decoded = [self.world_model.decode(belief) for belief in beliefs[: steps + 1]]
         return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs))
 
     def foresee(self, clip: Clip, steps: int) -> list[Belief]:
-        """Now and the next `steps` key frames."""
+        """Return the beliefs about now and about the next `steps` key frames."""
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
 
     def plan(self, clip: Clip, beliefs: Sequence[Belief]) -> Trajectory:
-        """Plan from what is believed of now and of the next key frames, as many as the planner looks at."""
+        """Plan from the belief about now and those next key frames that the planner uses."""
         now = clip.now
         poses, speeds = ego_motion(clip, self.planner.history)
         plan: Trajectory = self.planner(
@@ -59,10 +59,10 @@ class PlanningAgent(nn.Module, Generic[W]):
         return plan
 
     def planned_on(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
-        """The volume as the planner is given it."""
+        """Return the volume that the planner reads."""
         return self.world_model.volume_for(belief, "plan")
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
-        """The plan from now on."""
+        """Return the plan from now on."""
         return self.plan(observation, self.foresee(observation, self.planner.looks_ahead))

@@ -1,4 +1,4 @@
-"""Many tokens to one vector, as CLIP's ResNets do it (Radford et al. 2021, section 2.4)."""
+"""Pooling of many tokens into one vector, as in CLIP's ResNets (Radford et al. 2021, section 2.4)."""
 
 import math
 
@@ -9,13 +9,14 @@ from torch import Tensor, nn
 
 
 class AttentionPool(nn.Module):
-    """Attention whose one query is the mean of the tokens, and a projection to D.
+    """Attention whose single query is the mean of the tokens, followed by a projection to D channels.
 
-    A learned token stands beside those of each item, so that an item without any has an embedding too.
+    A learned token is added to the tokens of each item, so that an item without tokens has an embedding too.
 
     Args:
-        width, heads: of the tokens, and of the attention.
-        dim: D.
+        width: channels C of the tokens.
+        heads: attention heads.
+        dim: channels D of the output.
     """
 
     def __init__(self, width: int, heads: int, dim: int) -> None:
@@ -30,7 +31,7 @@ class AttentionPool(nn.Module):
     def forward(
         self, tokens: Float[Tensor, "n T C"], filled: Bool[Tensor, "n T"] | None = None
     ) -> Float[Tensor, "n D"]:
-        """One vector an item; None where every token counts."""
+        """Return one vector per item. `filled` marks the tokens that count; None means all of them."""
         rows = len(tokens)
         tokens = torch.cat([self.own.expand(rows, 1, -1), tokens], dim=1)
         mask = None if filled is None else F.pad(filled, (1, 0), value=True)
@@ -43,10 +44,11 @@ class AttentionPool(nn.Module):
     def _seen(
         self, mean: Float[Tensor, "n C"], tokens: Float[Tensor, "n T C"], mask: Bool[Tensor, "n T"] | None
     ) -> Float[Tensor, "n C"]:
-        """Attention of one query an item, without a key or a value of any token.
+        """Return the attention of one query per item without computing a key or a value for any token.
 
-        Keys are linear in the tokens, so the query is taken into their space instead; a key's bias adds the
-        same to all tokens. A mean of values is the value of a mean.
+        Keys are linear in the tokens, so the query is mapped into the space of the tokens instead. The bias
+        of the keys adds the same number to all scores, which the softmax removes. The mean of the values is
+        the value of the mean.
         """
         query = self.to_query(mean).unflatten(1, (self.heads, -1))
         to_key, to_value = self.to_key_value.weight.unflatten(0, (2, self.heads, -1))

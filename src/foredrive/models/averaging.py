@@ -1,4 +1,4 @@
-"""The plainest way from camera features to a volume: the yardstick for attention."""
+"""The simplest lifting of camera features to a volume, as a baseline for attention."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ class AveragingConfig:
     """Sizes of an `AveragingEncoder`."""
 
     hidden: int
-    """Channels between the convolutions."""
+    """Channels between the two convolutions."""
     kind: Literal["averaging"] = "averaging"
 
 
 class AveragingEncoder(nn.Module):
-    """One bilinear sample per voxel and camera, the mean over cameras, two 3-D convolutions.
+    """One bilinear sample per voxel and camera, the mean over cameras, and two 3-D convolutions.
 
-    As in Simple-BEV (Harley et al. 2023) and ImVoxelNet (Rukhovich et al. 2022): nothing is learned about
-    where to look, and what lies along a ray is told apart by the convolutions alone.
+    As in Simple-BEV (Harley et al. 2023) and ImVoxelNet (Rukhovich et al. 2022), sampling positions are not
+    learned. Only the convolutions can separate the voxels along a ray.
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         channels: D.
-        levels: number of image feature levels; the finest is read.
+        levels: number of image feature levels; only the finest is read.
     """
 
     centres_m: Tensor
@@ -52,7 +52,7 @@ class AveragingEncoder(nn.Module):
         rig: CameraRig,
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b D Z Y X"]:
-        """Lift the finest image features; the result lies channels-last in memory."""
+        """Lift the finest image features. The result is channels-last in memory."""
         uv, visible = project_to_cameras(self.centres_m, rig, image_valid)
         b, q = len(uv), len(self.centres_m)
         at_projection = uv.new_zeros(b, q, 1, 1, 1, 2)

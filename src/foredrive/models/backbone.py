@@ -1,4 +1,4 @@
-"""Image features at several resolutions: a ResNet from transformers and a feature pyramid."""
+"""Image features at several resolutions: a ResNet from transformers with a feature pyramid."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ IMAGE_STRIDE = {"stage1": 4, "stage2": 8, "stage3": 16, "stage4": 32}
 
 
 def normalise_images(images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
-    """8-bit RGB to zero mean and unit variance under ImageNet's statistics."""
+    """Normalise 8-bit RGB images to zero mean and unit variance by the statistics of ImageNet."""
     mean = torch.tensor(IMAGENET_MEAN, device=images.device).view(3, 1, 1)
     std = torch.tensor(IMAGENET_STD, device=images.device).view(3, 1, 1)
     return (images.float() / 255 - mean) / std
@@ -28,32 +28,33 @@ class BackboneConfig:
     """Sizes of an `ImageBackbone`."""
 
     embedding_size: int
-    """Channels of the ResNet's stem."""
+    """Channels of the stem of the ResNet."""
     hidden_sizes: tuple[int, ...]
-    """Channels of its stages, as in `transformers.ResNetConfig`; so are `depths` and `layer_type`."""
+    """Channels of the stages. `hidden_sizes`, `depths` and `layer_type` are those of
+    `transformers.ResNetConfig`."""
     depths: tuple[int, ...]
     layer_type: Literal["basic", "bottleneck"]
     stages: tuple[str, ...]
-    """The stages that feed the pyramid, e.g. ("stage2", "stage3")."""
+    """Stages that feed the pyramid, e.g. ("stage2", "stage3")."""
     weights: str | None = None
-    """A hub name or local folder of a `transformers` ResNet, whose sizes then replace the ones given here;
-    None starts from random weights."""
+    """Hub name or local folder of a `transformers` ResNet. Its sizes then replace the ones given here. None
+    starts from random weights."""
     checkpoint: bool = False
-    """Keep only the images for the backward pass and compute the rest again. The running statistics of batch
+    """Keep only the images for the backward pass and recompute the rest. The running statistics of batch
     normalisation then count every batch twice."""
 
 
 class ImageBackbone(nn.Module):
-    """ResNet (He et al. 2016) with a feature pyramid (Lin et al. 2017) of one channel count.
+    """A ResNet (He et al. 2016) with a feature pyramid (Lin et al. 2017). All levels have D channels.
 
     Args:
         config: sizes.
         channels: D of every pyramid level.
-        fetch: load `config.weights`; not needed where trained weights will replace them.
+        fetch: load `config.weights`. Not needed when trained weights replace them later.
     """
 
     def __init__(self, config: BackboneConfig, *, channels: int, fetch: bool = True) -> None:
-        from transformers import ResNetBackbone, ResNetConfig  # takes seconds, and recipes need it not
+        from transformers import ResNetBackbone, ResNetConfig  # slow to import, and recipes do not need it
 
         super().__init__()
         self.checkpoint = config.checkpoint
@@ -87,7 +88,7 @@ class ImageBackbone(nn.Module):
             )
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
-        """Pyramid levels from fine to coarse, channels last."""
+        """Return the pyramid levels from fine to coarse, channels last."""
         if self.checkpoint and torch.is_grad_enabled():
             return checkpoint(self._pyramid, images, use_reentrant=False)
         return self._pyramid(images)

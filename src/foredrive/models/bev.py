@@ -1,4 +1,4 @@
-"""A bird's-eye-view encoder after BEVFormer (Li et al. 2022): the planar baseline of NeMo's Table 1."""
+"""A bird's-eye-view encoder after BEVFormer (Li et al. 2022): the planar baseline in Table 1 of NeMo."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,15 +23,15 @@ class BevConfig:
     """W, the channels of a cell."""
     heads: int
     points: int
-    """Read per head, level and height."""
+    """Points read per head, level and height."""
     pillars: int
-    """Heights above a cell that are read, evenly spaced over the grid's."""
+    """Heights read above a cell, evenly spaced over the grid."""
     layers: int
     """Rounds of refinement."""
     feed_forward: float = 2.0
-    """Hidden width of the feed-forward networks over the width."""
+    """Hidden width of the feed-forward networks, as a multiple of `width`."""
     checkpoint: bool = False
-    """Keep only each round's input for the backward pass and compute the rest again."""
+    """Keep only the input of each round for the backward pass and recompute the rest."""
     kind: Literal["bev"] = "bev"
 
 
@@ -55,7 +55,13 @@ class PlaneSelfAttention(nn.Module):
     def forward(
         self, query: Float[Tensor, "b Q W"], shape_zyx: tuple[int, int, int], place: Float[Tensor, "Q 3"]
     ) -> Float[Tensor, "b Q W"]:
-        """Args: cell features in Y X order, the shape (1, Y, X), cell centres in cells (x y, z = 0.5)."""
+        """Attend among the cells of the plane.
+
+        Args:
+            query: cell features in Y X order.
+            shape_zyx: (1, Y, X).
+            place: cell centres in cell units (x, y, z = 0.5).
+        """
         b, q, _ = query.shape
         offset = F.pad(self.offset(query).view(b, q, self.heads, self.points, 2), (0, 1))
         weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
@@ -66,13 +72,13 @@ class PlaneSelfAttention(nn.Module):
 class PillarCrossAttention(nn.Module):
     """Deformable cross-attention of a cell: it reads around the projections of K heights above it.
 
-    The P points of a head and level are dealt out to the heights, and one softmax weighs all of them, as in
-    BEVFormer; each height is averaged over the cameras that see it.
+    As in BEVFormer, the P points of a head and level are divided among the heights, and one softmax weights
+    all of them. Each height is averaged over the cameras that see it.
 
     Args:
         features: channels of the image features.
-        channels: W, of the cells.
-        heads, levels, points: as in `CameraCrossAttention`; `points` per height.
+        channels: W, channels of the cells.
+        heads, levels, points: as in `CameraCrossAttention`; `points` is per height.
         pillars: K.
     """
 
@@ -100,7 +106,13 @@ class PillarCrossAttention(nn.Module):
         uv: Float[Tensor, "b C N 2"],
         visible: Bool[Tensor, "b C N"],
     ) -> Float[Tensor, "b Q W"]:
-        """Args: cells, of batch size b or 1; image features; projections of N = Q·K points, heights last."""
+        """Attend to the cameras.
+
+        Args:
+            query: cells, of batch size b or 1.
+            features: image features, one tensor per level.
+            uv, visible: projections of N = Q·K points, heights last, and their visibility.
+        """
         b, q = len(uv), query.shape[1]
         pillars, heads, levels, points = self.shape
         offset = self.offset(query).view(-1, q * pillars, heads, levels, points, 2)
@@ -114,15 +126,15 @@ class PillarCrossAttention(nn.Module):
 
 
 class BevEncoder(nn.Module):
-    """Learned queries of a plane, refined by attention to the cameras, then unfolded into a volume.
+    """Learned queries of a plane, refined by attention to the cameras and then unfolded into a volume.
 
-    What it hands on has the shape of `LiftingEncoder`'s volume, so that occupancy, motion and planning are
-    the same on both; but all it knows of height went through W numbers a cell. Frames are encoded one by
-    one (BEVFormer-S); what lies between them is the motion module's.
+    The output has the shape of the volume of `LiftingEncoder`, so occupancy, motion and planning are the same
+    for both. All information about height passes through W numbers per cell. Frames are encoded one by one
+    (BEVFormer-S); the motion module relates them in time.
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         channels: D, of the volume and of the image features.
         levels: number of image feature levels.
     """
@@ -164,7 +176,7 @@ class BevEncoder(nn.Module):
         rig: CameraRig,
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b D Z Y X"]:
-        """Image features to a plane to a volume; the result lies channels-last in memory."""
+        """Encode image features as a plane and unfold it into a volume, channels-last in memory."""
         uv, visible = project_to_cameras(self.pillars_m, rig, image_valid)
         height, ny, nx = self.spec.shape_zyx
         plane = refine(

@@ -1,4 +1,4 @@
-"""From an embedding to a sentence, by a small transformer after a prefix (ClipCap, Mokady et al. 2021)."""
+"""A small transformer that turns an embedding into a sentence, after ClipCap (Mokady et al. 2021)."""
 
 from collections.abc import Sequence
 
@@ -7,19 +7,19 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 PAD, END = 0, 1
-"""Numbers of what stands behind a sentence, and of its end; words follow."""
+"""Token numbers of the padding after a sentence and of its end. Words follow."""
 FIRST_WORD = 2
 
 
 class CaptionDecoder(nn.Module):
-    """Sentences of a small vocabulary, word by word, from the direction of an embedding.
+    """A decoder of sentences from a small vocabulary, word by word, given the direction of an embedding.
 
     Args:
         dim: D of the towers.
         words: the vocabulary.
-        longest: T, words of the longest sentence, its end included.
-        prefix: tokens that an embedding becomes.
-        width, heads, layers: of the transformer.
+        longest: T, number of words of the longest sentence, including its end.
+        prefix: number of tokens made from an embedding.
+        width, heads, layers: sizes of the transformer.
     """
 
     def __init__(
@@ -47,7 +47,10 @@ class CaptionDecoder(nn.Module):
     def forward(
         self, embedding: Float[Tensor, "n D"], said: Int[Tensor, "n S"]
     ) -> Float[Tensor, "n S_plus_1 V"]:
-        """Logits of each next word, given S words; the first, given none. Embeddings are of length 1."""
+        """Return the logits of each next word given S words; the first ones are given no word.
+
+        Embeddings have length 1.
+        """
         before = self.to_prefix(embedding).unflatten(1, (self.prefix, -1))
         tokens = torch.cat([before, self.embed(said)], dim=1)
         length = tokens.shape[1]
@@ -57,17 +60,17 @@ class CaptionDecoder(nn.Module):
 
     @torch.no_grad()
     def say(self, embedding: Float[Tensor, "n D"]) -> list[str]:
-        """The sentence of each embedding of length 1, always the likeliest next word."""
+        """Return a sentence for each embedding of length 1, by greedy decoding."""
         said = torch.zeros(len(embedding), 0, dtype=torch.int64, device=embedding.device)
         for _ in range(self.longest):
             said = torch.cat([said, self(embedding, said)[:, -1:].argmax(-1)], dim=1)
         return [self._sentence(row) for row in said.tolist()]
 
     def numbers(self, sentence: str) -> list[int]:
-        """A sentence's words by number, its end behind them.
+        """Return the token numbers of a sentence, followed by its end.
 
         Raises:
-            KeyError: a word that is not in the vocabulary.
+            KeyError: a word is not in the vocabulary.
         """
         number = {word: n for n, word in enumerate(self.words, FIRST_WORD)}
         return [*(number[word] for word in sentence.split()), END]

@@ -1,4 +1,4 @@
-"""A small probabilistic detection head on a volume, after DETR: a set of boxes, each with its uncertainty."""
+"""A small probabilistic detection head after DETR: from a volume to a set of boxes with uncertainties."""
 
 from dataclasses import dataclass
 
@@ -10,25 +10,26 @@ from foredrive.scene import Detections, VoxelSpec
 from foredrive.scene.record import Record
 
 LOG_STD_RANGE = (-4.0, 2.0)
-"""Standard deviations stay between 2 cm and 7 m (and as much of log sizes and headings)."""
+"""Bounds of the log standard deviations: 2 cm to 7 m for positions; log sizes and headings use the same
+numbers."""
 TYPICAL_LOG_LWH = (1.2, 0.4, 0.4)
 
 
 @dataclass(frozen=True)
 class BoxSet(Record):
-    """What the head says of each query; `detections` is the same as probabilities."""
+    """The raw output of the head for each query. `detections` returns it as probabilities."""
 
     logits: Float[Tensor, "*b Q K_1"]
-    """Of the classes and, last, of no object."""
+    """Logits of the classes and, last, of "no object"."""
     mean: Float[Tensor, "*b Q 6"]
-    """Centre (ego frame, m) and log length, width, height (m)."""
+    """Centre (ego frame, m) and log of length, width and height (m)."""
     log_std: Float[Tensor, "*b Q 6"]
     heading: Float[Tensor, "*b Q 2"]
-    """Sine and cosine of the yaw, of length 1."""
+    """Sine and cosine of the yaw, normalised to length 1."""
     log_std_yaw: Float[Tensor, "*b Q"]
 
     def detections(self) -> Detections:
-        """As the package's type; sine and cosine have the variance that the angle has."""
+        """Return the boxes as `Detections`. Sine and cosine get the variance of the angle."""
         log_prob = self.logits.double().log_softmax(-1)
         log_existence = log_prob[..., :-1].logsumexp(-1)
         std_yaw = self.log_std_yaw[..., None].expand(*self.log_std_yaw.shape, 2)
@@ -43,19 +44,19 @@ class BoxSet(Record):
 
 
 class DetectionHead(nn.Module):
-    """Volume → set of boxes.
+    """A head from a volume to a set of boxes.
 
-    Height is folded into the channels; convolutions shrink the plane until one cell is one query. Queries
-    attend to each other, so that one of them can speak for an object and the others be silent, and each
-    says where a box is from the middle of its cell, what it is and how sure it is of that.
+    Height is folded into the channels. Convolutions shrink the plane until each cell is one query. Queries
+    attend to each other, so that one can claim an object and the others stay empty. Each query predicts a box
+    relative to the centre of its cell, its class, and its uncertainty.
 
     Args:
-        spec: of the volume.
+        spec: grid of the volume.
         channels: D of the volume.
         classes: K.
-        width: of the queries.
-        shrink: times the plane is halved.
-        layers, heads: of the attention among queries.
+        width: channels of the queries.
+        shrink: how many times the plane is halved.
+        layers, heads: sizes of the attention among queries.
     """
 
     middle_m: Tensor
@@ -98,11 +99,11 @@ class DetectionHead(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, classes + 1 + 6 + 2 + 7))
         final = self.out[1]
         assert isinstance(final, nn.Linear)
-        with torch.no_grad():  # at first hardly anything exists
+        with torch.no_grad():  # start with a low probability of existence
             final.bias[classes] = 4.0
 
     def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> BoxSet:
-        """All queries' boxes."""
+        """Return the boxes of all queries."""
         plane = self.plane(volume.flatten(1, 2))
         queries = self.attention(plane.flatten(2).mT + self.place)
         logits, shift, size, heading, log_std = self.out(queries).split(

@@ -1,4 +1,4 @@
-"""A planner that sees nothing but the ego vehicle's own status."""
+"""A planner that sees only the status of the ego vehicle."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,14 @@ from foredrive.scene import Clip, Command, Trajectory
 
 
 def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Float[Tensor, "b P+1"]]:
-    """Where a vehicle was, and how fast, up to now.
+    """Return past poses and speeds of the ego vehicle.
 
     Returns:
-        x, y (m), yaw (rad) of the last P = `past_frames` key frames in the ego frame at now; speed at those
-        and now (m/s, 0 where unknown).
+        x, y (m) and yaw (rad) of the last P = `past_frames` key frames in the ego frame at now; speed at
+        these frames and at now (m/s, 0 where unknown).
 
     Raises:
-        InputError: if the clip has fewer frames.
+        InputError: the clip has fewer frames.
     """
     now = clip.now
     if now < past_frames:
@@ -31,12 +31,12 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
 
 
 def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[Tensor, "b S"]:
-    """What a vehicle knows of itself at now: `ego_motion` and the command as one-hot (zeros where unknown).
+    """Return the ego status at now: `ego_motion` and the command as one-hot (zeros where unknown).
 
-    Accelerations follow from the speeds.
+    Accelerations are implied by the speeds.
 
     Args:
-        target: it also knows where the route leads.
+        target: append `route_lead`.
     """
     poses, speeds = ego_motion(clip, past_frames)
     leads = route_lead(clip) if target else None
@@ -44,7 +44,7 @@ def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[T
 
 
 def route_lead(clip: Clip) -> Float[Tensor, "b 3"]:
-    """Where the route leads: x, y (m) and 1; zeros where that is not known."""
+    """Return the target point of the route: x, y (m) and 1; zeros where it is unknown."""
     known = clip.target_valid[:, None]
     return torch.cat([torch.where(known, clip.target_xy, 0.0), known.to(clip.target_xy)], dim=-1)
 
@@ -56,7 +56,7 @@ def status_row(
     command_valid: Bool[Tensor, "b"],
     lead: Float[Tensor, "b 3"] | None = None,
 ) -> Float[Tensor, "b S"]:
-    """The numbers of `ego_status` in their order; `route_lead` comes last, if it is given."""
+    """Return the numbers of `ego_status` in order. `route_lead` comes last, if given."""
     one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
     row = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
     return row if lead is None else torch.cat([row, lead.to(row)], dim=-1)
@@ -71,16 +71,17 @@ class EgoMLPConfig:
 
 
 class EgoMLP(nn.Module):
-    """An `Agent`: ego status to waypoints by a three-layer perceptron (Zhai et al. 2023, "AD-MLP").
+    """An `Agent` that maps ego status to waypoints by a three-layer perceptron ("AD-MLP", Zhai et al. 2023).
 
-    It cannot know what is around, so what it scores is what a protocol gives away. Inputs and outputs are
-    standardised by the training set's mean and spread, which are part of the weights.
+    It cannot see the surroundings, so its score shows what a protocol reveals without them. Inputs and
+    outputs are standardised by the mean and spread of the training set, which are part of the weights.
 
     Args:
         config: sizes.
-        past_frames: key frames before now that it looks back on (4 in the paper).
-        horizon_steps, dt_s: of the plan.
-        target: it also knows where the route leads, which in the paper it does not.
+        past_frames: number of key frames before now that it reads (4 in the paper).
+        horizon_steps: steps of the plan.
+        dt_s: time step of the plan, s.
+        target: also read the target point of the route (not in the paper).
     """
 
     status_mean: Tensor
@@ -115,17 +116,17 @@ class EgoMLP(nn.Module):
         self.register_buffer("plan_std", torch.ones(outputs))
 
     def forward(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 3"]:
-        """x, y (m) and yaw (rad) of each step, in the ego frame at now."""
+        """Return x, y (m) and yaw (rad) of each step, in the ego frame at now."""
         plan = self.layers(self.standardised(status))
         return (plan * self.plan_std + self.plan_mean).unflatten(1, (self.horizon_steps, 3))
 
     def standardised(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b S"]:
-        """Ego status in numbers of order 1."""
+        """Return the ego status in numbers of order 1."""
         return (status - self.status_mean) / self.status_std
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
-        """The plan from now on."""
+        """Return the plan from now on."""
         plan = self(ego_status(observation, self.past_frames, target=self.target))[:, None]  # [b, 1, T, 3]
         return Trajectory(
             xy=plan[..., :2],

@@ -1,4 +1,4 @@
-"""A transformer decoder's layer for few queries and very many places to look at."""
+"""A transformer decoder layer for few queries and a large memory."""
 
 import torch
 import torch.nn.functional as F
@@ -9,16 +9,16 @@ from torch import Tensor, nn
 def attend_few(
     attention: nn.MultiheadAttention, query: Float[Tensor, "b Q C"], memory: Float[Tensor, "b N C"]
 ) -> Float[Tensor, "b Q C"]:
-    """What `attention(query, memory, memory)` returns, without a key and a value for each of the N places.
+    """Return `attention(query, memory, memory)` without computing keys and values for each of the N places.
 
-    q·(W m) = (Wᵀ q)·m: the queries are taken to where the places are, not the other way round, and the value
-    projection comes after the average. That is Q·H·N·C products instead of N·C², and no [b N C] is kept but
-    the memory itself: 16 times less for one query with 4 heads of 32 channels. The keys' bias shifts all
-    scores of a query alike, so that the softmax drops it.
+    Since q·(W m) = (Wᵀ q)·m, the queries are projected into the space of the memory, and the value projection
+    is applied after the average. This takes Q·H·N·C products instead of N·C², and no [b N C] tensor is kept
+    except the memory itself: 16 times less for one query with 4 heads of 32 channels. The bias of the keys
+    shifts all scores of a query equally, so the softmax cancels it.
 
     Args:
-        attention: batch first, one packed projection, no masks; its dropout acts on the weights as usual.
-        query, memory: C channels each, any numbers Q and N.
+        attention: batch first, one packed projection, no masks. Its dropout acts on the weights as usual.
+        query, memory: C channels each; Q and N are arbitrary.
     """
     assert attention.in_proj_weight is not None
     b, count, channels = query.shape
@@ -31,19 +31,21 @@ def attend_few(
     weight = F.dropout(weight, attention.dropout, attention.training)
     seen = (weight @ memory).view(b, count, heads, channels)
     value = torch.einsum("bqhc,hwc->bqhw", seen, to_value.view(heads, width, channels))
-    # what is dropped of the weights is dropped of the bias, too
+    # Dropped weights must drop their share of the bias too.
     value = value + weight.sum(-1).view(b, count, heads, 1) * bias_value.view(heads, width)
     return attention.out_proj(value.flatten(2))
 
 
 class FewQueriesDecoderLayer(nn.Module):
-    """`nn.TransformerDecoderLayer(norm_first=True, batch_first=True)` by `attend_few`; the same parameters.
+    """The layer `nn.TransformerDecoderLayer(norm_first=True, batch_first=True)` with `attend_few`.
+
+    It has the same parameters.
 
     Args:
         width: C.
-        heads: of both attentions.
+        heads: heads of both attentions.
         feed_forward: hidden width.
-        dropout: share.
+        dropout: dropout probability.
     """
 
     def __init__(self, width: int, heads: int, feed_forward: int, dropout: float = 0.1) -> None:
@@ -58,7 +60,7 @@ class FewQueriesDecoderLayer(nn.Module):
     def forward(
         self, query: Float[Tensor, "b Q C"], memory: Float[Tensor, "b N C"]
     ) -> Float[Tensor, "b Q C"]:
-        """The queries after a look at each other and at the memory."""
+        """Return the queries after self-attention and attention to the memory."""
         own = self.norm1(query)
         query = query + self.dropout(self.self_attn(own, own, own, need_weights=False)[0])
         query = query + self.dropout(attend_few(self.multihead_attn, self.norm2(query), memory))

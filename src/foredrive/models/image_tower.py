@@ -1,4 +1,4 @@
-"""A small image tower: a ResNet, and attention over what it sees."""
+"""A small image tower: a ResNet with attention pooling."""
 
 from collections.abc import Sequence
 
@@ -11,16 +11,16 @@ from foredrive.models.backbone import normalise_images
 
 
 class ImageTower(nn.Module):
-    """ResNet (He et al. 2016) of four stages with an attention pool: images of any size to D numbers.
+    """A ResNet (He et al. 2016) of four stages with an attention pool: images of any size to D numbers.
 
     Args:
-        widths, depths: of the ResNet's stages, basic layers.
-        heads: of the pool.
+        widths, depths: sizes of the stages of the ResNet (basic layers).
+        heads: heads of the pool.
         dim: D.
     """
 
     def __init__(self, *, widths: Sequence[int], depths: Sequence[int], heads: int, dim: int) -> None:
-        from transformers import ResNetBackbone, ResNetConfig  # takes seconds
+        from transformers import ResNetBackbone, ResNetConfig  # slow to import
 
         super().__init__()
         last = f"stage{len(widths)}"
@@ -36,7 +36,7 @@ class ImageTower(nn.Module):
         self.pool = AttentionPool(widths[-1], heads, dim)
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """One vector an image."""
+        """Return one vector per image."""
         pixels = normalise_images(images).contiguous(memory_format=torch.channels_last)
         (seen,) = self.resnet(pixels).feature_maps
         return self.pool(seen.flatten(2).mT)

@@ -1,4 +1,4 @@
-"""Lift, splat (Philion & Fidler 2020): image features to a plane by a distribution over depth."""
+"""Lift-splat (Philion & Fidler 2020): image features to a plane by a distribution over depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from foredrive.scene import CameraRig, VoxelSpec
 
 @dataclass(frozen=True)
 class LiftSplatConfig:
-    """The depths of a `LiftSplatEncoder` (4 to 45 m by 1 m in the paper)."""
+    """Depth range of a `LiftSplatEncoder` (4 to 45 m in steps of 1 m in the paper)."""
 
     near_m: float
     far_m: float
@@ -24,15 +24,16 @@ class LiftSplatConfig:
 
 
 class LiftSplatEncoder(nn.Module):
-    """Each feature of the finest level is put at every depth along its ray, as far as it is likely to belong
-    there; what falls into a cell of the plane is summed up.
+    """An encoder that places each feature at every depth along its ray, weighted by depth probability.
+
+    The contributions to each cell of the plane are summed.
 
     Args:
         config: depths.
-        spec: the grid whose plane (and range of heights) is filled.
+        spec: grid whose plane and range of heights are filled.
         channels: D of the image features.
         width: C of the plane.
-        levels: number of image feature levels; the finest is read.
+        levels: number of image feature levels; only the finest is read.
     """
 
     depths_m: Tensor
@@ -58,7 +59,7 @@ class LiftSplatEncoder(nn.Module):
         rig: CameraRig,
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b _W Y X"]:
-        """Image features to a plane."""
+        """Encode image features as a plane."""
         finest = features[0]
         told = self.depth_and_context(finest).float()
         depth, context = told.split([len(self.depths_m), self.width], dim=-1)
@@ -70,7 +71,7 @@ class LiftSplatEncoder(nn.Module):
     def cells(
         self, rig: CameraRig, feature_hw: tuple[int, int]
     ) -> tuple[Int[Tensor, "b P"], Bool[Tensor, "b P"]]:
-        """The cell of the plane (y · X + x) that each depth of each feature lies in, and whether in any."""
+        """Return the cell (y · X + x) of each depth of each feature, and whether it is in the grid."""
         points = self.points_m(rig, feature_hw)
         lower = points.new_tensor(self.spec.lower_m)
         index = ((points - lower) / self.spec.voxel_m).floor().long()
@@ -80,13 +81,13 @@ class LiftSplatEncoder(nn.Module):
         return cell, inside
 
     def points_m(self, rig: CameraRig, feature_hw: tuple[int, int]) -> Float[Tensor, "b P 3"]:
-        """Ego coordinates of each depth of each feature: cameras, rows, columns, depths."""
+        """Return ego coordinates (m) of each depth of each feature: cameras, rows, columns, depths."""
         h, w = feature_hw
         scale = rig.K.new_tensor([rig.size_hw[1] / w, rig.size_hw[0] / h])
         uv = pixel_centres((h, w)).to(rig.K).flatten(0, 1) * scale
         b, c = rig.K.shape[:2]
         rays = pixels_to_rays(uv.expand(b, c, -1, 2), rig.K, rig.dist)
-        rays = rays / rays[..., 2:]  # by depth, not by range
+        rays = rays / rays[..., 2:]  # normalised by depth, not by range
         in_camera = rays[..., None, :] * self.depths_m[:, None]
         R, t = rig.T_ego_cam[..., :3, :3], rig.T_ego_cam[..., :3, 3]
         in_ego = torch.einsum("bcij,bcnkj->bcnki", R.float(), in_camera.float()) + t[:, :, None, None].float()
@@ -100,11 +101,11 @@ def splat(
     inside: Bool[Tensor, "b P"],
     size_yx: tuple[int, int],
 ) -> Float[Tensor, "b W Y X"]:
-    """Sums of what falls into each cell of a plane; nothing is computed of what falls beside it.
+    """Sum the contributions to each cell of a plane. Nothing is computed for points outside.
 
     Args:
-        share: of each of N features that belongs to each of K depths.
-        cell: index y · X + x of each of the P = N·K, of any value where not `inside`.
+        share: weight of each of N features at each of K depths.
+        cell: index y · X + x of each of the P = N·K points; any value where not `inside`.
     """
     b, count, width = len(share), size_yx[0] * size_yx[1], feature.shape[-1]
     whose = inside.flatten().nonzero()[:, 0] // share.shape[-1]

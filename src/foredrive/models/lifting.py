@@ -1,4 +1,4 @@
-"""From camera features to a volume: learned voxel queries refined by deformable attention (NeMo eq. 1)."""
+"""Lifting of camera features to a volume by voxel queries and deformable attention (NeMo eq. 1)."""
 
 import math
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ from foredrive.scene import CameraRig, VoxelSpec
 
 
 def directions_2d(heads: int) -> Float[Tensor, "H 2"]:
-    """Unit square directions, one a head (Zhu et al. 2021, initialisation)."""
+    """Return directions on the unit square, one per head (the initialisation of Zhu et al. 2021)."""
     angle = torch.arange(heads) * (2 * math.pi / heads)
     grid = torch.stack([angle.cos(), angle.sin()], dim=-1)
     return grid / grid.abs().amax(-1, keepdim=True)
 
 
 def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
-    """Directions spread over the sphere (golden spiral), one a head, scaled to the unit cube."""
+    """Return directions spread over the sphere (golden spiral), one per head, scaled to the unit cube."""
     index = torch.arange(heads) + 0.5
     z = 1 - 2 * index / heads
     angle = math.pi * (1 + math.sqrt(5)) * index
@@ -35,11 +35,11 @@ def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
 
 
 def place_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, "Q D"]:
-    """What a query begins with: sines and cosines of where its voxel lies, as seen from the vehicle.
+    """Return the initial queries: sines and cosines of the position of each voxel relative to the vehicle.
 
-    Direction, distance and height first, as they decide what cameras show of a place; then x and y. With
-    more channels than these 28 the others begin at random and small, with fewer the last are left out.
-    Queries that all begin at random have to learn first where they are.
+    Direction, distance and height come first, because they decide how cameras see a place; then x and y.
+    These are 28 channels. Further channels start random and small; with fewer channels the last ones are cut.
+    Queries that start fully random have to learn their position first.
     """
     x, y, z = centres_m.unbind(-1)
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
@@ -59,13 +59,13 @@ class LiftingConfig:
 
     heads: int
     points: int
-    """Read per head, and per level of image features."""
+    """Points read per head and per level of image features."""
     layers: int
     """Rounds of refinement."""
     feed_forward: float = 2.0
-    """Hidden width of the feed-forward networks over the channels."""
+    """Hidden width of the feed-forward networks, as a multiple of the channels."""
     checkpoint: bool = False
-    """Keep only each round's input for the backward pass and compute the rest again."""
+    """Keep only the input of each round for the backward pass and recompute the rest."""
     kind: Literal["lifting"] = "lifting"
 
 
@@ -89,7 +89,13 @@ class VolumeSelfAttention(nn.Module):
     def forward(
         self, query: Float[Tensor, "b Q D"], shape_zyx: tuple[int, int, int], place: Float[Tensor, "Q 3"]
     ) -> Float[Tensor, "b Q D"]:
-        """Args: voxel features in Z Y X order, their grid's shape, voxel centres in voxel units (x y z)."""
+        """Attend among the voxels.
+
+        Args:
+            query: voxel features in Z Y X order.
+            shape_zyx: shape of their grid.
+            place: voxel centres in voxel units (x, y, z).
+        """
         b, q, _ = query.shape
         offset = self.offset(query).view(b, q, self.heads, self.points, 3)
         weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
@@ -122,7 +128,13 @@ class CameraCrossAttention(nn.Module):
         uv: Float[Tensor, "b C Q 2"],
         visible: Bool[Tensor, "b C Q"],
     ) -> Float[Tensor, "b Q D"]:
-        """Args: voxel features, of batch size b or 1; image features; projections; who sees what."""
+        """Attend to the cameras.
+
+        Args:
+            query: voxel features, of batch size b or 1.
+            features: image features, one tensor per level.
+            uv, visible: projections of the voxels and their visibility per camera.
+        """
         q, b = query.shape[1], len(uv)
         offset = self.offset(query).view(-1, q, self.heads, self.levels, self.points, 2)
         weight = self.weight(query).view(-1, q, self.heads, self.levels * self.points).softmax(-1)
@@ -135,13 +147,13 @@ class CameraCrossAttention(nn.Module):
 
 
 class LiftingLayer(nn.Module):
-    """Self-attention, cross-attention, feed-forward; each residual and normalised.
+    """A layer of self-attention, cross-attention and feed-forward; each is residual and normalised.
 
     Args:
         channels: D.
         self_attention: among the queries, as `VolumeSelfAttention`.
         cross_attention: to the cameras, as `CameraCrossAttention`.
-        feed_forward: hidden width over D.
+        feed_forward: hidden width as a multiple of D.
     """
 
     def __init__(
@@ -162,10 +174,10 @@ class LiftingLayer(nn.Module):
         uv: Float[Tensor, "b C N 2"],
         visible: Bool[Tensor, "b C N"],
     ) -> Float[Tensor, "b Q D"]:
-        """One round of refinement; arguments as in the two attentions.
+        """Run one round of refinement. The arguments are those of the two attentions.
 
-        A query batch of 1 stands for queries that are still the same for the whole batch: until they have
-        seen images, work on them is done once.
+        A query batch of 1 means that the queries are still the same for the whole batch. Until they have read
+        images, the work on them is done once.
         """
         query = self.norms[0](query + self.self_attention(query, shape_zyx, place))
         query = self.norms[1](query + self.cross_attention(query, features, uv, visible))
@@ -183,7 +195,7 @@ def refine(
     *,
     recompute: bool,
 ) -> Float[Tensor, "_b Q D"]:
-    """Queries after all rounds of `LiftingLayer`s; with `recompute` only each round's input is kept."""
+    """Return the queries after all `LiftingLayer`s. `recompute` keeps only the input of each round."""
     for layer in layers:
         inputs = (query, shape_zyx, place, features, uv, visible)
         if recompute and torch.is_grad_enabled():
@@ -196,7 +208,7 @@ def refine(
 def project_to_cameras(
     points_m: Float[Tensor, "Q 3"], rig: CameraRig, image_valid: Bool[Tensor, "b C"]
 ) -> tuple[Float[Tensor, "b C Q 2"], Bool[Tensor, "b C Q"]]:
-    """Where points of the ego frame fall in every image, in [0, 1], and whether they are seen there."""
+    """Project points of the ego frame into every image. Return positions in [0, 1] and visibility."""
     b, c = image_valid.shape
     in_camera = transform_points(inverse_se3(rig.T_ego_cam), points_m.expand(b, c, -1, -1))
     uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
@@ -205,11 +217,11 @@ def project_to_cameras(
 
 
 class LiftingEncoder(nn.Module):
-    """Learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
+    """An encoder from learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         channels: D.
         levels: number of image feature levels.
     """
@@ -243,7 +255,7 @@ class LiftingEncoder(nn.Module):
         rig: CameraRig,
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b D Z Y X"]:
-        """Lift image features; the result lies channels-last in memory."""
+        """Lift image features. The result is channels-last in memory."""
         uv, visible = project_to_cameras(self.centres_m, rig, image_valid)
         query = refine(
             self.layers,

@@ -23,63 +23,64 @@ class PathCorrectionConfig:
     """Sizes of a `PathCorrection`."""
 
     distances_m: tuple[float, ...]
-    """Along the path; it goes on straight where it ends."""
+    """Distances along the path. Beyond its end, the path continues straight."""
     aside_m: tuple[float, ...] = (-3.0, 0.0, 3.0)
-    """Places across the path that are read: on it and in the lanes next to it."""
+    """Lateral offsets that are read: on the path and in the lanes beside it."""
     width: int
     hidden: int
-    """Width of what is kept of one distance."""
+    """Channels kept for each distance."""
     dropout: float = 0.2
     place_scale_m: float = 20.0
-    """Places are divided by it."""
+    """Scale by which positions are divided."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
-    """Sizes of a `VolumePlanner`, and the inputs that it is given."""
+    """Sizes and inputs of a `VolumePlanner`."""
 
     width: int
     """C (256 in the paper)."""
     layers: int
-    """Of the decoder (3 in the paper)."""
+    """Layers of the decoder (3 in the paper)."""
     heads: int
     pool: tuple[int, int, int]
-    """Block of voxels (z, y, x) that share a key and a value in the attention within the future volume."""
+    """Block of voxels (z, y, x) that shares a key and a value in the attention within the future volume."""
     future: Literal["attention", "concatenation", "none"] = "attention"
-    """How the predicted next volume is put together with the present one."""
+    """Combination of the predicted next volume with the present one."""
     history: int = 0
-    """Key frames before now whose pose and speed the query knows. In the paper it knows the speed at now
-    alone, which does not tell whether the vehicle brakes."""
+    """Number of key frames before now whose pose and speed enter the query. In the paper only the speed at
+    now does, which does not reveal braking."""
     target: bool = False
-    """The query knows where the route leads (`Clip.target_xy`), as agents on CARLA's leaderboards do; in the
-    paper it knows the command alone."""
+    """Add the target point of the route (`Clip.target_xy`) to the query, as agents on CARLA's leaderboards
+    do. The paper uses only the command."""
     ego_mlp: EgoMLPConfig | None = None
-    """The MLP whose plan is changed, fitted to the demonstrations before fine-tuning; None changes the plan
+    """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning. None corrects the plan
     that goes straight on at the present speed."""
     path: PathCorrectionConfig | None = None
-    """Read the volume along the plan made without looking, too; not in the paper."""
+    """Also read the volume along the initial plan. Not in the paper."""
     feed_forward: float = 2.0
-    """Hidden width of the decoder's feed-forward networks over C."""
+    """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
     dropout: float = 0.1
-    """Of the decoder."""
+    """Dropout of the decoder."""
     speed_scale_mps: float = 10.0
     past_scale_m: float = 5.0
     target_scale_m: float = 20.0
-    """Inputs are divided by these."""
+    """Scales by which inputs are divided."""
     step_scale_m: float = 1.0
-    """What an output of 1 stands for: with steps of this order the last layer need not grow first."""
+    """Length of a step for an output of 1. With outputs of order 1, the last layer does not have to grow
+    first."""
 
 
 class FutureAttention(nn.Module):
     """Self-attention within the predicted future volume, multiplied onto the present one (eq. 13).
 
-    Q, K and V all come from V̂_{t+1}. Every voxel attending to every other is out of reach (640,000² pairs at
-    the paper's size, about which it is silent), so keys and values are averaged over blocks of `pool` voxels,
-    as in spatial-reduction attention (Wang et al. 2021); `pool=(1, 1, 1)` is eq. 13 to the letter.
+    Q, K and V all come from V̂_{t+1}. Full attention is too large: 640,000² pairs at the size of the paper,
+    which does not discuss it. So keys and values are averaged over blocks of `pool` voxels, as in
+    spatial-reduction attention (Wang et al. 2021). `pool=(1, 1, 1)` is exactly eq. 13.
 
     Args:
         channels: D.
-        pool: block of voxels (z, y, x) that share one key and value.
+        pool: block of voxels (z, y, x) that shares one key and value.
     """
 
     def __init__(self, channels: int, pool: tuple[int, int, int]) -> None:
@@ -92,38 +93,38 @@ class FutureAttention(nn.Module):
     def forward(
         self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"]
     ) -> Float[Tensor, "b D Z Y X"]:
-        """V_F = A ⊙ V_t."""
+        """Return V_F = A ⊙ V_t."""
         blocks = F.avg_pool3d(future, self.pool).flatten(2).transpose(1, 2)  # [b, blocks, D]
         tokens = future.flatten(2).transpose(1, 2)  # [b, Z·Y·X, D]
         one_head = (x[:, None] for x in (self.query(tokens), self.key(blocks), self.value(blocks)))
-        attended = F.scaled_dot_product_attention(*one_head)[:, 0]  # without a head it would hold all pairs
+        attended = F.scaled_dot_product_attention(*one_head)[:, 0]  # else all pairs would be stored
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
 class PathReads(NamedTuple):
-    """What a volume says along a plan, at D distances and S places across it."""
+    """Features of a volume along a plan, at D distances and S lateral offsets."""
 
     values: Float[Tensor, "b D S F"]
-    """The columns of the volume there, F = Z·D features."""
+    """Columns of the volume at these places, F = Z·D features."""
     places_m: Float[Tensor, "b D S 2"]
-    """Where, in the ego frame."""
+    """Positions in the ego frame, m."""
 
 
 class PathCorrection(nn.Module):
-    """By how much what lies along a plan changes it.
+    """A correction of a plan from the volume features along it.
 
-    Columns of the volume are read at given distances on the plan's path and beside it. The same numbers mean
-    the same place on the way whatever the curve, so that braking for what stands in the lane need not be
-    learned anew for every cell of the plane. What is read can be kept, so that many thousand demonstrations
-    are looked at in seconds (`training.fit_path`): from the thousand of fine-tuning it would learn nothing
+    Columns of the volume are read at given distances on the path and beside it. The same inputs then mean the
+    same place along the path whatever its curve, so braking for an obstacle in the lane is not learned anew
+    for every cell of the plane. The columns can be stored, so that many thousand demonstrations train it in
+    seconds (`training.fit_path`). The thousand demonstrations of fine-tuning would teach it nothing
     (`bench nemo-planning-limits`).
 
     Args:
         config: sizes.
         spec: grid of the volume.
-        channels: of the volume.
-        told: how many numbers about the ego vehicle come with it: whether 20 m are near depends on its speed.
-        steps: T, of the plan.
+        channels: channels of the volume.
+        told: number of inputs about the ego vehicle, because whether 20 m is near depends on its speed.
+        steps: T, steps of the plan.
     """
 
     distances_m: Tensor
@@ -162,11 +163,11 @@ class PathCorrection(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, reads: PathReads, told: Float[Tensor, "b S"]) -> Float[Tensor, "b T 2"]:
-        """Changes of the steps between waypoints, m.
+        """Return corrections of the steps between waypoints, m.
 
         Args:
             reads: see `read`.
-            told: about the ego vehicle, in numbers of order 1.
+            told: inputs about the ego vehicle, in numbers of order 1.
         """
         values = (reads.values.float() - self.mean) / self.std
         seen = torch.cat([values, reads.places_m / self.place_scale_m], dim=-1).flatten(2)
@@ -174,7 +175,7 @@ class PathCorrection(nn.Module):
         return self.change(torch.cat([along, told], dim=-1)).float()
 
     def read(self, volume: Float[Tensor, "b D Z Y X"], path_xy: Float[Tensor, "b T 2"]) -> PathReads:
-        """What lies along a path, from the origin of the ego frame through waypoints."""
+        """Read the volume along a path from the origin of the ego frame through waypoints."""
         places = self.places(path_xy)
         columns = volume.permute(0, 3, 4, 2, 1).flatten(3).contiguous()
         with full_precision(columns, places) as (values, at):
@@ -183,7 +184,7 @@ class PathCorrection(nn.Module):
         return PathReads(read, places)
 
     def places(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
-        """Where is looked: at every distance along the path, at S places across it."""
+        """Return the positions to read: at every distance along the path, at S lateral offsets."""
         steps = torch.diff(path_xy, dim=1, prepend=torch.zeros_like(path_xy[:, :1]))
         lengths = steps.norm(dim=-1)[:, None]  # [b, 1, T]
         begins = lengths.cumsum(-1) - lengths
@@ -192,26 +193,27 @@ class PathCorrection(nn.Module):
         yaw = _headings(path_xy[:, None])[:, 0]
         forward = torch.stack([yaw.cos(), yaw.sin()], dim=-1)  # [b, T, 2]
         on_path = share @ steps + beyond[..., None] * forward[:, -1:]
-        step = (self.distances_m[:, None] >= begins).sum(-1) - 1  # [b, D]: the last one begun
+        step = (self.distances_m[:, None] >= begins).sum(-1) - 1  # [b, D]: index of the last step begun
         ahead = forward.gather(1, step[..., None].expand(-1, -1, 2))
         left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
         return on_path[:, :, None] + self.aside_m[:, None] * left[:, :, None]
 
 
 class VolumePlanner(nn.Module):
-    """Waypoints from the present volume and, unless `future` is "none", the one predicted next.
+    """A planner of waypoints from the present volume and, unless `future` is "none", the predicted next one.
 
-    The two are put together by attention (eq. 13), or by concatenation, or only the present is looked at:
-    three rows of NeMo's Table 1. Height is folded into the channels, Z·D → C by an MLP; one query (command,
-    speed and a learned planning embedding, fused) attends to the plane through a transformer decoder; an MLP
-    regresses by how much the steps between waypoints differ from those of a plan made without looking, and
-    they are summed up. That plan goes straight on at this speed, or is what `ego_mlp` says.
+    The two volumes are combined by attention (eq. 13) or concatenation, or only the present one is used:
+    three rows of NeMo's Table 1. Height is folded into the channels, Z·D → C, by an MLP. One query (command,
+    speed and a learned planning embedding, fused) attends to the plane through a transformer decoder. An MLP
+    regresses the differences between the steps of the plan and those of an initial plan, and the steps are
+    summed up. The initial plan goes straight on at the present speed, or is the output of `ego_mlp`.
 
     Args:
         config: sizes and inputs.
         spec: grid of the volumes.
         channels: D.
-        horizon_steps, dt_s: of the plan.
+        horizon_steps: steps of the plan.
+        dt_s: time step of the plan, s.
     """
 
     def __init__(
@@ -242,20 +244,20 @@ class VolumePlanner(nn.Module):
         )
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
-        self.command = nn.Embedding(len(Command) + 1, width)  # the last one: not known
+        self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command
         told = 2 + 4 * config.history + 3 * config.target
         self.speed = nn.Sequential(nn.Linear(told, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
-        # Normalising first keeps an open path for speed and command, which most of a plan follows from.
+        # Pre-norm keeps a direct path for speed and command, which determine most of a plan.
         layer = FewQueriesDecoderLayer(
             width, config.heads, round(config.feed_forward * width), config.dropout
         )
-        self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(config.layers)])  # as torch's
+        self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(config.layers)])  # as in torch
         self.waypoints = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
-        if self.ego_mlp is not None:  # its plan is good already: looking starts from no change to it
+        if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
             for parameter in self.waypoints[-1].parameters():
                 nn.init.zeros_(parameter)
         told = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
@@ -265,7 +267,7 @@ class VolumePlanner(nn.Module):
 
     @property
     def looks_ahead(self) -> int:
-        """The number of key frames that have to be imagined for a plan."""
+        """Number of key frames that have to be imagined for a plan."""
         return 0 if self.config.future == "none" else 1
 
     def forward(
@@ -282,10 +284,10 @@ class VolumePlanner(nn.Module):
         """Plan in the ego frame at now.
 
         Args:
-            now, future: volumes at now and at the next key frame, if it is looked at.
-            command, command_valid, speed_mps, speed_valid: of now.
+            now, future: volumes at now and, if it is used, at the next key frame.
+            command, command_valid, speed_mps, speed_valid: values at now.
             past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
-            lead: see `route_lead`; asked for by a planner that knows it.
+            lead: see `route_lead`; required if `target` is set.
         """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
@@ -328,7 +330,7 @@ class VolumePlanner(nn.Module):
         past: Float[Tensor, "b P 4"],
         lead: Float[Tensor, "b 3"] | None = None,
     ) -> tuple[Float[Tensor, "b T 2"], Float[Tensor, "b _S"]]:
-        """The plan that looking changes, and ego status in numbers of order 1 (none without an ego MLP)."""
+        """Return the initial plan and the standardised ego status (no columns without an ego MLP)."""
         if self.target and lead is None:
             raise ValueError("this planner knows where the route leads")
         if self.ego_mlp is None:
@@ -351,7 +353,7 @@ class VolumePlanner(nn.Module):
 
 
 def _headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:
-    """Headings along a path from the origin; where it hardly moves, the heading it had before."""
+    """Return headings along a path from the origin. Where it hardly moves, the previous heading is kept."""
     with torch.no_grad():
         step = torch.diff(xy, dim=2, prepend=torch.zeros_like(xy[:, :, :1]))
         along = torch.atan2(step[..., 1], step[..., 0])

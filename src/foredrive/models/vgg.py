@@ -17,11 +17,11 @@ TORCHVISION_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 class Vgg16Features(nn.Module):
     """Activations relu1_2, relu2_2, relu3_3, relu4_3 of VGG-16 (Simonyan & Zisserman 2015), frozen.
 
-    Layer names follow torchvision's `features.N`, so its published weights load as they are.
+    Layer names follow torchvision's `features.N`, so its published weights load directly.
 
     Args:
-        weights: a .safetensors or .pth file of torchvision's VGG-16, or "download" to fetch it from
-            PyTorch's server into the torch hub cache.
+        weights: a .safetensors or .pth file of torchvision's VGG-16, or "download" to fetch it from PyTorch's
+            server into the torch hub cache.
     """
 
     mean: Tensor
@@ -51,11 +51,11 @@ class Vgg16Features(nn.Module):
         self.eval()
 
     def train(self, mode: bool = True) -> "Vgg16Features":
-        """Stays in evaluation mode: these features are a fixed yardstick."""
+        """Stay in evaluation mode, because the features are fixed."""
         return super().train(False)
 
     def forward(self, rgb: Float[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _c _h _w"], ...]:
-        """Features of RGB images in [0, 1]."""
+        """Return features of RGB images in [0, 1]."""
         x = (rgb - self.mean) / self.std
         taps = []
         for index, layer in enumerate(self.features):

@@ -1,4 +1,4 @@
-"""The records that recipes are: plain values only, so that they can be read, written and compared."""
+"""The records of recipes: plain values only, so that they can be read, written and compared."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ R = TypeVar("R", bound="Recipe[Any, Any]")
 
 @dataclass(frozen=True)
 class Recipe(Generic[M, S]):
-    """Everything that decides a run, but for where the logs are.
+    """All settings of a run, except where the logs are.
 
     M is the config of a world model and S that of its training stages: a row of `WORLD_MODELS`.
     """
@@ -35,23 +35,23 @@ class Recipe(Generic[M, S]):
     model: M
     planner: PlannerConfig
     pretrain: S | None
-    """None: fine-tuning starts from scratch, or from weights that are given."""
+    """None: fine-tuning starts from scratch or from given weights."""
     finetune: S
     path: PathFit | None = None
-    """How the planner's `PathCorrection` is fitted to what the fine-tuned world model sees; joint fine-tuning
-    then leaves it alone. None leaves it to joint fine-tuning."""
+    """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
+    trains it in fine-tuning."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
 
 
 def rescheduled(stage: S, **changes: Any) -> S:
-    """Return the stage with other entries of its schedule."""
+    """Return the stage with changed entries of its schedule."""
     return replace(stage, schedule=replace(stage.schedule, **changes))  # type: ignore[attr-defined, type-var]
 
 
 def labelled_by(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
-    """Return the recipe with voxel labels of another source; its name tells."""
+    """Return the recipe with voxel labels of another source, which is added to its name."""
     if occupancy_source == recipe.clips.occupancy_source:
         return recipe
     clips = replace(recipe.clips, occupancy_source=occupancy_source)
@@ -71,15 +71,15 @@ def recipe_yaml(recipe: Any) -> str:
 
 
 def is_recipe_file(name: str) -> bool:
-    """Return whether the name of a recipe is that of a file."""
+    """Return whether the name of a recipe is that of a YAML file."""
     return name.endswith((".yaml", ".yml"))
 
 
 def load_recipe(path: Path) -> Recipe[Any, Any]:
-    """Read a recipe that `save_recipe` wrote, today or in an earlier format.
+    """Read a recipe written by `save_recipe`, in today's format or an earlier one.
 
     Raises:
-        InputError: naming the file, and the entry that is wrong, missing or unknown.
+        InputError: an entry is wrong, missing or unknown. The message names the file and the entry.
     """
     return recipe_from(upgraded(read_values(path)), str(path))
 
@@ -88,10 +88,11 @@ def recipe_from(written: Any, source: str) -> Recipe[Any, Any]:
     """Validate the plain values of a recipe.
 
     Args:
-        source: named in errors.
+        written: the plain values.
+        source: name of the source in errors.
 
     Raises:
-        InputError: naming the entry that is wrong, missing or unknown.
+        InputError: an entry is wrong, missing or unknown. The message names it.
     """
     model = written.get("model") if isinstance(written, Mapping) else None
     kind = model.get("kind") if isinstance(model, Mapping) else None
@@ -103,7 +104,7 @@ def recipe_from(written: Any, source: str) -> Recipe[Any, Any]:
 
 
 def load_values(kind: type[V], path: Path) -> V:
-    """Read plain values of a dataclass; raises as `load_recipe` does."""
+    """Read a dataclass of plain values from YAML. Raises the errors of `load_recipe`."""
     found: V = validated(kind, read_values(path), str(path))
     return found
 
@@ -112,7 +113,7 @@ def read_values(path: Path) -> Any:
     """Read YAML.
 
     Raises:
-        InputError: the file cannot be read or is no YAML.
+        InputError: the file cannot be read or is not YAML.
     """
     try:
         return yaml.safe_load(path.read_text())
@@ -126,7 +127,7 @@ def validated(kind: Any, written: Any, source: str) -> Any:
     """Return plain values as a dataclass, generic or not.
 
     Raises:
-        InputError: naming the entry that is wrong, missing or unknown.
+        InputError: an entry is wrong, missing or unknown. The message names it.
     """
     try:
         return TypeAdapter(kind).validate_python(written, extra="forbid")
@@ -140,11 +141,11 @@ def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str,
     """Return plain values with some of them replaced.
 
     Args:
-        written: of a recipe of any kind, complete.
-        settings: each KEY.KEY=VALUE; the value is read as YAML.
+        written: the complete values of a recipe of any kind.
+        settings: entries KEY.KEY=VALUE; the value is read as YAML.
 
     Raises:
-        InputError: on a setting of another form or an unknown key, with the nearest known one.
+        InputError: a setting has another form or an unknown key. The message names the nearest known key.
     """
     values: dict[str, Any] = _plain(written)
     for setting in settings:
@@ -168,7 +169,7 @@ def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str,
 
 
 def _nearest(key: str, name: str, siblings: Mapping[str, Any], values: Mapping[str, Any]) -> str:
-    """Return what an unknown key may have meant, as the end of a sentence."""
+    """Return a suggestion for an unknown key, as the end of a sentence."""
     near = difflib.get_close_matches(key, siblings, n=1)
     if near:
         return f"; {near[0]!r} is near"
@@ -189,7 +190,7 @@ def _names(values: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def _plain(value: object) -> Any:
-    """Return tuples as lists, as YAML has them."""
+    """Return tuples as lists, for YAML."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value

@@ -21,7 +21,7 @@ OBSERVED, IMAGINED = 4, 4
 
 
 def driveworld_tiny() -> DriveWorldRecipe:
-    """DriveWorld small enough for two CPU cores. Every part is there, only smaller; T and L are the paper's.
+    """Return a small DriveWorld for two CPU cores. It has all parts, and T and L of the paper.
 
     Images, voxels and the planner are those of `nemo_tiny`.
     """
@@ -58,10 +58,10 @@ def driveworld_tiny() -> DriveWorldRecipe:
 
 
 def driveworld_town() -> DriveWorldRecipe:
-    """DriveWorld for claims tested on two CPU cores: grid, planner and steps are those of `nemo_town`.
+    """Return a DriveWorld for claims tested on two CPU cores, with `nemo_town`'s grid, planner and steps.
 
-    One round of deformable lifting: after 300 steps, statics carried along, above-ground IoU on 32 clips of
-    Town05 was 0.127; by lift, splat, shoot, whose steps take two thirds of the time, 0.108.
+    It has one round of deformable lifting. After 300 steps, with `carry_statics`, above-ground IoU on 32
+    clips of Town05 was 0.127. With lift-splat it was 0.108, at two thirds of the time per step.
     """
     tiny, nemo = driveworld_tiny(), nemo_town()
     pretrain, finetune = tiny.pretrain, tiny.finetune
@@ -80,10 +80,12 @@ def driveworld_town() -> DriveWorldRecipe:
 
 
 def driveworld_base() -> DriveWorldRecipe:
-    """The paper's size: ResNet-101, 200×200×16 voxels, 24 epochs at 2e-4, then 20 (UniAD's second stage).
+    """Return the paper's size: ResNet-101, 200×200×16 voxels, 24 epochs at 2e-4, then 20.
 
-    Constants of §4.1 and of MILE (state and history); what they leave open: D = 64, a plane of 256 channels,
-    a memory of 16, K = 32, images of 448×800, voxels of 0.5 m.
+    The 20 epochs are UniAD's second stage.
+
+    Constants are from §4.1 and from MILE (state and history). Values not given there: D = 64, a plane of 256
+    channels, a memory of 16, K = 32, images of 448×800, voxels of 0.5 m.
     """
     nemo = nemo_base()
     schedule = replace(nemo.finetune.schedule, epochs=24)
@@ -122,5 +124,5 @@ def driveworld_base() -> DriveWorldRecipe:
 
 
 def _in_time(clips: ClipConfig) -> ClipConfig:
-    """NeMo's images and voxels, of as many key frames as the paper looks at."""
+    """Return NeMo's images and voxels with the paper's number of key frames."""
     return replace(clips, past_frames=OBSERVED - 1, future_frames=IMAGINED, future_images=False)

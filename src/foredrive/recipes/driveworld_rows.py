@@ -1,4 +1,4 @@
-"""The rows of DriveWorld's Table 1, and occupancy in 3-D, with which its other tables compare."""
+"""The rows of DriveWorld's Table 1, and 3-D occupancy pre-training, the baseline of its other tables."""
 
 from dataclasses import replace
 
@@ -13,17 +13,23 @@ ROWS = {
     "mln": "dmb with motion-aware layer normalisation (Table 1)",
     "carried": "latent statics moved along with the ego vehicle; not in the paper",
 }
-"""What each row changes; the full model has task prompts besides."""
+"""The change of each row. The full model also has task prompts."""
 
 
 def driveworld_rows(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
-    """All rows by name, the full DriveWorld first under its own; the others are named FULL_ROW.
+    """Return all rows by name: the full DriveWorld first, under its own name, the others as FULL_ROW.
 
-    Table 1: `scratch` (no pre-training); `rssm`, plain latent dynamics in one vector; `ssp`, with Static
-    Scene Propagation; `dmb`, with the Dynamic Memory Bank too; `mln`, with motion-aware layer normalisation
-    too; the full one has task prompts besides. `occupancy` is pre-trained by the occupancy of single frames,
-    as OccNet and UniScene are. All are fine-tuned alike. `carried` is no row of the paper: the full one whose
-    statics move along with the ego vehicle.
+    Rows of Table 1:
+    - `scratch`: no pre-training.
+    - `rssm`: plain latent dynamics in one vector.
+    - `ssp`: `rssm` with Static Scene Propagation.
+    - `dmb`: `ssp` with the Dynamic Memory Bank.
+    - `mln`: `dmb` with motion-aware layer normalisation.
+    - The full model: `mln` with task prompts.
+
+    Other rows: `occupancy` is pre-trained by the occupancy of single frames, like OccNet and UniScene.
+    `carried` is not in the paper: the full model with statics warped by the ego motion. All rows are
+    fine-tuned in the same way.
 
     Args:
         full: a recipe with pre-training.

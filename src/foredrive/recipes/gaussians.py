@@ -1,4 +1,4 @@
-"""How logs are rebuilt from Gaussians."""
+"""Recipes for rebuilding logs from Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -13,30 +13,30 @@ from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 @dataclass(frozen=True)
 class RebuildRecipe:
-    """Everything that decides a reconstruction, but for where the log is."""
+    """All settings of a reconstruction, except where the log is."""
 
     name: str
     image_hw: tuple[int, int]
     initial: InitialSize
     schedule: RebuildSchedule
     cameras: tuple[str, ...] | None = None
-    """By their own or 123D's names; None takes all."""
+    """Names of cameras, their own or 123D's; None takes all."""
     hold_out_every: int = 2
-    """Of so many frames the last is not learned from, and judged on; 0 learns from all."""
+    """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
     actors: bool = True
-    """What moves has Gaussians of its own; False: all stands still."""
+    """Give moving actors their own Gaussians. If False, everything is static."""
     decoder_width: int = 32
-    """Channels of the camera's decoder."""
+    """Channels of the camera decoder."""
     rolling: bool = True
-    """Rows of an image and beams of a sweep look at their own times."""
+    """Rows of an image and beams of a sweep have their own times."""
     drop: bool = True
-    """Beams may fail to return; False: all do."""
+    """Beams may fail to return. If False, all return."""
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
 
 
 def gaussians_tiny() -> RebuildRecipe:
-    """Some minutes on two cores, images of 480×270."""
+    """Return a recipe for some minutes on two cores, with images of 480×270."""
     steps = 500
     return RebuildRecipe(
         name="gaussians_tiny",
@@ -68,7 +68,7 @@ def gaussians_tiny() -> RebuildRecipe:
 
 
 def gaussians_base() -> RebuildRecipe:
-    """SplatAD as published, for a GPU: all cameras at full size, 30 000 steps, five million Gaussians."""
+    """Return SplatAD as published, for a GPU: all cameras, full size, 30 000 steps, 5 million Gaussians."""
     return RebuildRecipe(
         name="gaussians_base",
         about="SplatAD's sizes, for a GPU",
@@ -95,7 +95,7 @@ REBUILD_RECIPES: dict[str, RebuildRecipe] = {
 
 
 def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe:
-    """Return a recipe by its name or from a YAML file; arguments and errors as of `find_recipe`."""
+    """Return a recipe by its name or from a YAML file. Arguments and errors are those of `find_recipe`."""
     if is_recipe_file(name):
         recipe = load_values(RebuildRecipe, Path(name))
     elif name in REBUILD_RECIPES:

@@ -1,4 +1,4 @@
-"""The recipes that have a name."""
+"""The named recipes."""
 
 import difflib
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ def find_recipe(name: str, settings: Sequence[str] = ()) -> Recipe[Any, Any]:
 
     Args:
         name: a key of `RECIPES`, or the path of a file.
-        settings: KEY.KEY=VALUE each; entries of the recipe to replace.
+        settings: entries KEY.KEY=VALUE to replace in the recipe.
 
     Raises:
         InputError: there is no such recipe, or a setting does not fit it.

@@ -17,12 +17,12 @@ NemoRecipe = Recipe[NemoConfig, NemoStage]
 
 
 def nemo_tiny() -> NemoRecipe:
-    """NeMo small enough for two CPU cores: the demo. Every part is there, only smaller.
+    """Return a small NeMo for two CPU cores, the demo. It has all parts.
 
-    With the paper's λ (scal 10, BCE 1) a few hundred steps end in a road and nothing on it: the affinity loss
-    pushes every voxel it is unsure of towards free, where its own gradient vanishes. A stronger BCE that
-    counts occupied voxels threefold gets there. Imagined frames weigh a quarter: until motion is learned
-    they only blur what stands beside the road.
+    With the paper's λ (scal 10, BCE 1), a few hundred steps give an empty road: the affinity loss pushes
+    uncertain voxels towards free, where its gradient vanishes. A stronger BCE with threefold weight on
+    occupied voxels avoids this. Imagined frames have weight 1/4, because before motion is learned they only
+    blur objects beside the road.
     """
     few_steps = LossWeights(wpts=0.0, recon=0.0, occ=0.0, scal=1.0, bce=10.0, occupied=3.0, future=0.25)
     return Recipe(
@@ -64,11 +64,11 @@ def nemo_tiny() -> NemoRecipe:
 
 
 def nemo_town() -> NemoRecipe:
-    """NeMo for claims tested on two CPU cores: 500 steps of pre-training, 150 of fine-tuning on towns.
+    """Return a NeMo for claims tested on two CPU cores: 500 steps pre-training, 150 fine-tuning on towns.
 
-    As `nemo_tiny`, but it sees further ahead and is trained for longer. Its planner knows the last key frame
-    too and starts from what ego status alone says, so that what it scores beyond the ego-only MLP is what
-    looking brings; it reads the volume along that plan by a head that is fitted last.
+    It is `nemo_tiny` with a longer view ahead and more training. Its planner also knows the last key frame
+    and starts from the plan of the ego MLP, so any gain over the ego MLP comes from perception. It reads the
+    volume along that plan by a head that is fitted last.
     """
     tiny = nemo_tiny()
     assert tiny.pretrain is not None
@@ -97,11 +97,13 @@ def nemo_town() -> NemoRecipe:
 
 
 def nemo_drive() -> NemoRecipe:
-    """`nemo_town` to drive in closed loop, trained on lessons (`foredrive drive --agent disturbed`).
+    """Return `nemo_town` for closed-loop driving, trained on DAgger demonstrations.
 
-    Two things differ in what the planner is told. It does not know where it was half a second ago: who
-    learns from that learns to go on as before, and stands for ever once he stands. And it knows where the
-    route leads, as agents on CARLA's leaderboards do: the command alone leaves open when a turn begins.
+    `foredrive drive --agent disturbed` records the demonstrations.
+
+    The inputs of the planner differ in two ways. It does not know its pose half a second ago: with that input
+    it learns to continue its motion, and once stopped it never starts. And it knows the target point of the
+    route, as agents on CARLA's leaderboards do, because the command alone does not tell where a turn begins.
     """
     town = nemo_town()
     return dataclasses.replace(
@@ -114,10 +116,10 @@ def nemo_drive() -> NemoRecipe:
 
 
 def nemo_base() -> NemoRecipe:
-    """The paper's size: ResNet-50, 200×200×16 voxels of 0.5 m, six cameras, two stages of 10 epochs.
+    """Return the paper's size: ResNet-50, 200×200×16 voxels of 0.5 m, six cameras, two stages of 10 epochs.
 
-    Constants of §4.1; what it leaves open: D = 64, three rounds of lifting with 8 heads and 8 points, four
-    pyramid levels, T_f = 3 at 0.5 s, images of 450×800, λ_perc = 0.1 (Video Autoencoder).
+    Constants are from §4.1. Values not given there: D = 64, three rounds of lifting with 8 heads and 8
+    points, four pyramid levels, T_f = 3 at 0.5 s, images of 450×800, λ_perc = 0.1 (Video Autoencoder).
     """
     schedule = Schedule(
         batch_size=1,
@@ -170,5 +172,5 @@ def nemo_base() -> NemoRecipe:
 
 
 BASE_BEV = BevConfig(width=256, heads=8, points=2, pillars=4, layers=3, checkpoint=True)
-"""BEVFormer's width and heights; as many rounds as NeMo's own encoder."""
+"""BEVFormer's width and heights, with as many rounds as NeMo's own encoder."""
 TOWN_BEV = BevConfig(width=96, heads=4, points=2, pillars=4, layers=2)

@@ -1,4 +1,4 @@
-"""The rows of NeMo's Tables 1 and 3: one recipe with a part left out or put in another's place."""
+"""The rows of NeMo's Tables 1 and 3: one recipe with a part removed or replaced."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,22 +18,25 @@ ROWS = {
     "no_occupancy": "base, pre-trained without occupancy prediction (Table 3)",
     "no_flow": "base, pre-trained on the present alone (Table 3)",
 }
-"""What each row of the paper's tables changes."""
+"""The change of each row of the paper's tables."""
 
 
 def nemo_rows(full: NemoRecipe, bev: BevConfig) -> dict[str, NemoRecipe]:
-    """All rows by name, the full NeMo first under its own; the others are named FULL_ROW.
+    """Return all rows by name: the full NeMo first, under its own name, the others as FULL_ROW.
 
-    Table 1: `scratch` (no pre-training), `base` (pre-trained, then planning alone, from the present volume
-    alone), `concatenation` and `attention` (base with the predicted volume), the full one (attention, and
-    the losses of pre-training kept while planning is learned), `bev_scratch` and `bev` (BEVFormer-like, as
-    scratch and base; pre-trained by occupancy alone).
-    Table 3: what base becomes when pre-training lacks `no_image` reconstruction, `no_occupancy` prediction or
-    `no_flow`, that is, sees the present alone.
+    Rows of Table 1:
+    - `scratch`: no pre-training.
+    - `base`: pre-training, then planning only, from the present volume.
+    - `concatenation`, `attention`: `base` with the predicted volume.
+    - The full model: `attention`, with the losses of pre-training kept in fine-tuning.
+    - `bev_scratch`, `bev`: `scratch` and `base` with a BEVFormer-like encoder, pre-trained by occupancy only.
+
+    Rows of Table 3: `base` without `no_image` reconstruction, without `no_occupancy` prediction, or without
+    `no_flow`, that is, pre-trained on the present only.
 
     Args:
         full: a recipe with pre-training whose planner attends to the future.
-        bev: size of the baseline's encoder.
+        bev: sizes of the baseline's encoder.
     """
     rows: dict[str, Callable[[NemoRecipe], NemoRecipe]] = {
         "scratch": lambda recipe: replace(_planning_alone(recipe, "none"), pretrain=None),
@@ -62,7 +65,7 @@ def nemo_rows(full: NemoRecipe, bev: BevConfig) -> dict[str, NemoRecipe]:
 
 
 def _planning_alone(recipe: NemoRecipe, future: Literal["attention", "concatenation", "none"]) -> NemoRecipe:
-    """Fine-tuning by the waypoints alone."""
+    """Return the recipe with fine-tuning by waypoints only."""
     stage = recipe.finetune
     weights = replace(stage.weights, recon=0.0, occ=0.0)
     return replace(
@@ -77,7 +80,7 @@ def _in_bev(recipe: NemoRecipe, bev: BevConfig) -> NemoRecipe:
 
 
 def _pretrained_with(recipe: NemoRecipe, *, image: bool, occupancy: bool, flow: bool) -> NemoRecipe:
-    """Pre-training with some of its three parts."""
+    """Return the recipe with some of the three parts of pre-training."""
     stage = recipe.pretrain
     assert stage is not None
     weights = stage.weights

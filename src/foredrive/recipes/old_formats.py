@@ -1,14 +1,14 @@
-"""Recipes written by earlier versions, in today's form."""
+"""Conversion of recipes from earlier formats."""
 
 from collections.abc import Mapping
 from typing import Any
 
 
 def upgraded(written: Any) -> Any:
-    """Return the values of a recipe in today's form; what is no recipe is returned as it is.
+    """Return the values of a recipe in today's format. Anything else is returned unchanged.
 
-    Until November 2026 `model` was flat: sizes of the planner and of all parts lay side by side, NeMo's and
-    its stages had no `kind`, and some numbers were fixed in the code.
+    Until November 2026 `model` was flat: it held the sizes of the planner and of all parts side by side. NeMo
+    and its stages had no `kind`, and some numbers were fixed in the code.
     """
     model = written.get("model") if isinstance(written, Mapping) else None
     if not isinstance(model, Mapping) or "planner_width" not in model:
@@ -68,7 +68,7 @@ STATES = {
     "memory_bank": "memory_bank",
     "motion_norm": "motion_norm",
 }
-"""Entries of DriveWorld's state space, by their names in the flat form."""
+"""Entries of DriveWorld's state space, by their names in the flat format."""
 
 
 def _driveworld(flat: dict[str, Any]) -> dict[str, Any]:

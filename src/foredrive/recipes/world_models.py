@@ -1,4 +1,4 @@
-"""The world models that recipes can name: their configs, how each is built and what it learns from."""
+"""The world models that recipes can name: their configs, how each is built, and its training objective."""
 
 import warnings
 from collections.abc import Callable
@@ -20,13 +20,14 @@ class WorldModelKind(NamedTuple):
     """One kind of world model."""
 
     config: type
-    """Frozen dataclass of its sizes; its `kind` is the key of `WORLD_MODELS`."""
+    """Frozen dataclass of its sizes. Its `kind` is the key of `WORLD_MODELS`."""
     stage: type
     """Frozen dataclass of a training stage with the same `kind` and a `schedule`."""
     build: Callable[[Any, ClipConfig, bool], WorldModel]
-    """Builds the model from its config and that of its clips; fetches named weights if the last is true."""
+    """Builds the model from its config and that of its clips. If the last argument is true, fetches named
+    weights."""
     objective: Callable[[Any, PlanningAgent[Any], ClipConfig], nn.Module]
-    """Builds the module that maps an example to its losses from a stage and the agent."""
+    """Builds the module that maps an example to its losses, from a stage and the agent."""
 
 
 def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
@@ -42,7 +43,7 @@ def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
 
 
 def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConfig) -> NemoObjective:
-    """Build NeMo's objective; without real VGG-16 weights the perceptual loss has weight 0."""
+    """Build NeMo's objective. Without real VGG-16 weights the perceptual loss has weight 0."""
     features = None
     if stage.vgg16 is not None:
         try:

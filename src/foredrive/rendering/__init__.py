@@ -1,1 +1,1 @@
-"""What sensors would see of a scene made of Gaussians."""
+"""Rendering of sensors in scenes made of Gaussians."""

@@ -1,9 +1,10 @@
-"""Whether cameras look where their calibration says: images against what lidar saw.
+"""A check of camera calibration: images against lidar.
 
-Two things are asked of a camera. What lidar saw should look the same from where the vehicle is some metres on
-(depth, poses and camera then fit together), and where lidar sees one thing in front of another the image
-should have an edge (Levinson & Thrun, "Automatic online calibration of cameras and lasers", RSS 2013). Both
-fit best where the camera really looks, and less by half a degree or a decimetre beside.
+A camera is tested in two ways. Lidar points should look the same from the vehicle's position some metres
+later; this holds if depth, poses and camera fit together. And where lidar sees one object in front of
+another, the image should have an edge (Levinson & Thrun, "Automatic online calibration of cameras and
+lasers", RSS 2013). Both scores are highest at the true calibration. They are lower at an error of half a
+degree or a decimetre.
 """
 
 import dataclasses
@@ -28,29 +29,29 @@ from foredrive.scene import LidarSweep
 _TURN_RAD, _MOVE_M = math.radians(0.5), 0.1
 _TURN_STEPS = (((0, 1), 4.0), ((0, 1), 2.0), ((0, 1), 1.0), ((0, 1, 2), 1.0), ((0, 1, 2), 0.5))
 _MOVE_STEPS = (((0, 1, 2), 2.0), ((0, 1, 2), 1.0), ((0, 1, 2), 0.5))
-"""About or along which axes offsets are looked for, and by how many of the units above."""
+"""Steps of the search: axes (of rotation or translation) and step size in the units above."""
 _REACH = 8.0
-"""At most so many."""
+"""Bound of the search, in the units above."""
 _VIEWS, _FEWEST_VIEWS = 12, 4
 _ON_M = 3.0
-"""How far the vehicle drives between two images that are compared."""
+"""Driven distance between two compared images, m."""
 _POINTS, _FEWEST_POINTS = 4000, 50
-"""Of a sweep, in an image."""
+"""Maximum points used of a sweep and minimum points in an image."""
 _WIDTH_PX, _FINE_PX, _COARSE_PX = 480, 1.5, 12.0
-"""Width of images at most, their blur, and over how much brightness and contrast are evened out."""
+"""Maximum image width, its blur, and the scale over which brightness and contrast are normalised."""
 _LEAST_CONTRAST = 0.02
 _STRONGEST = 0.95
-"""Quantile of the gradient from which on an edge is as good as any."""
+"""Quantile of the gradient from which on all edges count equally."""
 _JUMP_M, _JUMP_SHARE, _NEXT_RAD = 0.5, 0.1, math.radians(0.8)
-"""What is behind an edge is farther by so much and by a share of the range, in a beam so near."""
+"""An edge needs a range jump of this many metres plus this share of the range, between beams this close."""
 _STANDS_MPS = 0.3
 _COARSEST = 150.0
-"""Pixels per rad of images in which half a degree can be seen."""
+"""Minimum focal length, px/rad: coarser images cannot show half a degree."""
 
 
 @dataclass(frozen=True)
 class Glance:
-    """An image, one of the same place from further on, and what lidar saw of all that stands there."""
+    """An image, a later image of the same place, and the static lidar points in view."""
 
     view: CameraView
     later: CameraView | None
@@ -58,31 +59,31 @@ class Glance:
     later_look: Float[Tensor, "1 1 H W"] | None
     edge: Float[Tensor, "1 1 H W"]
     T_scene_ego: Float[Tensor, "4 4"]
-    """Of the sweep."""
+    """Pose of the sweep's ego frame."""
     points_ego: Float[Tensor, "N 3"]
     edges_ego: Float[Tensor, "E 3"]
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How well sensors fit, and would elsewhere."""
+    """Agreement of the sensors as calibrated and after the best offset."""
 
     given: float
-    """As they are calibrated: agreement over both questions, some 0.6 to 1.2; 0 is chance."""
+    """Score as calibrated: the sum of both tests, typically 0.6 to 1.2; 0 is chance."""
     best: float
-    """With `offset`."""
+    """Score with `offset`."""
     offset: Float[Tensor, "3"]
     agreed: float
-    """Share of the glances that fit better with it."""
+    """Share of the glances that fit better with `offset`."""
 
 
 def glances(cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: Tracks) -> list[Glance]:
-    """Views of one camera spread over the way that was driven, or over time where that is short.
+    """Pick views of one camera, evenly spaced along the driven path, or in time if the path is short.
 
     Args:
-        cameras: in the order of time, with images.
-        sweeps: of the same drive.
-        tracks: what moves is left out.
+        cameras: views in order of time, with images.
+        sweeps: sweeps of the same drive.
+        tracks: moving actors, which are left out.
     """
     if not cameras or not sweeps or float(_small(cameras[0]).K[0, 0]) < _COARSEST:
         return []
@@ -105,16 +106,16 @@ def glances(cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: 
 
 
 def agreement(of_camera: Sequence[Glance]) -> float | None:
-    """How well a camera fits as it is calibrated (see `Fit.given`); None where too little is seen to tell."""
+    """Return the score of a camera as calibrated (see `Fit.given`), or None if there are too few views."""
     if len(of_camera) < _FEWEST_VIEWS:
         return None
     return float(_scores(of_camera, torch.zeros(6), torch.zeros(3)).mean())
 
 
 def camera_turn(of_camera: Sequence[Glance]) -> Fit | None:
-    """By how much a camera should be turned to fit best: upwards, to its right, clockwise, rad.
+    """Find the rotation of a camera that fits best: up, to its right, clockwise, rad.
 
-    None where too little is seen to tell.
+    Return None if there are too few views.
     """
     if len(of_camera) < _FEWEST_VIEWS:
         return None
@@ -126,9 +127,9 @@ def camera_turn(of_camera: Sequence[Glance]) -> Fit | None:
 
 
 def lidar_move(of_cameras: Sequence[Glance]) -> Fit | None:
-    """By how much the lidar should be moved for all cameras to fit best: forward, left, up, m.
+    """Find the translation of the lidar that fits all cameras best: forward, left, up, m.
 
-    None where too little is seen to tell.
+    Return None if there are too few views.
     """
     if len(of_cameras) < _FEWEST_VIEWS:
         return None
@@ -136,7 +137,7 @@ def lidar_move(of_cameras: Sequence[Glance]) -> Fit | None:
 
 
 def with_images_of(cameras: Sequence[CameraView], others: Sequence[CameraView]) -> list[CameraView]:
-    """Views with the images that another camera took nearest in time."""
+    """Return the views with the images that another camera took nearest in time."""
     return [
         dataclasses.replace(view, image=min(others, key=lambda other: abs(other.t_s - view.t_s)).image)
         for view in cameras
@@ -148,7 +149,7 @@ def _best(
     unit: float,
     steps: Sequence[tuple[tuple[int, ...], float]],
 ) -> Fit:
-    """Uphill by ever smaller steps, each along the axis that gains most."""
+    """Climb by steps of decreasing size, each along the axis that gains most."""
     at, given = torch.zeros(3), scores(torch.zeros(3))
     best = given
     for axes, size in steps:
@@ -164,13 +165,13 @@ def _best(
 
 
 def _scores(some: Sequence[Glance], camera: Float[Tensor, "6"], lidar_m: Float[Tensor, "3"]) -> Tensor:
-    """Of each, with the camera (m, rad, its own axes) and the lidar (ego axes) elsewhere."""
+    """Return the score of each glance with the camera (m, rad, own axes) and the lidar (ego axes) moved."""
     T_cam_moved = exp_se3(camera)
     return torch.tensor([_score(glance, T_cam_moved, lidar_m) for glance in some])
 
 
 def _score(glance: Glance, T_cam_moved: Float[Tensor, "4 4"], lidar_m: Float[Tensor, "3"]) -> float:
-    """How much edge there is at lidar's edges, and how both images correlate at its points."""
+    """Return the mean edge strength at lidar edges plus the correlation of both images at lidar points."""
 
     def place(view: CameraView, points_ego: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor]:
         return _seen_at(view, T_cam_moved, transform_points(glance.T_scene_ego, points_ego + lidar_m))
@@ -218,12 +219,12 @@ def _glance(view: CameraView, later: CameraView | None, sweep: SweepView, tracks
 
 
 def _standing(sweep: SweepView, tracks: Tracks) -> LidarSweep:
-    """The beams that met what stands."""
+    """Return the beams that hit static surfaces."""
     beams = sweep.beams[sweep.beams.returned]
     states = states_at(tracks, sweep.t_s)
     owner = owners(transform_points(sweep.T_scene_ego, beams.points_ego), beams.dt_s, states, tracks)
     moving = states.velocity_mps.norm(dim=-1) > _STANDS_MPS
-    return beams[~torch.cat([moving, moving.new_zeros(1)])[owner]]  # STATIC, -1, is the last entry
+    return beams[~torch.cat([moving, moving.new_zeros(1)])[owner]]  # STATIC is -1, the last entry
 
 
 def _small(view: CameraView) -> CameraView:
@@ -231,7 +232,7 @@ def _small(view: CameraView) -> CameraView:
 
 
 def _look(view: CameraView) -> Float[np.ndarray, "H W"]:
-    """Brightness, with what is bright and what is rich in contrast evened out."""
+    """Return brightness, normalised by local mean and contrast."""
     assert view.image is not None
     grey = gaussian_filter(view.image.float().mean(0).numpy() / 255, _FINE_PX)
     mean = gaussian_filter(grey, _COARSE_PX)
@@ -240,14 +241,14 @@ def _look(view: CameraView) -> Float[np.ndarray, "H W"]:
 
 
 def _edges(look: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """How much it changes, 1 at most, less its mean."""
+    """Return the gradient magnitude, at most 1, minus its mean."""
     change = gaussian_gradient_magnitude(look, 0.5)
     change = (change / max(float(np.quantile(change, _STRONGEST)), 1e-6)).clip(max=1.0)
     return change - change.mean()
 
 
 def _edges_ego(beams: LidarSweep) -> Float[Tensor, "E 3"]:
-    """Returns beside which, in the same channel, a beam met something farther."""
+    """Return the points next to which a beam of the same channel hit something farther."""
     beams = beams[beams.beam >= 0]
     azimuth = torch.atan2(beams.dir_ego[:, 1], beams.dir_ego[:, 0])
     order = (beams.beam * 10.0 + azimuth).argsort()

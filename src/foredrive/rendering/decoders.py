@@ -1,26 +1,28 @@
-"""From composited features to what sensors report (Hess et al., "SplatAD", 2025, §3.4)."""
+"""Decoders from composited features to sensor readings (Hess et al., "SplatAD", 2025, §3.4)."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 ALBEDO = 3
-"""Leading features that are colour already."""
+"""Number of leading features that are albedo."""
 _LAST_LAYER_GAIN = 1e-2
-"""At first an image is little else than its albedo."""
+"""Initial gain of the last layer. An image is at first almost its albedo."""
 _FAINT, _SENT_BACK = -2.0, 2.0
-"""Logits before anything is learned: most returns are faint, and most beams return."""
+"""Initial logits: most returns are faint, and most beams return."""
 _LEAST_CHANCE = 1e-4
-"""That a beam returns, or does not."""
+"""Bound on the probabilities that a beam returns or does not."""
 
 
 class CameraDecoder(nn.Module):
-    """Colour that depends on view and camera: rgb = albedo · (1 + s) + b, with s, b from a small CNN over the
-    other features, the camera's appearance and the viewing direction.
+    """A decoder of colour that depends on view and camera.
+
+    rgb = albedo · (1 + s) + b, with s and b from a small CNN over the other features, the appearance code of
+    the camera and the viewing direction.
     """
 
     def __init__(self, features: int, cameras: int, appearance: int = 8, width: int = 32) -> None:
-        """A decoder for `features` features beside albedo."""
+        """Create a decoder for `features` features besides albedo."""
         super().__init__()
         self.appearance = nn.Parameter(0.1 * torch.randn(cameras, appearance))
         last = nn.Conv2d(width, 2 * ALBEDO, 1)
@@ -35,18 +37,18 @@ class CameraDecoder(nn.Module):
             last,
         )
         for parameter in self.net.parameters():
-            if parameter.dim() == 4:  # laid out as composited features are
+            if parameter.dim() == 4:  # same memory layout as composited features
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
     def forward(
         self, feature: Float[Tensor, "H W D"], direction: Float[Tensor, "H W 3"], camera: int
     ) -> Float[Tensor, "3 H W"]:
-        """Linear in albedo, not clamped.
+        """Decode an image. It is linear in albedo and not clamped.
 
         Args:
             feature: composited albedo and features.
             direction: unit viewing direction in the scene's frame.
-            camera: which of the rig.
+            camera: index in the rig.
         """
         albedo = feature[..., :ALBEDO].permute(2, 0, 1)
         appearance = self.appearance[camera].expand(*feature.shape[:2], -1)
@@ -56,10 +58,10 @@ class CameraDecoder(nn.Module):
 
 
 class LidarDecoder(nn.Module):
-    """Intensity and ray drop of beams, by an MLP over features, the lidar's appearance and the direction."""
+    """A decoder of intensity and ray drop: an MLP over features, appearance code and direction."""
 
     def __init__(self, features: int, appearance: int = 8, width: int = 32) -> None:
-        """A decoder for `features` features beside albedo."""
+        """Create a decoder for `features` features besides albedo."""
         super().__init__()
         self.appearance = nn.Parameter(0.1 * torch.randn(appearance))
         last = nn.Linear(width, 2)
@@ -76,13 +78,13 @@ class LidarDecoder(nn.Module):
     def forward(
         self, feature: Float[Tensor, "P D"], alpha: Float[Tensor, "P"], direction: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
-        """Intensity in 0 to 1, and the logit of the probability that the beam does not return.
+        """Return intensity in 0 to 1 and the logit of the probability that the beam does not return.
 
-        It returns if something stops it, and if that sends it back, which is what the MLP says.
+        A beam returns if something stops it (`alpha`) and the surface sends it back (the output of the MLP).
 
         Args:
             feature: composited albedo and features.
-            alpha: share of the beam's light that something stops.
+            alpha: share of the beam's light that is stopped.
             direction: unit direction of the beams in the scene's frame.
         """
         appearance = self.appearance.expand(len(feature), -1)

@@ -1,4 +1,4 @@
-"""Changes to a rebuilt scene, as a short list that can be kept in a file and applied again."""
+"""Edits of a rebuilt scene: a short list that can be saved to a file and applied again."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ Offset = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Move:
-    """Let an actor be elsewhere all the time: by an offset and a turn in its own frame."""
+    """An edit that moves an actor at all times by an offset and a rotation in its own frame."""
 
     actor: int
     offset_m: Offset = (0.0, 0.0, 0.0)
@@ -35,7 +35,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Remove:
-    """Let an actor not be there."""
+    """An edit that removes an actor."""
 
     actor: int
     kind: Literal["remove"] = "remove"
@@ -43,11 +43,11 @@ class Remove:
 
 @dataclass(frozen=True)
 class Duplicate:
-    """Let there be another one like an actor, elsewhere."""
+    """An edit that adds a copy of an actor at another place."""
 
     actor: int
     copy: int
-    """Its id; no other actor's."""
+    """Id of the copy; must be free."""
     offset_m: Offset = (0.0, 0.0, 0.0)
     yaw_rad: float = 0.0
     kind: Literal["duplicate"] = "duplicate"
@@ -55,16 +55,16 @@ class Duplicate:
 
 @dataclass(frozen=True)
 class Insert:
-    """Let an actor of another run drive where one of this scene does, beside it by an offset."""
+    """An edit that adds an actor of another run, on the path of an actor of this scene, with an offset."""
 
     run: str
-    """Folder of the run it comes from."""
+    """Folder of the other run."""
     actor: int
-    """Its id there."""
+    """Id in the other run."""
     copy: int
-    """Its id here."""
+    """Id in this scene."""
     follows: int
-    """Whose way it takes."""
+    """Id of the actor whose path it follows."""
     offset_m: Offset = (0.0, 0.0, 0.0)
     yaw_rad: float = 0.0
     kind: Literal["insert"] = "insert"
@@ -72,24 +72,24 @@ class Insert:
 
 @dataclass(frozen=True)
 class Send:
-    """Let there be another one like an actor, all the time, straight on at one velocity."""
+    """An edit that adds a copy of an actor, which drives straight at constant velocity at all times."""
 
     actor: int
     copy: int
-    """Its id; no other actor's."""
+    """Id of the copy; must be free."""
     at_m: Offset
-    """Where its middle is at `at_s`, in the scene's frame."""
+    """Position of its centre at `at_s`, in the scene's frame, m."""
     at_s: float
     velocity_mps: Offset = (0.0, 0.0, 0.0)
-    """In the scene's axes."""
+    """Velocity in the scene's axes."""
     yaw_rad: float = 0.0
-    """Its heading about the scene's z."""
+    """Heading about the z axis of the scene."""
     kind: Literal["send"] = "send"
 
 
 @dataclass(frozen=True)
 class ShiftEgo:
-    """Let the ego vehicle, and its sensors, be elsewhere all the time: by an offset in its own frame."""
+    """An edit that moves the ego vehicle and its sensors at all times, by an offset in its own frame."""
 
     offset_m: Offset
     yaw_rad: float = 0.0
@@ -105,21 +105,22 @@ class Edited:
 
     graph: SceneGraph
     T_ego_shifted: Float[Tensor, "4 4"]
-    """Where the ego vehicle is, in the frame it was driven in: what is behind every T_scene_ego."""
+    """Pose of the ego vehicle in the frame in which it was driven. It multiplies every T_scene_ego from the
+    right."""
 
 
 def apply_edits(
     graph: SceneGraph, edits: Sequence[Edit], open_run: Callable[[str], SceneGraph] | None = None
 ) -> Edited:
-    """Apply edits one after the other.
+    """Apply edits in order.
 
     Args:
-        graph: is left as it is.
-        edits: in their order.
-        open_run: the scene of another run's folder, for `Insert`.
+        graph: the scene; it is not changed.
+        edits: edits in order.
+        open_run: opens the scene of another run's folder, for `Insert`.
 
     Raises:
-        InputError: on an actor that is not there (naming those that are), or a copy with an id that is taken.
+        InputError: an actor does not exist (the message names those that do), or the id of a copy is taken.
     """
     T_ego_shifted = torch.eye(4).to(graph.tracks.T_scene_actor)
     for edit in edits:
@@ -149,14 +150,14 @@ def apply_edits(
 def move_between(
     actor: int, T_scene_before: Float[Tensor, "4 4"], T_scene_after: Float[Tensor, "4 4"]
 ) -> Move:
-    """The edit that takes an actor from one pose to another of the same moment; of its turn the yaw alone."""
+    """Return the edit that moves an actor between two poses of the same time. Only its yaw turns."""
     change = (inverse_se3(T_scene_before) @ T_scene_after).tolist()
     forward_m, left_m, up_m = (row[3] for row in change[:3])
     return Move(actor, (forward_m, left_m, up_m), math.atan2(change[1][0], change[0][0]))
 
 
 def free_id(graph: SceneGraph) -> int:
-    """An id that no actor has, for a copy."""
+    """Return an id that no actor has, for a copy."""
     return max(graph.tracks.track_id.tolist(), default=0) + 1
 
 
@@ -164,7 +165,7 @@ def save_edits(edits: Sequence[Edit], path: Path) -> None:
     """Write edits as JSON.
 
     Raises:
-        InputError: if there is a file of something else, which is left as it is.
+        InputError: the file exists and is not a list of edits; it is not overwritten.
     """
     if path.exists():
         load_edits(path)
@@ -173,10 +174,10 @@ def save_edits(edits: Sequence[Edit], path: Path) -> None:
 
 
 def load_edits(path: Path) -> list[Edit]:
-    """Read what `save_edits` wrote.
+    """Read a file written by `save_edits`.
 
     Raises:
-        InputError: naming the file and the entry that is wrong.
+        InputError: the file cannot be read, or an entry is wrong. The message names both.
     """
     try:
         edits: list[Edit] = TypeAdapter(list[Edit]).validate_json(path.read_bytes(), extra="forbid")
@@ -222,7 +223,7 @@ def _with_copy(
     offset_m: Offset,
     yaw_rad: float,
 ) -> SceneGraph:
-    """With an actor of `source`, called `copy` here, on the way of one of this scene's, standing as high."""
+    """Add an actor of `source` as `copy`, on the path of an actor of this scene and at its ground height."""
     row, way = source.tracks.index_of(actor), graph.tracks.index_of(follows)
     if copy in graph.tracks.track_id.tolist():
         raise InputError(f"there is an actor {copy} already: a copy needs an id of its own")
@@ -253,7 +254,7 @@ def _with_copy(
 
 
 def _with_sent(graph: SceneGraph, edit: Send) -> SceneGraph:
-    """With a copy of an actor on a straight way."""
+    """Add a copy of an actor on a straight path."""
     graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, (0.0, 0.0, 0.0), 0.0)
     tracks, row = graph.tracks, len(graph.tracks) - 1
     since_s = (tracks.t_s - edit.at_s)[:, None]

@@ -1,4 +1,4 @@
-"""Views that nobody recorded: any camera and any lidar, anywhere, at any time."""
+"""Views that were not recorded: any camera and any lidar, anywhere, at any time."""
 
 import torch
 
@@ -11,15 +11,15 @@ from foredrive.sensors import SpinningLidar
 
 
 def free_camera(rig: CameraRig, camera: int, moment: EgoMoment, sensor: int | None = None) -> CameraView:
-    """A camera whose middle row is exposed at a moment.
+    """Return a camera whose middle row is exposed at a given moment.
 
-    To see what was recorded at a frame, ask for `vehicle.at(t_s + rig.exposed_dt_s[camera])`.
+    For the view recorded at a frame, use `vehicle.at(t_s + rig.exposed_dt_s[camera])`.
 
     Args:
-        rig: [C]; the vehicle's own, or another with intrinsics, size and places of its own.
-        camera: which of the rig.
-        moment: where the vehicle is, and when.
-        sensor: which learned camera it is like in colour and corrections; None: the `camera`-th, as in the
+        rig: [C]; the vehicle's own, or one with other intrinsics, size and places.
+        camera: index in the rig.
+        moment: pose and time of the vehicle.
+        sensor: index of the learned camera whose colours and corrections are used. None: `camera`, as in the
             vehicle's own rig.
     """
     T_ego_cam = rig.T_ego_cam[camera].to(moment.T_scene_ego)
@@ -36,7 +36,7 @@ def free_camera(rig: CameraRig, camera: int, moment: EgoMoment, sensor: int | No
 
 
 def free_sweep(lidar: SpinningLidar, moment: EgoMoment) -> SweepView:
-    """All beams of the revolution that ends at a moment; what they meet is not known yet."""
+    """Return all beams of the revolution that ends at a moment, without ranges."""
     twist = moment.twist_ego.cpu()
     rays = lidar.beams(twist)
     zero = torch.zeros_like(rays.dt_s)
@@ -54,7 +54,7 @@ def free_sweep(lidar: SpinningLidar, moment: EgoMoment) -> SweepView:
 
 
 def rendered_sweep(view: SweepView, picture: SweepPicture) -> LidarSweep:
-    """The beams of a view with what they met in a scene, in the ego frame of its time."""
+    """Return the beams of a view with rendered ranges and intensities, in the ego frame at its time."""
     beams, returned = view.beams, picture.returned.cpu()
     return LidarSweep(
         origin_ego=beams.origin_ego,

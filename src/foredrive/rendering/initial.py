@@ -1,4 +1,4 @@
-"""Gaussians before anything is learned: lidar points in their colours, the far field, random points."""
+"""Initial Gaussians before training: coloured lidar points, the far field, random points."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -30,36 +30,39 @@ from foredrive.rendering.views import CameraView, SweepView
 _NEIGHBOURS = 3
 _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
 _PATCH = 8
-"""Neighbours that tell how a Gaussian lies where no camera looks."""
+"""Number of neighbours that set the shape of a Gaussian where no camera looks."""
 _FLATTEST_M = 0.03
 
 
 @dataclass(frozen=True)
 class InitialSize:
-    """How many Gaussians a scene begins with, and how they look."""
+    """Numbers and appearance of the initial Gaussians of a scene."""
 
     lidar_points: int
-    """At most, over the static part, of what a camera saw."""
+    """Maximum number of static lidar points that a camera saw."""
     unseen_points: int
-    """The same of what none saw."""
+    """Maximum number of static lidar points that no camera saw."""
     pixel_points: int
-    """Along random pixels, at the range of the beam nearest in the image, or far away where none is near."""
+    """Points along random pixels, at the range of the nearest beam in the image, or far away where none is
+    near."""
     near_points: int
-    """Along random pixels, anywhere."""
+    """Points along random pixels at any range."""
     actor_points: int = 500
-    """At least, of each actor; where lidar saw fewer, random points in its box make up for it."""
+    """Minimum number of points per actor. Where lidar saw fewer, random points in its box are added."""
     actor_points_most: int = 5000
     features: int = 8
-    """Beside albedo."""
+    """Number of features besides albedo."""
     opacity: float = 0.5
     near_opacity: float = 0.1
     scale: float = 0.5
     """Standard deviation in units of the mean distance to the nearest neighbours."""
     pixel_scale: float = 0.6
-    """The same of points along pixels, in units of the distance between pixels drawn of a camera."""
+    """Standard deviation of points along pixels, in units of the distance between the drawn pixels of a
+    camera."""
     near_m: float = 2.0
     far_from_m: float = 500.0
-    """What is far lies in a thin shell: a vehicle that drives elsewhere sees it stay whole."""
+    """Far points lie in a thin shell from here to `far_m`. It then stays closed for a vehicle on another
+    path."""
     far_m: float = 2000.0
 
 
@@ -70,18 +73,18 @@ def initial_scene(
     size: InitialSize,
     generator: torch.Generator,
 ) -> SceneGraph:
-    """Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
+    """Build Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
-    Points of the lidar that no camera saw are coloured like those near them, and lie flat on what they are
-    part of: nothing but some beams will ever say how large they should be. Points of mirrored actors
-    (`Tracks.mirrored`) are taken from both sides. Without sweeps points anywhere along pixels stand for all.
+    Lidar points that no camera saw are coloured like points near them and lie flat on their surface, because
+    only a few beams would constrain their size in training. Points of symmetric actors (`Tracks.mirrored`)
+    are used on both sides. Without sweeps, points at any range along pixels replace all others.
 
     Args:
-        cameras: that may be learned from, with images.
-        sweeps: that may be learned from.
+        cameras: training views, with images.
+        sweeps: training sweeps.
         tracks: actors, whose points go into their own frames.
         size: how many of each.
-        generator: of which points are taken.
+        generator: random choice of points.
     """
     standing, of_actors = lidar_points(cameras, sweeps, tracks)
     standing = like_neighbours(standing_points(standing, size.lidar_points, size.unseen_points, generator))
@@ -114,7 +117,7 @@ def _actor(
     size: InitialSize,
     generator: torch.Generator,
 ) -> Gaussians:
-    """What lidar saw of an actor, from both sides if it is mirrored, and random points in its box."""
+    """Build an actor from its lidar points (on both sides if symmetric) and random points in its box."""
     points = like_neighbours(some_points(points, size.actor_points_most, generator))
     part = _gaussians(points, size, size.opacity, by_neighbours=True)
     if both_sides:
@@ -152,7 +155,7 @@ def _gaussians(
 
 
 def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
-    """Gaussians as wide, along each of their axes, as their neighbours are spread: flat where those are."""
+    """Build Gaussians with the covariance axes of their neighbours: flat where the neighbours are flat."""
     found = _gaussians(points, size, size.opacity)
     if len(points.xyz_m) <= _PATCH:
         return found
@@ -160,14 +163,14 @@ def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
     _, near = cKDTree(xyz).query(xyz, k=_PATCH + 1)
     spread = xyz[near] - xyz[near].mean(1, keepdims=True)
     variance, axes = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread / (_PATCH + 1))
-    axes *= np.sign(np.linalg.det(axes))[:, None, None]  # a rotation
+    axes *= np.sign(np.linalg.det(axes))[:, None, None]  # make it a rotation
     scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
     quaternion, log_scale = quaternion_of(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
     return dataclasses.replace(found, quaternion=quaternion.float(), log_scale=log_scale.float())
 
 
 def _neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Mean distance to the nearest neighbours, within bounds."""
+    """Return the mean distance to the nearest neighbours, within bounds."""
     if len(xyz_m) <= _NEIGHBOURS:
         return torch.full((len(xyz_m),), 0.1)
     points = xyz_m.numpy()

@@ -1,4 +1,4 @@
-"""Gaussians as the PLY files that viewers of 3-D Gaussians read (Kerbl et al., 2023)."""
+"""Gaussians as PLY files for viewers of 3-D Gaussians (Kerbl et al., 2023)."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from foredrive.files import atomic_path
 from foredrive.rendering.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
-"""Albedo is 0.5 plus this times the constant coefficient."""
+"""Albedo is 0.5 plus this factor times the constant coefficient."""
 _COLUMNS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -19,7 +19,7 @@ _COLUMNS = (
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write centres, rotations, scales, opacities and albedo; what decoders add to it has no place there."""
+    """Write centres, rotations, scales, opacities and albedo. The file cannot hold the effect of decoders."""
     gaussians = gaussians.map_tensors(lambda tensor: tensor.detach().cpu())
     columns = [
         gaussians.mean_m,

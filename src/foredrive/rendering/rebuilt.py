@@ -1,4 +1,4 @@
-"""A rebuilt scene: Gaussians, tracks, sensor corrections and decoders, all of which are learned."""
+"""A rebuilt scene: Gaussians, tracks, sensor corrections and decoders, all learned."""
 
 import functools
 import math
@@ -23,9 +23,9 @@ from foredrive.rendering.views import CameraView, SweepView
 from foredrive.sensors import TimedRays
 
 BACKGROUND = 0.5
-"""Albedo of what no Gaussian covers."""
+"""Albedo of the background, where no Gaussian covers a pixel."""
 OF_GAUSSIANS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
-"""Parameters with one row a Gaussian."""
+"""Parameters with one row per Gaussian."""
 _LEAST_ALPHA = 1e-6
 
 
@@ -34,9 +34,9 @@ class CameraPicture:
     """A rendered image."""
 
     rgb: Float[Tensor, "3 H W"]
-    """Not clamped."""
+    """RGB, not clamped."""
     range_m: Float[Tensor, "H W"]
-    """Expected depth along the camera's axis of the light that something stopped."""
+    """Expected depth along the camera's axis of the stopped light, m."""
     alpha: Float[Tensor, "H W"]
 
 
@@ -45,29 +45,29 @@ class SweepPicture:
     """A rendered sweep, beam by beam."""
 
     range_m: Float[Tensor, "P"]
-    """Expected range of the light that something stopped."""
+    """Expected range of the stopped light, m."""
     median_range_m: Float[Tensor, "P"]
-    """Infinite where less than half was stopped; without gradient."""
+    """Median range, m; infinite where less than half of the light was stopped. Without gradient."""
     intensity: Float[Tensor, "P"]
     drop_logit: Float[Tensor, "P"]
-    """Of the probability that the beam does not return."""
+    """Logit of the probability that the beam does not return."""
     alpha: Float[Tensor, "P"]
     alpha_before_hit: Float[Tensor, "P"] | None
 
     @property
     def hit_range_m(self) -> Float[Tensor, "P"]:
-        """Where beams end: the median, or the expected range where less than half of the light is stopped."""
+        """Return where beams end: the median range, or the expected range where the median is infinite."""
         return torch.where(self.median_range_m.isfinite(), self.median_range_m, self.range_m)
 
     @property
     def returned(self) -> Bool[Tensor, "P"]:
-        """Which beams are more likely to return than not."""
+        """Return which beams are more likely to return than not."""
         return self.drop_logit <= 0
 
 
 @dataclass(frozen=True)
 class SweepPoints:
-    """A sweep's beams as they are composited: prepared once, used in every step."""
+    """The beams of a sweep in the form needed for compositing: prepared once, used in every step."""
 
     tiles: TiledPoints
     dir_scene: Float[Tensor, "P 3"]
@@ -76,15 +76,14 @@ class SweepPoints:
 
 
 class RebuiltScene(nn.Module):
-    """What is learned of a log.
+    """The learned parts of a log's scene.
 
     Args:
-        graph: to begin with.
-        cameras: in the rig.
-        rolling: sensors look at different times within an image or a sweep; False takes all rows and beams
-            to be of one moment.
-        decoder_width: channels of the camera's decoder.
-        reach_m: how far lidars see: nothing beyond it stops a beam.
+        graph: initial scene.
+        cameras: number of cameras in the rig.
+        rolling: rows of an image and beams of a sweep have their own times. False treats all as simultaneous.
+        decoder_width: channels of the camera decoder.
+        reach_m: maximum lidar range. Nothing beyond it stops a beam.
     """
 
     actor: Tensor
@@ -117,13 +116,13 @@ class RebuiltScene(nn.Module):
             self.register_buffer(name, getattr(tracks, name))
         self.register_buffer("key_t_s", tracks.t_s)
         self.actor_offset = nn.Parameter(torch.zeros(*tracks.present.shape, 6))
-        """Of key poses, in the actors' own axes: m, rad."""
+        """Offsets of key poses, in the actors' own axes: m, rad."""
         self.camera_offset = nn.Parameter(torch.zeros(cameras, 6))
-        """Of where each camera is mounted, in its own axes: m, rad."""
+        """Offsets of the camera mounts, in the cameras' own axes: m, rad."""
         self.camera_twist = nn.Parameter(torch.zeros(cameras, 6))
-        """What is added to each camera's velocity and turn rate."""
+        """Corrections of the cameras' velocities and turn rates."""
         self.camera_late_s = nn.Parameter(torch.zeros(cameras))
-        """How much later than it says each camera exposes."""
+        """Delay of each camera's exposure with respect to its logged time, s."""
         features = self.feature.shape[1]
         self.camera_decoder = CameraDecoder(features, cameras, width=decoder_width)
         self.lidar_decoder = LidarDecoder(features)
@@ -132,13 +131,13 @@ class RebuiltScene(nn.Module):
 
     @property
     def gaussians(self) -> Gaussians:
-        """All Gaussians, those of actors in their own frames."""
+        """All Gaussians; those of actors are in their own frames."""
         feature = torch.cat([self.albedo, self.feature], dim=-1)
         return Gaussians(self.mean_m, self.quaternion, self.log_scale, self.opacity_logit, feature)
 
     @property
     def tracks(self) -> Tracks:
-        """Tracks with the offsets that were learned."""
+        """The tracks with learned offsets."""
         logged = Tracks(
             self.track_id, self.category, self.size_lwh, self.key_t_s, self.T_scene_actor, self.present
         )
@@ -146,14 +145,14 @@ class RebuiltScene(nn.Module):
 
     @property
     def graph(self) -> SceneGraph:
-        """The scene as it is now."""
+        """The scene with its current parameters."""
         return SceneGraph(self.gaussians, self.actor, self.tracks)
 
     def resize(self, file: Path) -> None:
-        """Make room for the weights in a file, which may hold another number of Gaussians.
+        """Resize the parameters for the weights in a file, which may hold another number of Gaussians.
 
         Raises:
-            InputError: on a file that cannot be read, or holds none.
+            InputError: the file cannot be read or holds no weights of a scene.
         """
         try:
             with safe_open(file, "pt") as saved:
@@ -166,7 +165,7 @@ class RebuiltScene(nn.Module):
             setattr(self, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
 
     def add_standing(self, gaussians: Gaussians) -> None:
-        """Put more Gaussians into the static part."""
+        """Add Gaussians to the static part."""
         added = {
             name: getattr(gaussians, name) for name in ("mean_m", "quaternion", "log_scale", "opacity_logit")
         }
@@ -182,8 +181,8 @@ class RebuiltScene(nn.Module):
         """Render an image.
 
         Args:
-            graph: this scene, or one made of it by edits.
-            view: the camera; what its image shows is not looked at.
+            graph: this scene, or an edited version of it.
+            view: the camera; its image is not read.
             mirror: see `place`.
         """
         late_s, twist = self.camera_late_s[view.sensor], view.twist_cam + self.camera_twist[view.sensor]
@@ -214,7 +213,7 @@ class RebuiltScene(nn.Module):
         )
 
     def prepare_sweep(self, view: SweepView) -> SweepPoints:
-        """A sweep's beams in the lidar's frame: the vehicle's axes, where the lidar is then."""
+        """Return the beams of a sweep in the lidar's frame: axes of the vehicle, origin at the lidar."""
         beams = view.beams
         rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
         T_ego_lidar = torch.eye(4).to(beams.origin_ego)
@@ -243,9 +242,9 @@ class RebuiltScene(nn.Module):
         """Render a sweep.
 
         Args:
-            graph: this scene, or one made of it by edits.
+            graph: this scene, or an edited version of it.
             points: from `prepare_sweep`.
-            t_s: the sweep's time.
+            t_s: time of the sweep.
             hit_range_m: see `composite_splats`.
             mirror: see `place`.
         """

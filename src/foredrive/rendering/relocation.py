@@ -1,5 +1,7 @@
-"""Gaussians as samples of a distribution: dead ones move to live ones, faint ones walk at random (Kheradmand
-et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", 2024).
+"""Relocation of Gaussians as samples of a distribution.
+
+Dead Gaussians move to live ones, and faint ones walk at random (Kheradmand et al., "3D Gaussian Splatting as
+Markov Chain Monte Carlo", 2024).
 """
 
 import math
@@ -12,21 +14,20 @@ from foredrive.geometry.quaternions import multiply
 from foredrive.rendering.gaussians import Gaussians
 
 MIN_OPACITY = 0.005
-"""Gaussians that are less opaque are dead."""
+"""Gaussians with a lower opacity are dead."""
 MOST_COPIES = 51
 _STEEPNESS = 100.0
 _STAYS = 0.15
-"""Opacity from which on the walk is less than a millionth of what it would be."""
+"""Opacity above which the walk is less than a millionth of its full size."""
 
 
 def shared_among(
     opacity: Float[Tensor, "N"], copies: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-    """Opacity and change of scale of Gaussians that are to be `copies`, themselves counted (eq. 9).
+    """Return opacity and scale factor of Gaussians split into `copies`, including themselves (eq. 9).
 
-    With o' = 1 - (1 - o)^(1/n) the centre stays as opaque, and the scale is divided by
-    Σ_{i=1..n} Σ_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / √(k+1) over o, so that what is
-    seen keeps its integral.
+    With o' = 1 - (1 - o)^(1/n) the centre keeps its opacity. The scale is divided by Σ_{i=1..n} Σ_{k=0..i-1}
+    binom(i-1, k) (-1)^k o'^(k+1) / √(k+1) over o, which keeps the integral of the rendered splat.
     """
     copies = copies.clamp(1, MOST_COPIES)
     shared = 1 - (1 - opacity.double()) ** (1 / copies)
@@ -34,18 +35,18 @@ def shared_among(
     for i in range(1, MOST_COPIES + 1):
         for k in range(i):
             weight[i, k] = math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1)
-    total = weight.cumsum(0).to(opacity.device)  # over i, up to n
+    total = weight.cumsum(0).to(opacity.device)  # sum over i, up to n
     powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacity.device)
     integral = (total[copies] * powers).sum(-1)
     return shared.to(opacity), (opacity / integral).to(opacity)
 
 
 def random_walk_m(gaussians: Gaussians, step_m: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:
-    """How far centres walk: normal noise of the Gaussian's own shape, for those that hardly show (eq. 8).
+    """Return random steps of the centres: normal noise in the shape of each faint Gaussian (eq. 8).
 
     Args:
-        gaussians: that walk.
-        step_m: λ_noise times the centres' learning rate.
+        gaussians: the Gaussians.
+        step_m: λ_noise times the learning rate of the centres.
         generator: on the CPU, so that a run is the same on any device.
     """
     opacity = gaussians.opacity_logit.sigmoid()

@@ -1,4 +1,4 @@
-"""A rebuilt scene as a vehicle's sensors see it: the `Renderer` that drives in rebuilt logs look through."""
+"""Sensor rendering of a rebuilt scene: the `Renderer` for drives in rebuilt logs."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,23 +17,23 @@ from foredrive.scene import CameraRig, Rendered
 
 @dataclass(frozen=True, eq=False)
 class RebuiltRenderer:
-    """A `Renderer` of a rebuilt scene by the sensors of its log."""
+    """A `Renderer` of a rebuilt scene with the sensors of its log."""
 
     scene: RebuiltScene
     graph: SceneGraph
-    """The scene's own, or one made of it by edits."""
+    """The scene's own graph, or an edited version of it."""
     vehicle: Vehicle
 
     @property
     def rig(self) -> CameraRig:
-        """The log's cameras, where they are mounted."""
+        """The log's cameras at their mounts."""
         return dataclasses.replace(self.vehicle.rig, exposed_dt_s=None)
 
     @torch.no_grad()
     def render(
         self, T_world_ego: Float64[Tensor, "4 4"], twist_ego: Float[Tensor, "6"], t_s: float
     ) -> Rendered:
-        """What cameras see that are exposed at a time of the log, and a lidar whose revolution ends then."""
+        """Render the cameras exposed at a time of the log and the lidar revolution that ends then."""
         T_scene_ego = (inverse_se3(self.vehicle.T_world_scene) @ T_world_ego).float()
         moment = EgoMoment(T_scene_ego, twist_ego, t_s)
         device, rig = self.scene.actor.device, self.rig

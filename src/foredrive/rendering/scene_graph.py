@@ -1,4 +1,4 @@
-"""A scene: what stands and what moves, each with its own Gaussians, put together for one moment."""
+"""A scene graph: a static part and moving actors, each with its own Gaussians, composed for one time."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from foredrive.rendering.tracks import Tracks, states_at
 from foredrive.scene.record import Record
 
 STATIC = -1
-"""Stands for no actor."""
+"""Row number of the static part, which belongs to no actor."""
 _MIRROR_XYZ = (1.0, -1.0, 1.0)
 _MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
-"""Mirroring y turns a rotation about the axis a by θ into one about (-aₓ, a_y, -a_z)."""
+"""Mirroring y turns a rotation by θ about the axis a into one by θ about (-aₓ, a_y, -a_z)."""
 
 
 @dataclass(frozen=True)
@@ -24,38 +24,38 @@ class SceneGraph(Record):
     """N Gaussians of a static part and of A actors."""
 
     gaussians: Gaussians
-    """The static part's in the scene's frame, those of actors in the frame of their boxes."""
+    """Static Gaussians are in the scene's frame, those of actors in the frame of their boxes."""
     actor: Int[Tensor, "N"]
     """Row in `tracks`, or `STATIC`."""
     tracks: Tracks
 
     def of_actor(self, row: int) -> Gaussians:
-        """The Gaussians of an actor, in its frame; of the static part for `STATIC`."""
+        """Return the Gaussians of an actor in its frame, or the static ones for `STATIC`."""
         return self.gaussians[self.actor == row]
 
 
 @dataclass(frozen=True)
 class Placed(Record):
-    """M of a scene's Gaussians where they are at one moment."""
+    """M of a scene's Gaussians, placed for one time."""
 
     gaussians: Gaussians
-    """In the scene's frame."""
+    """Gaussians in the scene's frame."""
     velocity_mps: Float[Tensor, "M 3"]
-    """Of their centres, in the scene's axes."""
+    """Velocities of the centres, in the scene's axes."""
     source: Int[Tensor, "M"]
-    """Which of the scene's Gaussians each is."""
+    """Index of each one in the scene's Gaussians."""
 
 
 def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None) -> Placed:
-    """The static part, and every actor that is there at a time, turned and moving with its Gaussians.
+    """Place the static part and every present actor at a time, with poses and velocities.
 
     Args:
         graph: the scene.
-        t_s: seconds since the drive's start.
-        mirror: actors whose left and right change sides; None: none.
+        t_s: seconds since the start of the drive.
+        mirror: actors whose left and right sides are swapped; None: none.
     """
     states = states_at(graph.tracks, t_s)
-    shown = torch.cat([states.present, states.present.new_ones(1)])[graph.actor]  # -1 is the last entry
+    shown = torch.cat([states.present, states.present.new_ones(1)])[graph.actor]  # STATIC, -1: last entry
     moving = (shown & (graph.actor >= 0)).nonzero()[:, 0]
     still = (graph.actor < 0).nonzero()[:, 0]
     standing = graph.gaussians[still]
@@ -82,13 +82,13 @@ def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | No
 
 
 def joined(parts: list[Gaussians]) -> Gaussians:
-    """Several sets of Gaussians as one."""
+    """Concatenate sets of Gaussians."""
     names = [field.name for field in dataclasses.fields(Gaussians)]
     return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def mirrored(gaussians: Gaussians) -> Gaussians:
-    """Left and right exchanged: y to -y, in the frame of the box."""
+    """Swap left and right: y to -y, in the frame of the box."""
     return _mirrored(gaussians, torch.ones_like(gaussians.opacity_logit, dtype=torch.bool))
 
 

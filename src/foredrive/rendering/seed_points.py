@@ -1,4 +1,4 @@
-"""Coloured points that Gaussians begin at: what lidar met, and what lies along pixels."""
+"""Coloured seed points for Gaussians: lidar points and points along pixels."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene.record import Record
 
 GREY = 0.5
-"""Of what no camera saw, where no other point has a colour."""
+"""Grey value of points that no camera saw, if no other point has a colour."""
 SEEN_SHARE = 0.75
-"""Of an actor's points that are taken, how many a camera saw."""
+"""Share of an actor's chosen points that a camera saw."""
 UNSEEN_RAD, UNSEEN_M = 0.03, (0.125, 1.0)
-"""How far apart points begin that no camera saw: a share of the range, between bounds."""
+"""Spacing of points that no camera saw: a share of the range, within bounds."""
 BEAM_WIDTH_RAD = 0.01
-"""Of its range the most that a Gaussian at a lidar's point may measure (standard deviation)."""
+"""Maximum standard deviation of a Gaussian at a lidar point, as a share of its range."""
 NEAR_IN_IMAGE = 0.06
-"""How far from a pixel, in heights of the image, a beam says how far that pixel looks."""
+"""Maximum distance from a pixel to a beam that sets its range, in image heights."""
 _BOX_MARGIN_M = 0.1
 _ALIKE = 5
-"""How many neighbours make the colour of a point that no camera saw."""
+"""Number of neighbours that set the colour of a point that no camera saw."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class SeedPoints(Record):
     xyz_m: Float[Tensor, "N 3"]
     rgb: Float[Tensor, "N 3"]
     seen: Bool[Tensor, "N"]
-    """By a camera."""
+    """True if a camera saw the point."""
     scale_m: Float[Tensor, "N"]
-    """Standard deviation at most."""
+    """Maximum standard deviation, m."""
 
 
 def lidar_points(
     cameras: list[CameraView], sweeps: list[SweepView], tracks: Tracks
 ) -> tuple[SeedPoints, list[SeedPoints]]:
-    """Of the static part, in the scene's frame, and of each actor, in its own."""
+    """Return the lidar points of the static part (scene's frame) and of each actor (its own frame)."""
     exposed_s = torch.tensor([view.t_s for view in cameras])
     standing: list[SeedPoints] = []
     found: list[list[SeedPoints]] = [[no_points()] for _ in range(len(tracks))]
@@ -84,18 +84,18 @@ def points_along_pixels(
     far_m: tuple[float, float],
     generator: torch.Generator,
 ) -> SeedPoints:
-    """Points along random pixels of all images, as far as the beam that is nearest in the image.
+    """Return points along random pixels of all images, at the range of the nearest beam in the image.
 
-    Pixels beside beams that met an actor are left to it.
+    Pixels whose nearest beam hit an actor are skipped, because the actor has its own points.
 
     Args:
-        cameras: with images.
+        cameras: views with images.
         sweeps: at least one.
         tracks: the actors.
-        count: how many pixels, over all images.
-        scale: standard deviation in units of the distance between pixels drawn of a camera.
-        far_m: where points lie, even in 1/m, that look upwards where no beam is near.
-        generator: of which pixels are taken.
+        count: number of pixels over all images.
+        scale: standard deviation in units of the distance between the drawn pixels of a camera.
+        far_m: range of points that look upwards with no beam near, uniform in 1/m.
+        generator: random choice of pixels.
     """
     found = [no_points()]
     moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
@@ -114,7 +114,7 @@ def points_along_pixels(
             apart_px, index = cKDTree(uv_beam[inside].numpy()).query(uv.numpy())
             nearest = torch.from_numpy(np.asarray(index))
             beside = torch.from_numpy(np.asarray(apart_px)) < NEAR_IN_IMAGE * view.size_hw[0]
-            met = beside | (direction[:, 2] < 0)  # the ground right before the vehicle is below all beams
+            met = beside | (direction[:, 2] < 0)  # the ground just in front of the vehicle is below all beams
             beam_m = (xyz[inside] - view.T_scene_cam[:3, 3]).norm(dim=-1)[nearest]
             range_m, kept = torch.where(met, beam_m, away_m), standing[inside][nearest] | ~met
         drawn = count * sum(other.sensor == view.sensor for other in cameras) / len(cameras)
@@ -130,7 +130,7 @@ def points_anywhere(
     range_m: tuple[float, float],
     generator: torch.Generator,
 ) -> SeedPoints:
-    """Points along random pixels of all images, at ranges even in 1/m; see `points_along_pixels`."""
+    """Return points along random pixels, at ranges uniform in 1/m. See `points_along_pixels`."""
     found = [no_points()]
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
@@ -143,10 +143,10 @@ def points_anywhere(
 def standing_points(
     points: SeedPoints, most: int, most_unseen: int, generator: torch.Generator
 ) -> SeedPoints:
-    """At most so many of those that a camera saw, and at most so many of the others, but evenly.
+    """Choose at most `most` of the points that a camera saw and at most `most_unseen` of the others, evenly.
 
-    Beams meet what is near over and over. Where no camera looks one point is enough in each cube whose side
-    is about `UNSEEN_RAD` of the range from which the place was met at closest.
+    Beams hit near surfaces over and over. Where no camera looks, one point is enough per cube. The side of a
+    cube is about `UNSEEN_RAD` times the smallest range from which the place was measured.
     """
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]][:most], order[~points.seen[order]]
@@ -154,7 +154,7 @@ def standing_points(
 
 
 def _one_a_cube(points: SeedPoints) -> Int[Tensor, "K"]:
-    """The first point of each cube, in their order."""
+    """Return the index of the first point of each cube, in order."""
     xyz_m, range_m = points.xyz_m.double().numpy(), points.scale_m.double().numpy() / BEAM_WIDTH_RAD
     _, block = np.unique(np.floor(xyz_m / UNSEEN_M[1]), axis=0, return_inverse=True)
     closest_m = np.full(block.max(initial=-1) + 1, np.inf)
@@ -166,7 +166,7 @@ def _one_a_cube(points: SeedPoints) -> Int[Tensor, "K"]:
 
 
 def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
-    """At most so many, `SEEN_SHARE` of them among those that a camera saw, where there are so many."""
+    """Choose at most `most` points, `SEEN_SHARE` of them seen by a camera if there are enough."""
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]], order[~points.seen[order]]
     of_seen = max(round(SEEN_SHARE * most), most - len(unseen))
@@ -175,7 +175,7 @@ def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> Se
 
 
 def like_neighbours(points: SeedPoints) -> SeedPoints:
-    """With those that no camera saw in the median colour of the nearest that one saw, if there are any."""
+    """Give unseen points the median colour of their nearest seen neighbours, if there are any."""
     if bool(points.seen.all()) or not bool(points.seen.any()):
         return points
     near = cKDTree(points.xyz_m[points.seen].numpy()).query(
@@ -188,12 +188,12 @@ def like_neighbours(points: SeedPoints) -> SeedPoints:
 
 
 def no_points() -> SeedPoints:
-    """None."""
+    """Return an empty set."""
     return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0))
 
 
 def all_points(parts: list[SeedPoints]) -> SeedPoints:
-    """Several sets as one."""
+    """Concatenate sets of points."""
     names = [field.name for field in dataclasses.fields(SeedPoints)]
     return SeedPoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
@@ -201,7 +201,7 @@ def all_points(parts: list[SeedPoints]) -> SeedPoints:
 def owners(
     xyz: Float[Tensor, "N 3"], dt_s: Float[Tensor, "N"], states: ActorStates, tracks: Tracks
 ) -> Int[Tensor, "N"]:
-    """In whose box each point lies at the time of its beam."""
+    """Return the actor whose box holds each point at the time of its beam, or `STATIC`."""
     owner = torch.full((len(xyz),), STATIC)
     for row in states.present.nonzero()[:, 0].tolist():
         T, half_m = states.T_scene_actor[row], 0.5 * tracks.size_lwh[row] + _BOX_MARGIN_M
@@ -214,7 +214,7 @@ def owners(
 
 
 def _nearest_views(cameras: list[CameraView], exposed_s: Float[Tensor, "V"], t_s: float) -> list[CameraView]:
-    """Of each camera the view that is nearest in time."""
+    """Return the view of each camera that is nearest in time."""
     order = (exposed_s - t_s).abs().argsort(stable=True).tolist()
     nearest: dict[int, CameraView] = {}
     for index in order:
@@ -223,7 +223,7 @@ def _nearest_views(cameras: list[CameraView], exposed_s: Float[Tensor, "V"], t_s
 
 
 def _colours(xyz: Float[Tensor, "N 3"], view: CameraView) -> tuple[Bool[Tensor, "N"], Float[Tensor, "S 3"]]:
-    """Which points an image shows, and their colours in it."""
+    """Return which points an image shows, and their colours."""
     assert view.image is not None
     uv, _, inside = project(
         transform_points(inverse_se3(view.T_scene_cam), xyz), view.K, view.dist, view.size_hw
@@ -233,7 +233,7 @@ def _colours(xyz: Float[Tensor, "N 3"], view: CameraView) -> tuple[Bool[Tensor, 
 
 
 def _pixels_apart_rad(view: CameraView, drawn: int | float) -> float:
-    """How far apart so many places in an image are."""
+    """Return the mean angular spacing (rad) of `drawn` random pixels of an image."""
     height, width = view.size_hw
     return (height * width / max(drawn, 1.0)) ** 0.5 / float(view.K[0, 0])
 
@@ -245,7 +245,7 @@ def _shares(count: int, parts: int) -> list[int]:
 def _random_pixels(
     view: CameraView, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 3"]]:
-    """Places in an image, px, and unit directions in the scene's frame."""
+    """Return random positions in an image (px) and their unit directions in the scene's frame."""
     height, width = view.size_hw
     uv = torch.rand(count, 2, generator=generator) * torch.tensor([width, height])
     return uv, rotate_vectors(view.T_scene_cam, pixels_to_rays(uv, view.K, view.dist))

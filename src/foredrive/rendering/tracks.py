@@ -1,4 +1,4 @@
-"""Where tracked actors are at any time: key poses, offsets that can be learned, and motion between them."""
+"""Tracks of actors: key poses, learnable offsets, and motion between key poses."""
 
 import dataclasses
 import math
@@ -24,39 +24,39 @@ MIRRORED = (
     *(Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER),
     *(Category.CONSTRUCTION_VEHICLE, Category.MOTORCYCLE, Category.BICYCLE),
 )
-"""What looks the same from both sides."""
+"""Categories that are left-right symmetric."""
 LONGEST_STAY_S = 0.5
-"""How long before and after it an actor stays that was seen at one time alone."""
+"""Time before and after its key time for which an actor with a single key time is present, s."""
 
 
 @dataclass(frozen=True)
 class Tracks(Record):
-    """A rigid actors at K common key times, in the scene's frame; an actor's frame is its box's."""
+    """A rigid actors at K common key times, in the scene's frame. An actor's frame is that of its box."""
 
     track_id: Int[Tensor, "A"]
     category: Int[Tensor, "A"]
     """A `Category`."""
     size_lwh: Float[Tensor, "A 3"]
-    """m."""
+    """Length, width, height, m."""
     t_s: Float[Tensor, "K"]
-    """Key times in ascending order; all actors share them."""
+    """Key times in ascending order, the same for all actors."""
     T_scene_actor: Float[Tensor, "A K 4 4"]
     present: Bool[Tensor, "A K"]
-    """Whether an actor is there; poses where it is not mean nothing."""
+    """True where an actor is present. Elsewhere its poses are undefined."""
 
     def __len__(self) -> int:
         return len(self.track_id)
 
     @property
     def mirrored(self) -> Bool[Tensor, "A"]:
-        """Which actors look the same from both sides."""
+        """Return which actors are left-right symmetric."""
         return torch.isin(self.category, torch.tensor(MIRRORED, device=self.category.device))
 
     def index_of(self, track_id: int) -> int:
-        """Row of an actor.
+        """Return the row of an actor.
 
         Raises:
-            InputError: naming the actors there are, if there is none of this id.
+            InputError: there is no actor with this id. The message lists those that exist.
         """
         rows = (self.track_id == track_id).nonzero()
         if len(rows) == 0:
@@ -65,29 +65,28 @@ class Tracks(Record):
         return int(rows[0])
 
     def moved(self, offset: Float[Tensor, "A K 6"]) -> "Tracks":
-        """With every key pose changed in the actor's own frame by exp(offset): m, then rad."""
+        """Return tracks with every key pose changed in the actor's frame by exp(offset): m, then rad."""
         return dataclasses.replace(self, T_scene_actor=self.T_scene_actor @ exp_se3(offset))
 
 
 @dataclass(frozen=True)
 class ActorStates(Record):
-    """A actors at one moment."""
+    """The states of A actors at one time."""
 
     T_scene_actor: Float[Tensor, "A 4 4"]
     velocity_mps: Float[Tensor, "A 3"]
-    """Of the actor's origin, in the scene's axes."""
+    """Velocity of the actor's origin, in the scene's axes."""
     turn_radps: Float[Tensor, "A 3"]
-    """Angular velocity in the scene's axes."""
+    """Angular velocity, in the scene's axes."""
     present: Bool[Tensor, "A"]
 
 
 def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
-    """All actors at a time: positions on straight lines between key poses, rotations about one axis.
+    """Return all actors at a time: positions interpolated linearly, rotations about one axis.
 
-    An actor is there between two key times if it is there at both. Before the first key time and after the
-    last, by at most one step between key times, it goes on as it moved; one key time alone stands still.
-
-    Differentiable in the poses and in `t_s`, where it is a tensor.
+    An actor is present between two key times if it is present at both. Before the first and after the last
+    key time its motion continues for at most one step between key times. With a single key time it is static.
+    The result is differentiable in the poses and in `t_s`, if that is a tensor.
     """
     now_s = float(t_s.detach()) if isinstance(t_s, Tensor) else t_s
     T, velocity_mps, turn_radps = poses_at(tracks.t_s, tracks.T_scene_actor, t_s)
@@ -104,10 +103,11 @@ def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
 def poses_at(
     key_t_s: Float[Tensor, "K"], T: Float[Tensor, "A K 4 4"], t_s: float | Tensor
 ) -> tuple[Float[Tensor, "A 4 4"], Float[Tensor, "A 3"], Float[Tensor, "A 3"]]:
-    """Poses at a time, with velocities (m/s) and turn rates (rad/s) in the axes that they are given in.
+    """Return poses at a time, with velocities (m/s) and turn rates (rad/s) in the axes of their frame.
 
-    Positions on straight lines between key poses, rotations about one axis; before the first and after the
-    last key time they go on so. One key pose alone stands still. Differentiable in `T` and `t_s`.
+    Positions are interpolated linearly between key poses, rotations about one axis. Before the first and
+    after the last key time the motion continues. A single key pose is static. The result is differentiable in
+    `T` and `t_s`.
     """
     if len(key_t_s) == 1:
         still = torch.zeros(len(T), 3).to(T)
@@ -116,7 +116,7 @@ def poses_at(
     step_s = float(key_t_s[after] - key_t_s[after - 1])
     share = (t_s - float(key_t_s[after - 1])) / step_s
     T0, T1 = T[:, after - 1], T[:, after]
-    turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in its own axes
+    turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in the actor's own axes
     now = T0 @ exp_se3(torch.cat([torch.zeros_like(turn), share * turn], dim=-1))
     now = torch.cat([now[..., :3], now[..., 3:] + share * (T1 - T0)[..., 3:]], dim=-1)
     way = T1[:, :3, 3] - T0[:, :3, 3]
@@ -124,7 +124,7 @@ def poses_at(
 
 
 def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
-    """The later one of the two key times that a time lies between, or beside; of two at least."""
+    """Return the index of the later of the two key times around, or nearest to, a time."""
     after = int(torch.searchsorted(key_t_s.contiguous(), now_s))
     return min(max(after, 1), len(key_t_s) - 1)
 
@@ -132,7 +132,7 @@ def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
 def boxes_at(
     tracks: Tracks, T_scene_ego: Float[Tensor, "4 4"], t_s: float, within_m: float = math.inf
 ) -> Boxes:
-    """Boxes of the actors that are there at a time, in the ego frame, unbatched."""
+    """Return the boxes of actors present at a time, in the ego frame, unbatched."""
     states = states_at(tracks, t_s)
     T_ego_scene = inverse_se3(T_scene_ego)
     T_ego_actor = T_ego_scene @ states.T_scene_actor.to(T_scene_ego)
@@ -150,10 +150,10 @@ def boxes_at(
 
 
 def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:
-    """The tracks of an unbatched clip, in the scene's frame; key times are those of its frames.
+    """Read the tracks of an unbatched clip in the scene's frame. Key times are those of its frames.
 
-    Gaps between two sightings are filled with motion from one to the other, and an actor stays for one frame
-    before its first and after its last sighting, moving on as it did.
+    Gaps between two detections are filled by interpolation. An actor is kept for one frame before its first
+    and after its last detection, with continued motion.
     """
     boxes = clip.boxes
     T_scene_ego = (inverse_se3(T_world_scene) @ clip.T_world_ego).float()
@@ -173,7 +173,7 @@ def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:
 
 
 def _filled(tracks: Tracks) -> Tracks:
-    """With poses between an actor's sightings and one key time around them."""
+    """Fill the poses between an actor's detections and at one key time around them."""
     poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()
     for a in range(len(tracks)):
         keys = tracks.present[a].nonzero()[:, 0]

@@ -1,7 +1,8 @@
-"""Ground that nobody ever saw, under parked vehicles and behind them, made up from the ground beside it.
+"""Guessed ground where no sensor could look, such as under parked vehicles and behind them.
 
-What is learned ends where sensors could not look; once an actor is taken away, or the ego vehicle drives
-elsewhere, holes would show there. These Gaussians are no reconstruction but a guess, added last.
+The learned scene ends where sensors could not look. Holes would show there after an actor is removed or when
+the ego vehicle drives elsewhere. These Gaussians are extrapolated from the ground nearby, not reconstructed,
+and are added last.
 """
 
 from collections.abc import Sequence
@@ -20,36 +21,37 @@ from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.views import CameraView
 
 WITHIN_M = 25.0
-"""Of the driven way."""
+"""Maximum distance from the driven path, m."""
 STEP_M = 0.4
-"""Between the Gaussians that are added."""
+"""Spacing of the added Gaussians, m."""
 _HEIGHT_M, _SLOPE = 0.15, 0.04
-"""What is ground lies so near to the level of the wheels, and so much more a metre beside the way."""
+"""Height tolerance of ground: this many metres from the level of the wheels, plus this much per metre of
+lateral distance."""
 _CELL_M, _FEWEST = 1.0, 4
-"""Ground is known in a cell of this side that holds so many Gaussians."""
+"""Side of a ground cell, m, and the minimum number of Gaussians in a known cell."""
 _FROM_KNOWN_M = 5.0
-"""The farthest that ground is guessed from where it is known."""
+"""Maximum distance from known ground to a guess, m."""
 _LEVELS, _ALIKE = 8, 64
-"""How many of the nearest cells say how high the ground is, how many of the nearest Gaussians how it looks:
-their median, since some are hidden themselves and of any colour."""
+"""Number of nearest cells that set the height of the ground, and of nearest Gaussians that set its features.
+The median of the features is used because some of these Gaussians are hidden and have arbitrary colours."""
 _VIEWS = 10
-"""Most that are looked through, of each camera."""
+"""Maximum number of views per camera that are checked."""
 _BEHIND, _BEHIND_M = 0.02, 0.2
-"""How much farther a point lies than what a view shows there, if it is hidden: a share of that, and m."""
+"""A point is hidden if it is farther than the rendered depth by this share of it plus this many metres."""
 _OPAQUE, _MOST_M = 0.3, 0.5
-"""Least opacity, and greatest standard deviation, of a Gaussian that shows the ground."""
+"""Minimum opacity and maximum standard deviation (m) of a Gaussian that shows the ground."""
 
 
 @torch.no_grad()
 def add_unseen_ground(
     scene: RebuiltScene, T_scene_ego: Float[Tensor, "K 4 4"], views: Sequence[CameraView]
 ) -> None:
-    """Put Gaussians of `guessed_ground` into a scene, but for those that a camera would have seen.
+    """Add the Gaussians of `guessed_ground` to a scene, except those that a camera would have seen.
 
     Args:
-        scene: that was learned.
-        T_scene_ego: poses of the ego vehicle, whose frame stands on the ground.
-        views: that were learned from; some of each camera are looked through.
+        scene: a learned scene.
+        T_scene_ego: poses of the ego vehicle, whose frame is on the ground.
+        views: training views; some of each camera are checked.
     """
     graph = scene.graph
     ground = guessed_ground(graph.of_actor(STATIC), T_scene_ego)
@@ -62,12 +64,12 @@ def add_unseen_ground(
 def guessed_ground(
     standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"], step_m: float = STEP_M
 ) -> Gaussians:
-    """Flat Gaussians where there is no ground near the driven way; none where ground is known nowhere.
+    """Return flat Gaussians where ground is missing near the driven path; none if no ground is known.
 
     Args:
-        standing: the static part, learned.
-        T_scene_ego: poses of the ego vehicle, whose frame stands on the ground.
-        step_m: between those that are added.
+        standing: the learned static part.
+        T_scene_ego: poses of the ego vehicle, whose frame is on the ground.
+        step_m: spacing of the added Gaussians.
     """
     ground = _ground(standing, T_scene_ego)
     xyz = ground.mean_m.double().cpu().numpy()
@@ -99,7 +101,7 @@ def guessed_ground(
 
 
 def _some_views(views: Sequence[CameraView]) -> list[CameraView]:
-    """At most so many of each camera, spread over the drive."""
+    """Choose at most `_VIEWS` views of each camera, spread over the drive."""
     chosen: list[CameraView] = []
     for sensor in sorted({view.sensor for view in views}):
         own = [view for view in views if view.sensor == sensor]
@@ -110,7 +112,7 @@ def _some_views(views: Sequence[CameraView]) -> list[CameraView]:
 def _seen(
     scene: RebuiltScene, graph: SceneGraph, view: CameraView, xyz_m: Float[Tensor, "N 3"]
 ) -> Bool[Tensor, "N"]:
-    """Which points a view shows: those that lie in it and not behind anything."""
+    """Return which points a view shows: inside the image and not hidden."""
     uv, depth_m, inside = project(
         transform_points(inverse_se3(view.T_scene_cam), xyz_m), view.K, view.dist, view.size_hw
     )
@@ -123,7 +125,7 @@ def _seen(
 
 
 def _ground(standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"]) -> Gaussians:
-    """The Gaussians that show the ground near the way: about as high as the wheels stand."""
+    """Return the Gaussians that show the ground near the path, at about the height of the wheels."""
     mean_m = standing.mean_m
     way = cKDTree(T_scene_ego[:, :2, 3].double().cpu().numpy())
     apart_m, pose = way.query(mean_m[:, :2].double().cpu().numpy())
@@ -135,7 +137,7 @@ def _ground(standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"]) -> Gaussia
 
 
 def _levels(xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "C 3"]:
-    """Middles of the cells in which ground is known, with its median height."""
+    """Return the centres of the cells with known ground, with its median height."""
     cells, member, count = np.unique(
         np.floor(xyz_m[:, :2] / _CELL_M), axis=0, return_inverse=True, return_counts=True
     )

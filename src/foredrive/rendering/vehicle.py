@@ -1,6 +1,4 @@
-"""The vehicle of a log: where it drove and which sensors it carried, so that a scene can be looked at without
-the log.
-"""
+"""The vehicle of a log: its path and sensors, so that a scene can be rendered without the log."""
 
 import dataclasses
 import json
@@ -22,67 +20,71 @@ from foredrive.scene.record import Record
 from foredrive.sensors import SpinningLidar
 
 _SLACK_S = 1e-3
-"""By which a time may lie outside of the drive."""
+"""Tolerance for times outside of the drive, s."""
 
 
 @dataclass(frozen=True)
 class EgoMoment(Record):
-    """The ego vehicle at one time: on its logged way, or anywhere else."""
+    """The ego vehicle at one time, on its logged path or anywhere else."""
 
     T_scene_ego: Float[Tensor, "4 4"]
     twist_ego: Float[Tensor, "6"]
     """Velocity (m/s), then turn rate (rad/s) over ground, in its own axes."""
     t_s: float
-    """Since the drive's start: where actors are."""
+    """Seconds since the start of the drive; sets the actors' positions."""
 
     def later(self, dt_s: float) -> "EgoMoment":
-        """Where it is a little later, if it goes on as it moves."""
+        """Return the vehicle after `dt_s` of constant motion."""
         T_scene_ego = self.T_scene_ego @ exp_se3(dt_s * self.twist_ego)
         return EgoMoment(T_scene_ego, self.twist_ego, self.t_s + dt_s)
 
     def shifted(self, T_ego_shifted: Float[Tensor, "4 4"]) -> "EgoMoment":
-        """A vehicle that keeps its place beside this one (`Edited.T_ego_shifted`)."""
+        """Return a vehicle at a fixed pose relative to this one (`Edited.T_ego_shifted`)."""
         twist = sensor_twist(T_ego_shifted, self.twist_ego)
         return EgoMoment(self.T_scene_ego @ T_ego_shifted, twist, self.t_s)
 
 
 @dataclass(frozen=True)
 class Vehicle(Record):
-    """What a log's vehicle carried, and where it was at K times."""
+    """The sensors of a log's vehicle and its poses at K times."""
 
     t_s: Float[Tensor, "K"]
-    """Frames of the log, since its start."""
+    """Times of the log's frames, s since its start."""
     T_scene_ego: Float[Tensor, "K 4 4"]
     T_world_scene: Float64[Tensor, "4 4"]
-    """The scene's frame, the ego frame of the first frame, in the log's world."""
+    """The frame of the scene (the ego frame of the first log frame) in the log's world."""
     rig: CameraRig
-    """[C]; `T_ego_cam` is where cameras are mounted, `exposed_dt_s` when they usually look after a frame's
-    time. Their order is that of `CameraView.sensor`."""
+    """[C]; `T_ego_cam` is the mount of each camera, `exposed_dt_s` its usual delay after a frame's time. The
+    order is that of `CameraView.sensor`."""
     lidar: SpinningLidar | None
-    """None where its pattern is not known."""
+    """None if its pattern is unknown."""
     T_ego_lidar: Float[Tensor, "4 4"] | None
-    """Where it is; None without one."""
+    """Mount of the lidar; None without one."""
     reach_m: float
-    """How far its lidar sees; infinite without one."""
+    """Range of the lidar, m; infinite without one."""
 
     def check_time(self, t_s: float) -> None:
-        """Raises InputError if a time lies outside of the drive."""
+        """Check that a time lies within the drive.
+
+        Raises:
+            InputError: it does not.
+        """
         first_s, last_s = float(self.t_s[0]), float(self.t_s[-1])
         if not first_s - _SLACK_S <= t_s <= last_s + _SLACK_S:
             raise InputError(f"{t_s:g} s is not in the log, which lasts from {first_s:g} s to {last_s:.1f} s")
 
     def at(self, t_s: float) -> EgoMoment:
-        """Where the vehicle was at a time; before its first and after its last pose it goes on straight."""
+        """Return the vehicle at a time. Before its first and after its last pose the motion continues."""
         T, velocity_mps, turn_radps = poses_at(self.t_s, self.T_scene_ego[None], t_s)
         R_ego_scene = T[0, :3, :3].T
         twist = torch.cat([R_ego_scene @ velocity_mps[0], R_ego_scene @ turn_radps[0]])
         return EgoMoment(T[0], twist, t_s)
 
     def camera(self, name: str) -> int:
-        """Which camera of the rig has a name.
+        """Return the index of a camera in the rig.
 
         Raises:
-            InputError: naming the cameras there are, if there is none of this name.
+            InputError: there is no camera of this name. The message lists those that exist.
         """
         if name not in self.rig.names:
             raise InputError(f"no camera {name!r}; there are: {', '.join(self.rig.names) or 'none'}")
@@ -96,12 +98,12 @@ def read_vehicle(
     T_ego_lidar: Float[Tensor, "4 4"] | None = None,
     reach_m: float = math.inf,
 ) -> Vehicle:
-    """The vehicle of a whole drive.
+    """Read the vehicle of a whole drive.
 
-    A camera's place is the mean over its images, each with the ego motion until its exposure taken off.
+    The mount of a camera is the mean over its images, after the ego motion until each exposure is removed.
 
     Args:
-        drive: unbatched, all its frames.
+        drive: unbatched, with all frames.
         T_world_scene, lidar, T_ego_lidar, reach_m: see `Vehicle`.
     """
     T_scene_ego = (inverse_se3(T_world_scene) @ drive.T_world_ego).float()
@@ -146,10 +148,10 @@ def save_vehicle(vehicle: Vehicle, path: Path) -> None:
 
 
 def load_vehicle(path: Path) -> Vehicle:
-    """Read what `save_vehicle` wrote.
+    """Read a file written by `save_vehicle`.
 
     Raises:
-        InputError: if there is none, or something else.
+        InputError: the file cannot be read or does not describe a vehicle.
     """
     try:
         saved = json.loads(path.read_text())
@@ -187,7 +189,7 @@ def _lidar(saved: dict[str, Any]) -> SpinningLidar:
 
 
 def _plain(value: Any) -> Any:
-    """Records and descriptions as what JSON holds."""
+    """Convert records to values that JSON can hold."""
     if isinstance(value, Tensor):
         return value.tolist()
     if dataclasses.is_dataclass(value):
@@ -196,7 +198,7 @@ def _plain(value: Any) -> Any:
 
 
 def _mean_pose(T: Float[Tensor, "N 4 4"]) -> Float[Tensor, "4 4"]:
-    """The mean of nearly equal poses: of rotations that which is nearest to the mean of the matrices."""
+    """Return the mean of nearly equal poses. Its rotation is the one nearest to the mean of the matrices."""
     mean = T.mean(0)
     u, _, vh = torch.linalg.svd(mean[:3, :3])
     mean[:3, :3] = u @ vh

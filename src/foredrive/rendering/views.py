@@ -1,4 +1,4 @@
-"""What sensors saw, as rendering compares with it: one image or one sweep, placed and timed in the scene."""
+"""Sensor readings to compare renderings with: one image or one sweep, with pose and time in the scene."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ class CameraView(Record):
     K: Float[Tensor, "3 3"]
     dist: Float[Tensor, "5"]
     T_scene_cam: Float[Tensor, "4 4"]
-    """When the middle row is exposed."""
+    """Pose when the middle row is exposed."""
     twist_cam: Float[Tensor, "6"]
     """Velocity (m/s), then turn rate (rad/s) of the camera over ground, in its own axes."""
     t_s: float
-    """When the middle row is exposed, since the drive's start."""
+    """Time at which the middle row is exposed, s since the start of the drive."""
     readout_s: float
-    """From the first to the last row; 0 is a global shutter."""
+    """Time from the first to the last row, s; 0 is a global shutter."""
     size_hw: tuple[int, int]
     sensor: int
-    """Which camera of the rig."""
+    """Index of the camera in the rig."""
     image: UInt8[Tensor, "3 H W"] | None = None
 
     def shrunk(self, factor: int) -> "CameraView":
-        """The view at a lower resolution, the image averaged."""
+        """Return the view at a lower resolution, with the image averaged."""
         height, width = self.size_hw
         size_hw = (max(height // factor, 1), max(width // factor, 1))
         if factor == 1:
@@ -47,10 +47,10 @@ class CameraView(Record):
 
 @dataclass(frozen=True)
 class SweepView(Record):
-    """A lidar revolution: its beams in the ego frame of time `t_s`."""
+    """A lidar revolution: its beams in the ego frame at time `t_s`."""
 
     beams: LidarSweep
-    """Those that are rendered and compared with, all valid."""
+    """Beams to render and compare, all valid."""
     misses_known: bool
     T_scene_ego: Float[Tensor, "4 4"]
     twist_ego: Float[Tensor, "6"]
@@ -59,7 +59,7 @@ class SweepView(Record):
 
 
 def camera_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[list[CameraView]]:
-    """The images of an unbatched clip, by camera, in the order of time; cameras without images have none."""
+    """Return the images of an unbatched clip by camera, in order of time; some may have none."""
     T_scene_ego = _scene_poses(clip, T_world_scene)
     twists = ego_twists(clip)
     rig = clip.rig
@@ -84,7 +84,7 @@ def camera_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[list
 
 
 def sweep_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[SweepView]:
-    """The sweeps of an unbatched clip in the order of time."""
+    """Return the sweeps of an unbatched clip in order of time."""
     T_scene_ego = _scene_poses(clip, T_world_scene)
     twists = ego_twists(clip)
     return [
@@ -100,7 +100,7 @@ def sweep_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[Sweep
 
 
 def ego_twists(clip: Clip) -> Float[Tensor, "T 6"]:
-    """Velocity and turn rate over ground in the ego axes, m/s and rad/s: from the poses before and after."""
+    """Return velocity (m/s) and turn rate (rad/s) over ground in the ego axes, by central differences."""
     frames = len(clip.t_s)
     if frames == 1:
         return torch.zeros(1, 6)

@@ -1,4 +1,4 @@
-"""The training loop, checkpoints, resuming, logging."""
+"""Training: the loop, checkpoints, resuming, logging."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Teaching towers to meet in one space: images and texts by contrast, sweeps by what an image tower says."""
+"""Training of towers for a common space: images and texts by contrast, sweeps from image embeddings."""
 
 import math
 from dataclasses import dataclass
@@ -16,38 +16,38 @@ from foredrive.ops.precision import computes_bfloat16
 from foredrive.scene.record import Record
 
 FIRST_TEMPERATURE, SHARPEST = 0.07, 100.0
-"""CLIP's (Radford et al. 2021, section 2.4)."""
+"""Temperature at the start and maximum inverse temperature, from CLIP (Radford et al. 2021, section 2.4)."""
 CROP_SHARE = 0.1
-"""Of height and width that a training image may lose."""
+"""Share of height and width that cropping removes from a training image."""
 
 
 @dataclass(frozen=True)
 class CaptionedImages(Record):
-    """Views, T texts that are true of each, and what each text says out of a vocabulary of V facts."""
+    """Views, T true texts of each, and the facts each text states out of a vocabulary of V facts."""
 
     images: UInt8[Tensor, "*n 3 H W"]
     texts: Float[Tensor, "*n T D"]
-    """Embeddings; the mean of all texts has been taken off them."""
+    """Embeddings of the texts, with the mean over all texts subtracted."""
     said: Bool[Tensor, "*n T V"]
     holds: Bool[Tensor, "*n V"]
-    """What is true of the view."""
+    """Facts that are true of the view."""
     key: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class ImagedSweeps(Record):
-    """Sectors of sweeps, and what an image tower says of the same moments and sectors; nothing of texts."""
+    """Sectors of sweeps and image embeddings of the same times and sectors, without texts."""
 
     cloud: PointCloud
     targets: Float[Tensor, "*n 2 D"]
-    """Of the images, as they are and mirrored; of any length."""
+    """Embeddings of the images, original and mirrored; any length."""
     key: tuple[str, ...]
 
 
 class ContrastObjective(nn.Module):
-    """InfoNCE both ways (Radford et al. 2021, figure 3) between images and frozen embeddings of texts.
+    """InfoNCE in both directions (Radford et al. 2021, figure 3) between images and frozen text embeddings.
 
-    A text that is true of another image of the batch, be it the same text or not, is no negative of it.
+    A text that is also true of another image of the batch is not a negative for that image.
     """
 
     def __init__(self, tower: ImageTower) -> None:
@@ -56,7 +56,7 @@ class ContrastObjective(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(-math.log(FIRST_TEMPERATURE)))
 
     def forward(self, batch: CaptionedImages, generator: torch.Generator) -> dict[str, Tensor]:
-        """One text of each view, drawn anew; views mirrored and cropped, which changes no fact."""
+        """Return losses with one random text per view. Mirroring and cropping the views changes no fact."""
         rows = torch.arange(len(batch.images), device=batch.images.device)
         drawn = torch.randint(batch.texts.shape[1], (len(rows),), generator=generator).to(rows.device)
         device = batch.images.device.type
@@ -70,7 +70,7 @@ class ContrastObjective(nn.Module):
 
 
 class DistilObjective(nn.Module):
-    """What LidarCLIP learns by (Hess et al. 2024, section 3): the image's embedding of the same moment.
+    """The loss of LidarCLIP (Hess et al. 2024, section 3): regress the image embedding of the same time.
 
     Args:
         kind: mean squared error on features of any length, or 1 - cosine.
@@ -81,7 +81,7 @@ class DistilObjective(nn.Module):
         self.encoder, self.kind = encoder, kind
 
     def forward(self, batch: ImagedSweeps, generator: torch.Generator) -> dict[str, Tensor]:
-        """Half of the sweeps are mirrored, and compared with mirrored images."""
+        """Return losses. Half of the sweeps are mirrored and compared with mirrored images."""
         rows = torch.arange(len(batch.targets), device=batch.targets.device)
         mirrored = (torch.rand(len(rows), generator=generator) < 0.5).to(rows.device)
         y = torch.where(mirrored[batch.cloud.item], -1.0, 1.0)
@@ -94,7 +94,7 @@ class DistilObjective(nn.Module):
 
 
 def _jittered(images: UInt8[Tensor, "n 3 H W"], generator: torch.Generator) -> UInt8[Tensor, "n 3 h w"]:
-    """One crop for the batch, and every other image mirrored."""
+    """Crop all images of the batch equally and mirror each with probability 1/2."""
     height, width = images.shape[-2:]
     kept_h, kept_w = height - round(CROP_SHARE * height), width - round(CROP_SHARE * width)
     top = int(torch.randint(height - kept_h + 1, (1,), generator=generator))

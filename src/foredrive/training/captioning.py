@@ -1,4 +1,4 @@
-"""Teaching a decoder to say what an embedding shows, from images' embeddings alone."""
+"""Training of a caption decoder from image embeddings only."""
 
 import math
 from dataclasses import dataclass
@@ -12,17 +12,18 @@ from foredrive.models.caption_decoder import PAD, CaptionDecoder
 from foredrive.scene.record import Record
 
 NOISE = 0.4
-"""Length of the noise on embeddings of length 1, about that of what parts a sweep's from its image's: with it
-a decoder of images reads sweeps (as CapDec's reads images, Nukrai et al. 2022)."""
+"""Length of the noise on embeddings of length 1, about the distance between the embeddings of a sweep and its
+image. With it a decoder trained on images can read sweeps (as CapDec's decoder, trained on texts, reads
+images; Nukrai et al. 2022)."""
 
 
 @dataclass(frozen=True)
 class CaptionedEmbeddings(Record):
-    """Unit embeddings of views' images, as they are and mirrored, and a sentence that is true of each."""
+    """Unit embeddings of views' images, original and mirrored, and a true sentence for each."""
 
     embedding: Float[Tensor, "*n 2 D"]
     words: Int[Tensor, "*n S"]
-    """Numbers of `CaptionDecoder`, `PAD` behind the end."""
+    """Token numbers of `CaptionDecoder`, with `PAD` after the end."""
     key: tuple[str, ...]
 
 
@@ -34,7 +35,7 @@ class CaptionObjective(nn.Module):
         self.decoder = decoder
 
     def forward(self, batch: CaptionedEmbeddings, generator: torch.Generator) -> dict[str, Tensor]:
-        """Of either image, with noise; "hits" is the share of words that come first."""
+        """Return losses for one of the two images, drawn, with noise. "hits" is the top-1 accuracy."""
         rows = len(batch.words)
         drawn = torch.randint(2, (rows,), generator=generator).to(batch.words.device)
         given = batch.embedding[torch.arange(rows, device=drawn.device), drawn]

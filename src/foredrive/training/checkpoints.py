@@ -1,4 +1,4 @@
-"""Checkpoints as safetensors, whole or not at all."""
+"""Checkpoints as safetensors, written atomically."""
 
 import json
 import shutil
@@ -17,10 +17,10 @@ MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "prog
 
 
 def save_checkpoint(folder: Path, model: nn.Module, optimizer: Optimizer, step: int) -> Path:
-    """Write `folder/step_N` and remove older ones; the new one is complete before any old one goes.
+    """Write `folder/step_N` and then remove older checkpoints.
 
-    The model's weights, the optimizer's tensors and the step number are all that exact resuming needs:
-    data order and random numbers follow from the seed and the step.
+    Exact resuming needs only the model's weights, the optimizer's tensors and the step number. Data order and
+    random numbers follow from the seed and the step.
     """
     final = folder / f"step_{step:07d}"
     with atomic_path(final) as temporary:
@@ -36,12 +36,16 @@ def save_checkpoint(folder: Path, model: nn.Module, optimizer: Optimizer, step: 
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
-    """The checkpoint with the highest step, if there is one."""
+    """Return the checkpoint with the highest step, or None."""
     return max(folder.glob("step_*"), default=None)
 
 
 def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
-    """Restore model and optimizer; returns the number of finished steps."""
+    """Restore model and optimizer. Return the number of finished steps.
+
+    Raises:
+        InputError: the checkpoint cannot be read or is of another architecture.
+    """
     load_weights(model, path / MODEL)
     try:
         progress = json.loads((path / PROGRESS).read_text())
@@ -53,7 +57,7 @@ def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
 
 
 def save_weights(model: nn.Module, path: Path) -> None:
-    """All parameters and buffers of a model, contiguous, as safetensors."""
+    """Write all parameters and buffers of a model as safetensors."""
     save_file({name: tensor.detach().contiguous() for name, tensor in model.state_dict().items()}, path)
 
 
@@ -61,7 +65,10 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
     """Load weights into a model of the same architecture.
 
     Args:
-        part: the model is this part of what was saved, such as "world_model"; "" is all of it.
+        part: prefix of the model in the file, such as "world_model"; "" is the whole file.
+
+    Raises:
+        InputError: the file cannot be read or is of another architecture.
     """
     prefix = f"{part}." if part else ""
     try:

@@ -1,4 +1,4 @@
-"""Two ways to train a detection head: by matching (DETR), or by the likelihood of the set (Paper A)."""
+"""Two ways to train a detection head: matching (DETR) or the likelihood of the set (Paper A)."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -17,12 +17,12 @@ from foredrive.sets.assignment import best_assignment
 NO_OBJECT_WEIGHT = 0.1
 BOX_WEIGHT, HEADING_WEIGHT = 0.5, 0.5
 STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
-"""Errors of this size, in m and log m, count alike."""
+"""Errors of this size, in m and log m, have equal weight."""
 
 Sample = tuple[Float[Tensor, "D Z Y X"], LabelledBoxes]
-"""A volume, and the objects in it."""
+"""A volume and its labelled objects."""
 Loss = Callable[[BoxSet, LabelledBoxes], Float[Tensor, ""]]
-"""Of one frame: `matching_loss` or `set_loss`."""
+"""The loss of one frame: `matching_loss` or `set_loss`."""
 
 
 def fit_head(
@@ -35,9 +35,10 @@ def fit_head(
     learning_rate: float = 1e-3,
     seed: int = 0,
 ) -> DetectionHead:
-    """A copy of the head, trained for some more steps; the learning rate rises and falls to nothing.
+    """Train a copy of the head with a one-cycle learning rate. Return the copy.
 
-    Raises `InputError` if there are fewer samples than a batch holds.
+    Raises:
+        InputError: there are fewer samples than a batch holds.
     """
     if len(samples) < batch:
         raise InputError(f"{len(samples)} samples are fewer than a batch of {batch}")
@@ -57,7 +58,7 @@ def fit_head(
 
 
 def said_of(head: DetectionHead, volumes: Sequence[Float[Tensor, "D Z Y X"]]) -> list[MultiBernoulli]:
-    """What the head says of each volume, float64, without gradients."""
+    """Return the output of the head for each volume, in float64 and without gradients."""
     with torch.no_grad():
         return [
             as_multi_bernoulli(head(volume[None])[0].map_tensors(torch.Tensor.double)) for volume in volumes
@@ -65,7 +66,10 @@ def said_of(head: DetectionHead, volumes: Sequence[Float[Tensor, "D Z Y X"]]) ->
 
 
 def as_multi_bernoulli(found: BoxSet) -> MultiBernoulli:
-    """One frame's boxes as a random finite set, from logits: no digits are lost where r is close to 1."""
+    """Return the boxes of one frame as a random finite set.
+
+    It is built from logits, so no precision is lost where r is close to 1.
+    """
     boxes = BoxDensity(
         mean=found.mean,
         chol=torch.diag_embed(found.log_std.exp()),
@@ -76,16 +80,16 @@ def as_multi_bernoulli(found: BoxSet) -> MultiBernoulli:
 
 
 def set_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
-    """MB-NLL of one frame, an object: every association counts as it is likely, none has to be chosen."""
+    """Return the MB-NLL of one frame per object. All associations count by their likelihood."""
     pmb = PoissonMultiBernoulli(as_multi_bernoulli(found))
     return set_nll(pmb, truth).nll / max(len(truth.label), 1)
 
 
 def matching_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
-    """DETR's of one frame, an object: cross-entropy and L1 of the best matching.
+    """Return the DETR loss of one frame per object: cross-entropy and L1 of the best matching.
 
-    Standard deviations learn from the Gaussian likelihood of matched boxes at fixed means, as probabilistic
-    detectors do that are trained by matching.
+    Standard deviations are learned from the Gaussian likelihood of matched boxes with fixed means, as in
+    probabilistic detectors trained by matching.
     """
     assert truth.yaw is not None
     query, match = _best_matching(found, truth)
@@ -109,13 +113,13 @@ def matching_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
 
 
 def _best_matching(found: BoxSet, truth: LabelledBoxes) -> tuple[Tensor, Tensor]:
-    """Queries and the objects they are matched with: each object has one."""
+    """Return matched queries and objects. Each object has one query."""
     with torch.no_grad():
         class_cost = -found.logits.softmax(-1)[:, truth.label.long()]
         scale = found.mean.new_tensor(STATE_SCALE)
         apart = (found.mean[:, None] - truth.state.to(found.mean)) / scale
         cost = (class_cost + BOX_WEIGHT * apart.abs().sum(-1)).T.double().cpu().numpy()
-    dear = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # no object stays without, if there are queries
+    dear = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # match every object while queries last
     column = torch.as_tensor(best_assignment(cost, dear).column)
     match = (column >= 0).nonzero()[:, 0]
     return column[match].to(found.mean.device), match.to(found.mean.device)

@@ -1,4 +1,4 @@
-"""DriveWorld's objective: eq. 3, and waypoints where a planner is learned with it."""
+"""DriveWorld's objective: eq. 3, and the waypoint loss when a planner is trained with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ MOVING_MPS = 0.5
 
 @dataclass(frozen=True)
 class DriveWorldWeights:
-    """Weights of the terms of eq. 3, each a mean over frames; the paper gives none, MILE the first two.
+    """Weights of the terms of eq. 3, each a mean over frames. The paper gives none; the first two are MILE's.
 
-    With all of them 0 but `wpts`, planning alone is learned.
+    If all are 0 except `wpts`, only planning is trained.
     """
 
     kl: float = 1e-3
     balance: float = 0.75
-    """Share of the divergence that the prior has to close."""
+    """Share of the divergence that moves the prior (see `balanced_kl`)."""
     occ: float = 1.0
     action: float = 1.0
     """L1 in units of 10 m/s and 0.1 rad."""
@@ -39,9 +39,9 @@ class DriveWorldWeights:
     scal: float = 1.0
     bce: float = 10.0
     occupied: float = 3.0
-    """Of the occupancy loss, as for NeMo."""
+    """Weights within the occupancy loss, as for NeMo."""
     wpts: float = 0.0
-    """Of the waypoints; with 0 the planner is left as it is."""
+    """Weight of the waypoints. With 0 the planner is not trained."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class DriveWorldStage:
     schedule: Schedule
     weights: DriveWorldWeights
     temporal: bool = True
-    """Otherwise each frame's occupancy is learned from that frame alone."""
+    """Train the latent dynamics. If False, each frame's occupancy is learned from that frame only."""
     statics_of: Literal["random", "now"] = "random"
-    """The frame whose statics all frames are decoded from: a random one, as the paper pre-trains, or the
-    present, as when the model is used."""
+    """Frame whose statics all frames are decoded with: a random one, as in the paper's pre-training, or the
+    present one, as in use."""
     kind: Literal["driveworld"] = "driveworld"
 
 
 class DriveWorldObjective(nn.Module):
-    """Maps a batch to its losses.
+    """The mapping from a batch to its losses.
 
     Args:
         agent: a DriveWorld and its planner.
-        weights: of the terms.
-        steps: L, imagined key frames.
-        temporal: otherwise every observed frame's occupancy is learned from its own plane alone, and nothing
-            that has to do with time: pre-training in 3-D, as OccNet's and UniScene's.
-        statics_of: the frame that all frames take what stands from.
+        weights: weights of the terms.
+        steps: L, number of imagined key frames.
+        temporal: if False, every observed frame's occupancy is learned from its own plane only, and nothing
+            about time: the 3-D pre-training of OccNet and UniScene.
+        statics_of: frame whose statics all frames use.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class DriveWorldObjective(nn.Module):
         world.flow.requires_grad_(weights.flow > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
-        """Losses by name; "loss" is what to descend. The generator draws states and the frame of statics."""
+        """Return losses by name; "loss" is minimised. `generator` draws states and the frame of statics."""
         clip, weights, world = example.clip, self.weights, self.agent.world_model
         observed = clip.observed()
         seen = world.see(last_frames(observed, world.past_frames))
@@ -109,7 +109,7 @@ class DriveWorldObjective(nn.Module):
         return losses
 
     def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
-        """How well states are foreseen, and what the policy and the estimated velocities are off by."""
+        """Return the divergence of prior and posterior and the errors of the policy and the velocities."""
         first = clip.now + 1 - len(unrolled.posteriors)
         pairs = zip(unrolled.posteriors, unrolled.priors, strict=True)
         kl = torch.stack([balanced_kl(q, p, self.weights.balance).mean() for q, p in pairs]).mean()
@@ -124,7 +124,7 @@ class DriveWorldObjective(nn.Module):
     def _volume_losses(
         self, world: DriveWorld, beliefs: Sequence[Belief], example: Example
     ) -> dict[str, Float[Tensor, ""]]:
-        """Occupancy and flow of every frame."""
+        """Return the losses of occupancy and flow over all frames."""
         weights, occ, flow = self.weights, [], []
         for frame, belief in enumerate(beliefs, start=example.clip.now - world.past_frames):
             decoded = world.decode(belief)
@@ -147,7 +147,7 @@ class DriveWorldObjective(nn.Module):
 
 
 def _action_loss(seen: Unrolled, clip: Clip, shown: slice) -> Float[Tensor, ""]:
-    """L1 between the policy's actions and what was done, but at the clip's last frame, where that is open."""
+    """Return the L1 error of the policy's actions, without the clip's last frame: its action is unknown."""
     done = actions_of(clip)[:, shown]
     frames = done.shape[1] - (1 if shown.stop >= clip.t_s.shape[1] else 0)
     off = (seen.actions[:, :frames] - done[:, :frames]).abs() / done.new_tensor(ACTION_SCALE)
@@ -155,7 +155,7 @@ def _action_loss(seen: Unrolled, clip: Clip, shown: slice) -> Float[Tensor, ""]:
 
 
 def _velocity_loss(seen: Unrolled, boxes: Boxes, known: Bool[Tensor, "b T"]) -> Float[Tensor, ""]:
-    """L1 of the velocities of the nearest moving objects, nearest first."""
+    """Return the L1 error of the velocities of the nearest moving objects, sorted by distance."""
     estimated = seen.velocities_mps
     truth, there = nearest_moving(boxes, estimated.shape[2])
     there = there & known[:, :, None]
@@ -164,7 +164,7 @@ def _velocity_loss(seen: Unrolled, boxes: Boxes, known: Bool[Tensor, "b T"]) -> 
 
 
 def nearest_moving(boxes: Boxes, count: int) -> tuple[Float[Tensor, "b T K 2"], Bool[Tensor, "b T K"]]:
-    """Velocities of the `count` nearest boxes that move, nearest first; which of them there are."""
+    """Return the velocities of the `count` nearest moving boxes, nearest first, and which of them exist."""
     moves = boxes.valid & (boxes.velocity.norm(dim=-1).nan_to_num(0.0) > MOVING_MPS)
     away_m = torch.where(moves, boxes.centre[..., :2].norm(dim=-1), torch.inf)
     missing = max(0, count - away_m.shape[-1])
@@ -177,5 +177,5 @@ def nearest_moving(boxes: Boxes, count: int) -> tuple[Float[Tensor, "b T K 2"], 
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Float[Tensor, ""]:
-    """Mean over a mask; 0 if it is empty."""
+    """Return the mean over a mask, or 0 if it is empty."""
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)

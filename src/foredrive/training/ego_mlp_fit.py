@@ -1,4 +1,4 @@
-"""Fitting the ego MLP, which plans from ego status alone."""
+"""Fitting of the ego MLP, which plans from ego status only."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ EGO_MLP_FIT = RowFit(steps=1000, batch_size=256, lr=1e-3, weight_decay=1e-2)
 
 @dataclass(frozen=True)
 class DrivenStatus(Record):
-    """Ego status at now and the driven future of N clips: all that the ego MLP learns from."""
+    """Training data of the ego MLP: ego status at now and the driven future of N clips."""
 
     status: Float[Tensor, "N S"]
     driven: Float[Tensor, "N T 3"]
-    """x, y, yaw of the rear axle in the ego frame at now."""
+    """x, y (m), yaw (rad) of the rear axle in the ego frame at now."""
     valid: Bool[Tensor, "N T"]
 
 
@@ -32,11 +32,11 @@ def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False
 
     Args:
         clips: batches.
-        past_frames: of the ego status.
-        target: whether the ego status holds where the route leads.
+        past_frames: key frames before now in the ego status.
+        target: whether the ego status includes the target point of the route.
 
     Raises:
-        InputError: if there are none.
+        InputError: there are no clips.
     """
     rows = [_driven_status(clip, past_frames, target) for clip in clips]
     if not rows:
@@ -63,7 +63,7 @@ def fit_ego_mlp(
     fit: RowFit = EGO_MLP_FIT,
     target: bool = False,
 ) -> EgoMLP:
-    """Fit an ego MLP by L1 on the driven steps. Takes seconds; the same seed gives the same weights."""
+    """Fit an ego MLP by L1 on the driven steps. It takes seconds; the same seed gives the same weights."""
     horizon_steps = data.driven.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -80,7 +80,7 @@ def fit_ego_mlp(
 
 
 def _standardise(model: EgoMLP, data: DrivenStatus) -> None:
-    """Set the means and spreads; columns that hardly vary keep a spread of 1."""
+    """Set means and spreads of inputs and outputs. Columns that hardly vary keep a spread of 1."""
     whole = data.driven[data.valid.all(dim=-1)].flatten(1)
     for name, rows in (("status", data.status), ("plan", whole)):
         if len(rows) < 2:

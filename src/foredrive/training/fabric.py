@@ -1,4 +1,4 @@
-"""Fabric as training wants it: mixed precision that leaves the inputs alone."""
+"""Fabric for training, with mixed precision that does not change the inputs."""
 
 from typing import Any, Literal
 
@@ -10,15 +10,20 @@ from foredrive.ops.precision import computes_bfloat16
 
 
 class _Autocast(MixedPrecision):
-    """Fabric's own rounds all inputs (focal lengths, poses) to half precision, or fails on frozen records."""
+    """Mixed precision without conversion of inputs.
+
+    Fabric's own converts all inputs (focal lengths, poses) to half precision, or fails on frozen records.
+    """
 
     def convert_input(self, data: Any) -> Any:
         return data
 
 
 def make_fabric(precision: Literal["32-true", "bf16-mixed"]) -> Fabric:
-    """All GPUs there are, or the CPU; "bf16-mixed" runs what autocast knows in bfloat16, unless that would
-    take longer."""
+    """Return a Fabric on all available GPUs or the CPU.
+
+    "bf16-mixed" uses bfloat16 autocast, unless that would be slower.
+    """
     device = "cuda" if torch.cuda.is_available() else "cpu"
     mixed = precision == "bf16-mixed" and computes_bfloat16(device)
     return Fabric(

@@ -1,7 +1,8 @@
-"""Imported last by the process that workers are forked from: what it holds stays shared with them.
+"""Garbage collector setting for worker processes; import it last in the process they are forked from.
 
-Python's garbage collector writes into every object that it looks at, so the first full collection in a worker
-would copy all pages of the modules it was born with, about 90 MiB. What is frozen is not looked at.
+Python's garbage collector writes into every object that it visits. The first full collection in a worker
+would therefore copy all pages of the modules it inherited, about 90 MiB. Frozen objects are not visited, so
+their pages stay shared.
 """
 
 import gc

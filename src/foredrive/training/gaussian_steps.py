@@ -1,4 +1,4 @@
-"""Which Gaussians there are while a scene is learned, their optimizer with them."""
+"""Changes of the number and places of Gaussians during training, together with their optimizer state."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,9 +11,9 @@ from foredrive.rendering.relocation import MIN_OPACITY, MOST_COPIES, shared_amon
 
 @torch.no_grad()
 def relocate(scene: RebuiltScene, optimizer: Optimizer, generator: torch.Generator) -> int:
-    """Move every dead Gaussian to a live one, drawn by opacity, which shares with it; returns how many.
+    """Move every dead Gaussian to a live one, drawn by opacity. Return how many were moved.
 
-    Both then look together as the live one did, and begin without momentum.
+    Both then render together as the live one did, and start without momentum.
     """
     opacity = scene.opacity_logit.sigmoid()
     dead = (opacity <= MIN_OPACITY).nonzero()[:, 0]
@@ -34,9 +34,9 @@ def relocate(scene: RebuiltScene, optimizer: Optimizer, generator: torch.Generat
 def grow(
     scene: RebuiltScene, optimizer: Optimizer, most: int, share: float, generator: torch.Generator
 ) -> int:
-    """Add a share of Gaussians to those there are, up to `most` in all; returns how many.
+    """Add a share of new Gaussians, up to `most` in total. Return how many were added.
 
-    Each is put beside one that is drawn by opacity, as in `relocate`.
+    Each is placed on one drawn by opacity, as in `relocate`.
     """
     count = min(int((1 + share) * len(scene.actor)), most) - len(scene.actor)
     if count <= 0:
@@ -54,14 +54,14 @@ def grow(
 
 
 def _drawn(weight: Float[Tensor, "N"], count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
-    """Rows by weight, with replacement; torch.multinomial takes no more than 2**24 rows."""
+    """Draw rows by weight, with replacement. torch.multinomial takes no more than 2**24 rows."""
     total = weight.double().cumsum(0).cpu()
     at = torch.rand(count, generator=generator, dtype=torch.float64) * total[-1]
     return torch.searchsorted(total, at).clamp_max(len(total) - 1).to(weight.device)
 
 
 def _share(scene: RebuiltScene, chosen: Int[Tensor, "count"]) -> None:
-    """Make those that were chosen as faint and small as they and their copies have to be together."""
+    """Lower opacity and scale of the chosen Gaussians, so that with their copies they render as before."""
     rows, copies = chosen.unique(return_counts=True)
     opacity, scale = shared_among(scene.opacity_logit[rows].sigmoid(), (copies + 1).clamp_max(MOST_COPIES))
     scene.opacity_logit[rows] = opacity.clamp(MIN_OPACITY, 1 - 1e-6).logit()
@@ -75,7 +75,7 @@ def _forget(optimizer: Optimizer, parameter: nn.Parameter, rows: Int[Tensor, "_"
 
 
 def _replace(optimizer: Optimizer, old: nn.Parameter, new: nn.Parameter) -> None:
-    """Let the optimizer go on with a longer parameter."""
+    """Continue the optimizer with a longer parameter."""
     state = optimizer.state.pop(old, {})
     optimizer.state[new] = {
         name: torch.cat([value, value.new_zeros(len(new) - len(old), *value.shape[1:])])

@@ -1,4 +1,4 @@
-"""Ctrl-C between steps, and never in the middle of one."""
+"""Ctrl-C handling: interrupts take effect between training steps."""
 
 import contextlib
 import multiprocessing
@@ -11,14 +11,14 @@ from foredrive.interrupts import raises_interrupts
 
 @contextlib.contextmanager
 def hold_interrupts() -> Iterator[Callable[[], bool]]:
-    """Note a first Ctrl-C, and raise it as KeyboardInterrupt at the end of the block only.
+    """Record a first Ctrl-C and raise it as KeyboardInterrupt only at the end of the block.
 
-    A step that is interrupted halfway has changed some of the weights or statistics already: a checkpoint of
-    it would be of no step at all. A second Ctrl-C is raised at once. Where Ctrl-C does not raise
-    KeyboardInterrupt (outside the main thread, or with a handler of somebody else's) nothing is changed.
+    A step interrupted halfway has already changed some weights or statistics, so a checkpoint then would
+    belong to no step. A second Ctrl-C is raised at once. Where Ctrl-C does not raise KeyboardInterrupt
+    (outside the main thread, or with a foreign handler) nothing is changed.
 
     Yields:
-        a function that tells whether Ctrl-C was pressed, so that the block can come to its end.
+        a function that returns whether Ctrl-C was pressed, so that the block can end.
     """
     if not raises_interrupts():
         yield lambda: False
@@ -41,13 +41,13 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
 
 
 def start_fork_server(preload: str) -> None:
-    """Start the process that worker processes are forked from, if it does not run yet.
+    """Start the process that worker processes are forked from, if it is not running yet.
 
-    It keeps SIGINT blocked, and its children inherit that: a terminal sends Ctrl-C to every process, but
-    workers shall not die of it before the step is done that needs them.
+    It keeps SIGINT blocked, and its children inherit that. A terminal sends Ctrl-C to every process, but
+    workers must not die before the step that needs them is done.
 
     Args:
-        preload: module that the workers need; it is imported once and not in each of them, and stays shared.
+        preload: module that the workers need. It is imported once, not in each worker, and stays shared.
     """
     multiprocessing.set_forkserver_preload([preload, "foredrive.training.frozen"])
     resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT

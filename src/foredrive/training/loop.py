@@ -19,17 +19,17 @@ from foredrive.files import atomic_path, naming
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import hold_interrupts, start_fork_server
 
-if TYPE_CHECKING:  # it takes seconds, and schedules and metrics are read without it
+if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
 
 
 @runtime_checkable
 class Batch(Protocol):
-    """What an objective is given; records move to devices as they are."""
+    """The input of an objective. It is a record that can be moved to a device."""
 
     @property
     def key(self) -> tuple[str, ...]:
-        """Names its items in errors."""
+        """Names of its items, for error messages."""
         ...
 
 
@@ -38,7 +38,7 @@ B = TypeVar("B", bound=Batch)
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast to train. AdamW, linear warm-up, then a cosine down to `final_lr_fraction`.
+    """Length and learning rate of a training: AdamW, linear warm-up, then a cosine to `final_lr_fraction`.
 
     The length is given in steps, or in epochs over the data when `steps` is None.
     """
@@ -56,7 +56,7 @@ class Schedule:
     seed: int = 0
 
     def total_steps(self, items: int) -> int:
-        """Number of steps over a data set of `items`."""
+        """Return the number of steps over a data set of `items`."""
         if (self.steps is None) == (self.epochs is None):
             raise InputError("a schedule has either steps or epochs")
         if self.steps is not None:
@@ -65,7 +65,7 @@ class Schedule:
         return self.epochs * math.ceil(items / self.batch_size)
 
     def lr_at(self, step: int, total: int) -> float:
-        """Learning rate of step `step` (from 0)."""
+        """Return the learning rate of step `step` (from 0)."""
         if step < self.warmup_steps:
             return self.lr * (step + 1) / self.warmup_steps
         progress = (step - self.warmup_steps) / max(total - self.warmup_steps, 1)
@@ -74,7 +74,7 @@ class Schedule:
 
 
 def batch_order(items: int, batch_size: int, seed: int) -> Iterator[list[int]]:
-    """Endless batches of indices, a fresh permutation each epoch, the same for the same seed."""
+    """Yield endless batches of indices, a new permutation each epoch, reproducible by `seed`."""
     for epoch in itertools.count():
         generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
         order = torch.randperm(items, generator=generator).tolist()
@@ -90,15 +90,15 @@ def train(
     folder: Path,
     fabric: "Fabric",
 ) -> None:
-    """Train `objective` on `dataset`; continue from `folder` where a checkpoint lies there.
+    """Train `objective` on `dataset`, continuing from a checkpoint in `folder` if there is one.
 
-    `objective(example, generator)` returns losses by name, of which "loss" is descended. Writes
-    `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is started again gives
-    the same losses as one that was not: the order of data and every random number follow from the seed and
-    the step. Ctrl-C ends it after the step that is under way, with a checkpoint; a second one at once.
+    `objective(example, generator)` returns losses by name; "loss" is minimised. Writes `folder/metrics.jsonl`
+    and `folder/checkpoints/step_N`. An interrupted run that is resumed gives the same losses as an
+    uninterrupted one: data order and random numbers follow from the seed and the step. Ctrl-C ends the run
+    after the current step, with a checkpoint. A second Ctrl-C ends it at once.
 
     Raises:
-        InputError: on an empty data set, or when a loss is not finite (the batch is named).
+        InputError: the data set is empty, or a loss is not finite (the message names the batch).
     """
     items = len(dataset)  # type: ignore[arg-type]
     if items == 0:
@@ -144,7 +144,7 @@ def _loader(
     total: int,
     fabric: "Fabric",
 ) -> DataLoader[B]:
-    """Batches from step `done` on; each rank takes its share of every global batch."""
+    """Return batches from step `done` on. Each rank takes its share of every global batch."""
     items = len(dataset)  # type: ignore[arg-type]
     batches = itertools.islice(
         batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed), done, total
@@ -157,13 +157,13 @@ def _loader(
         batch_sampler=mine,
         collate_fn=collate,
         num_workers=schedule.workers,
-        # forked workers die when numba's threads have run in the parent
+        # Forked workers crash if numba's threads have run in the parent.
         multiprocessing_context="forkserver" if schedule.workers else None,
     )
 
 
 def _share(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
-    """Every rank gets something, also of a short last batch."""
+    """Return a rank's part of a batch. Every rank gets at least one item, also of a short last batch."""
     padded = list(itertools.islice(itertools.cycle(batch), max(len(batch), world_size)))
     return padded[rank::world_size]
 
@@ -204,7 +204,7 @@ def _progress(fabric: "Fabric") -> Progress:
 
 
 class MetricsLog:
-    """metrics.jsonl: one line a step; lines past the step that is resumed from are dropped."""
+    """The file metrics.jsonl, one line per step. Lines after the resumed step are dropped."""
 
     def __init__(self, path: Path, done: int) -> None:
         kept = [line for line in read_metrics(path) if line["step"] <= done]
@@ -214,7 +214,7 @@ class MetricsLog:
         self.started = time.perf_counter()
 
     def add(self, step: int, losses: dict[str, Tensor]) -> None:
-        """Add the losses of one finished step."""
+        """Write the losses of one finished step."""
         now = time.perf_counter()
         line = {"step": step, **{name: value.item() for name, value in losses.items()}}
         with naming(self.path), self.path.open("a") as file:
@@ -223,7 +223,7 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | int]]:
-    """Whole lines of a metrics file; a last line cut off by a crash is left out."""
+    """Return the lines of a metrics file. A last line cut off by a crash is left out."""
     lines = []
     for text in path.read_text().splitlines() if path.exists() else []:
         try:

@@ -21,7 +21,7 @@ from foredrive.training.rays import thinned_rays
 class LossWeights:
     """The λ of NeMo. The paper: recon 0.5, occ 0.5, wpts 1 in fine-tuning; scal 10, BCE 1; perc not given.
 
-    In pre-training `wpts` is 0 and the planner is left as it is.
+    In pre-training `wpts` is 0 and the planner is not trained.
     """
 
     wpts: float
@@ -31,9 +31,9 @@ class LossWeights:
     bce: float = 1.0
     perc: float = 0.1
     occupied: float = 1.0
-    """Weight of occupied voxels within the BCE; above the road they are a few in a hundred."""
+    """Weight of occupied voxels within the BCE. Above the road, only a few percent are occupied."""
     future: float = 1.0
-    """Weight of each imagined key frame beside now's; the paper counts all alike."""
+    """Weight of each imagined key frame relative to now. The paper weighs all equally."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,21 @@ class NemoStage:
     ray_stride: int
     """One pixel in `ray_stride` along rows and columns is rendered."""
     vgg16: str | None = None
-    """File of VGG-16 weights for the perceptual loss, or "download"; None leaves that loss out (weight 0)."""
+    """File of VGG-16 weights for the perceptual loss, or "download". None disables that loss (weight 0)."""
     imagine: bool = True
-    """Imagine the future key frames and supervise them by what happened; otherwise the present alone."""
+    """Imagine the future key frames and supervise them. If False, only the present is trained."""
     kind: Literal["nemo"] = "nemo"
 
 
 class NemoObjective(nn.Module):
-    """Maps a batch to its losses; the module that is trained, so that DDP sees one forward pass.
+    """The mapping from a batch to its losses. It is the trained module, so that DDP sees one forward pass.
 
     Args:
         agent: world model and planner.
         weights: λ.
-        steps: T_f, number of future key frames that are imagined and supervised; 0 trains on now alone.
+        steps: T_f, number of future key frames that are imagined and supervised; 0 trains only on now.
         ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
-        image_features: VGG-16 features with real weights for the perceptual loss, or None to leave it out.
+        image_features: VGG-16 features with real weights for the perceptual loss, or None to disable it.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class NemoObjective(nn.Module):
         world.renderer.requires_grad_(weights.recon > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
-        """Losses by name; "loss" is the one to descend. The generator picks rays and samples."""
+        """Return losses by name; "loss" is minimised. The generator picks rays and samples."""
         clip, world = example.clip, self.agent.world_model
         now, weights = clip.now, self.weights
         observed = clip.observed()
@@ -129,7 +129,7 @@ class NemoObjective(nn.Module):
 
 
 def train_planner(planner: VolumePlanner, trained: bool) -> None:
-    """Whether a planner takes part in a stage; the ego MLP that it starts from never does."""
+    """Enable or disable the training of a planner. Its ego MLP is never trained here."""
     planner.requires_grad_(trained)
     if planner.ego_mlp is not None:
         planner.ego_mlp.requires_grad_(False)

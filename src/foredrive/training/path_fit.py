@@ -1,4 +1,4 @@
-"""Fitting what a planner reads along its path to many demonstrations, the world model being left as it is."""
+"""Fitting of a planner's path correction to many demonstrations, with a fixed world model."""
 
 from dataclasses import dataclass
 
@@ -13,36 +13,36 @@ from foredrive.training.row_fit import RowFit, fit_rows
 
 @dataclass(frozen=True)
 class PathFit(RowFit):
-    """Length and speed of the fit of a `PathCorrection`, and how many clips it is fitted to."""
+    """Schedule of the fit of a `PathCorrection` and spacing of its clips."""
 
     steps: int = 1500
     batch_size: int = 64
     lr: float = 1e-3
     weight_decay: float = 0.05
     stride_s: float = 1.0
-    """Time between the clips whose volumes are read."""
+    """Time between the clips whose volumes are read, s."""
 
 
 @dataclass(frozen=True)
 class PathDemonstrations(Record):
-    """What was read along N plans made without looking, what was planned without that, what was driven."""
+    """Features read along N initial plans, these plans, and the driven waypoints."""
 
     values: Float[Tensor, "N D S F"]
     places_m: Float[Tensor, "N D S 2"]
     told: Float[Tensor, "N _told"]
     planned_xy: Float[Tensor, "N T 2"]
-    """What the correction is added to."""
+    """Initial plans, which the correction is added to."""
     driven_xy: Float[Tensor, "N T 2"]
     valid: Bool[Tensor, "N T"]
 
 
 def fit_path(correction: PathCorrection, shown: PathDemonstrations, fit: PathFit, seed: int) -> None:
-    """Fit by L1 on the waypoints; inputs are standardised by their means and spreads from then on."""
+    """Fit the correction by L1 on the waypoints, and store means and spreads that standardise its inputs."""
     shown = shown.to(correction.mean.device)
     values = shown.values.float()
     correction.mean.copy_(values.mean(dim=(0, 1, 2)))
     correction.std.copy_(values.std(dim=(0, 1, 2)) + 1e-3)
-    correction.requires_grad_(True)  # joint training has left it out
+    correction.requires_grad_(True)  # joint training disables it
 
     def loss(rows: Tensor) -> Tensor:
         batch = shown[rows]

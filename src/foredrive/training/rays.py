@@ -1,4 +1,4 @@
-"""Which rays of a clip are rendered, and what colour they should have."""
+"""Rays to render from a clip, and their true colours."""
 
 from typing import NamedTuple
 
@@ -22,10 +22,10 @@ class ImageRays(NamedTuple):
 
 
 def thinned_rays(clip: Clip, frame: int, stride: int, generator: torch.Generator | None = None) -> ImageRays:
-    """Rays of every stride-th pixel of all cameras of one frame.
+    """Return the rays of every stride-th pixel of all cameras of one frame.
 
-    What is left is an image again, a small one, so that losses on images (perceptual ones too) apply. The
-    phase of the grid is random with a generator, central without.
+    The thinned pixels form a small image, so losses on images (also perceptual ones) apply. The phase of the
+    grid is random with a generator and central without.
 
     Args:
         clip: images [b T C 3 H W].

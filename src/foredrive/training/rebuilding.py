@@ -1,4 +1,4 @@
-"""Learning a scene from the images and sweeps of a drive, one of them a step."""
+"""Training of a scene from the images and sweeps of a drive, one image or sweep per step."""
 
 import dataclasses
 import time
@@ -29,12 +29,12 @@ from foredrive.training.interrupts import hold_interrupts
 from foredrive.training.loop import MetricsLog
 
 _SMOOTHING = 0.95
-"""Of the PSNR that is shown."""
+"""Smoothing factor of the displayed PSNR."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Of Adam, at the first step; all fall exponentially to `final` of it."""
+    """Learning rates of Adam at the first step. All decay exponentially to the fraction `final`."""
 
     mean_m: float = 1.6e-4
     quaternion: float = 1e-3
@@ -49,15 +49,15 @@ class LearningRates:
     camera_late_s: float = 1e-5
     final: float = 0.1
     final_mean: float = 0.01
-    """The same for centres."""
+    """The final fraction for centres."""
 
 
 @dataclass(frozen=True)
 class RebuildWeights:
-    """Of the losses (Hess et al., "SplatAD", 2025, §3.5 and supplement)."""
+    """Weights of the losses (Hess et al., "SplatAD", 2025, §3.5 and supplement)."""
 
     ssim: float = 0.2
-    """Share of 1 - SSIM, of L1 the rest."""
+    """Weight of 1 - SSIM; L1 has the rest."""
     depth: float = 0.1
     intensity: float = 1.0
     drop: float = 0.1
@@ -68,7 +68,7 @@ class RebuildWeights:
 
 @dataclass(frozen=True)
 class RebuildSchedule:
-    """How long a scene is learned, and how it grows."""
+    """Length of a scene's training, and its growth."""
 
     steps: int
     most_gaussians: int
@@ -76,44 +76,45 @@ class RebuildSchedule:
     weights: RebuildWeights = field(default_factory=RebuildWeights)
     images_per_sweep: int = 1
     beam_stride: int = 1
-    """Every so manieth beam of a sweep is looked at."""
+    """Stride of the beams used from a sweep."""
     shrink_steps: tuple[int, ...] = ()
-    """Until which steps images are shrunk: by 4 until the first, by 2 until the second of two."""
+    """Steps until which images are shrunk. With two entries: by 4 until the first step, by 2 until the
+    second."""
     grow_from: int = 500
     grow_until: int = 15_000
     grow_every: int = 100
     growth: float = 0.05
     walk: float = 5e5
-    """λ_noise: noise of centres in units of their learning rate."""
+    """λ_noise: noise of the centres in units of their learning rate."""
     mirror_share: float = 0.5
-    """How often an actor that looks the same from both sides is mirrored."""
+    """Probability that a left-right symmetric actor is mirrored in a step."""
     before_hit_m: float = 0.8
-    """Nothing may stop the light up to so far before a lidar's return."""
+    """Light that is stopped more than this distance before a lidar return is penalised, m."""
     checkpoint_every: int = 500
     seed: int = 0
 
     def shrink_at(self, step: int) -> int:
-        """By how much images are shrunk at a step."""
+        """Return the factor by which images are shrunk at a step."""
         return int(2 ** sum(step < end for end in self.shrink_steps))
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What is learned from."""
+    """The training data."""
 
     cameras: Sequence[CameraView]
     sweeps: Sequence[SweepView]
 
 
 def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: Path) -> None:
-    """Learn `scene`; go on from `folder` where a checkpoint lies there.
+    """Train `scene`, continuing from a checkpoint in `folder` if there is one.
 
-    Writes `folder/metrics.jsonl` and `folder/checkpoints/step_N`. A run that is interrupted and started again
-    comes to the same scene as one that was not: all random numbers follow from the seed and the step. Ctrl-C
-    ends it after the step that is under way, with a checkpoint.
+    Writes `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is resumed gives
+    the same scene as an uninterrupted one: all random numbers follow from the seed and the step. Ctrl-C ends
+    the run after the current step, with a checkpoint.
 
     Raises:
-        InputError: if there is nothing to learn from, or a loss is not finite.
+        InputError: there are neither images nor sweeps, or a loss is not finite.
     """
     if not seen.cameras and not seen.sweeps:
         raise InputError("there is nothing to learn from: neither images nor sweeps")
@@ -149,7 +150,7 @@ def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: 
 
 
 def make_optimizer(scene: RebuiltScene, rates: LearningRates) -> Adam:
-    """Adam with a group a kind of parameter, named as in `LearningRates`."""
+    """Return Adam with one group per kind of parameter, named as in `LearningRates`."""
     groups = []
     for rate in dataclasses.fields(rates):
         if rate.name in ("final", "final_mean"):
@@ -173,7 +174,7 @@ def _progress() -> Progress:
 
 
 class _Trainer:
-    """One step after the other."""
+    """A trainer that runs one step at a time."""
 
     def __init__(self, scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, optimizer: Adam) -> None:
         self.scene, self.seen, self.schedule, self.optimizer = scene, seen, schedule, optimizer
@@ -203,7 +204,7 @@ class _Trainer:
         return {name: value.detach() for name, value in losses.items()}
 
     def _item(self, step: int) -> tuple[Literal["image", "sweep"], int]:
-        """What is looked at: after every few images a sweep, each in a fresh order once all were seen."""
+        """Choose the item of a step: one sweep after every few images, each in a new order per epoch."""
         images, sweeps = len(self.seen.cameras), len(self.seen.sweeps)
         turn = self.schedule.images_per_sweep + 1
         if not images or (sweeps and step % turn == turn - 1):
@@ -252,7 +253,7 @@ class _Trainer:
 
     @torch.no_grad()
     def _evolve(self, step: int, generator: torch.Generator) -> None:
-        """Relocate, grow, walk."""
+        """Relocate, grow and walk."""
         schedule, scene = self.schedule, self.scene
         if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
             relocate(scene, self.optimizer, generator)

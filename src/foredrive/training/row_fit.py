@@ -1,4 +1,4 @@
-"""Fitting small modules to rows that lie in memory: no checkpoints, no workers, done in seconds."""
+"""Fitting of small modules to rows in memory: no checkpoints, no workers, a few seconds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class RowFit:
-    """Length and speed of a fit: AdamW, the learning rate falling to 0 along a cosine."""
+    """Schedule of a fit: AdamW, with a cosine learning rate down to 0."""
 
     steps: int
     batch_size: int
@@ -25,14 +25,14 @@ def fit_rows(
     fit: RowFit,
     seed: int,
 ) -> None:
-    """Descend `loss` on random rows, drawn with replacement; leaves `module` in evaluation mode.
+    """Minimise `loss` on random rows, drawn with replacement. `module` ends in evaluation mode.
 
     Args:
-        module: whose parameters are fitted.
-        rows: how many there are.
-        loss: of the rows with these indices.
-        fit: length and speed.
-        seed: of the draws, and of dropout. Torch's own generators are left as they were.
+        module: its parameters are fitted.
+        rows: number of rows.
+        loss: loss of the rows with the given indices.
+        fit: schedule.
+        seed: seed of the draws and of dropout. Torch's own generators are restored afterwards.
     """
     optimizer = torch.optim.AdamW(module.parameters(), lr=fit.lr, weight_decay=fit.weight_decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)

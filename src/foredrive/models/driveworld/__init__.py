@@ -1,4 +1,4 @@
-"""DriveWorld (Min et al. 2024): a world model whose state is remembered, and whose scene is handed on."""
+"""DriveWorld (Min et al. 2024): a world model with a memory of past states and a static scene branch."""
 
 from foredrive.models.driveworld.actions import actions_of, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence

@@ -1,4 +1,4 @@
-"""What a vehicle does from one key frame to the next, as velocity and steering angle of a bicycle."""
+"""Actions of a vehicle between key frames: velocity and steering angle of a bicycle model."""
 
 import math
 
@@ -11,7 +11,7 @@ from foredrive.scene import Clip, Frames
 
 WHEELBASE_M = 2.86
 SLOW_MPS = 0.5
-"""A vehicle slower than this is said not to steer: its curvature is noise."""
+"""Below this speed (m/s) the steering angle is set to 0, because the curvature is noise."""
 
 
 def actions_of(clip: Clip) -> Float[Tensor, "b T 2"]:
@@ -30,13 +30,13 @@ def actions_between(
     speed_mps: Float[Tensor, "b T"],
     speed_valid: Bool[Tensor, "b T"],
 ) -> Float[Tensor, "b T 2"]:
-    """Return the action from each frame to the next: velocity, m/s, and the bicycle's steering angle, rad.
+    """Return the action from each frame to the next: velocity (m/s) and steering angle of the bicycle (rad).
 
-    The angle is that of the arc between two poses; 0 at the last frame, where it is not known, and while
-    the vehicle hardly moves.
+    The angle is that of the arc between the two poses. It is 0 at the last frame, where it is unknown, and
+    while the vehicle hardly moves.
 
     Args:
-        T_any_ego: poses in any one frame.
+        T_any_ego: poses in any common frame.
     """
     T_step = (inverse_se3(T_any_ego[:, :-1]) @ T_any_ego[:, 1:]).float()
     way_m = T_step[..., :2, 3].norm(dim=-1)
@@ -49,7 +49,7 @@ def actions_between(
 
 
 def motion_of(action: Float[Tensor, "b 2"], dt_s: float) -> Float[Tensor, "b 4 4"]:
-    """The ego frame after an action, in that before it: the bicycle's arc."""
+    """Return the pose after an action in the ego frame before it, along the arc of the bicycle."""
     speed, steering = action.unbind(-1)
     way_m, curvature = speed * dt_s, torch.tan(steering) / WHEELBASE_M
     yaw = way_m * curvature

@@ -9,48 +9,50 @@ from torch import Tensor
 from foredrive.scene.record import Record
 
 LEAST_STD = 0.1
-"""Keeps the divergence of two states finite, as in MILE (Hu et al. 2022)."""
+"""Smallest standard deviation. It keeps the divergence between two states finite, as in MILE (Hu et al.
+2022)."""
 
 
 @dataclass(frozen=True)
 class DiagonalGaussian(Record):
-    """N(mean, diag(std²))."""
+    """The distribution N(mean, diag(std²))."""
 
     mean: Float[Tensor, "*b S"]
     std: Float[Tensor, "*b S"]
 
     @classmethod
     def of(cls, raw: Float[Tensor, "*b _R"]) -> "DiagonalGaussian":
-        """From a network's output: mean and std = 2 sigmoid(raw / 2) + 0.1, which is 1.1 at 0."""
+        """Build it from a network's output: mean, and std = 2 sigmoid(raw / 2) + 0.1, which is 1.1 at 0."""
         mean, spread = raw.float().chunk(2, dim=-1)
         return cls(mean, 2 * torch.sigmoid(spread / 2) + LEAST_STD)
 
     @classmethod
     def standard(cls, like: Float[Tensor, "*b S"]) -> "DiagonalGaussian":
-        """N(0, I), of the shape of another state."""
+        """Return N(0, I) in the shape of another state."""
         return cls(torch.zeros_like(like), torch.ones_like(like))
 
     def sample(self, generator: torch.Generator | None = None) -> Float[Tensor, "*b S"]:
-        """Reparametrised: gradients reach mean and std (Kingma & Welling 2014)."""
+        """Draw a reparametrised sample, so that gradients reach mean and std (Kingma & Welling 2014)."""
         device = self.mean.device if generator is None else generator.device
         noise = torch.randn(self.mean.shape, generator=generator, device=device, dtype=self.mean.dtype)
         return self.mean + self.std * noise.to(self.mean.device)
 
     def detach(self) -> "DiagonalGaussian":
-        """Without a gradient."""
+        """Return a copy without gradient."""
         return self.map_tensors(torch.detach)
 
 
 def kl_divergence(q: DiagonalGaussian, p: DiagonalGaussian) -> Float[Tensor, "*b"]:
-    """KL(q ‖ p) = Σ ln(σp/σq) + (σq² + (μq - μp)²) / 2σp² - 1/2, nats."""
+    """Return KL(q ‖ p) = Σ ln(σp/σq) + (σq² + (μq - μp)²) / 2σp² - 1/2, in nats."""
     terms = (p.std / q.std).log() + (q.std**2 + (q.mean - p.mean) ** 2) / (2 * p.std**2) - 0.5
     return terms.sum(dim=-1)
 
 
 def balanced_kl(posterior: DiagonalGaussian, prior: DiagonalGaussian, balance: float) -> Float[Tensor, "*b"]:
-    """balance · KL(sg(q) ‖ p) + (1 - balance) · KL(q ‖ sg(p)) (Hafner et al. 2021, KL balancing).
+    """Return balance · KL(sg(q) ‖ p) + (1 - balance) · KL(q ‖ sg(p)) (KL balancing, Hafner et al. 2021).
 
-    The value is that of KL(q ‖ p); the prior learns faster than the posterior gives way to it.
+    The value equals KL(q ‖ p). With balance > 1/2 the prior moves faster towards the posterior than the
+    posterior towards the prior.
     """
     of_prior = kl_divergence(posterior.detach(), prior)
     of_posterior = kl_divergence(posterior, prior.detach())

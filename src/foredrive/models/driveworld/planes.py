@@ -1,4 +1,4 @@
-"""From planes to vectors and back: what DriveWorld's latent dynamics see, and what is decoded from them."""
+"""Networks between planes and vectors: the inputs and outputs of DriveWorld's latent dynamics."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from foredrive.scene import VoxelSpec
 
 
 class AdaptiveNorm(nn.Module):
-    """Instance normalisation whose scale and shift come from a vector (Huang & Belongie 2017, AdaIN)."""
+    """Instance normalisation whose scale and shift come from a vector (AdaIN, Huang & Belongie 2017)."""
 
     def __init__(self, channels: int, vector: int) -> None:
         super().__init__()
@@ -21,17 +21,17 @@ class AdaptiveNorm(nn.Module):
     def forward(
         self, plane: Float[Tensor, "b C Y X"], vector: Float[Tensor, "b V"]
     ) -> Float[Tensor, "b C Y X"]:
-        """(1 + scale) ⊙ norm(plane) + shift."""
+        """Return (1 + scale) ⊙ norm(plane) + shift."""
         scale, shift = self.style(vector)[..., None, None].chunk(2, dim=1)
         return (1 + scale) * self.norm(plane) + shift
 
 
 class PlaneToVector(nn.Module):
-    """x_t: a plane as one vector, by strided convolutions that keep where things are until the end.
+    """A plane reduced to one vector x_t by strided convolutions, flattened only at the end.
 
     Args:
-        channels: of the plane.
-        hidden: of the convolutions.
+        channels: channels of the plane.
+        hidden: channels of the first convolution.
         vector: width of x_t (512 in the paper).
     """
 
@@ -50,18 +50,19 @@ class PlaneToVector(nn.Module):
         )
 
     def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b V"]:
-        """The vector."""
+        """Return the vector."""
         return self.net(plane)
 
 
 class VectorToPlane(nn.Module):
-    """A vector expanded to a plane: a learned constant that grows twofold step by step, styled by the vector
-    (m_θ; MILE's decoder).
+    """A vector expanded to a plane (m_θ; the decoder of MILE).
+
+    A learned constant is upsampled by a factor of two per step and styled by the vector at each step.
 
     Args:
-        vector: width of what it is expanded from.
-        widths: channels of each step, coarsest first; the last is the plane's.
-        size_yx: of the plane.
+        vector: width of the input.
+        widths: channels of each step, coarsest first; the last is that of the plane.
+        size_yx: size of the plane.
     """
 
     def __init__(self, vector: int, widths: Sequence[int], size_yx: tuple[int, int]) -> None:
@@ -76,7 +77,7 @@ class VectorToPlane(nn.Module):
         self.style = nn.ModuleList([AdaptiveNorm(width, vector) for width in widths])
 
     def forward(self, vector: Float[Tensor, "b V"]) -> Float[Tensor, "b C Y X"]:
-        """The plane."""
+        """Return the plane."""
         plane = self.constant.expand(len(vector), -1, -1, -1)
         for size, convolve, style in zip(self.sizes, self.convolve, self.style, strict=True):
             if plane.shape[-2:] != size:
@@ -86,7 +87,7 @@ class VectorToPlane(nn.Module):
 
 
 class StaticScene(nn.Module):
-    """b̂ = z_θ(b'): what stands, read off the plane of one frame and handed on without warping (§3.1)."""
+    """Static features b̂ = z_θ(b'), read from the plane of one frame and passed on without warping (§3.1)."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -98,18 +99,20 @@ class StaticScene(nn.Module):
         )
 
     def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b _O Y X"]:
-        """Latent statics."""
+        """Return the latent statics."""
         return self.net(plane)
 
 
 def carried_plane(
     plane: Float[Tensor, "b C Y X"], T_src_dst: Float[Tensor, "b 4 4"], spec: VoxelSpec
 ) -> Float[Tensor, "b C Y X"]:
-    """A plane in the frame dst, read bilinearly where dst's cells lie in src; 0 beyond its edge.
+    """Warp a plane from the frame src to the frame dst.
+
+    Each cell of dst is read bilinearly at its place in src; it is 0 beyond the edge.
 
     Args:
-        plane: over the ground of `spec`, in the frame src.
-        T_src_dst: points of dst -> src; only their way over the ground counts.
+        plane: features over the ground of `spec`, in the frame src.
+        T_src_dst: transform of points dst -> src; only its motion over the ground is used.
     """
     size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
     lower = plane.new_tensor(spec.lower_m[:2])
@@ -122,10 +125,10 @@ def carried_plane(
 
 
 class PlanesToVolume(nn.Module):
-    """l_θ up to its last layer: planes, put together channel by channel, unfolded into a volume of features.
+    """Planes, concatenated along channels, unfolded into a feature volume: l_θ without its last layer.
 
     Args:
-        channels: of all planes together.
+        channels: channels of all planes together.
         hidden: channels of the volume before the last convolution.
         out: D.
         height: Z.
@@ -144,6 +147,6 @@ class PlanesToVolume(nn.Module):
         )
 
     def forward(self, planes: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b D Z Y X"]:
-        """The volume."""
+        """Return the volume."""
         unfolded = self.unfold(planes).unflatten(1, (-1, self.height))
         return self.convolve(unfolded)

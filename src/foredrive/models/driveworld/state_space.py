@@ -10,9 +10,9 @@ from foredrive.models.driveworld.gaussian import DiagonalGaussian
 from foredrive.scene.record import Record
 
 ACTIONS = 2
-"""Velocity, m/s, and steering angle, rad, of the bicycle."""
+"""Number of action channels: velocity (m/s) and steering angle (rad) of the bicycle."""
 ACTION_SCALE = (10.0, 0.1)
-"""What actions are divided by on their way in and multiplied by on their way out."""
+"""Scale of the actions: inputs are divided by it and outputs multiplied by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,43 +22,43 @@ class StateSpaceConfig:
     observation: int
     """Width of x_t (512 in the paper)."""
     state: int
-    """S (512 in MILE)."""
+    """S, width of the stochastic state (512 in MILE)."""
     history: int
-    """H (1024 in MILE)."""
+    """H, width of the deterministic history (1024 in MILE)."""
     memory: int
-    """M, the number of histories that the Dynamic Memory Bank holds."""
+    """M, number of histories held by the Dynamic Memory Bank."""
     heads: int
-    """Of the attention to the memory."""
+    """Heads of the attention to the memory."""
     objects: int
-    """K, the moving objects whose velocities are estimated."""
+    """K, number of moving objects whose velocities are estimated."""
     hidden: int
     """Width of the MLPs."""
     action: int = 64
-    """Width of an action's encoding."""
+    """Width of the encoding of an action."""
     memory_bank: bool = True
-    """Attend to the memory; otherwise h̃ is h."""
+    """Attend to the memory. If False, h̃ is h."""
     motion_norm: bool = True
-    """Motion-aware layer normalisation; otherwise s̃ is s."""
+    """Use motion-aware layer normalisation. If False, s̃ is s."""
 
 
 @dataclass(frozen=True)
 class Latent(Record):
-    """What the model carries from one time to the next."""
+    """The latent state that the model carries from one time to the next."""
 
     history: Float[Tensor, "b H"]
     """h_t, deterministic."""
     state: Float[Tensor, "b S"]
     """s_t, stochastic."""
     memory: Float[Tensor, "b M H"]
-    """h_1 … h_t, newest last; of more than M the oldest are forgotten."""
+    """h_1 … h_t, newest last. Only the last M are kept."""
     remembered: Bool[Tensor, "b M"]
-    """Which places of the memory are filled."""
+    """True for the filled places of the memory."""
 
 
 class MotionAwareNorm(nn.Module):
-    """s̃ = γ ⊙ LN(s) + β with γ, β from the velocities of K objects and the time that passes (§3.1).
+    """Normalisation s̃ = γ ⊙ LN(s) + β, with γ, β from the velocities of K objects and the time step (§3.1).
 
-    As in StreamPETR (Wang et al. 2023) it starts as plain normalisation: γ at 1, β at 0.
+    As in StreamPETR (Wang et al. 2023) it starts as plain normalisation: γ = 1, β = 0.
 
     Args:
         state: S.
@@ -77,17 +77,17 @@ class MotionAwareNorm(nn.Module):
     def forward(
         self, state: Float[Tensor, "b S"], velocity_mps: Float[Tensor, "b K 2"], dt_s: Float[Tensor, "b"]
     ) -> Float[Tensor, "b S"]:
-        """The motion-aware state."""
+        """Return the motion-aware state."""
         motion = self.reduce(torch.cat([velocity_mps.flatten(1) / ACTION_SCALE[0], dt_s[:, None]], dim=-1))
         return self.gamma(motion) * self.norm(state) + self.beta(motion)
 
 
 class Recall(nn.Module):
-    """h̃_t: the history refined by attention to all that the memory holds (§3.1).
+    """The history refined by attention to the whole memory: h̃_t (§3.1).
 
     Args:
         history: H.
-        heads: of the attention.
+        heads: attention heads.
     """
 
     def __init__(self, history: int, heads: int) -> None:
@@ -96,7 +96,7 @@ class Recall(nn.Module):
         self.norm = nn.LayerNorm(history)
 
     def forward(self, latent: Latent) -> Float[Tensor, "b H"]:
-        """The refined history."""
+        """Return the refined history."""
         asked = latent.history[:, None]
         read, _ = self.attention(
             asked, latent.memory, latent.memory, key_padding_mask=~latent.remembered, need_weights=False
@@ -105,10 +105,10 @@ class Recall(nn.Module):
 
 
 class StateSpace(nn.Module):
-    """Posterior, prior, policy and transition.
+    """Posterior, prior, policy and transition of the latent dynamics.
 
-    Where the velocities of the K objects come from the paper leaves open: here they are estimated from s_t,
-    so that they can be in imagination too, and learned from labelled boxes where there are any.
+    The paper does not say where the velocities of the K objects come from. Here they are estimated from s_t,
+    so that they exist in imagination too. They are learned from labelled boxes where there are any.
 
     Args:
         config: sizes.
@@ -134,7 +134,7 @@ class StateSpace(nn.Module):
     action_scale: Tensor
 
     def begin(self, batch: int, device: torch.device) -> Latent:
-        """h_1 = 0, and nothing remembered but that."""
+        """Return the initial latent: h_1 = 0, and a memory that holds only h_1."""
         history, state, memory = self.sizes
         zeros = torch.zeros(batch, history, device=device)
         latent = Latent(
@@ -146,7 +146,7 @@ class StateSpace(nn.Module):
         return _remembering(latent, zeros)
 
     def transition(self, latent: Latent, dt_s: Float[Tensor, "b"]) -> Latent:
-        """h_{t+1} = f(h̃_t, s̃_t), remembered; the state is still that of before."""
+        """Return the latent with h_{t+1} = f(h̃_t, s̃_t), added to the memory. The state stays s_t."""
         state = latent.state
         if self.motion_norm is not None:
             state = self.motion_norm(state, self.velocities_mps(state), dt_s)
@@ -156,26 +156,26 @@ class StateSpace(nn.Module):
     def posterior(
         self, latent: Latent, last_action: Float[Tensor, "b 2"], x: Float[Tensor, "b X"]
     ) -> DiagonalGaussian:
-        """q(s_t | o_≤t, a_<t) from (h_t, a_{t-1}, x_t) (eq. 1)."""
+        """Return q(s_t | o_≤t, a_<t) from (h_t, a_{t-1}, x_t) (eq. 1)."""
         told = torch.cat([latent.history, self.action_in(last_action / self.action_scale), x], dim=-1)
         return DiagonalGaussian.of(self.posterior_net(told))
 
     def prior(self, latent: Latent, last_action: Float[Tensor, "b 2"]) -> DiagonalGaussian:
-        """p(s_t | h_{t-1}, s_{t-1}) from (h_t, â_{t-1}) (eq. 2)."""
+        """Return p(s_t | h_{t-1}, s_{t-1}) from (h_t, â_{t-1}) (eq. 2)."""
         told = torch.cat([latent.history, self.action_in(last_action / self.action_scale)], dim=-1)
         return DiagonalGaussian.of(self.prior_net(told))
 
     def action(self, latent: Latent) -> Float[Tensor, "b 2"]:
-        """â_t = π(h_t, s_t): velocity, m/s, and steering angle, rad."""
+        """Return â_t = π(h_t, s_t): velocity (m/s) and steering angle (rad)."""
         return self.policy(torch.cat([latent.history, latent.state], dim=-1)).float() * self.action_scale
 
     def velocities_mps(self, state: Float[Tensor, "b S"]) -> Float[Tensor, "b K 2"]:
-        """Estimated velocities over ground of the K nearest moving objects, in the ego axes."""
+        """Return estimated velocities over ground (m/s, ego axes) of the K nearest moving objects."""
         return self.velocity(state).unflatten(-1, (self.objects, 2)).float() * ACTION_SCALE[0]
 
 
 def _remembering(latent: Latent, history: Float[Tensor, "b H"]) -> Latent:
-    """With a new history, which is remembered."""
+    """Return the latent with a new history, which is added to the memory."""
     filled = torch.ones_like(latent.remembered[:, :1])
     return Latent(
         history=history,

@@ -1,4 +1,4 @@
-"""Task prompts: what a text encoder makes of a task tells the features what they are for (§3.3)."""
+"""Task prompts: the text encoding of a task tells the features which task they serve (§3.3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ PROMPTS = {
     "forecast": "The task is to predict the 3D occupancy of the future scene.",
     "plan": "The task is to plan the path that the ego vehicle will drive.",
 }
-"""By the names that heads ask for; the first is the paper's."""
+"""Prompts by the names of the tasks. The first one is from the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,15 +23,15 @@ class PromptConfig:
     """Sizes of a `TaskPrompt`."""
 
     widths: tuple[int, ...]
-    """Channels of the steps of the expansion, the last those of the plane."""
+    """Channels of the steps of the expansion; the last is that of the plane."""
     encoding: int
-    """Width of the text encoder's output."""
+    """Width of the output of the text encoder."""
     text_encoder: str
-    """By name or folder; needed once, by training from scratch."""
+    """Name or folder of the text encoder. Needed only once, when training starts from scratch."""
 
 
 def encode_prompts(config: PromptConfig) -> Float[Tensor, "P E"]:
-    """Return the encoding of every prompt in `PROMPTS`, in their order.
+    """Return the encoding of every prompt in `PROMPTS`, in order.
 
     Raises:
         InputError: the text encoder cannot be loaded, or its output has another width.
@@ -46,15 +46,15 @@ def encode_prompts(config: PromptConfig) -> Float[Tensor, "P E"]:
 
 
 class TaskPrompt(nn.Module):
-    """q(g(p)): a prompt's frozen encoding, expanded to a plane by AdaIN and convolutions.
+    """The plane q(g(p)): the frozen encoding of a prompt, expanded by AdaIN and convolutions.
 
-    The text encoder runs once, when the model is built; its encodings are part of the weights, so that a
-    trained model needs it no more.
+    The text encoder runs once, when the model is built. Its encodings are part of the weights, so a trained
+    model does not need it.
 
     Args:
         encodings: g(p) of each prompt.
-        widths: channels of the steps of the expansion, the last those of the plane.
-        size_yx: of the plane.
+        widths: channels of the steps of the expansion; the last is that of the plane.
+        size_yx: size of the plane.
     """
 
     encodings: Tensor
@@ -68,6 +68,6 @@ class TaskPrompt(nn.Module):
         self.expand = VectorToPlane(encodings.shape[1], widths, size_yx)
 
     def forward(self, task: str, batch: int) -> Float[Tensor, "b C Y X"]:
-        """The plane of one task."""
+        """Return the plane of one task."""
         encoding = self.encodings[self.tasks.index(task)]
         return self.expand(encoding[None]).expand(batch, -1, -1, -1)

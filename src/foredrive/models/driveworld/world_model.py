@@ -35,7 +35,8 @@ ENCODERS: Mapping[type, Callable[..., Encoder]] = {
     LiftSplatConfig: LiftSplatEncoder,
     PooledLiftingConfig: PooledLiftingEncoder,
 }
-"""Each takes its config, the grid, the channels, the plane's width and the number of image feature levels."""
+"""Encoder class per config. Each takes the config, the grid, the channels D, the width of the plane and the
+number of image feature levels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,7 @@ class DriveWorldConfig:
     encoder: Annotated[PooledLiftingConfig | LiftSplatConfig, Discriminator("kind")]
     states: StateSpaceConfig
     channels: int
-    """D, of the volume and of the image features."""
+    """D, channels of the volume and of the image features."""
     plane: int
     """C, channels of the plane that images are lifted to."""
     observation_hidden: int
@@ -56,27 +57,27 @@ class DriveWorldConfig:
     volume_hidden: int
     """Channels of the volume before its last convolution (l_θ)."""
     statics: int
-    """Channels of latent statics; 0 leaves Static Scene Propagation out."""
+    """Channels of the latent statics; 0 disables Static Scene Propagation."""
     prompt: PromptConfig | None
-    """Task prompts; None leaves them out."""
+    """Task prompts; None disables them."""
     carry_statics: bool = False
-    """Move latent statics along with the ego vehicle, by the driven path and, in imagination, by the actions.
-    The paper hands them on as they are."""
+    """Warp the latent statics by the ego motion: the driven path and, in imagination, the actions. The paper
+    passes them on without warping."""
     occupied_prior: float = 0.02
-    """Where occupancy starts: most of space is free."""
+    """Initial occupancy probability. It is small because most space is free."""
     kind: Literal["driveworld"] = "driveworld"
 
 
 @dataclass(frozen=True)
 class Seen(Record):
-    """The last T frames of a clip before anything is made of them in time."""
+    """Encodings of the last T frames of a clip, before any processing in time."""
 
     planes: Float[Tensor, "b T C Y X"]
-    """Each in its own ego frame."""
+    """One plane per frame, each in its own ego frame."""
     actions: Float[Tensor, "b T 2"]
-    """What was done at each but the last; zeros there."""
+    """Actions at each frame; zeros at the last."""
     T_now_ego: Float[Tensor, "b T 4 4"]
-    """Each frame's ego frame -> that of the last."""
+    """Transform from the ego frame of each frame to that of the last."""
 
 
 @dataclass(frozen=True)
@@ -84,26 +85,27 @@ class Unrolled:
     """One pass over the frames of a clip, for training."""
 
     beliefs: tuple[Belief, ...]
-    """Of the T observed frames, then of the L imagined ones; `T_now_ego` leads to the statics' frame."""
+    """Beliefs of the T observed frames, then of the L imagined ones. `T_now_ego` leads to the frame of the
+    statics."""
     posteriors: tuple[DiagonalGaussian, ...]
-    """Of the observed frames."""
+    """Posteriors of the observed frames."""
     priors: tuple[DiagonalGaussian, ...]
     actions: Float[Tensor, "b K 2"]
-    """π's at every frame of `beliefs`."""
+    """Actions of the policy π at every frame of `beliefs`."""
     velocities_mps: Float[Tensor, "b T M 2"]
-    """Of moving objects, estimated at the observed frames."""
+    """Estimated velocities (m/s) of moving objects at the observed frames."""
 
 
 class DriveWorld(nn.Module):
-    """A `WorldModel`. Beliefs of later frames are in those frames' own ego frames, nothing is warped.
+    """A `WorldModel`. Beliefs of later frames are in the ego frames of those frames; volumes are not warped.
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         past_frames: T - 1.
-        dt_s: time between key frames.
-        fetch: load the backbone's weights and encode the task prompts; not needed where trained weights will
-            replace them.
+        dt_s: time between key frames, s.
+        fetch: load the weights of the backbone and encode the task prompts. Not needed when trained weights
+            replace them later.
 
     Raises:
         InputError: the text encoder cannot be loaded.
@@ -142,18 +144,18 @@ class DriveWorld(nn.Module):
         nn.init.constant_(self.occupancy.bias, math.log(prior / (1 - prior)))
         self.flow = nn.Linear(channels, 3)
         for parameter in self.flow.parameters():
-            nn.init.zeros_(parameter)  # nothing moves until it is learned
+            nn.init.zeros_(parameter)  # start with zero flow
 
     def observe(self, clip: Clip) -> Belief:
-        """Return the belief about now by the posterior's means; statics are now's.
+        """Return the belief about now, from the means of the posteriors and the statics of now.
 
         Raises:
-            InputError: if the clip shows the future or has too few frames.
+            InputError: the clip contains future frames or has too few frames.
         """
         return self.encode(last_frames(clip, self.past_frames))
 
     def encode(self, frames: Frames) -> Belief:
-        """Do the work of `observe`; no step depends on the values of the data."""
+        """Do the work of `observe`. No step depends on the values of the data."""
         return self.believe(self.see(frames))
 
     def see(self, frames: Frames) -> Seen:
@@ -166,7 +168,7 @@ class DriveWorld(nn.Module):
         return Seen(planes, actions_in(frames), frames.T_now_ego.float())
 
     def believe(self, seen: Seen) -> Belief:
-        """`observe` of frames that have been seen."""
+        """Return the belief of `observe` from frames that are already lifted."""
         latents, *_ = self._filter(seen, None)
         return self._decoded(latents[-1], self._statics(seen.planes[:, -1]), "occupancy", None)
 
@@ -177,14 +179,14 @@ class DriveWorld(nn.Module):
         actions: Float[Tensor, "b K 2"] | None = None,
         generator: torch.Generator | None = None,
     ) -> list[Belief]:
-        """The next `steps` key frames under given actions, or those of the model's own policy.
+        """Imagine the next `steps` key frames under the given actions or those of the model's own policy.
 
         Args:
-            actions: velocity, m/s, and steering angle, rad, of now and the frames after it.
-            generator: draws states from the prior; without one they are its means.
+            actions: velocity (m/s) and steering angle (rad) at now and at the frames after it.
+            generator: draws states from the prior; without it, states are the means of the prior.
 
         Raises:
-            InputError: the belief is not one of this model, or there are too few actions.
+            InputError: the belief is not from this model, or there are too few actions.
         """
         if belief.state is None or belief.statics is None:
             raise InputError("DriveWorld imagines from beliefs of its own")
@@ -206,8 +208,9 @@ class DriveWorld(nn.Module):
         return futures
 
     def decode(self, belief: Belief) -> Decoded:
-        """Occupancy, flow, and the policy's action."""
-        # both heads at once, where the volume lies: two layers over voxels make a step a tenth longer
+        """Decode occupancy, flow and the action of the policy."""
+        # One convolution for both heads, in the memory layout of the volume: two linear layers over voxels
+        # would make a step a tenth longer.
         heads = (self.occupancy, self.flow)
         weight = torch.cat([head.weight for head in heads])[:, :, None, None, None]
         read = conv3d(belief.volume, weight, torch.cat([head.bias for head in heads])).float()
@@ -216,7 +219,7 @@ class DriveWorld(nn.Module):
         return Decoded(occupancy_logit=logit, feature=belief.volume, flow=flow, action=action)
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """The volume under another task's prompt; without prompts that of the belief."""
+        """Return the volume under the prompt of another task. Without prompts it is that of the belief."""
         if self.prompt is None:
             return belief.volume
         if belief.state is None or belief.statics is None:
@@ -231,11 +234,11 @@ class DriveWorld(nn.Module):
         generator: torch.Generator | None,
         statics_of: Literal["random", "now"] = "random",
     ) -> Unrolled:
-        """All that training looks at: T observed frames by the posterior, `steps` imagined by the prior.
+        """Return all that training needs: T frames observed by the posterior, `steps` imagined by the prior.
 
         Args:
-            generator: samples the states; without one they are means, and statics now's.
-            statics_of: the frame whose statics all frames are decoded from (§3.1: a random one).
+            generator: samples the states. Without it, states are means and the statics are those of now.
+            statics_of: frame whose statics all frames are decoded with (§3.1: a random one).
         """
         latents, posteriors, priors = self._filter(seen, generator)
         frames = len(latents)
@@ -265,7 +268,7 @@ class DriveWorld(nn.Module):
         )
 
     def without_time(self, seen: Seen) -> list[Belief]:
-        """Each observed frame from its own plane alone, as pre-training by single frames looks at them."""
+        """Decode each observed frame from its own plane only, as in single-frame pre-training."""
         nothing = self.states.begin(len(seen.planes), seen.planes.device)
         return [
             self._decoded(nothing, self._statics(plane), "occupancy", None)
@@ -275,9 +278,9 @@ class DriveWorld(nn.Module):
     def _filter(
         self, seen: Seen, generator: torch.Generator | None
     ) -> tuple[list[Latent], list[DiagonalGaussian], list[DiagonalGaussian]]:
-        """Latents, posteriors and priors of the observed frames; the first prior is N(0, I).
+        """Return latents, posteriors and priors of the observed frames. The first prior is N(0, I).
 
-        States are drawn with a generator, the posteriors' means without.
+        States are sampled with `generator`; without it, they are the means of the posteriors.
         """
         b, frames = seen.planes.shape[:2]
         vectors = self.to_vector(seen.planes.flatten(0, 1)).unflatten(0, (b, frames))
@@ -297,19 +300,19 @@ class DriveWorld(nn.Module):
         return latents, posteriors, priors
 
     def _ahead(self, latent: Latent, action: Float[Tensor, "b 2"]) -> tuple[Latent, DiagonalGaussian]:
-        """One key frame on: the new history, and what state to expect there."""
+        """Go one key frame ahead. Return the latent with its new history and the prior of its state."""
         dt_s = torch.full_like(latent.history[:, 0], self.dt_s)
         latent = self.states.transition(latent, dt_s)
         return latent, self.states.prior(latent, action)
 
     def _statics(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b _S Y X"]:
-        """b̂; no channels without Static Scene Propagation."""
+        """Return the statics b̂ of a plane; no channels without Static Scene Propagation."""
         return plane[:, :0] if self.statics is None else self.statics(plane)
 
     def _carried(
         self, statics: Float[Tensor, "b _S Y X"], T_shown_ego: Float[Tensor, "b 4 4"] | None
     ) -> Float[Tensor, "b _S Y X"]:
-        """Statics of one frame for another, if they are carried along."""
+        """Return the statics in the frame of another belief: warped if `carry_statics`, else unchanged."""
         if not self.carry_statics or T_shown_ego is None:
             return statics
         return carried_plane(statics, T_shown_ego, self.spec)
@@ -327,7 +330,7 @@ class DriveWorld(nn.Module):
     def _volume(
         self, latent: Latent, statics: Float[Tensor, "b _S Y X"], task: Task
     ) -> Float[Tensor, "b D Z Y X"]:
-        """m_θ and l_θ: the features of a state and of what stands."""
+        """Apply m_θ and l_θ: decode a state and the statics into a volume of features."""
         history = latent.history if self.states.recall is None else self.states.recall(latent)
         planes = [self.from_vector(torch.cat([history, latent.state], dim=-1)), statics]
         if self.prompt is not None:
@@ -336,14 +339,14 @@ class DriveWorld(nn.Module):
         return volume
 
     def _unpacked(self, state: Float[Tensor, "b _P"]) -> Latent:
-        """The inverse of `_packed`."""
+        """Undo `_packed`."""
         history, size, memory = self.states.sizes
         parts = state.split([history, size, memory * history, memory], dim=-1)
         return Latent(parts[0], parts[1], parts[2].unflatten(-1, (memory, history)), parts[3] > 0.5)
 
 
 def _packed(latent: Latent) -> Float[Tensor, "b _P"]:
-    """A latent as one vector, as beliefs carry it."""
+    """Pack a latent into one vector, for a `Belief`."""
     parts = (latent.history, latent.state, latent.memory.flatten(1), latent.remembered.to(latent.state))
     return torch.cat(parts, dim=-1)
 

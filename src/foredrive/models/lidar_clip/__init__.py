@@ -1,4 +1,4 @@
-"""LidarCLIP's encoder (Hess et al. 2024) of sweeps into the space of an image tower."""
+"""LidarCLIP's encoder (Hess et al. 2024): lidar sweeps to the embedding space of an image tower."""
 
 from foredrive.models.lidar_clip.encoder import LidarEncoder
 from foredrive.models.lidar_clip.pillars import PillarGrid, PointCloud

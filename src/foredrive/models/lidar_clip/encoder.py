@@ -1,4 +1,4 @@
-"""Sweeps to vectors in the space of an image tower."""
+"""An encoder of lidar sweeps into the embedding space of an image tower."""
 
 import math
 
@@ -12,18 +12,19 @@ from foredrive.models.lidar_clip.windows import WindowAttention
 
 POINT_WIDTH = 64
 WAVES = 8
-"""Sines and cosines of each coordinate, from two grids long to a few cells."""
+"""Sines and cosines per coordinate. The longest period is twice the grid, the shortest a few cells."""
 
 
 class LidarEncoder(nn.Module):
     """The encoder of LidarCLIP (Hess et al. 2024, section 3): pillars, windowed attention, an attention pool.
 
-    It looks at the returns of one sector, x along its middle, and takes any number of them from any lidar.
+    It reads the returns of one sector, with the x axis along its middle. It takes any number of returns from
+    any lidar.
 
     Args:
-        grid: the ground it looks at.
+        grid: the ground area that is read.
         dim: D of the image tower.
-        width, heads, hidden, blocks: of the attention.
+        width, heads, hidden, blocks: sizes of the attention.
         window: side of a window, in pillars.
     """
 
@@ -50,7 +51,7 @@ class LidarEncoder(nn.Module):
         self.pool = AttentionPool(width, heads, dim)
 
     def forward(self, cloud: PointCloud, items: int) -> Float[Tensor, "n D"]:
-        """One vector for each of `items` sweeps, those without a return included."""
+        """Return one vector for each of `items` sweeps, including sweeps without returns."""
         pillars = self.pillars(cloud, items)
         waves = self.cell_waves[pillars.cell_yx].flatten(1)
         features = self.attention(pillars.features + self.place(waves), pillars.cell_yx, pillars.item)
@@ -60,7 +61,7 @@ class LidarEncoder(nn.Module):
 def _padded(
     features: Float[Tensor, "K C"], item: Int[Tensor, "K"], items: int
 ) -> tuple[Float[Tensor, "n T C"], Bool[Tensor, "n T"]]:
-    """Tokens by item, and which of them are there."""
+    """Return the tokens grouped by item, padded, and a mask of the real ones."""
     count = torch.bincount(item, minlength=items)
     place = torch.arange(len(item), device=item.device) - (count.cumsum(0) - count)[item]
     longest = int(count.max())

@@ -1,4 +1,4 @@
-"""Points of any number to features of the pillars that hold some (dynamic voxelisation, Zhou et al. 2020)."""
+"""Pillar features from any number of points (dynamic voxelisation, Zhou et al. 2020)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,35 +16,35 @@ POINT_CHANNELS = 4
 
 @dataclass(frozen=True)
 class PillarGrid:
-    """Cells on the ground, and which heights count."""
+    """Cells on the ground and the range of heights."""
 
     lower_m: tuple[float, float, float] = (0.0, -20.0, -1.0)
-    """Of x, y and z; what lies beyond the grid is not looked at."""
+    """Lower bound in x, y and z. Points outside the grid are ignored."""
     pillar_m: float = 0.5
     cells: int = 80
-    """Along x, and along y."""
+    """Number of cells along x and along y."""
     height_m: float = 6.0
 
 
 @dataclass(frozen=True)
 class PointCloud(Record):
-    """The returns of a batch of sweeps one after another, however many each has."""
+    """The returns of a batch of sweeps, concatenated; each sweep may have any number."""
 
     points: Float[Tensor, "P 4"]
     """x, y, z (m) and intensity (0 to 1)."""
     item: Int[Tensor, "P"]
-    """Which sweep of the batch each is of."""
+    """Index of the sweep of each point in the batch."""
 
     @classmethod
     def of_sweeps(cls, sweeps: LidarSweep) -> "PointCloud":
-        """The returns of sweeps [n N]; padding and what is not finite are left out."""
+        """Gather the returns of sweeps [n N], without padding and non-finite points."""
         points = torch.cat([sweeps.points_ego, sweeps.intensity[..., None]], dim=-1)
         kept = sweeps.valid & sweeps.returned & points.isfinite().all(-1)
         return cls(points[kept].float(), kept.nonzero()[:, 0])
 
 
 class Pillars(NamedTuple):
-    """Occupied pillars of a batch, by item, then y, then x."""
+    """The occupied pillars of a batch, sorted by item, then y, then x."""
 
     features: Float[Tensor, "K D"]
     cell_yx: Int[Tensor, "K 2"]
@@ -52,14 +52,14 @@ class Pillars(NamedTuple):
 
 
 class PillarEncoder(nn.Module):
-    """Two layers on every point, each followed by the maximum over the point's pillar.
+    """Two layers on every point, each followed by the maximum over the pillar of the point.
 
-    A point is told by where it lies from the middle of its pillar and from the mean of the pillar's points,
-    by its height and intensity, and by how many share the pillar: the same wherever the pillar is. No
-    point is dropped.
+    A point is described by its offsets from the centre of its pillar and from the mean of the points there,
+    by its height and intensity, and by the number of points in the pillar. This does not depend on the
+    position of the pillar. No point is dropped.
 
     Args:
-        widths: of both layers.
+        widths: widths of both layers.
     """
 
     def __init__(self, grid: PillarGrid, widths: tuple[int, int]) -> None:
@@ -70,7 +70,7 @@ class PillarEncoder(nn.Module):
         self.second = nn.Sequential(nn.Linear(2 * first, second), nn.LayerNorm(second))
 
     def forward(self, cloud: PointCloud, items: int) -> Pillars:
-        """The pillars of a batch of `items` sweeps, some of which may have none."""
+        """Return the pillars of a batch of `items` sweeps. A sweep may have none."""
         grid = self.grid
         lower = cloud.points.new_tensor(grid.lower_m)
         place = (cloud.points[:, :3] - lower) / grid.pillar_m
@@ -96,9 +96,10 @@ class PillarEncoder(nn.Module):
     def _second(
         self, features: Float[Tensor, "P C"], pillar: Int[Tensor, "P"], pillars: int
     ) -> Float[Tensor, "K D"]:
-        """The second layer, on each point's features beside the maximum over its pillar.
+        """Apply the second layer to each point's features, joined with the maximum over its pillar.
 
-        What comes of that maximum is worked out once a pillar. Rectifying after the last maximum is the same.
+        The part of the maximum is computed once per pillar. The ReLU after the last maximum gives the same
+        result as before it.
         """
         linear, norm = self.second
         assert isinstance(linear, nn.Linear)
@@ -110,7 +111,7 @@ class PillarEncoder(nn.Module):
 def pillar_max(
     features: Float[Tensor, "P D"], pillar: Int[Tensor, "P"], pillars: int
 ) -> Float[Tensor, "K D"]:
-    """The maximum of each channel over the points of each pillar; every pillar has one at least."""
+    """Return the maximum of each channel over the points of each pillar, of which there is at least one."""
     out = features.new_zeros(pillars, features.shape[1])
     index = pillar[:, None].expand_as(features)
     return out.scatter_reduce(0, index, features, "amax", include_self=False)

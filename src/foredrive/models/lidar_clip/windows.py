@@ -1,4 +1,4 @@
-"""Self-attention within windows of the ground, over the pillars that are there (SST, Fan et al. 2022)."""
+"""Self-attention among occupied pillars within windows of the ground (SST, Fan et al. 2022)."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from foredrive.ops.set_attention import attend_within
 
 
 class Windows(NamedTuple):
-    """Which pillars attend to each other, and where each lies in its window."""
+    """A partition of pillars into windows; pillars attend to each other within a window."""
 
     order: Int[Tensor, "K"]
-    """Pillars, window by window."""
+    """Pillar indices, window by window."""
     counts: Int[Tensor, "W"]
-    """How many each window holds."""
+    """Number of pillars in each window."""
     place: Int[Tensor, "K"]
-    """Row by row within a window."""
+    """Cell of each pillar within its window, in row order."""
 
     @classmethod
     def cut(cls, cell_yx: Int[Tensor, "K 2"], item: Int[Tensor, "K"], side: int, shift: int) -> "Windows":
-        """Windows of `side` cells each way whose borders lie `shift` cells before the grid's own."""
+        """Cut the grid into windows of `side` by `side` cells, borders `shift` cells before the grid's."""
         window_yx = (cell_yx + shift).div(side, rounding_mode="floor")
         inside = cell_yx + shift - window_yx * side
         across = int(window_yx.max()) + 1 if len(window_yx) else 1
@@ -32,11 +32,12 @@ class Windows(NamedTuple):
 
 
 class WindowBlock(nn.Module):
-    """Pre-norm attention within windows and a feed-forward layer; where pillars lie tells queries and keys.
+    """Pre-norm attention within windows and a feed-forward layer. Queries and keys get a place code.
 
     Args:
-        width, heads, hidden: d, its heads, the feed-forward layer's width.
-        side: of a window, in cells.
+        width, heads: channels d and heads of the attention.
+        hidden: width of the feed-forward layer.
+        side: side of a window, in cells.
     """
 
     def __init__(self, width: int, heads: int, hidden: int, side: int) -> None:
@@ -52,7 +53,7 @@ class WindowBlock(nn.Module):
         )
 
     def forward(self, features: Float[Tensor, "K D"], windows: Windows) -> Float[Tensor, "K D"]:
-        """Pillars after they have attended to those in their window."""
+        """Return the pillars after attention within their windows."""
         normed = self.norm(features)
         query_key = self.to_query_key(normed + self.place[windows.place])
         value = self.to_value(normed)
@@ -63,7 +64,7 @@ class WindowBlock(nn.Module):
 
 
 class WindowAttention(nn.Module):
-    """Blocks whose windows are shifted by half a window in every other block (Liu et al. 2021)."""
+    """Blocks with windows that are shifted by half a window in every other block (Liu et al. 2021)."""
 
     def __init__(self, *, blocks: int, width: int, heads: int, hidden: int, side: int) -> None:
         super().__init__()
@@ -73,7 +74,7 @@ class WindowAttention(nn.Module):
     def forward(
         self, features: Float[Tensor, "K D"], cell_yx: Int[Tensor, "K 2"], item: Int[Tensor, "K"]
     ) -> Float[Tensor, "K D"]:
-        """Features of pillars that know their surroundings; pillars of different items never meet."""
+        """Return pillar features with context. Pillars of different items never attend to each other."""
         if len(features) == 0:
             return features
         both = [Windows.cut(cell_yx, item, self.side, shift) for shift in (0, self.side // 2)]

@@ -1,4 +1,4 @@
-"""NeMo's motion flow module: what moves, and how the ego vehicle does (§3.2, eq. 7–8)."""
+"""NeMo's motion flow module: flow of the scene and motion of the ego vehicle (§3.2, eq. 7–8)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,30 +17,30 @@ class MotionConfig:
     hidden: int
     """Channels of the ConvNets."""
     xi_scale: float = 0.1
-    """Scales the rigid head's outputs to metres and radians, so that early steps warp gently."""
+    """Factor from outputs of the rigid head to metres and radians. It keeps early warps small."""
 
 
 class Motion(NamedTuple):
     """Motion over each of the next F key frames.
 
-    Both lead from the coordinates of frame t+k+1 back to those of frame t+k, because volumes are warped by
-    gathering: V̂_{t+k+1}[z] = V_{t+k}[R (z + f) + t].
+    Flow and pose both map from the coordinates of frame t+k+1 back to those of frame t+k, because volumes are
+    warped by gathering: V̂_{t+k+1}[z] = V_{t+k}[R (z + f) + t].
     """
 
     flow: Float[Tensor, "b F 3 Z Y X"]
-    """f, metres along x y z."""
+    """f, in metres along x, y, z."""
     T_prev_next: Float[Tensor, "b F 4 4"]
     """(R, t): the ego frame at t+k+1 -> the ego frame at t+k."""
 
 
 class MotionFlow(nn.Module):
-    """The 3-D ConvNets H (flow per voxel) and G (SE(3)) on the concatenated volumes of past and present.
+    """3-D ConvNets H (flow per voxel) and G (SE(3)) on the concatenated volumes of past and present.
 
     Args:
         config: sizes.
         channels: D of one volume.
-        frames: number of volumes put together, T_p + 1.
-        steps: T_f, the number of future key frames.
+        frames: number of concatenated volumes, T_p + 1.
+        steps: T_f, number of future key frames.
     """
 
     def __init__(self, config: MotionConfig, *, channels: int, frames: int, steps: int) -> None:
@@ -63,7 +63,7 @@ class MotionFlow(nn.Module):
             nn.ReLU(),
             nn.Conv3d(hidden, 2 * hidden, 3, padding=1, stride=2),
             nn.ReLU(),
-            nn.AdaptiveAvgPool3d((1, 4, 4)),  # keeps where in the plane things are: rotation needs it
+            nn.AdaptiveAvgPool3d((1, 4, 4)),  # keeps coarse positions, which rotation needs
             nn.Flatten(),
             nn.Linear(2 * hidden * 16, 4 * hidden),
             nn.ReLU(),
@@ -71,11 +71,11 @@ class MotionFlow(nn.Module):
         )
 
     def forward(self, volumes: Float[Tensor, "b T D Z Y X"]) -> Motion:
-        """Args: volumes of the past and of now (last), each in its own ego frame."""
+        """Predict motion from the volumes of the past and of now (last), each in its own ego frame."""
         stacked = volumes.flatten(1, 2).contiguous(memory_format=torch.channels_last_3d)
         batch = len(stacked)
         if batch == 1 and stacked.device.type == "cpu" and not torch.compiler.is_compiling():
-            # PyTorch leaves one volume alone to its slow convolution: two take a sixth of the time.
+            # PyTorch uses a slow convolution for a batch of one. A batch of two takes a sixth of the time.
             stacked = stacked.expand(2, -1, -1, -1, -1)
         flow = self.flow(stacked)[:batch].float().unflatten(1, (self.steps, 3))
         xi = self.rigid(stacked)[:batch].float().unflatten(1, (self.steps, 6))

@@ -1,4 +1,4 @@
-"""Features composited along rays, then colour (NeMo eq. 2, 5, 6)."""
+"""Volume rendering: features composited along rays, then decoded to colour (NeMo eq. 2, 5, 6)."""
 
 from dataclasses import dataclass
 
@@ -25,14 +25,14 @@ class RendererConfig:
 
 
 class VolumeRenderer(nn.Module):
-    """Renders the feature of a ray with occupancy as alpha and maps it to RGB by f_recon.
+    """A renderer of features along rays, with occupancy as alpha; f_recon maps the result to RGB.
 
-    Eq. 5 leaves open what a ray sees that leaves the volume. Here the transmittance that remains falls on a
-    learned background feature, which stands for the sky and for all that is too far for the grid.
+    Eq. 5 does not define the colour of rays that leave the volume. Here the remaining transmittance falls on
+    a learned background feature, which represents the sky and everything beyond the grid.
 
     Args:
         config: sizes.
-        spec: the volume's grid.
+        spec: grid of the volume.
         channels: D.
     """
 
@@ -56,7 +56,7 @@ class VolumeRenderer(nn.Module):
         direction: Float[Tensor, "b R 3"],
         generator: torch.Generator | None = None,
     ) -> RenderedRays:
-        """Render rays given in the volume's ego frame; without a generator samples sit at bin centres."""
+        """Render rays in the ego frame of the volume. Without a generator, samples are at bin centres."""
         b, rays, _ = origin.shape
         depth = stratified_depths(self.near_m, self.far_m, self.samples, (b, rays), generator)
         depth = depth.to(origin)

@@ -1,4 +1,4 @@
-"""NeMo's world model: images to volume, occupancy, motion, imagined futures."""
+"""NeMo's world model: images to volume, occupancy, motion and imagined futures."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -26,7 +26,7 @@ ENCODERS: Mapping[type, Callable[..., Encoder]] = {
     BevConfig: BevEncoder,
     AveragingConfig: AveragingEncoder,
 }
-"""Each takes its config, the grid, the channels and the number of image feature levels."""
+"""Encoder class per config. Each takes the config, grid, channels and number of image feature levels."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,12 @@ class NemoConfig:
     motion: MotionConfig
     renderer: RendererConfig
     channels: int
-    """D, of the volume."""
+    """D, channels of the volume."""
     occupancy_hidden: int
     """Width of the occupancy MLP f_occ."""
     occupied_prior: float = 0.02
-    """Where f_occ starts: most of space is free, and a volume that starts opaque hides what lies behind."""
+    """Initial occupancy probability of f_occ. It is small because most space is free and an opaque volume
+    would hide what is behind."""
     kind: Literal["nemo"] = "nemo"
 
 
@@ -51,11 +52,11 @@ class Nemo(nn.Module):
 
     Args:
         config: sizes.
-        spec: the volume's grid.
-        past_frames: T_p, the key frames before now that are read.
-        max_steps: T_f, the most key frames that are imagined.
-        dt_s: time between key frames.
-        fetch: load the backbone's weights; not needed where trained weights will replace them.
+        spec: grid of the volume.
+        past_frames: T_p, number of key frames read before now.
+        max_steps: T_f, maximum number of imagined key frames.
+        dt_s: time between key frames, s.
+        fetch: load the weights of the backbone. Not needed when trained weights replace them later.
     """
 
     samples_futures = False
@@ -86,12 +87,12 @@ class Nemo(nn.Module):
         """Encode the last T_p + 1 frames, each in its own ego frame (V_t of eq. 1).
 
         Raises:
-            InputError: if the clip shows the future or has too few frames.
+            InputError: the clip contains future frames or has too few frames.
         """
         return self.encode(last_frames(clip, self.past_frames))
 
     def encode(self, frames: Frames) -> Belief:
-        """Do the work of `observe`; no step depends on the values of the data."""
+        """Do the work of `observe`. No step depends on the values of the data."""
         b, t, c = frames.image_valid.shape
         levels = self.backbone(frames.images.flatten(0, 2))
         features = [level.unflatten(0, (b * t, c)) for level in levels]
@@ -108,7 +109,11 @@ class Nemo(nn.Module):
     ) -> list[Belief]:
         """Warp the volume into the next key frames by predicted flow and ego motion (eq. 7–8).
 
-        NeMo predicts its own ego motion and takes no actions. It has one future, whatever the generator.
+        NeMo predicts its own ego motion and takes no actions. It has only one future, so `generator` is
+        ignored.
+
+        Raises:
+            InputError: the belief is an imagined one, actions are given, or `steps` is out of range.
         """
         if belief.history is None:
             raise InputError("NeMo imagines from what `observe` returned, not from an imagined belief")
@@ -134,5 +139,5 @@ class Nemo(nn.Module):
         return Decoded(occupancy_logit=logit, feature=belief.volume, flow=belief.flow_mps)
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """Return the belief's own volume: NeMo's features are the same for all tasks."""
+        """Return the volume of the belief. NeMo's features are the same for all tasks."""
         return belief.volume

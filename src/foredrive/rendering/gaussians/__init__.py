@@ -1,4 +1,4 @@
-"""Scenes of 3-D Gaussians, and how cameras and lidars project them."""
+"""Scenes of 3-D Gaussians and their projection by cameras and lidars."""
 
 from foredrive.rendering.gaussians.beams import lidar_points
 from foredrive.rendering.gaussians.camera import project_camera

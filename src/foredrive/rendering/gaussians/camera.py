@@ -1,4 +1,4 @@
-"""Gaussians on the image plane of a camera (Zwicker et al., "EWA splatting", 2002)."""
+"""Projection of Gaussians to the image plane of a camera (Zwicker et al., "EWA splatting", 2002)."""
 
 import torch
 from jaxtyping import Float
@@ -10,14 +10,14 @@ from foredrive.rendering.gaussians.footprint import footprint, in_sensor, positi
 from foredrive.rendering.gaussians.gaussians import Gaussians
 
 NEAR_M = 0.2
-"""Gaussians whose centre is nearer than this are not seen."""
+"""Minimum depth of the centre of a visible Gaussian, m."""
 SPREAD_PX2 = 0.3
 """ε: variance that a pixel adds to a splat, px²."""
 BEYOND, BEYOND_BENT = 0.15, 0.025
-"""How far beyond each border of the image, in image sizes, projections are linearised where the centre is;
-from there on they go on as they are at that limit. A bent image may fold soon after its border."""
+"""Margin beyond each border of the image, in image sizes, without and with distortion. Inside it, projections
+are linearised at the centre; outside it, at the limit. A distorted image may fold soon after its border."""
 REACH = 4.0
-"""Standard deviations that an opaque Gaussian is seen over, and some."""
+"""Visible extent of an opaque Gaussian in standard deviations, with some margin."""
 
 
 def project_camera(
@@ -31,19 +31,19 @@ def project_camera(
     twist_cam: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
 ) -> Splats:
-    """Splats on the image plane, for `pixel_points`; those that cannot reach the image are left out.
+    """Return splats on the image plane, for `pixel_points`. Those that cannot reach the image are left out.
 
-    Centres are projected exactly, lens distortion included, covariances by the projection's Jacobian there.
-    `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors.
+    Centres are projected exactly, including lens distortion; covariances by the Jacobian of the projection
+    there. `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors.
 
     Args:
-        gaussians: in the scene's frame.
+        gaussians: Gaussians in the scene's frame.
         T_cam_scene: scene -> camera (x right, y down, z forward) when the middle row is exposed.
         K, dist: intrinsics, px, for images of `size_hw`, and distortion k1 k2 p1 p2 k3.
-        velocity_mps: of each Gaussian in the scene's axes; None: all stand still.
-        twist_cam: velocity (m/s) then turn rate (rad/s) of the camera in its own axes, which a rolling
-            shutter makes visible; None: it stands still. See `geometry.se3.sensor_twist`.
-        compensate: take as much opacity away as ε = 0.3 px² spreads a splat.
+        velocity_mps: velocity of each Gaussian in the scene's axes; None: all are static.
+        twist_cam: velocity (m/s) then turn rate (rad/s) of the camera in its own axes, for rolling shutter;
+            None: it is static. See `geometry.se3.sensor_twist`.
+        compensate: lower the opacity by as much as ε = 0.3 px² widens a splat.
     """
     position = positions_in_sensor(gaussians, T_cam_scene)
     lower, upper = _limits(K.detach(), dist.detach(), size_hw)
@@ -73,7 +73,7 @@ def project_camera(
 def _limits(
     K: Float[Tensor, "3 3"], dist: Float[Tensor, "5"], size_hw: tuple[int, int]
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
-    """Least and greatest x/z, y/z of the image and some way beyond it."""
+    """Return bounds of x/z and y/z for the image with its margin."""
     height, width = size_hw
     border = [(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)]
     rays = pixels_to_rays(K.new_tensor(border), K, dist)
@@ -90,7 +90,7 @@ def _project(
     lower: Float[Tensor, "2"],
     upper: Float[Tensor, "2"],
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "2 3 N"]]:
-    """Pixels of points, and how they change with them, px/m."""
+    """Return pixels of points and the Jacobian with respect to the points, px/m."""
     near = 1 / position_m[2]
     xy = (position_m[:2] * near).T
     within = torch.minimum(torch.maximum(xy, lower), upper)

@@ -1,4 +1,4 @@
-"""What projections have in common: Gaussians in a sensor's frame, and their footprints on its plane.
+"""Gaussians in the frame of a sensor, and their footprints on its plane: common to all projections.
 
 Components come first, [3 N] and [3 3 N], as in `Gaussians.factor`.
 """
@@ -13,33 +13,33 @@ from foredrive.geometry.se3 import hat
 from foredrive.rendering.gaussians.gaussians import Gaussians
 
 MIN_RATIO = 1e-12
-"""Least ratio of areas, where the compensated opacity has a gradient still."""
+"""Lower bound of the ratio of areas. It keeps a gradient in the compensated opacity."""
 
 
 class InSensor(NamedTuple):
-    """N Gaussians in the frame of a sensor at the splats' time."""
+    """N Gaussians in the frame of a sensor at the time of the splats."""
 
     position_m: Float[Tensor, "3 N"]
     factor_m: Float[Tensor, "3 3 N"]
     """M of the covariance M Mᵀ, as in `Gaussians.factor`."""
     velocity_mps: Float[Tensor, "3 N"]
-    """As the sensor sees it, its own motion included."""
+    """Velocity relative to the sensor."""
     opacity: Float[Tensor, "N"]
     feature: Float[Tensor, "N D"]
 
 
 class Footprint(NamedTuple):
-    """Covariances on a plane, widened by what a pixel or a beam takes in."""
+    """Covariances on a plane, widened by the size of a pixel or a beam."""
 
     inverse: Float[Tensor, "N 3"]
     """Inverse of the widened covariance: xx, xy, yy."""
     compensation: Float[Tensor, "N"]
-    """√(det Σ / det(Σ + ε)): by how much the opacity falls for the wider splat to weigh what it did (Yu et
+    """√(det Σ / det(Σ + ε)): factor on the opacity that keeps the total weight of the widened splat (Yu et
     al., "Mip-Splatting", 2024)."""
 
 
 def positions_in_sensor(gaussians: Gaussians, T_sensor_scene: Float[Tensor, "4 4"]) -> Float[Tensor, "3 N"]:
-    """Where the centres lie, m."""
+    """Return the centres in the sensor's frame, m."""
     return T_sensor_scene[:3, :3] @ gaussians.mean_m.T + T_sensor_scene[:3, 3:]
 
 
@@ -51,7 +51,7 @@ def in_sensor(
     velocity_mps: Float[Tensor, "N 3"] | None,
     twist_sensor: Float[Tensor, "6"] | None,
 ) -> InSensor:
-    """The chosen Gaussians in a sensor's frame; the arguments are those of `project_camera`."""
+    """Transform the chosen Gaussians to a sensor's frame. The arguments are those of `project_camera`."""
     if len(chosen) < len(gaussians.mean_m):
         gaussians = gaussians.map_tensors(lambda tensor: tensor.index_select(0, chosen))
         position_m = position_m.index_select(1, chosen)
@@ -70,7 +70,7 @@ def in_sensor(
 
 
 def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) -> Float[Tensor, "K 3 N"]:
-    """J M for every Gaussian."""
+    """Return J M for every Gaussian."""
     columns = [column.unbind() for column in factor.unbind(1)]
     products = [
         torch.addcmul(torch.addcmul(j * x, k, y), m, z) for j, k, m in jacobian for x, y, z in columns
@@ -79,12 +79,12 @@ def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) ->
 
 
 def footprint(spread: Float[Tensor, "2 3 N"], epsilon: float) -> Footprint:
-    """Footprints whose covariance on the plane is U Uᵀ, for U = `spread`, plus ε on its diagonal."""
+    """Return footprints with covariance U Uᵀ on the plane, for U = `spread`, plus ε on its diagonal."""
     u, v = spread
     xx, xy, yy = (u * u).sum(0), (u * v).sum(0), (v * v).sum(0)
     (a, b, c), (d, e, f) = u, v
     minors = a * e - b * d, a * f - c * d, b * f - c * e
-    area = minors[0].square() + minors[1].square() + minors[2].square()  # det U Uᵀ, without what cancels
+    area = minors[0].square() + minors[1].square() + minors[2].square()  # det U Uᵀ, without cancellation
     widened = area + epsilon * (xx + yy) + epsilon * epsilon
     inverse = torch.stack([yy + epsilon, -xy, xx + epsilon], -1) / widened[:, None]
     return Footprint(inverse, (area / widened).clamp(min=MIN_RATIO).sqrt())

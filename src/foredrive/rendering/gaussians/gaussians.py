@@ -1,4 +1,4 @@
-"""What a scene is made of."""
+"""The 3-D Gaussians of a scene."""
 
 from dataclasses import dataclass
 
@@ -11,24 +11,24 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class Gaussians(Record):
-    """N Gaussians in the frame of a scene (or of an actor), as optimisers know them (Kerbl et al., 2023)."""
+    """N Gaussians in the frame of a scene or an actor, as unconstrained parameters (Kerbl et al., 2023)."""
 
     mean_m: Float[Tensor, "N 3"]
     quaternion: Float[Tensor, "N 4"]
-    """w x y z of the rotation from the Gaussian's axes to the frame; of any length but 0."""
+    """w x y z of the rotation from the axes of the Gaussian to the frame; any length except 0."""
     log_scale: Float[Tensor, "N 3"]
-    """Logarithm of the standard deviations along the Gaussian's axes, m."""
+    """Logarithm of the standard deviations (m) along the axes of the Gaussian."""
     opacity_logit: Float[Tensor, "N"]
     feature: Float[Tensor, "N D"]
-    """Albedo r g b first, then whatever decoders make use of."""
+    """Albedo r g b first, then features for the decoders."""
 
     def factor(self) -> Float[Tensor, "3 3 N"]:
-        """M = R S, with which the covariance is M Mᵀ, m.
+        """Return M = R S, m; the covariance is M Mᵀ.
 
-        Components come first because arithmetic on long vectors is many times as fast as on small matrices.
+        Components come first because arithmetic on long vectors is many times faster than on small matrices.
         """
         q = self.quaternion.T.contiguous()
-        w, x, y, z = q * (0.5 * (q * q).sum(0)).rsqrt()  # length √2: products are twice those of units
+        w, x, y, z = q * (0.5 * (q * q).sum(0)).rsqrt()  # length √2: products are twice those of length 1
         xx, yy, zz = x * x, y * y, z * z
         xy, xz, yz = x * y, x * z, y * z
         wx, wy, wz = w * x, w * y, w * z

@@ -1,4 +1,4 @@
-"""Gaussians as a lidar sees them: over azimuth and elevation (Hess et al., "SplatAD", 2025)."""
+"""Projection of Gaussians to azimuth and elevation of a lidar (Hess et al., "SplatAD", 2025)."""
 
 import math
 
@@ -11,11 +11,11 @@ from foredrive.rendering.gaussians.footprint import footprint, in_sensor, positi
 from foredrive.rendering.gaussians.gaussians import Gaussians
 
 NEAR_M = 0.2
-"""Gaussians whose centre is nearer than this are not seen."""
+"""Minimum range of the centre of a visible Gaussian, m."""
 UPRIGHT = 0.02
-"""Nor are those where azimuth means nothing: within so much (cosine) of straight up or down."""
+"""Minimum cosine of the elevation. Closer to straight up or down, azimuth is undefined."""
 SPREAD_RAD2 = 0.01719 * math.radians(1) ** 2
-"""ε: variance that a beam's width adds to a splat, as SplatAD has it: 0.131° squared."""
+"""ε: variance that a beam's width adds to a splat, from SplatAD: 0.131° squared."""
 
 
 def project_lidar(
@@ -27,20 +27,20 @@ def project_lidar(
     compensate: bool = True,
     reach_m: float = math.inf,
 ) -> Splats:
-    """Splats over azimuth and elevation, for `beam_points`; those that no beam can see are left out.
+    """Return splats over azimuth and elevation, for `beam_points`. Those that no beam can see are left out.
 
-    With J the Jacobian of (azimuth, elevation, range) and Σ' = J Σ Jᵀ, a splat's covariance is that of its
-    angles plus ε; where a beam passes beside its centre, the range is what it is on average there: it
+    With J the Jacobian of (azimuth, elevation, range) and Σ' = J Σ Jᵀ, the covariance of a splat is that of
+    its angles plus ε. Where a beam passes beside the centre, its range is the conditional mean there: it
     changes by Σ'_range,angles (Σ'_angles + ε)⁻¹ over the plane. Gradients reach all tensors.
 
     Args:
-        gaussians: in the scene's frame.
-        T_lidar_scene: scene -> lidar (x forward, y left, z up) at the beams' time 0.
-        velocity_mps: of each Gaussian in the scene's axes; None: all stand still.
-        twist_lidar: velocity (m/s) then turn rate (rad/s) of the lidar in its own axes; None: it stands
-            still. See `geometry.se3.sensor_twist`.
-        compensate: take as much opacity away as ε spreads a splat.
-        reach_m: Gaussians whose centre is farther than this are not seen.
+        gaussians: Gaussians in the scene's frame.
+        T_lidar_scene: scene -> lidar (x forward, y left, z up) at time 0 of the beams.
+        velocity_mps: velocity of each Gaussian in the scene's axes; None: all are static.
+        twist_lidar: velocity (m/s) then turn rate (rad/s) of the lidar in its own axes; None: it is static.
+            See `geometry.se3.sensor_twist`.
+        compensate: lower the opacity by as much as ε widens a splat.
+        reach_m: maximum range of the centre of a visible Gaussian.
     """
     position = positions_in_sensor(gaussians, T_lidar_scene)
     with torch.no_grad():
@@ -73,7 +73,7 @@ def project_lidar(
 def _project(
     position_m: Float[Tensor, "3 N"],
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N"], Float[Tensor, "3 3 N"]]:
-    """Azimuth and elevation, rad, range, m, and how these three change with the position."""
+    """Return azimuth and elevation (rad), range (m), and the Jacobian of all three by position."""
     x, y, z = position_m
     level2 = x * x + y * y
     level, range2 = level2.sqrt(), level2 + z * z
