@@ -27,7 +27,7 @@ class Conditions:
     rain_mmph: float = 0.0
     """Rain rate, mm/h: 2 is light, 10 moderate, 50 heavy."""
     wetness: float = 0.0
-    """Wetness of the ground, 0 (dry) to 1 (under water). In rain the ground is wet for any value."""
+    """Wetness of the ground, 0 (dry) to 1 (under water). In rain the ground is wet whatever this value is."""
     visibility_m: float = CLEAR_VISIBILITY_M
     """Visibility, m, as defined by Koschmieder: the distance at which 2 % of the contrast remains. Fog is
     below 1000 m."""

@@ -151,12 +151,13 @@ class World:
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
-        """Parked cars. They are a part of the world that `render` and `occupancy` already include."""
+        """Return the parked cars. They are a part of the world that `render` and `occupancy` already
+        include."""
         return self.static.parked
 
     @property
     def surfaces(self) -> Int[np.ndarray, "L"]:
-        """The `Surface` of each look in the static mesh."""
+        """Return the `Surface` of each look in the static mesh."""
         return self._looks.surface
 
     def render(
@@ -174,7 +175,7 @@ class World:
 
         Args:
             actors: road users without the ego vehicle. Parked ones are ignored, because the world contains
-        them.
+                them.
             sensors: the sensors.
             T_world_ego: pose of the vehicle.
             twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
@@ -243,7 +244,7 @@ class World:
 
     @cached_property
     def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
-        """Points on the lamps of each traffic light, by the index of its stop zone."""
+        """Return points on the lamps of each traffic light, by the index of its stop zone."""
         look, xyz = self.static.mesh.look, self.static.mesh.xyz
         points = {}
         for head in self.static.heads:

@@ -99,7 +99,7 @@ def loft(
 
     Args:
         looks: looks of the faces, segment by segment from the rear, then around the ring from its first
-    point.
+            point.
         ends: looks of the rear and the front face.
     """
     xyz = np.concatenate([np.broadcast_to(x[:, None, None], (*rings.shape[:2], 1)), rings], axis=-1)

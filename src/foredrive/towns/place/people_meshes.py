@@ -27,7 +27,7 @@ def pedestrian(looks: MeshLooks, phase: float | None, dress: str) -> Mesh:
 
     Args:
         phase: phase of the double step, 0 to 1, which begins with the left foot moving forward. None:
-    standing.
+            standing.
         dress: "jacket", "coat" or "backpack".
     """
     legs, feet = [], []

@@ -117,7 +117,7 @@ def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -
 def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
     """Move the foot of a post to the right of the traffic until it is off the lanes.
 
-    Return None if that takes more than 4 m.
+    Return None if that takes 4 m or more.
     """
     right = np.array([np.sin(zone.post_yaw), -np.cos(zone.post_yaw), 0.0])
     for step in np.arange(0.0, 4.0, 0.25):
@@ -147,7 +147,8 @@ def _turned(mesh: Mesh, xyz: Float[np.ndarray, "3"], yaw: float) -> Mesh:
 def _traffic_light(
     town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks
 ) -> Mesh:
-    """Build a post with a head at eye level. Over several lanes, add an arm with one head for each lane."""
+    """Build a post with a head at eye level. If it serves several lanes, add an arm with one head for each
+    lane."""
     # In the post's frame x points along the traffic, so the lights face the negative x direction.
     parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, looks.metal)]
     parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, looks))

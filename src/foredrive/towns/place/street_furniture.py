@@ -21,8 +21,8 @@ WALKWAY_STEP_M, OPEN_STEP_M = (7.0, 22.0), (45.0, 140.0)
 POLE_STEP_M, POLE_ASIDE_M = 34.0, 2.0
 BILLBOARD_ASIDE_M, SITE_ASIDE_M = 5.0, 2.5
 FAST_MPS, FAST_WITHIN_M = 27.0, 14.0
-"""Minimum speed limit of motorways, which have guard rails, and the distance to them, m, that counts as
-beside."""
+"""Speed limit above which a road is a motorway, m/s, and the distance from it within which guard rails stand,
+m."""
 SECTION_M = 80.0
 RAILS, BARRIERS = 0.75, 0.12
 """Shares of a motorway's sections with guard rails and with sound barriers."""

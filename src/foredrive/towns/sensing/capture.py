@@ -53,17 +53,17 @@ class SensorSuite:
 
     @cached_property
     def pixel_rays(self) -> EgoRays:
-        """The central rays of the pixels, ordered by camera, row and column."""
+        """Return the central rays of the pixels, ordered by camera, row and column."""
         return _flat_rays(self.rig, 1)
 
     @cached_property
     def outline_rays(self) -> EgoRays:
-        """The rays of the pixels for outlines, with the rays of one pixel next to each other."""
+        """Return the rays of the pixels for outlines, with the rays of one pixel next to each other."""
         return _flat_rays(self.rig, self.samples_per_outline_pixel)
 
     @cached_property
     def pixel_rad(self) -> Float32[np.ndarray, "P"]:
-        """Angle between neighbouring pixels at each pixel, rad."""
+        """Return the angle between neighbouring pixels at each pixel, rad."""
         height, width = self.rig.size_hw
         return (1.0 / self.rig.K[:, 0, 0]).repeat_interleave(height * width).numpy()
 
@@ -192,7 +192,7 @@ class Film:
         self._linear = np.empty((count, 3), np.float32) if noisy else None
 
     def expose(self, pixels: slice | Int64[np.ndarray, "n"], radiance: Rays, samples: int) -> None:
-        """Add the light of pixels, with `samples` rays for each."""
+        """Set the light of pixels, from `samples` rays for each."""
         if self._linear is None:
             self._rgb[pixels] = shading.develop(radiance, self._exposure, samples)
         else:
@@ -215,9 +215,9 @@ def see(
 ) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
     """Render images of all cameras.
 
-    Also return what each pixel's central ray hit [C·H·W] in the middle of its exposure. Each row is rendered
-    from the pose of the vehicle at its readout time. The road users are at their positions at that time; they
-    move straight ahead.
+    Also return the hits of the pixels' central rays [C·H·W] in the middle of their exposure. Each row is
+    rendered from the pose of the vehicle at its readout time. The road users are at their positions at that
+    time; they move straight ahead.
     """
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
@@ -291,7 +291,7 @@ def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Fil
 def sweep(
     moment: Moment, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[LidarSweep, Seen]:
-    """Simulate one revolution of the lidar, and return what its beams hit.
+    """Simulate one revolution of the lidar, and return the sweep and the hits of its beams.
 
     Road users move straight ahead during the revolution. A beam without a return is free up to the surface
     that it hit.

@@ -214,7 +214,7 @@ def wall_intervals(mesh: Mesh, faces: Faces) -> Intervals:
 
 
 def _edges(height: Float[np.ndarray, "Y X"]) -> Bool[np.ndarray, "Y X"]:
-    """Return the places where the height differs from that of a neighbour."""
+    """Return whether the height at each place differs from that of a neighbour by more than EDGE_M."""
     edge = np.zeros(height.shape, dtype=bool)
     for axis in (0, 1):
         step = np.abs(np.diff(height, axis=axis)) > EDGE_M

@@ -100,7 +100,7 @@ def pick_echo(
 
     Returns:
         The echoes of the beams, with the range of the nearest ray where nothing returned; and for each beam
-    the index of the ray (of R) that contributed most.
+        the index of the ray (of R) that contributed most.
     """
     beams, n = group.shape
     echo = (np.empty(beams, np.float32), np.empty(beams, np.bool_), np.empty(beams, np.float32))

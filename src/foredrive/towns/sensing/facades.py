@@ -107,7 +107,7 @@ def _openings(p, look, u, v, w, du, dv, out):
 
     Args:
         out: [4] receives the shares of glass, of frames and of the accent colour, and the brightness of the
-    glass below its lintel.
+            glass below its lintel.
 
     Returns:
         The number of the window, 0 where there is none or where there are too many.

@@ -157,7 +157,7 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
         dx, dy, dz: the unit viewing direction.
         shine: exponent of the mirrored highlight (Blinn-Phong); 0 for none.
         out: [6] receives the irradiance as the radiance of a white surface, then the radiance of the
-    highlight as for a perfect mirror.
+            highlight as for a perfect mirror.
     """
     for c in range(6):
         out[c] = 0.0

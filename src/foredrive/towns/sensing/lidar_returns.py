@@ -54,8 +54,8 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
 
     Returns:
         range [N] m, up to the surface if a beam was lost; returned [N]; intensity [N] in 0..1, calibrated as
-    by the makers of real lidars. It is the reflectance, in percent of 255, of a white matt surface that looks
-    equally bright at perpendicular incidence. Only retroreflective surfaces exceed 100/255.
+        by the makers of real lidars. It is the reflectance, in percent of 255, of a white matt surface that
+        looks equally bright at perpendicular incidence. Only retroreflective surfaces exceed 100/255.
     """
     count = len(t)
     range_m = np.empty(count, np.float32)

@@ -76,7 +76,7 @@ class Surroundings:
 
         Args:
             dt_s: time of each ray relative to the time of the actors' placement, s, at most `LOOKAHEAD_S`
-        away. None: all at that time.
+                away. None: all at that time.
         """
         return _intersect(self._handles, origin, direction, dt_s)
 

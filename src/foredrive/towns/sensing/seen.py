@@ -1,4 +1,4 @@
-"""Records of what rays hit."""
+"""Records of the surfaces that rays hit."""
 
 from typing import NamedTuple, no_type_check
 
@@ -27,7 +27,7 @@ def nothing_seen(count: int) -> Seen:
 
 
 def note(seen: Seen, part: slice, hits: Hits, look: Int32[np.ndarray, "n"]) -> None:
-    """Record what some of the rays hit."""
+    """Record the hits of some of the rays."""
     seen.triangle[part], seen.actor[part], seen.look[part] = hits.triangle, hits.actor, look
     seen.range_m[part] = np.where(look == MISS, np.inf, hits.t)
 
@@ -35,7 +35,7 @@ def note(seen: Seen, part: slice, hits: Hits, look: Int32[np.ndarray, "n"]) -> N
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def track_ids(seen, of_actor, of_triangle, nobody):
-    """Return the track ids of what rays hit [N], from those of actors [A] and of the static world's triangles
+    """Return the track id of each hit [N], from those of actors [A] and of the static world's triangles
     [F]."""
     out = np.empty(len(seen.triangle), np.int64)
     for i in range(len(out)):
@@ -50,7 +50,7 @@ def track_ids(seen, of_actor, of_triangle, nobody):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def surface_ids(seen, of_look, sky):
-    """Return the surfaces of what rays hit [N], from the surfaces of looks [L]."""
+    """Return the surface of each hit [N], from the surfaces of looks [L]."""
     out = np.empty(len(seen.look), np.int8)
     for i in range(len(out)):
         out[i] = sky if seen.look[i] == MISS else of_look[seen.look[i]]

@@ -161,8 +161,8 @@ def texture(looks, look, xyz, uvw, extent, i, out):
         extent: [N 4] extent of a pixel's footprint in the texture coordinates, and on the surface, m.
         i: index of the hit.
         out: [`TEXTURE_WORDS`]. The first six receive red, green, blue (linear), the share of glass, the share
-    of paint, and a random number in 0..1 of the window, 0 where there is none or where there are too many.
-    The others are working memory.
+            of paint, and a random number in 0..1 of the window, 0 where there is none or where there are too
+            many. The others are working memory.
     """
     kind, p = looks.texture[look], looks.params
     x, y = xyz[i, 0], xyz[i, 1]

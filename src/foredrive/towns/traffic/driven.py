@@ -87,8 +87,8 @@ class SeenDriven:
     """Number of vehicles without the shadows."""
     route_passed: int
     may_ask: Bool[np.ndarray, "M"]
-    """Whose requests for right of way count. Those of vehicle 0 count only while it approaches or waits at
-    the line."""
+    """Vehicles whose requests for right of way count. Those of vehicle 0 count only while it approaches or
+    waits at the line."""
 
     @property
     def centre_m(self) -> Float64[np.ndarray, "3"]:

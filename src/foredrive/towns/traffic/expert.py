@@ -64,7 +64,7 @@ class Drive:
         traffic: the town's traffic. Its seed also decides the route.
         seconds: the duration of the drive, s, so that the route is long enough and turns within it.
         steering_noise: standard deviation, rad, of the occasional steering disturbance (.02 pushes the
-    vehicle some decimetres off the middle of its lane). The expert steers back. 0: no disturbance.
+            vehicle some decimetres off the middle of its lane). The expert steers back. 0: no disturbance.
 
     Raises:
         InputError: the noise is negative.

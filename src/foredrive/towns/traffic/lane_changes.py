@@ -35,8 +35,8 @@ SETTLED_M = 60.0
 """Minimum distance between two lane changes, m, unless a vehicle has to change."""
 LONGEST_STRETCH_M = 600.0
 URGENT_S = 12.0
-"""Time before the end of a lane at which a vehicle that has to leave it wants to do so, s; or `SETTLED_M`
-before the end."""
+"""Time before the end of a lane, in addition to `SETTLED_M`, at which a vehicle that has to leave it wants to
+do so, s."""
 HAS_TO_MPS2 = 4.0
 LIKES_TO_MPS2 = 0.5
 """Value of being in the lane of the route, m/s²: towards the lane's end, and far from it."""

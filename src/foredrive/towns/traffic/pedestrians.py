@@ -36,7 +36,8 @@ BEYOND_LIGHT_M = 8.0
 PATIENCE_S = 25.0
 """Waiting time after which people walk elsewhere, s."""
 HESITATE_S = 0.4
-"""Time before a collision course at which people stop for a vehicle that is driven from outside, s."""
+"""Time, s, by which people stop early before they would step in front of a vehicle that is driven from
+outside."""
 
 Danger = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 
@@ -128,7 +129,7 @@ def step_pedestrians(
     Args:
         light: the light at the start of each lane.
         danger: states for points, seen from above, whether people must not step there. People who are already
-    in danger walk on.
+            in danger walk on.
     """
     if not len(people.active) or not len(graph.length_m):
         return people
@@ -253,7 +254,8 @@ def _may_cross(
     starts_m: Float64[np.ndarray, "N W"],
     light: Int[np.ndarray, "L"],
 ) -> Bool[np.ndarray, "n"]:
-    """Return whether no light is green for the crossed lanes and every vehicle can stop or has passed."""
+    """Return whether no light is green or yellow for the crossed lanes, and every vehicle can stop or has
+    passed."""
     may = np.ones(len(walk), dtype=np.bool_)
     moving = light[graph.lane] > Light.RED
     released = np.unique(graph.crossing[moving & (graph.lane_span_m[:, 0] < BEYOND_LIGHT_M)])

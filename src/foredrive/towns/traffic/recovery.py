@@ -14,13 +14,13 @@ DISTURBED_S = 1.6
 RECOVERY_S = 5.0
 """Minimum time from the end of one disturbance to the next, s. The mean is twice as long."""
 RETURN_M, RETURN_S = 4.0, 0.8
-"""Length scale of the way back to the path: a few times 4 m plus 0.8 s of driving."""
+"""Length scale of the return to the path: `RETURN_M` (m), plus the distance that is driven in `RETURN_S`
+(s)."""
 STEEPEST_PER_M = 0.12
 """Maximum curvature that steering adds, 1/m."""
 LATERAL_MPS2 = 2.5
 DISTURBING = 0.4
-"""Maximum curvature of the disturbance, as a fraction of the curvature that the expert has for steering
-back."""
+"""Maximum curvature of the disturbance, as a fraction of the maximum curvature of the steering back."""
 FARTHEST_M = 0.8
 """Predicted offset at which the expert takes over from the disturbance, m."""
 

@@ -88,7 +88,7 @@ class Traffic:
 
     @cached_property
     def near_lanes(self) -> NearLanes:
-        """The town's lanes, searchable by position."""
+        """Return the town's lanes, searchable by position."""
         return near_lanes_of(self.lanes)
 
     def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
@@ -97,7 +97,7 @@ class Traffic:
         Args:
             ego: a placed vehicle that becomes vehicle 0. Without one, traffic fills the whole town.
             route: the lane in which vehicle 0 has to be at the end of each stretch, from its current stretch
-        on. After the last one it takes random turns.
+                on. After the last one it takes random turns.
         """
         rng = np.random.default_rng((self.seed, 1))
         lanes = np.zeros(0, dtype=np.int64) if route is None else route
@@ -123,8 +123,8 @@ class Traffic:
 
         Args:
             ego: the pose and motion of vehicle 0 at the time of `state` if it is driven from outside, on the
-        road or off it. All others react to it, and its motion is not decided here. None: it drives by the
-        same rules as the others.
+                road or off it. All others react to it, and its motion is not decided here. None: it drives by
+                the same rules as the others.
             orders: orders for some of the other road users. None: no orders, and strays stand still.
         """
         rng = np.random.default_rng((self.seed, 2, state.step_index))
@@ -194,8 +194,8 @@ class Traffic:
     def to_light_m(self, state: TrafficState, in_s: float = 0.0) -> float:
         """Return the distance of vehicle 0 to the next junction of its route, m.
 
-        The distance is infinite inside a junction, and if no light is closed at that junction in `in_s`
-        seconds.
+        The distance is infinite inside a junction. It is also infinite if that junction has no light, or if
+        its light is green `in_s` seconds from now.
         """
         v, ahead = state.vehicles, state.route[state.route_passed :]
         on_it = np.flatnonzero(self.lanes.contested[ahead])

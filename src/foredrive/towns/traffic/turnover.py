@@ -32,7 +32,7 @@ of them would have to brake harder."""
 
 
 class Turnover:
-    """The filling of a town's free traffic slots. Of the vehicle slots it fills only the first
+    """The turnover of a town's traffic: it fills free slots, of the vehicle slots only the first
     `vehicle_count`."""
 
     def __init__(
