@@ -39,8 +39,7 @@ class Texture(enum.IntEnum):
     p0..p2: `LinePattern`, colour (0 white, 1 yellow) and width of the left line; p3..p5: the same of the
     right line."""
     SLABS = 2
-    """u, v: distance from the left and right edge, where a kerb stone lies. p0: edge length of the slabs,
-    m."""
+    """u, v: distance from the left and right edge, where a kerb stone lies, m. p0: edge of the slabs, m."""
     GRASS = 3
     FACADE = 4
     """u: distance from the wall's left end; v: height above the ground; w: distance from its right end, m.
@@ -56,8 +55,7 @@ class Texture(enum.IntEnum):
     GLOW = 9
     """A surface that emits light."""
     FIELD = 10
-    """Crops. u: distance across the rows; v: along them; w: from the field's border inwards, m; grass
-    outside.
+    """Crops, with grass outside. u: distance across the rows; v: along them; w: from the border inwards, m.
     p0: distance of the rows; p1: their width; p2..p4: linear colour between them."""
 
 

@@ -46,7 +46,7 @@ class Shape:
     scene: TriangleScene
     mesh: Mesh
     first: int
-    """Index of its first triangle in the library's `soup`."""
+    """Index of its first triangle in the library's triangles."""
     solid: Intervals
     """Solid parts in the unit box."""
 

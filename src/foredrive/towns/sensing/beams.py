@@ -9,8 +9,8 @@ import numpy as np
 from foredrive.towns.sensing.lamps import DIPPED_RAD, HEAD, beam
 
 ASYMMETRY = 0.54
-"""Asymmetry of the phase function (Henyey & Greenstein, Astrophysical Journal 93, 1941). With this value fog
-scatters straight back what lidars measure, `air.BACKSCATTER_RATIO`."""
+"""Asymmetry of the phase function (Henyey & Greenstein, Astrophysical Journal 93, 1941). With this value the
+fog's backscatter agrees with that for lidars, `air.BACKSCATTER_RATIO`."""
 ASIDE_M = np.array([16.0, 25.0, 3.0], dtype=np.float32)
 """Distance from a lamp beyond which a ray shows nothing of its beam, by kind of lamp, m. Fog reduces it."""
 SPREAD_M = np.array([0.25, 0.8, 0.8], dtype=np.float32)

@@ -42,7 +42,7 @@ _VERSION = 0
 
 
 class _Arguments(ctypes.Structure):
-    """RTCIntersectArguments, which is equal to RTCOccludedArguments."""
+    """RTCIntersectArguments. RTCOccludedArguments has the same layout."""
 
     _fields_ = (
         ("flags", ctypes.c_int),
@@ -58,8 +58,10 @@ _arguments = _Arguments(flags=_COHERENT, feature_mask=0xFFFFFFFF)
 
 
 def _load() -> ctypes.CDLL:
-    """Find the library that embreex has loaded: a dependency of its module or, on Windows, a file beside
-    it."""
+    """Find the library that embreex has loaded.
+
+    It is a dependency of embreex' module or, on Windows, a file beside it.
+    """
     found = ctypes.CDLL(rtcore_scene.__file__)
     if hasattr(found, "rtcNewDevice"):
         return found
@@ -179,8 +181,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 @_kernel
 @no_type_check
 def _aligned(words):
-    """Return memory with the alignment that Embree needs: 32-bit words that start at a multiple of 64
-    bytes."""
+    """Return memory for Embree: 32-bit words that start at a multiple of 64 bytes."""
     memory = np.zeros(words + _ALIGNMENT // 4, np.float32)
     skip = (-memory.ctypes.data % _ALIGNMENT) // 4
     return memory[skip : skip + words]

@@ -15,8 +15,7 @@ MISS = -1
 GLASS_LOSS = 0.8
 """Share of a lidar pulse that a window transmits or mirrors away."""
 LIDAR_REFERENCE_M = 45.0
-"""Distance at which half of the pulses are lost for a surface of 2 % reflectivity at perpendicular incidence,
-m."""
+"""Distance, m, at which half of the pulses are lost for 2 % reflectivity at perpendicular incidence."""
 LIDAR_THRESHOLD = 0.02
 INTENSITY_OF_WHITE = 100.0 / 255.0
 RETROREFLECTED = 0.3
@@ -28,8 +27,8 @@ NEAREST_CLUTTER_M, CLUTTER_DEPTH_M = 1.2, 9.0
 """Range of clutter, m. Closer, the laser does not overlap with the detector's field of view. Further away,
 clutter is too weak."""
 DROP_MMPH = 150.0
-"""Scale of the rain rate, mm/h: the share of pulses that hit a drop large enough to be measured is 1 - exp(-R
-/ `DROP_MMPH`)."""
+"""Scale of the rain rate R, mm/h. The share of pulses that hit a drop large enough to be measured is
+1 - exp(-R / `DROP_MMPH`)."""
 
 _FOLIAGE = int(Texture.FOLIAGE)
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

@@ -30,7 +30,8 @@ COURTEOUS_MPS2, COURTEOUS_TO_STANDING_MPS2 = 1.5, 3.0
 stands. A standing vehicle would otherwise have to wait for ever."""
 STANDS_MPS = 0.5
 COURTEOUS_GAP_M = 1.0
-"""Additional gap to the vehicle that is let in, compared with a vehicle in the own lane, m."""
+"""Additional gap to the vehicle that is let in, m, compared with the gap to a leader in the driver's own
+lane."""
 SETTLED_M = 60.0
 """Minimum distance between two lane changes, m, unless a vehicle has to change."""
 LONGEST_STRETCH_M = 600.0
@@ -101,8 +102,8 @@ def find_stretches(graph: LaneGraph) -> Stretches:
 
 
 def change_length_m(vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
-    """Return the length of a lane change, m: `CHANGE_S` at the present speed, but at least what gentle
-    steering needs."""
+    """Return the length of a lane change, m: `CHANGE_S` at the present speed, but at least
+    `SHORTEST_CHANGE_M` so that steering stays gentle."""
     return np.maximum(CHANGE_S * vehicles.speed_mps, SHORTEST_CHANGE_M)
 
 

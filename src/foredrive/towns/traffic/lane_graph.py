@@ -73,8 +73,8 @@ class LaneGraph:
     with the id of the first piece."""
     xyz: Float64[np.ndarray, "P 3"]
     speed_mps: Float64[np.ndarray, "P"]
-    """Driving speed, m/s: the limit, and comfort in curves, lowered in time for what follows within the
-    lane."""
+    """Driving speed, m/s: the minimum of the limit and of comfort in curves, reduced in time for later parts
+    of the lane."""
     first: Int[np.ndarray, "L"]
     count: Int[np.ndarray, "L"]
     step_m: Float64[np.ndarray, "L"]
