@@ -143,16 +143,20 @@ class World:
         self._columns = make_columns(static.mesh, self._scene, self._looks.surface, static.thin)
 
     def under(self, conditions: Conditions) -> "World":
-        """Return the same town under other conditions. It shares the static content, which is not generated
-        again."""
+        """Return the same town under other conditions.
+
+        It shares the static content, which is not generated again.
+        """
         other = copy(self)
         other.conditions, other.light = conditions, make_light(conditions, self._east_rad)
         return other
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
-        """Return the parked cars. They are a part of the world that `render` and `occupancy` already
-        include."""
+        """Return the parked cars.
+
+        They are a part of the world that `render` and `occupancy` already include.
+        """
         return self.static.parked
 
     @property

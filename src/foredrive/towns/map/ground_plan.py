@@ -113,8 +113,10 @@ class BorderHeights:
         return self.z[self.tree.query(xy)[1]]
 
     def top(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Return the height of the top surface at the nearest border sample. Walkways are higher than the
-        road."""
+        """Return the height of the top surface at the nearest border sample.
+
+        Walkways are higher than the road.
+        """
         return self.raised[self.tree.query(xy)[1]]
 
 

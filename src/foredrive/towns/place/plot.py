@@ -14,8 +14,10 @@ FOUNDATION_M = 1.5
 
 @dataclass(frozen=True)
 class Plot:
-    """A rectangle for a building. Local x runs along the front with the street behind it; y points into the
-    plot."""
+    """A rectangle for a building.
+
+    Local x runs along the front with the street behind it; y points into the plot.
+    """
 
     corner: Float[np.ndarray, "2"]
     """Start of the front, the origin of the local coordinates. The plot lies to the left of `along`."""

@@ -71,8 +71,10 @@ class _Looks:
 
 
 def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
-    """Build traffic lights and signs at their places in the map, moved off the lanes. They are placed
-    first."""
+    """Build traffic lights and signs at their places in the map, moved off the lanes.
+
+    They are placed first.
+    """
     looks = _Looks(table)
     parts, heads, poles = [], [], []
     lanes = site.plan.lanes
@@ -128,8 +130,10 @@ def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"
 
 
 def _lamp_looks(table: LookTable, zone: int) -> tuple[int, int, int]:
-    """Return the looks of a light's three lamps, unlit. The zone separates them from those of other
-    lights."""
+    """Return the looks of a light's three lamps, unlit.
+
+    The zone separates them from those of other lights.
+    """
     off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
     red, yellow, green = (
         table.add(Look(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
@@ -147,8 +151,10 @@ def _turned(mesh: Mesh, xyz: Float[np.ndarray, "3"], yaw: float) -> Mesh:
 def _traffic_light(
     town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks
 ) -> Mesh:
-    """Build a post with a head at eye level. If it serves several lanes, add an arm with one head for each
-    lane."""
+    """Build a post with a head at eye level.
+
+    If it serves several lanes, add an arm with one head for each lane.
+    """
     # In the post's frame x points along the traffic, so the lights face the negative x direction.
     parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, looks.metal)]
     parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, looks))

@@ -1,5 +1,7 @@
-"""Shapes of road users. Each one fits the unit box around the origin, x ahead, and is scaled when it is
-placed."""
+"""Shapes of road users.
+
+Each one fits the unit box around the origin, x ahead, and is scaled when it is placed.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache

@@ -140,8 +140,10 @@ class Moment:
         ray_rad: Float32[np.ndarray, "N"],
         known: Float32[np.ndarray, "M 3"] = NOT_KNOWN,
     ) -> Rays:
-        """Return the radiance along rays. Where `known` is not negative, it is the result. It may have no
-        rows."""
+        """Return the radiance along rays.
+
+        Where `known` is not negative, it is the result. It may have no rows.
+        """
         mirrored = self.mirrored(found, hits, rays, ray_rad)
         looks, light = self.scene.looks, self.light
         out = shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)

@@ -93,8 +93,10 @@ def _pair(
 @_kernel
 @no_type_check
 def _into_cells(xyz, kind, heading, origin, reach_m):
-    """Return lists of the lamps that reach each cell. Headlights and tail lights reach only cells ahead of
-    them."""
+    """Return lists of the lamps that reach each cell.
+
+    Headlights and tail lights reach only cells ahead of them.
+    """
     counts = np.zeros(CELLS * CELLS + 1, np.int32)
     near = np.empty(0, np.int32)
     half = 0.7072 * CELL_M

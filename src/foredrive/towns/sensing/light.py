@@ -76,8 +76,9 @@ class LightArrays(NamedTuple):
 
 
 def sun_direction(hour: float, east_rad: float) -> Rgb:
-    """Return the unit vector towards the sun at a solar time. The sun rises in the east at 6 and sets in the
-    west at 18.
+    """Return the unit vector towards the sun at a solar time.
+
+    The sun rises in the east at 6 and sets in the west at 18.
 
     At noon it stands 60° high in the south, as on an equinox at 30° north. `east_rad` is the direction of
     east, counter-clockwise from the world's x, rad.
@@ -210,8 +211,10 @@ def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
 
 
 def _sun_rgb(elevation_deg: float) -> Rgb:
-    """Return the sunlight behind the air. The air mass is that of Kasten & Young (Applied Optics 28,
-    1989)."""
+    """Return the sunlight after its way through the air.
+
+    The air mass is that of Kasten & Young (Applied Optics 28, 1989).
+    """
     if elevation_deg < -0.5:
         return _rgb(0.0, 0.0, 0.0)
     height = max(elevation_deg, 0.0)

@@ -32,8 +32,9 @@ LIDARS: dict[str, Callable[[Float[Tensor, "4 4"], float], SpinningLidar]] = {
 
 
 def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:
-    """Return six cameras in all directions, without leading dimensions. The principal point is the image's
-    centre.
+    """Return six cameras in all directions, without leading dimensions.
+
+    The principal point is the image's centre.
 
     Rows are read from the top within `readout_s`, the middle row at the frame's time. 0: a global shutter.
     """
@@ -55,8 +56,10 @@ def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:
 
 
 def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:
-    """Return a lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°). Channel 0 is the
-    lowest."""
+    """Return a lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°).
+
+    Channel 0 is the lowest.
+    """
     elevation_deg = torch.linspace(-30.67, 10.67, channels)
     return SpinningLidar(
         elevation_rad=tuple(elevation_deg.deg2rad().tolist()),

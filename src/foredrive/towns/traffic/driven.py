@@ -105,8 +105,10 @@ class SeenDriven:
         return np.asarray((along > -half_length) & (along < ahead) & (aside < half_width + BESIDE_M))
 
     def without_shadows(self, moved: Vehicles) -> Vehicles:
-        """Return the vehicles without the shadows after all have moved. Vehicle 0 stays in its slot, wherever
-        it is."""
+        """Return the vehicles without the shadows after all have moved.
+
+        Vehicle 0 stays in its slot, wherever it is.
+        """
         return _replaced(moved.first(self.count), active=True)
 
 
@@ -165,7 +167,9 @@ def find_lane(
     known: Int[np.ndarray, "k"],
     inside: Int[np.ndarray, "j"],
 ) -> tuple[int, float] | None:
-    """Find the lane that a vehicle follows and the arc length beside it. Return None if it follows no lane.
+    """Find the lane that a vehicle follows and the arc length beside it.
+
+    Return None if it follows no lane.
 
     Args:
         centre: the middle of the vehicle on the ground.

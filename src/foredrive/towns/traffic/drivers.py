@@ -49,8 +49,10 @@ class Choice(NamedTuple):
     situation: Situation
 
     def where(self, who: Bool[np.ndarray, "N"], other: "Choice") -> "Choice":
-        """Return the choice with the decisions of the drivers `who` taken from `other`. The situation does
-        not change."""
+        """Return the choice with the decisions of the drivers `who` taken from `other`.
+
+        The situation does not change.
+        """
         standing = {name: np.where(who, other.standing[name], value) for name, value in self.standing.items()}
         return Choice(standing, np.where(who, other.wanted_mps2, self.wanted_mps2), self.situation)
 
@@ -90,8 +92,10 @@ def behind(
 
 
 def drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> Vehicles:
-    """Change the speed as wanted and move by a ballistic update. The jerk is comfortable except in an
-    emergency."""
+    """Change the speed as wanted and move by a ballistic update.
+
+    The jerk is comfortable except in an emergency.
+    """
     wanted = np.clip(wanted_mps2, -HARDEST_BRAKING_MPS2, v.accel_mps2)
     gentle = np.maximum(wanted, -v.speed_mps / SOFT_STOP_S)  # no jolt at the end of a stop
     wanted = np.where(wanted < -EMERGENCY_MPS2, wanted, gentle)

@@ -1,4 +1,6 @@
-"""The expert: a privileged driver that follows a route as vehicle 0 of the traffic. All others react to it.
+"""The expert: a privileged driver that follows a route as vehicle 0 of the traffic.
+
+All others react to it.
 
 It plans its speed as all drivers do, from the exact state of the others, the lights and the curves ahead
 (car_following, right_of_way). It changes lanes for its route and to pass slow vehicles (lane_changes). It
@@ -58,7 +60,9 @@ class Moment:
 
 
 class Drive:
-    """One drive of the expert in one town: a route and the moments along it. `state` is the present traffic.
+    """One drive of the expert in one town: a route and the moments along it.
+
+    `state` is the present traffic.
 
     Args:
         traffic: the town's traffic. Its seed also decides the route.

@@ -57,8 +57,10 @@ def draw_fleet(
     for_large: Bool[np.ndarray, "k"],
     for_bicycles: Bool[np.ndarray, "k"],
 ) -> Vehicles:
-    """Draw k vehicles with their drivers, not yet placed. Large ones and bicycles appear only where they are
-    allowed."""
+    """Draw k vehicles with their drivers, not yet placed.
+
+    Large ones and bicycles appear only where they are allowed.
+    """
     count = len(track_ids)
     share = np.array([kind.share for kind in KINDS])
     large = np.array([kind.is_large for kind in KINDS])

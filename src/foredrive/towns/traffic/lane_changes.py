@@ -140,8 +140,10 @@ def find_gaps(
     target: Int[np.ndarray, "N"],
     side: int,
 ) -> Gaps:
-    """Find the vehicles ahead and behind in the lanes `target` (-1: not requested). Overlapping vehicles have
-    a negative gap."""
+    """Find the vehicles ahead and behind in the lanes `target` (-1: not requested).
+
+    Overlapping vehicles have a negative gap.
+    """
     lanes = (graph.length_m, graph.sides, graph.successors)
     return Gaps(*_find_gaps(motion_of(vehicles, starts_m), lanes, target, side))
 

@@ -28,8 +28,10 @@ class Ahead(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Positions of N vehicles on their paths, as arguments of compiled functions. Arc lengths are as in
-    `Vehicles`."""
+    """Positions of N vehicles on their paths, as arguments of compiled functions.
+
+    Arc lengths are as in `Vehicles`.
+    """
 
     active: Bool[np.ndarray, "N"]
     path: Int[np.ndarray, "N W"]
@@ -185,8 +187,10 @@ def _find_leaders(motion, driver, length, sides, siblings):
 @numba.njit(cache=True)
 @no_type_check
 def _desired_gap_m(i, j, speed_mps, driver):
-    """Return the gap that vehicle i wants to j, as in `car_following`. The smaller its share, the harder i
-    brakes."""
+    """Return the gap that vehicle i wants to j, as in `car_following`.
+
+    The smaller the present gap is in comparison, the harder i brakes.
+    """
     time_gap_s, braking_mps2 = driver
     closing = speed_mps[i] - speed_mps[j]
     return STANDSTILL_M + max(0.0, speed_mps[i] * (time_gap_s[i] + closing / braking_mps2[i]))

@@ -192,8 +192,10 @@ def _choose_next(
     onward: Int[np.ndarray, "n"],
     u: Float64[np.ndarray, "n"],
 ) -> Int[np.ndarray, "n"]:
-    """Choose a walk that leaves the place ahead. It is the walk on which people arrive only if there is no
-    other."""
+    """Choose a walk that leaves the place ahead.
+
+    It is the walk on which people arrive only if there is no other.
+    """
     options = graph.incident[graph.ends[walk, (onward > 0).astype(np.int64)]]
     allowed = (options >= 0) & (options != walk[:, None])
     allowed[~allowed.any(axis=1), 0] = True  # dead end: turn back

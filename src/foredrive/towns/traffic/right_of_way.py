@@ -145,8 +145,10 @@ def _next_line(
 def _is_green(
     graph: LaneGraph, path: np.ndarray, column: np.ndarray, green: np.ndarray
 ) -> Bool[np.ndarray, "N"]:
-    """Return whether all lights of a path through a junction are open. Some lights stand within the
-    junction."""
+    """Return whether all lights of a path through a junction are open.
+
+    Some lights stand within the junction.
+    """
     before = np.arange(WINDOW) < column[:, None]
     on_the_way = np.logical_and.accumulate(before | (graph.contested[path] & (path >= 0)), axis=1) & ~before
     return ~(on_the_way & ~green[path]).any(axis=1)

@@ -41,8 +41,10 @@ class Route:
     """Lane at the start of each stretch: the same lane or a neighbour of it."""
 
     def polyline(self, graph: LaneGraph) -> Float64[np.ndarray, "M 3"]:
-        """Return points along the centrelines, `ROUTE_SPACING_M` apart. Lane changes come early on their
-        stretch."""
+        """Return points along the centrelines, `ROUTE_SPACING_M` apart.
+
+        Lane changes come early on their stretch.
+        """
         length = graph.length_m[self.lanes]
         begins = np.cumsum(length) - length
         s = np.arange(self.start_m, begins[-1] + length[-1], ROUTE_SPACING_M)

@@ -1,5 +1,7 @@
-"""Strays: people and cyclists on paths of their own, off walkways and across lanes. The caller sets their
-speed."""
+"""Strays: people and cyclists on paths of their own, off walkways and across lanes.
+
+The caller sets their speed.
+"""
 
 import dataclasses
 from dataclasses import dataclass

@@ -264,8 +264,10 @@ class Traffic:
     def _begin_change(
         self, state: TrafficState, situation: Situation, driven: SeenDriven | None, orders: Orders
     ) -> Vehicles | None:
-        """Begin the lane change of the one vehicle that has to change or gains most. Return None if there is
-        none."""
+        """Begin the lane change of the one vehicle that has to change or gains most.
+
+        Return None if there is none.
+        """
         v = state.vehicles
         if orders.change is not None:
             return begin_change(self.lanes, v, *orders.change)

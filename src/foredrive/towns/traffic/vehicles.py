@@ -192,8 +192,10 @@ def along_path(
     starts_m: Float64[np.ndarray, "N W"],
     s_m: Float64[np.ndarray, "N"],
 ) -> Float64[np.ndarray, "N 3"]:
-    """Return points on paths at arc lengths from the start of the current lane. Paths continue straight
-    beyond their ends."""
+    """Return points on paths at arc lengths from the start of the current lane.
+
+    Paths continue straight beyond their ends.
+    """
     column = np.where(path >= 0, starts_m <= s_m[:, None], False)
     column = np.where(
         column.any(1), WINDOW - 1 - np.argmax(column[:, ::-1], axis=1), np.argmax(path >= 0, axis=1)
@@ -251,8 +253,10 @@ def _left_of(forward: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 def _up_of(
     forward: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return forward × left, where left is horizontal. NumPy's cross product is much slower for a few
-    vectors."""
+    """Return forward × left, where left is horizontal.
+
+    NumPy's cross product is much slower for a few vectors.
+    """
     (fx, fy, fz), (lx, ly, _) = forward.T, left.T
     return np.stack([-fz * ly, fz * lx, fx * ly - fy * lx], axis=1)
 

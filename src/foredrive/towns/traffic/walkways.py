@@ -32,8 +32,10 @@ ACROSS_LANE_M = 2.2
 
 @dataclass(frozen=True)
 class WalkGraph:
-    """A graph of E walks (polylines) between V places. The vertices are stored end to end in `xyz`, as in a
-    lane graph."""
+    """A graph of E walks (polylines) between V places.
+
+    The vertices are stored end to end in `xyz`, as in a lane graph.
+    """
 
     xyz: Float64[np.ndarray, "P 3"]
     along_m: Float64[np.ndarray, "P"]
