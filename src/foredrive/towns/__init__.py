@@ -1,3 +1,3 @@
-"""The embedded world, grown on CARLA's road maps."""
+"""The embedded world: towns that are generated on CARLA's road maps."""
 
 import foredrive.data  # noqa: F401 - keeps Ray out of py123d, which is imported here, too

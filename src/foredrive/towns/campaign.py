@@ -1,4 +1,4 @@
-"""What to record: drives over towns, conditions and densities that turn left and right alike."""
+"""Recording campaigns: drives over towns, conditions and traffic densities, with balanced commands."""
 
 import itertools
 from collections import Counter
@@ -19,13 +19,13 @@ from foredrive.towns.traffic.traffic import Traffic
 
 SEEDS_PER_DRIVE = 8
 TRIES_PER_DRIVE = 4
-"""How many routes are drawn for each drive that is recorded, where seeds may be chosen, and how many of them
-are driven at most."""
+"""Number of routes that are drawn, and maximum number of routes that are driven, for each recorded drive, if
+the campaign chooses the seeds."""
 
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """One drive to be recorded."""
+    """The parameters of one recorded drive."""
 
     town: str
     seed: int
@@ -38,7 +38,8 @@ class DrivePlan:
 
     @property
     def log_name(self) -> str:
-        """Town and seed, and whatever of conditions and crowd was asked for: Town01_seed3_night_45v10p."""
+        """Return the log's name from town, seed, and explicit conditions and crowd:
+        Town01_seed3_night_45v10p."""
         conditions = "" if self.conditions is None else f"_{self.conditions}"
         usual = (self.vehicles, self.people) == (Crowd.vehicles, Crowd.people)
         return f"{self.town}_seed{self.seed}{conditions}" + (
@@ -47,27 +48,27 @@ class DrivePlan:
 
     @property
     def frames(self) -> int:
-        """Length of the log."""
+        """Return the number of frames of the log."""
         return max(1, round(self.seconds * self.rate_hz))
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Ranges that drives are drawn from: every town is driven under all conditions, several times.
+    """Ranges from which drives are drawn. Every town is driven under all conditions, several times.
 
     Raises:
-        InputError: an empty or impossible range.
+        InputError: a range is empty or impossible.
     """
 
     towns: tuple[str, ...]
     seeds: tuple[int, ...] | int
-    """Of each town under each of the conditions; or how many, then the seeds are chosen such that what is
-    done at the forks that are passed evens out over all drives."""
+    """Seeds of each town under each of the conditions. If this is a number, that many seeds are chosen such
+    that the commands at the passed forks are balanced over all drives."""
     conditions: tuple[str, ...] = ()
-    """Names of `CONDITIONS`. Alone, `ANY_CONDITIONS` deals them out evenly, one for each town and seed; none
-    at all leaves bright daylight."""
+    """Names of `CONDITIONS`. `ANY_CONDITIONS` alone distributes all conditions evenly, one for each town and
+    seed. Empty: bright daylight."""
     vehicles: tuple[int, int] = (Crowd.vehicles, Crowd.vehicles)
-    """Fewest and most; drawn for each town and seed."""
+    """Minimum and maximum, drawn for each town and seed."""
     people: tuple[int, int] = (Crowd.people, Crowd.people)
     seconds: float = 20.0
     rate_hz: float = 10.0
@@ -88,9 +89,10 @@ class Campaign:
 
 
 def plan_drives(campaign: Campaign) -> list[DrivePlan]:
-    """The drives of a campaign, always the same, by town, conditions and seed; log names are unique.
+    """Plan the drives of a campaign, sorted by town, conditions and seed.
 
-    Where it chooses seeds it drives some of them, without sensors: a second or two for each.
+    The result is always the same, and log names are unique. Where the campaign chooses seeds, some of them
+    are driven without sensors, which takes a second or two for each.
 
     Raises:
         InputError: there is no such town.
@@ -98,14 +100,14 @@ def plan_drives(campaign: Campaign) -> list[DrivePlan]:
     deck, driven = _deal_conditions(), Counter[Command]()
     plans = []
     for town in dict.fromkeys(campaign.towns):
-        load_town_map(town)  # names the known towns if it is none of them
+        load_town_map(town)  # raises an error that lists the known towns if it is none of them
         for conditions, seed in _town_drives(campaign, town, deck, driven):
             plans.append(_plan_drive(campaign, town, seed, conditions))
     return plans
 
 
 def _plan_drive(campaign: Campaign, town: str, seed: int, conditions: str | None) -> DrivePlan:
-    """One drive; its traffic is the same under all conditions."""
+    """Plan one drive. Its traffic is the same under all conditions."""
     rng = np.random.default_rng([seed, *town.encode()])
     vehicles, people = (
         int(rng.integers(fewest, most + 1)) for fewest, most in (campaign.vehicles, campaign.people)
@@ -116,7 +118,10 @@ def _plan_drive(campaign: Campaign, town: str, seed: int, conditions: str | None
 def _town_drives(
     campaign: Campaign, town: str, deck: Iterator[str], driven: Counter[Command]
 ) -> list[tuple[str | None, int]]:
-    """Conditions and seed of each drive in one town; counts the commands into `driven` if it chose seeds."""
+    """Return the conditions and the seed of each drive in one town.
+
+    If the campaign chooses the seeds, the commands are counted into `driven`.
+    """
     dealt = campaign.conditions == (ANY_CONDITIONS,)
     groups: list[str | None] = [None]
     if campaign.conditions and not dealt:
@@ -138,15 +143,17 @@ def _town_drives(
 
 
 def _deal_conditions() -> Iterator[str]:
-    """All conditions in random order, again and again."""
+    """Yield all conditions in random order, again and again."""
     for round_ in itertools.count():
         order = np.random.default_rng(round_).permutation(len(CONDITIONS))
         yield from (list(CONDITIONS)[i] for i in order)
 
 
 def route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Counter[Command]]:
-    """About how often the route of a drive says what while it is recorded, for each of some seeds (some ms
-    each)."""
+    """Return the approximate counts of the commands on the recorded part of a route, for each seed.
+
+    Takes some milliseconds for each seed.
+    """
     lanes = build_lane_graph(load_town_map(town))
     starts = find_starts(lanes)
     routes = (plan_route(lanes, starts, seed, seconds) for seed in seeds)
@@ -159,7 +166,7 @@ def route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Coun
 
 
 def commands_met(plan: DrivePlan) -> Counter[Command]:
-    """What the expert does at the forks that it passes while a drive is recorded."""
+    """Return the counts of the expert's commands at the forks that it passes during a recorded drive."""
     drive = Drive(Traffic(load_town_map(plan.town), plan.seed, plan.vehicles + 1, plan.people), plan.seconds)
     for _ in drive.moments(plan.frames, 1 / plan.rate_hz):
         pass
@@ -172,12 +179,13 @@ def choose_balanced(
     so_far: Counter[Command],
     met: Callable[[int], Counter[Command]],
 ) -> dict[int, Counter[Command]]:
-    """Indices of `count` routes whose commands, with those so far, even out, and the commands that are met.
+    """Choose `count` routes whose commands, together with those so far, are balanced.
 
-    Greedy: the next route is the one after which there are most commands, less the squares of how far each of
-    them is from their mean. What is met on a route is asked for only when the route would be chosen, of no
-    more than `TRIES_PER_DRIVE` for each; then its commands are known, and another one may be better. A
-    command that none of the routes has is left out of account.
+    Returns the indices of the routes, each with the commands that were met on it. The choice is greedy: the
+    next route maximises the number of commands minus the sum of their squared differences from their mean.
+    The commands that are met on a route are requested only when the route would be chosen, for at most
+    `TRIES_PER_DRIVE` routes per drive. Then its commands are known, and another route may be better. A
+    command that no route has is ignored.
     """
     kinds = list(Command)
     times = np.array([[route[kind] for kind in kinds] for route in routes])

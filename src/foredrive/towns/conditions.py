@@ -1,4 +1,4 @@
-"""Time of day and weather of a drive: what light falls on a town and what is in its air."""
+"""Time of day and weather of a drive: the light on a town and the content of its air."""
 
 from dataclasses import dataclass
 
@@ -9,27 +9,28 @@ from foredrive.errors import InputError
 
 CLEAR_VISIBILITY_M = 20_000.0
 FOG_M = 1000.0
-"""Visibility below which haze is called fog."""
+"""Visibility below which haze is called fog, m."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Constant over a drive.
+    """Time of day and weather, constant over a drive.
 
     Raises:
-        InputError: a value outside its range.
+        InputError: a value is outside its range.
     """
 
     hour: float = 12.0
-    """Solar time, 0 to 24: the sun rises at 6, sets at 18 and stands highest at 12."""
+    """Solar time, 0 to 24 h. The sun rises at 6, sets at 18 and is highest at 12."""
     clouds: float = 0.2
-    """Share of the sky, 0 clear to 1 overcast."""
+    """Cloud cover, 0 (clear) to 1 (overcast)."""
     rain_mmph: float = 0.0
     """Rain rate, mm/h: 2 is light, 10 moderate, 50 heavy."""
     wetness: float = 0.0
-    """Of the ground, 0 dry to 1 under water; a rainy drive is on wet ground whatever stands here."""
+    """Wetness of the ground, 0 (dry) to 1 (under water). In rain the ground is wet whatever this value is."""
     visibility_m: float = CLEAR_VISIBILITY_M
-    """By Koschmieder: at this distance 2 % of the contrast is left. Fog is below 1000 m."""
+    """Visibility, m, as defined by Koschmieder: the distance at which 2 % of the contrast remains. Fog is
+    below 1000 m."""
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -45,7 +46,7 @@ class Conditions:
 
     @property
     def time_of_day(self) -> TimeOfDay:
-        """By the height of the sun, and by the clock while it is day."""
+        """Return the time of day, by the height of the sun and, during the day, by the hour."""
         if self.hour < 5.3 or self.hour >= 18.7:
             return TimeOfDay.NIGHT
         if self.hour < 6.7:
@@ -58,7 +59,7 @@ class Conditions:
 
     @property
     def weather(self) -> Weather:
-        """In one word."""
+        """Return the weather in one word."""
         if self.rain_mmph > 0:
             return Weather.RAIN
         if self.visibility_m < FOG_M:
@@ -79,16 +80,16 @@ CONDITIONS = {
     "fog": Conditions(hour=9.0, clouds=0.9, wetness=0.2, visibility_m=150.0),
     "night_fog": Conditions(hour=4.0, clouds=0.9, wetness=0.2, visibility_m=120.0),
 }
-"""By the names the command line knows."""
+"""Conditions by their names on the command line."""
 ANY_CONDITIONS = "any"
-"""Stands for all of them, dealt out evenly."""
+"""Name for all conditions, distributed evenly."""
 
 
 def find_conditions(name: str) -> Conditions:
-    """Conditions by name.
+    """Return conditions by name.
 
     Raises:
-        InputError: there are none of that name.
+        InputError: there are no conditions of this name.
     """
     if name not in CONDITIONS:
         raise InputError(f"no conditions are named {name}; there are {', '.join(CONDITIONS)}")
@@ -96,5 +97,5 @@ def find_conditions(name: str) -> Conditions:
 
 
 def draw_daylight(rng: np.random.Generator) -> Conditions:
-    """A bright day, some time between morning and afternoon, with a few clouds."""
+    """Draw a bright day at a time between morning and afternoon, with a few clouds."""
     return Conditions(hour=float(rng.uniform(8.0, 16.0)), clouds=float(rng.uniform(0.0, 0.45)))

@@ -1,4 +1,4 @@
-"""Recording what the expert drives and senses in a town as a 123D log with exact labels."""
+"""Recording of a drive of the expert in a town as a 123D log with exact labels."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -41,10 +41,10 @@ from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
 FIRST_TIME_US = 1_577_836_800_000_000
-"""Midnight of 1 January 2020 UTC: a log's time must not depend on when it was made."""
+"""Midnight of 1 January 2020 UTC. The time in a log must not depend on when it was recorded."""
 BOXES_WITHIN_M = 80.0
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
-"""NeMo's grid."""
+"""Grid of NeMo."""
 FASTEST_HZ = 100.0
 STATUS_OF_LIGHT = {
     Light.RED: TrafficLightStatus.RED,
@@ -55,33 +55,33 @@ STATUS_OF_LIGHT = {
 
 @dataclass(frozen=True)
 class Crowd:
-    """How many share the road with the ego vehicle, within some 140 m of it."""
+    """The numbers of other road users within about 140 m of the ego vehicle."""
 
     vehicles: int = 30
     people: int = 20
-    """Where the town has walkways."""
+    """Number of people, where the town has walkways."""
 
 
 @dataclass(frozen=True)
 class LabelKinds:
-    """Which exact labels a recording carries, besides boxes with their lidar points, and traffic lights."""
+    """The exact labels of a recording, in addition to boxes with their lidar points, and traffic lights."""
 
     occupancy: VoxelSpec | None = OCCUPANCY
-    """Grid of the occupancy with flow, seen or not."""
+    """Grid of the occupancy with flow, including hidden voxels; None for no occupancy."""
     visibility: bool = True
-    """How much of each box the cameras see."""
+    """Share of each box that the cameras see."""
     depth: bool = False
-    """Images."""
+    """Depth images."""
     semantic: bool = False
-    """Images, and a label for each lidar return."""
+    """Semantic images, and a label for each lidar return."""
     instance: bool = False
-    """Track ids as images, and for each lidar return."""
+    """Track ids as images and for each lidar return."""
     captions: bool = True
-    """With the facts that they are made from (`Setting`)."""
+    """Captions, with the facts from which they are composed (`Setting`)."""
 
 
 def split_of(town: str) -> str:
-    """The 123D split that recordings of a town belong to."""
+    """Return the 123D split of a town's recordings."""
     return "town_test" if town in TEST_TOWNS else "town_train"
 
 
@@ -97,27 +97,28 @@ def record(
     conditions: Conditions | None = None,
     log_name: str | None = None,
 ) -> LogPath:
-    """Record one drive; the same arguments give the same bytes, on the same kind of processor.
+    """Record one drive. The same arguments give the same bytes on the same kind of processor.
 
-    The log lies at out/logs/SPLIT/NAME and replaces one of that name; the map, once for all logs of the
-    town, at out/maps. Boxes are those of all road users within `BOXES_WITHIN_M`, parked cars included; the
-    number of lidar returns from each, and how much of it the cameras see, tell hidden ones from visible ones.
+    The log is written to out/logs/SPLIT/NAME and replaces a log of that name. The map is written to out/maps,
+    once for all logs of the town. There are boxes for all road users within `BOXES_WITHIN_M`, parked cars
+    included. The number of lidar returns from each one, and its visible share, distinguish hidden from
+    visible ones.
 
     Args:
         town: one of `TOWNS`.
-        seconds: length of the drive.
-        seed: decides the place's buildings, the route, the traffic and all noise.
+        seconds: duration of the drive, s.
+        seed: seed of the buildings, the route, the traffic and all noise.
         out: 123D data root.
         rate_hz: frames per second.
-        sensors: six cameras of 144 × 256 px and 32 × 720 beams by default.
+        sensors: by default six cameras of 144 × 256 px and a lidar of 32 × 720 beams.
         crowd: `Crowd()` by default.
         labels: `LabelKinds()` by default.
-        conditions: time of day and weather; None draws bright daylight from the seed.
+        conditions: time of day and weather. None draws bright daylight from the seed.
         log_name: TOWN_seedN by default.
 
     Raises:
         InputError: there is no such town, or no frame to record.
-        OSError: the disk is full; what was written of the log is gone then.
+        OSError: the disk is full. The incomplete log is removed.
     """
     if not seconds > 0:
         raise InputError(f"a recording takes more than 0 s, got {seconds:g}")
@@ -144,12 +145,13 @@ def record(
 
 
 def write_town_map(town: str, out: Path) -> Path:
-    """Write the town's map, once for all of its logs; returns where maps lie."""
+    """Write the town's map, once for all of its logs, and return the folder of the maps."""
     return write_map(_map_objects(town), town, out)
 
 
 def _map_objects(town: str) -> Iterator[BaseMapObject]:
-    """The town's map as py123d parses it, but in an order that does not depend on the hashes of strings."""
+    """Yield the town's map as py123d parses it, but in an order that does not depend on the hashes of
+    strings."""
     for item in OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects():
         if isinstance(item, Lane | LaneGroup):
             item.predecessor_ids.sort()
@@ -158,12 +160,13 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
 
 
 def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:
-    """What the lights show, by the ids that the lanes behind them have in the written map.
+    """Return the states of the lights by the ids that the lanes behind them have in the written map.
 
     Args:
+        town: the map.
         lights: a `Light` for each of the town's stop zones.
     """
-    # The map's writer numbers lanes as the parser yields them, which is their order in the town.
+    # The map's writer numbers lanes in the order of the parser, which is their order in the town.
     id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
     return {
         id_of[lane]: STATUS_OF_LIGHT[Light(light)]
@@ -174,12 +177,12 @@ def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, Tr
 
 
 class SensedMoment(NamedTuple):
-    """A moment of a drive and what the sensors make of it."""
+    """A moment of a drive with its sensor data."""
 
     moment: Moment
     seen: SensorFrame
     seed: int
-    """Of what is random about the frame."""
+    """Seed of the random parts of the frame."""
 
 
 def _sensed(
@@ -200,7 +203,7 @@ def _sensed(
 def _frame(
     world: World, sensed: SensedMoment, sensors: SensorSuite, labels: LabelKinds, narrator: Narrator
 ) -> Frame:
-    """All that is recorded of a moment."""
+    """Return all recorded data of a moment."""
     moment, seen, seed = sensed
     everyone = [*moment.actors, *world.parked]
     near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
@@ -236,7 +239,7 @@ def _frame(
 def _ray_labels(
     seen: SensorFrame, actors: list[ActorState], sensors: SensorSuite, labels: LabelKinds
 ) -> dict[str, Any]:
-    """Labels of pixels and beams, by the names they have in `Frame`."""
+    """Return the labels of pixels and beams by their names in `Frame`."""
     out: dict[str, Any] = {}
     names = list(seen.images)
     if labels.depth:
@@ -255,7 +258,7 @@ def _ray_labels(
 
 
 def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:
-    """Boxes of road users in the ego frame, unbatched."""
+    """Return the boxes of road users in the ego frame, unbatched."""
     T_ego_world = np.linalg.inv(T_world_ego)
     centre = (
         np.array([a.centre_m for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -275,7 +278,7 @@ def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:
 
 
 def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
-    """How often each track was hit."""
+    """Return how often each track was hit."""
     hit, count = np.unique(hit_ids, return_counts=True)
     counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
     return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
@@ -286,7 +289,7 @@ def _distance_m(actor: ActorState, moment: Moment) -> float:
 
 
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:
-    """The cameras of a rig as a log declares them."""
+    """Return the cameras of a rig as declared in a log."""
     return [
         CameraSpec(
             name,

@@ -1,4 +1,4 @@
-"""A town to be seen: all that stands in it, and what the recording vehicle senses there."""
+"""A town for rendering: all static objects and the simulation of the recording vehicle's sensors."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -48,38 +48,39 @@ from foredrive.towns.sensing.seen import Seen, surface_ids, track_ids
 from foredrive.towns.traffic.lights import Light
 
 ACTOR_REACH_M = 200.0
-"""Road users further from the vehicle are not drawn."""
+"""Distance from the vehicle beyond which road users are not rendered, m."""
 ACTOR_RADIUS_M = 8.0
 LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
 LAMP_LIT = srgb_to_linear(((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45)))
 HEADLIGHT_LIT, TAIL_LIT, BRAKE_LIT, STREET_LAMP_LIT = srgb_to_linear(
     ((1.0, 0.98, 0.95), (0.42, 0.02, 0.01), (1.0, 0.10, 0.07), (1.0, 0.93, 0.80))
 )
-"""Of what shines, by linear colour."""
+"""Linear colours of lights that are on."""
 
 
 @dataclass(frozen=True)
 class SensorFrame:
-    """What the sensors saw at one time. Ids are track ids, NOBODY for what is no road user."""
+    """The sensor data at one time. Ids are track ids, NOBODY where there is no road user."""
 
     images: dict[str, UInt8[np.ndarray, "H W 3"]]
     pixel_ids: dict[str, Int[np.ndarray, "H W"]]
-    """At the pixels' centres, as all that is told of pixels."""
+    """Track id at the centre of each pixel. All other pixel labels also refer to the centre."""
     pixel_surface: dict[str, Int[np.ndarray, "H W"]]
-    """A `Surface`, -1 for the sky."""
+    """`Surface`, -1 for the sky."""
     pixel_range_m: dict[str, Float32[np.ndarray, "H W"]]
-    """Along the pixel's ray; infinite for the sky."""
+    """Distance along the pixel's ray, m; infinite for the sky."""
     sweep: LidarSweep
-    """Unbatched, in the ego frame at the frame's time; a beam that got lost is free up to where it hit."""
+    """Lidar sweep, unbatched, in the ego frame at the frame's time. A beam without a return is free up to the
+    surface that it hit."""
     beam_ids: Int[np.ndarray, "N"]
-    """Of all beams, also of those that did not return."""
+    """Track ids of all beams, including those without a return."""
     beam_surface: Int[np.ndarray, "N"]
-    """Likewise; -1 where a beam met nothing."""
+    """`Surface` of all beams, -1 where a beam hit nothing."""
 
 
 @dataclass(frozen=True)
 class VehicleLights:
-    """Looks of the lights of vehicles that drive, that brake, and that stand parked."""
+    """Looks of vehicle lights: while driving, while braking, and on parked vehicles."""
 
     front: int
     rear: int
@@ -89,7 +90,7 @@ class VehicleLights:
 
     @classmethod
     def of(cls, table: LookTable) -> "VehicleLights":
-        """Looks of the shapes' lights, and a second one for each."""
+        """Return the looks of the shapes' lights, and add one more look for each state."""
         front = MeshLooks(table).front_light
         rear = table.add(Look(Surface.VEHICLE, Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08))
         brake = table.add(replace(table.looks[rear], params=(0.0, 2.0)))
@@ -99,11 +100,11 @@ class VehicleLights:
 
 @dataclass(frozen=True)
 class StaticWorld:
-    """What does not move in a town."""
+    """The static content of a town."""
 
     mesh: Mesh
     track: Int32[np.ndarray, "F"]
-    """Track id of the parked car that a triangle belongs to, NOBODY for all others."""
+    """Track id of the parked car to which a triangle belongs, NOBODY for all others."""
     parked: tuple[ActorState, ...]
     heads: tuple[SignalHead, ...]
     thin: ThinThings
@@ -112,10 +113,11 @@ class StaticWorld:
 
 
 class World:
-    """A town grown from a seed: the same map, seed and conditions give the same world.
+    """A town generated from a seed. The same map, seed and conditions give the same world.
 
-    The conditions change the light and the air alone; None draws bright daylight from the seed. The assets
-    are those of the town's split by default: a held-out town holds looks and shapes never seen in training.
+    The conditions change only the light and the air; None draws bright daylight from the seed. By default the
+    assets are those of the town's split, so a held-out town has looks and shapes that never occur in
+    training.
     """
 
     def __init__(
@@ -141,19 +143,25 @@ class World:
         self._columns = make_columns(static.mesh, self._scene, self._looks.surface, static.thin)
 
     def under(self, conditions: Conditions) -> "World":
-        """The same town in another light; what stands there is shared, not grown again."""
+        """Return the same town under other conditions.
+
+        It shares the static content, which is not generated again.
+        """
         other = copy(self)
         other.conditions, other.light = conditions, make_light(conditions, self._east_rad)
         return other
 
     @property
     def parked(self) -> tuple[ActorState, ...]:
-        """Parked cars: a part of the world that `render` and `occupancy` know of already."""
+        """Return the parked cars.
+
+        They are a part of the world that `render` and `occupancy` already include.
+        """
         return self.static.parked
 
     @property
     def surfaces(self) -> Int[np.ndarray, "L"]:
-        """The `Surface` of each look in the static mesh."""
+        """Return the `Surface` of each look in the static mesh."""
         return self._looks.surface
 
     def render(
@@ -165,15 +173,18 @@ class World:
         noise_seed: int,
         lights: Int[np.ndarray, "Z"] | None = None,
     ) -> SensorFrame:
-        """What the sensors see at one time.
+        """Render the sensor data at one time.
 
-        The vehicle and the road users move on straight ahead during a sweep, and while an image is exposed.
+        The vehicle and the road users move straight ahead during a sweep and during the exposure of an image.
 
         Args:
-            actors: road users without the ego vehicle; those that are parked are passed over.
+            actors: road users without the ego vehicle. Parked ones are ignored, because the world contains
+                them.
+            sensors: the sensors.
+            T_world_ego: pose of the vehicle.
             twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
-            noise_seed: of range noise and lost beams, and of the noise in images.
-            lights: a `Light` for each of the town's stop zones; None leaves their lamps dark.
+            noise_seed: seed of range noise, of lost beams and of image noise.
+            lights: a `Light` for each of the town's stop zones. None: all lamps are off.
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
         moment = self._moment(near, lights, T_world_ego)
@@ -196,13 +207,13 @@ class World:
     def occupancy(
         self, actors: Sequence[ActorState], T_world_ego: Float64[np.ndarray, "4 4"], spec: VoxelSpec
     ) -> FullOccupancy:
-        """Exact occupancy of a grid in the ego frame, the insides of solid things included.
+        """Compute the exact occupancy of a grid in the ego frame, including the inside of solid objects.
 
-        `category` is that of the road user, or -1 minus the `Surface` of what is static; velocities are those
-        of the road users, in the ego axes. Takes .2 s where the vehicle has not been, then milliseconds.
+        `category` is that of the road user, or -1 minus the `Surface` of static matter. Velocities are those
+        of the road users in the ego axes. A call takes 0.2 s at a new place, and milliseconds at a known one.
 
         Raises:
-            InputError: voxels finer than `occupancy.FINEST_VOXEL_M`.
+            InputError: the voxels are finer than `occupancy.FINEST_VOXEL_M`.
         """
         reach_m = float(np.linalg.norm([*spec.lower_m, *spec.upper_m]))
         moving = [actor for actor in actors if not actor.parked]
@@ -217,17 +228,18 @@ class World:
         T_world_ego: Float64[np.ndarray, "4 4"],
         frame: SensorFrame,
     ) -> Float32[np.ndarray, "M"]:
-        """How much of each road user, parked cars included, a frame shows (see `labels.visibility`)."""
+        """Return the visible share of each road user, parked cars included, in a frame (see
+        `labels.visibility`)."""
         shaped = [(actor, self._shapes.shape_of(actor)) for actor in actors]
         return visibility(shaped, sensors, T_world_ego, np.stack(list(frame.pixel_ids.values())))
 
     def struck(
         self, origin: Float32[np.ndarray, "N 3"], direction: Float32[np.ndarray, "N 3"]
     ) -> tuple[Float32[np.ndarray, "N"], Int[np.ndarray, "N"]]:
-        """What stands in the way of rays, parked cars included.
+        """Cast rays at the static world, parked cars included.
 
         Returns:
-            How far it is, in lengths of `direction`, and its `Surface`; infinite and -1 if there is nothing.
+            The distance, in lengths of `direction`, and the `Surface`; infinite and -1 if a ray hits nothing.
         """
         hits = self._scene.cast(origin, direction)
         met = hits.triangle != shading.MISS
@@ -236,7 +248,7 @@ class World:
 
     @cached_property
     def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
-        """Points on the lamps of each traffic light, by the index of its stop zone."""
+        """Return points on the lamps of each traffic light, by the index of its stop zone."""
         look, xyz = self.static.mesh.look, self.static.mesh.xyz
         points = {}
         for head in self.static.heads:
@@ -273,7 +285,7 @@ class World:
     def _through_air_and_lens(
         self, images: UInt8[np.ndarray, "C H W 3"], sensors: SensorSuite, noise_seed: int
     ) -> UInt8[np.ndarray, "C H W 3"]:
-        """Images with glare by night, and with rain."""
+        """Add glare by night, and rain, to images."""
         if is_dark(self.conditions):
             images = np.stack([lens.add_glare(image) for image in images])
         if self.conditions.rain_mmph == 0.0:
@@ -288,7 +300,7 @@ class World:
         return np.stack(drops)
 
     def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
-        """Looks with the lamps that shine."""
+        """Return the looks with the lights that are on."""
         shining: dict[int, Rgb] = {self.static.vehicle_lights.brake: BRAKE_LIT}
         if drive_lit(self.conditions):
             shining |= {
@@ -318,7 +330,10 @@ class World:
 def build_static(
     town: TownMap, table: LookTable, shapes: ShapeLibrary, assets: Assets, rng: np.random.Generator
 ) -> StaticWorld:
-    """Grow a town. What the map says comes first, then what needs most room."""
+    """Generate the static content of a town.
+
+    Objects of the map come first, then the objects that need most space.
+    """
     plan = make_ground_plan(town)
     terrain = make_terrain(plan, town.bounds_m, rng)
     site = Site(plan, terrain)
@@ -356,7 +371,7 @@ def build_static(
 
 
 def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> Mesh:
-    """A parked car as a part of the town; its lights are off."""
+    """Build the mesh of a parked car as a part of the town, with its lights off."""
     shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car, lights.rear_off)
     moved = shape.transformed(unit_to_world(car))
     slot = np.clip(-1 - moved.look, 0, SLOTS - 1)

@@ -1,1 +1,1 @@
-"""What is true in a town: exact labels of what was sensed."""
+"""Exact labels of the sensor data from a town."""

@@ -1,4 +1,4 @@
-"""Captions: plain English sentences about what the cameras see, composed from a frame's facts."""
+"""Captions: plain English sentences about what the cameras see, composed from the facts of a frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Settin
 from foredrive.towns.conditions import FOG_M
 
 SEEN = 0.4
-"""Road users of which less is visible go unmentioned: nuScenes' lowest visibility level."""
+"""Minimum visibility of road users that are mentioned: nuScenes' lowest visibility level."""
 NEAR_M, AHEAD_M = 30.0, 50.0
-"""How far road users beside and behind, and those ahead, are worth words."""
+"""Maximum distance of road users that are mentioned, m: beside and behind, and ahead."""
 AHEAD_RAD, BEHIND_RAD = np.deg2rad(35.0), np.deg2rad(125.0)
 MOVING_MPS, WALKING_MPS = 0.5, 0.3
 ONCOMING_COS, ACROSS_COS = -0.8, 0.5
 FOG_SHARE = 0.7
-"""Of the meteorological range: beyond, fog leaves too little contrast."""
+"""Maximum distance in fog, as a fraction of the visibility. Beyond it the contrast is too low."""
 BOTH_SIDES = "on both sides"
 
 
@@ -28,24 +28,24 @@ class Thing:
     kind: ObjectKind
     xy_m: Float[np.ndarray, "2"]
     velocity_mps: Float[np.ndarray, "2"]
-    """Over ground, along the ego axes."""
+    """Velocity over ground along the ego axes, m/s."""
     yaw: float
     visibility: float
     parked: bool = False
     on_road: bool = False
-    """Stands on a driving lane."""
+    """Whether it stands on a driving lane."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What there is to tell of one moment."""
+    """The facts of one moment."""
 
     setting: Setting
     things: Sequence[Thing]
 
 
 def caption(situation: Situation, seed: int) -> str:
-    """Two to six sentences; the seed chooses among phrasings, never among facts."""
+    """Compose a caption of two to six sentences. The seed selects phrasings, never facts."""
     words, setting = _Words(np.random.default_rng(seed)), situation.setting
     seen = [thing for thing in situation.things if _is_seen(thing, setting)]
     sentences = [
@@ -158,7 +158,7 @@ def _a(noun: str) -> str:
 
 
 def _counted(things: Sequence[Thing], adjective: str = "") -> str:
-    """ "two oncoming cars and a bus"."""
+    """Return a phrase such as "two oncoming cars and a bus"."""
     parts = []
     for kind in ObjectKind:
         count = sum(thing.kind is kind for thing in things)
@@ -178,7 +178,7 @@ def _listed(parts: Sequence[str]) -> str:
 
 
 def _traffic(seen: Sequence[Thing], setting: Setting, words: _Words) -> list[str]:
-    """Vehicles in traffic, by where they are and where they go."""
+    """Describe the moving vehicles by their position and direction."""
     vehicles = [t for t in seen if not t.parked and t.kind is not ObjectKind.PEDESTRIAN]
     there = {where: [t for t in vehicles if _whereabouts(t, setting) == where] for where in _WHEREABOUTS}
     phrases = [
@@ -200,11 +200,11 @@ _WHEREABOUTS = {
     "right": ("on the right", "to the right"),
     "behind": ("behind",),
 }
-"""Where vehicles may be, and how that is said."""
+"""Possible positions of vehicles, and phrases for them."""
 
 
 def _whereabouts(thing: Thing, setting: Setting) -> str:
-    """One of `_WHEREABOUTS`; where the way bends, none of those ahead is said to drive across it."""
+    """Return one of `_WHEREABOUTS`. In bends no vehicle ahead counts as crossing."""
     sector = _sector(thing)
     if sector != "ahead" or np.hypot(*thing.velocity_mps) <= MOVING_MPS:
         return sector
@@ -221,7 +221,7 @@ def _crosses(thing: Thing) -> bool:
 
 
 def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
-    """Who walks across the road in front, and from which side."""
+    """Describe the people who walk across the road in front, and the side from which they come."""
     sentences = []
     for sign, side in ((1.0, "right"), (-1.0, "left")):
         group = [t for t in seen if _crosses(t) and np.sign(t.velocity_mps[1]) == sign]
@@ -234,7 +234,7 @@ def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
 
 
 def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
-    """People who do not cross."""
+    """Describe the people who do not cross."""
     people = [t for t in seen if t.kind is ObjectKind.PEDESTRIAN and not _crosses(t)]
     if not people:
         return ""
@@ -263,6 +263,6 @@ def _light(setting: Setting, words: _Words) -> str:
     if colour is None or waits_there:
         return ""
     ahead = f"{_a(colour)} traffic light ahead"
-    if setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT):  # not the one that it has just passed
+    if setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT):  # not the light that it has just passed
         return ahead
     return words.pick(f"the traffic light is {colour}", f"the light shows {colour}", ahead)

@@ -1,4 +1,4 @@
-"""Exact occupancy: every voxel that holds matter, seen or not, with what it is and how it moves."""
+"""Exact occupancy: every voxel that contains matter, visible or not, with its class and its motion."""
 
 import itertools
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.columns import COLUMN_M, TownColumns
 
 FINEST_VOXEL_M = COLUMN_M * 2**0.5
-"""A column of a turned grid must not slip between the town's columns."""
+"""Minimum voxel size, m. A column of a rotated grid must not lie between the town's columns."""
 
 _PRIORITY = {
     Surface.TERRAIN: 1,
@@ -30,7 +30,7 @@ _PRIORITY = {
     Surface.SIGN: 8,
     Surface.SIGNAL: 9,
 }
-"""What a voxel is that holds several things: the highest."""
+"""Priority of surfaces. A voxel with several surfaces gets the one with the highest priority."""
 _CODE_OF_SURFACE = np.array([_PRIORITY.get(surface, 0) for surface in Surface], dtype=np.int16)
 _SURFACE_OF_CODE = np.array([0, *sorted(_PRIORITY, key=lambda surface: _PRIORITY[surface])])
 _FIRST_ACTOR = len(_SURFACE_OF_CODE)
@@ -42,12 +42,12 @@ def full_occupancy(
     T_world_ego: Float64[np.ndarray, "4 4"],
     spec: VoxelSpec,
 ) -> FullOccupancy:
-    """Occupied voxels of a grid in the ego frame.
+    """Compute the occupied voxels of a grid in the ego frame.
 
-    The category of what is static is -1 minus its `Surface`. Parked cars are among the actors.
+    The category of static matter is -1 minus its `Surface`. Parked cars are among the actors.
 
     Raises:
-        InputError: voxels finer than the town is sampled.
+        InputError: the voxels are finer than the sampling of the town.
     """
     if spec.voxel_m < FINEST_VOXEL_M:
         raise InputError(
@@ -74,7 +74,7 @@ def _collect(
     T_world_ego: Float64[np.ndarray, "4 4"],
     spec: VoxelSpec,
 ) -> FullOccupancy:
-    """The grid's codes as what they stand for."""
+    """Convert the codes of the grid to categories and velocities."""
     kind = np.array([*(-1 - _SURFACE_OF_CODE), *(int(actor.category) for actor in actors)])
     still = np.zeros((_FIRST_ACTOR, 3))
     velocity_world = np.concatenate([still, *(actor.velocity_mps[None] for actor in actors)])
@@ -92,9 +92,10 @@ def _collect(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _fill(x, y, low, high, surface, code_of_surface, T, grid):
-    """Mark the voxels that upright intervals run through; the highest code wins.
+    """Mark the voxels that vertical intervals pass through. The highest code wins.
 
-    T leads to indices; along an interval it leans so little that a layer holds two voxels of it at most.
+    T maps to indices. An interval is nearly vertical in the grid: it passes through at most two voxels of a
+    layer.
     """
     depth, height, width = grid.shape
     for i in range(len(x)):
@@ -110,7 +111,7 @@ def _fill(x, y, low, high, surface, code_of_surface, T, grid):
         if max(a, a1) < 0 or min(a, a1) >= width or max(b, b1) < 0 or min(b, b1) >= height:
             continue
         first, last = int(np.floor(T[2, 2] * bottom + rest)), int(np.floor(T[2, 2] * top + rest))
-        if a == a1 and b == b1:  # upright in the grid, as nearly all are
+        if a == a1 and b == b1:  # vertical in the grid, as nearly all are
             for c in range(max(first, 0), min(last, depth - 1) + 1):
                 if code > grid[c, b, a]:
                     grid[c, b, a] = code

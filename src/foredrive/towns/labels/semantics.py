@@ -1,4 +1,4 @@
-"""What each pixel and each lidar return shows, in 123D's own classes, and how far off it is."""
+"""Labels of pixels and lidar returns in 123D's own classes, and depth."""
 
 from collections.abc import Sequence
 
@@ -13,9 +13,9 @@ from foredrive.towns.actors import ActorState
 from foredrive.towns.place.looks import Surface
 
 SKY = -1
-"""In place of a `Surface` where a ray met nothing."""
+"""Value in place of a `Surface` where a ray hit nothing."""
 NOBODY = -1
-"""In place of a track id, and of a `Category`, where it met no road user."""
+"""Value in place of a track id or a `Category` where a ray hit no road user."""
 
 _CAMERA_LABEL = {
     Surface.ROAD: CameraLabel.ROAD,
@@ -26,7 +26,7 @@ _CAMERA_LABEL = {
     Surface.POLE: CameraLabel.POLE,
     Surface.SIGN: CameraLabel.TRAFFIC_SIGN,
     Surface.SIGNAL: CameraLabel.TRAFFIC_LIGHT,
-    Surface.STRUCTURE: CameraLabel.BUILDING,  # as py123d takes KITTI-360's walls and bridges
+    Surface.STRUCTURE: CameraLabel.BUILDING,  # as py123d treats KITTI-360's walls and bridges
     Surface.VEHICLE: CameraLabel.VEHICLE,
     Surface.PEDESTRIAN: CameraLabel.PERSON,
     Surface.HIDDEN: CameraLabel.IGNORE,
@@ -40,7 +40,7 @@ _LIDAR_LABEL = {
     Surface.PEDESTRIAN: LidarLabel.PERSON,
     Surface.HIDDEN: LidarLabel.IGNORE,
 }
-"""Everything else is man-made."""
+"""Labels of surfaces. All other surfaces are man-made."""
 _TWO_WHEELED = (Category.BICYCLE, Category.MOTORCYCLE)
 _CAMERA_LABEL_OF_CATEGORY = {
     Category.PEDESTRIAN: CameraLabel.PERSON,
@@ -59,7 +59,10 @@ _LIDAR_LABEL_OF_CATEGORY = {
 
 
 def _tables() -> tuple[UInt8[np.ndarray, "K S"], UInt8[np.ndarray, "K S"]]:
-    """Camera and lidar labels by category (its number + 1; 0: no road user) and surface (its number + 1)."""
+    """Return tables of camera and lidar labels by category and surface.
+
+    The row is the category's number + 1 (0: no road user), the column the surface's number + 1.
+    """
     shape = (len(Category) + 1, len(Surface) + 1)
     camera, lidar = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     camera[:, SKY + 1] = CameraLabel.SKY
@@ -81,7 +84,7 @@ _CAMERA_TABLE, _LIDAR_TABLE = _tables()
 
 
 class CategoryOfTrack:
-    """Looks up the `Category` of track ids, -1 for those of no road user."""
+    """A lookup of the `Category` of track ids, -1 for ids that belong to no road user."""
 
     def __init__(self, actors: Sequence[ActorState]) -> None:
         tracks = np.array([NOBODY, *(actor.track_id for actor in actors)], dtype=np.int64)
@@ -94,20 +97,20 @@ class CategoryOfTrack:
 
 
 def camera_labels(surface: Int[np.ndarray, "*n"], category: Int[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """`DefaultCameraSegmentationLabel`s by `Surface` (or `SKY`) and `Category` (-1: no road user)."""
+    """Return `DefaultCameraSegmentationLabel`s by `Surface` (or `SKY`) and `Category` (-1: no road user)."""
     return _CAMERA_TABLE[category + 1, surface + 1]
 
 
 def lidar_labels(surface: Int[np.ndarray, "*n"], category: Int[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """`DefaultLidarSegmentationLabel`s, likewise; 0 where a beam met nothing."""
+    """Return `DefaultLidarSegmentationLabel`s in the same way; 0 where a beam hit nothing."""
     return _LIDAR_TABLE[category + 1, surface + 1]
 
 
 def instance_labels(track_ids: Int[np.ndarray, "*n"]) -> UInt16[np.ndarray, "*n"]:
-    """Instances are numbered by their track ids; 0 is no road user.
+    """Return the instance numbers: the track ids, or 0 for no road user.
 
     Raises:
-        InputError: a track id beyond the 16 bits that 123D has for it.
+        InputError: a track id exceeds the 16 bits that 123D has for it.
     """
     if track_ids.size and track_ids.max() > np.iinfo(np.uint16).max:
         raise InputError(f"instance images hold track ids up to 65535, got {track_ids.max()}")
@@ -117,6 +120,7 @@ def instance_labels(track_ids: Int[np.ndarray, "*n"]) -> UInt16[np.ndarray, "*n"
 def z_depth(
     range_m: Float32[np.ndarray, "C H W"], dir_ego: Float32[np.ndarray, "N 3"], rig: CameraRig
 ) -> Float32[np.ndarray, "C H W"]:
-    """Depth along the optical axes, m, of what pixels' unit rays met at a distance; infinite for the sky."""
+    """Convert distances along the unit rays of pixels to depths along the optical axes, m; infinite for the
+    sky."""
     axis = rig.T_ego_cam[:, :3, 2].numpy()
     return range_m * np.einsum("cni,ci->cn", dir_ego.reshape(len(axis), -1, 3), axis).reshape(range_m.shape)

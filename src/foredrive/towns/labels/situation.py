@@ -1,4 +1,4 @@
-"""Facts for captions: where the vehicle is, what it does, and who is around it."""
+"""Facts for captions: the place of the vehicle, its action, and the road users around it."""
 
 from collections.abc import Callable, Sequence
 
@@ -26,23 +26,23 @@ GENTLE_MPS2 = 1.0
 LEADER_M, LEADER_ASIDE_M = 30.0, 1.6
 FOLLOWED_M = 25.0
 MIDDLE_M = 0.8
-"""About half the height of a vehicle: the way lies on the road."""
+"""Height of a vehicle's middle above the road, m, because routes lie on the road."""
 BUMPER_M = 3.0
 LIGHT_M = 45.0
 LAMPS_M = 50.0
-"""Further off a lamp is but a part of a pixel."""
+"""Maximum distance of a lamp, m. Further away a lamp is only a part of a pixel."""
 PASSES_OVER_M, BELOW_M = 4.0, 5.0
 RING_M = (40.0, 250.0)
 RING_RADIUS_M = 60.0
-"""A lane that turns less than one of this radius is part of no roundabout, if it is longer than `SHORT_M`."""
+"""Maximum radius of the lanes of a roundabout, m. It does not apply to lanes shorter than `SHORT_M`."""
 SHORT_M = 12.0
 RING_LANES = 40
 RING_TURN_RAD = 1.5 * np.pi
-"""Short of a full circle by what is lost where lanes meet."""
+"""Minimum turn of a roundabout, rad. It is less than a full circle because turn is lost where lanes meet."""
 
 
 class Places:
-    """Tells what kind of place a point of a town is."""
+    """A classifier of the kind of place at points of a town."""
 
     def __init__(self, town: TownMap, lanes: LaneGraph) -> None:
         self._lanes = lanes
@@ -55,7 +55,7 @@ class Places:
         self._roads = shapely.STRtree([strip.polygon for strip in town.strips_of(StripKind.DRIVING)])
 
     def place(self, xyz: Float64[np.ndarray, "3"]) -> Place:
-        """Of a point on the road."""
+        """Return the kind of place at a point on the road."""
         sample = int(self._samples.query(xyz)[1])
         if self._over[sample]:
             return Place.BRIDGE
@@ -64,14 +64,14 @@ class Places:
         return self._of_lane[int(self._lane_of_sample[sample])]
 
     def on_road(self, xy: Float64[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
-        """Which points lie on a driving lane, seen from above."""
+        """Return whether each point lies on a driving lane, seen from above."""
         out = np.zeros(len(xy), dtype=np.bool_)
         out[self._roads.query(shapely.points(xy), predicate="within")[0]] = True
         return out
 
 
 class Narrator:
-    """Gathers what there is to tell of the moments of one drive."""
+    """A collector of the facts of the moments of one drive."""
 
     def __init__(
         self,
@@ -102,11 +102,13 @@ class Narrator:
         visibility: Float[np.ndarray, "M"],
         sees: Callable[[Float64[np.ndarray, "3"]], bool],
     ) -> Situation:
-        """The moments come in the order of time.
+        """Collect the facts of a moment. Calls must be in the order of time.
 
         Args:
-            actors: those around the vehicle, with how much of each is seen.
-            sees: whether the cameras see a point (ego frame).
+            moment: the moment of the drive.
+            actors: the road users around the vehicle.
+            visibility: the visible share of each of them.
+            sees: a function that returns whether the cameras see a point (ego frame).
         """
         T_ego_world = np.linalg.inv(moment.T_world_ego)
         R, at = T_ego_world[:3, :3], moment.T_world_ego[:3, 3]
@@ -143,7 +145,7 @@ class Narrator:
         centre: Float64[np.ndarray, "M 3"],
         visibility: Float[np.ndarray, "M"],
     ) -> tuple[ActorState | None, float]:
-        """The next vehicle on the way that is seen, and how far ahead its middle is."""
+        """Return the next visible vehicle on the route, and the distance to its middle, m."""
         end = int(np.searchsorted(self._arc_m, self._arc_m[self._passed] + LEADER_M))
         way, arc_m = self._line[self._passed : end], self._arc_m[self._passed : end]
         if not len(way) or not len(centre):
@@ -158,7 +160,7 @@ class Narrator:
         return actors[best], float(ahead_m[best])
 
     def _aside_speed(self, moment: Moment) -> float:
-        """How fast the vehicle moves to the left of its route, m/s; 0 at the first moment."""
+        """Return the speed of the vehicle to the left of its route, m/s; 0 at the first moment."""
         before, self._aside = self._aside, (moment.t_s, self._aside_m(moment))
         return 0.0 if before is None else (self._aside[1] - before[1]) / (moment.t_s - before[0])
 
@@ -190,7 +192,7 @@ class Narrator:
         T_ego_world: Float64[np.ndarray, "4 4"],
         sees: Callable[[Float64[np.ndarray, "3"]], bool],
     ) -> LightColour | None:
-        """What the next light on the way shows, if its lamps are in view."""
+        """Return the colour of the next light on the route if its lamps are in view."""
         axle_m = float(self._arc_m[self._passed])
         for lane, begin_m in zip(self._route.lanes, self._begins_m, strict=True):
             if begin_m > axle_m + LIGHT_M:
@@ -211,7 +213,7 @@ _COLOUR_OF_LIGHT = {
 
 
 def kind_of(actor: ActorState) -> ObjectKind:
-    """What to call a road user: as it looks, which tells vans from cars."""
+    """Return the name of a road user by its appearance, which distinguishes vans from cars."""
     if actor.category is Category.CAR:
         length_m, _, height_m = actor.size_lwh
         return ObjectKind.VAN if length_m > VAN_LENGTH_M and height_m > VAN_HEIGHT_M else ObjectKind.CAR
@@ -261,7 +263,7 @@ def _place_of(lanes: LaneGraph, lane: int) -> Place:
 def _crossed_levels(
     xyz: Float64[np.ndarray, "P 3"],
 ) -> tuple[Bool[np.ndarray, "P"], Bool[np.ndarray, "P"]]:
-    """Which points of lanes run above another lane, and which below one."""
+    """Return which points of lanes are above another lane, and which are below one."""
     over, under = np.zeros((2, len(xyz)), dtype=np.bool_)
     if np.ptp(xyz[:, 2]) < PASSES_OVER_M:
         return over, under
@@ -273,7 +275,8 @@ def _crossed_levels(
 
 
 def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
-    """Lanes of roundabouts: closed ways that turn left all along, and what joins them within a junction."""
+    """Return the lanes of roundabouts: closed paths that turn left throughout, and lanes in the same
+    junctions."""
     bends = lanes.turn_rad > np.where(lanes.length_m < SHORT_M, -0.1, lanes.length_m / RING_RADIUS_M)
     found: set[int] = set()
     for start in np.flatnonzero(bends & (lanes.length_m >= SHORT_M)).tolist():
@@ -285,7 +288,7 @@ def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
 
 
 def _ring_from(lanes: LaneGraph, start: int, bends: Bool[np.ndarray, "L"]) -> list[int]:
-    """A ring through a lane, empty if there is none."""
+    """Return the lanes of a ring that contains a lane; empty if there is none."""
     ways = [[start]]
     while ways:
         way = ways.pop()

@@ -1,4 +1,4 @@
-"""How much of each road user the cameras see, of what they would see if nothing stood in the way."""
+"""Visibility: the share of each road user that the cameras see, relative to an unobstructed view."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,11 @@ from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 
 RAYS_PER_CAMERA = 1024
-"""A road user that fills more of an image is judged by an even grid of about this many of its pixels."""
+"""Approximate maximum number of rays per camera and road user. A larger road user is sampled by an even grid
+of its pixels."""
 NEAR_M = 0.1
 THING_M = 0.5
-"""A thing may reach this far towards the camera from its middle."""
+"""Maximum distance from the middle of a small object to its surface, m."""
 _CORNERS = np.array([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -24,14 +25,18 @@ def visibility(
     T_world_ego: Float64[np.ndarray, "4 4"],
     pixel_ids: Int[np.ndarray, "C H W"],
 ) -> Float32[np.ndarray, "M"]:
-    """Share of each road user's silhouette, over all images, that is seen: 0 hidden to 1 in full view.
+    """Compute the visible share of each road user's silhouette over all images, 0 (hidden) to 1 (in full
+    view).
 
-    The silhouette is that of its shape alone at the frame's time, by the images' own rays: what lies beyond
-    the images' borders does not count, and one that fills no pixel's centre has 0. nuScenes' visibility
-    levels are this share cut at .4, .6 and .8.
+    The silhouette is that of the shape alone at the frame's time, sampled by the rays of the images. Parts
+    outside the images do not count. A road user that covers no pixel centre has 0. nuScenes' visibility
+    levels are this share with thresholds at .4, .6 and .8.
 
     Args:
-        pixel_ids: the track id that each pixel shows.
+        actors: the road users with their shapes.
+        sensors: the cameras.
+        T_world_ego: pose of the vehicle.
+        pixel_ids: track id at each pixel.
     """
     out = np.zeros(len(actors), dtype=np.float32)
     seen = np.isin([actor.track_id for actor, _ in actors], np.unique(pixel_ids))
@@ -56,10 +61,12 @@ def visibility(
 def is_seen(
     point_ego: Float64[np.ndarray, "3"], rig: CameraRig, range_m: Float32[np.ndarray, "C H W"]
 ) -> bool:
-    """Whether a small thing is in an image with nothing before it.
+    """Return whether a small object is in an image with nothing in front of it.
 
     Args:
-        range_m: how far off what each pixel shows is.
+        point_ego: position in the ego frame, m.
+        rig: the cameras.
+        range_m: distance of the surface at each pixel, m.
     """
     height, width = rig.size_hw
     poses, matrices = rig.T_ego_cam.double().numpy(), rig.K.double().numpy()
@@ -77,7 +84,7 @@ def is_seen(
 
 
 def _windows(T_ego_unit: Float64[np.ndarray, "M 4 4"], sensors: SensorSuite) -> Int64[np.ndarray, "M C 4"]:
-    """Rows and columns, from and up to, that hold each unit box in each image; empty where it is not."""
+    """Return the row and column ranges of each unit box in each image; empty where it is not visible."""
     rig = sensors.rig
     height, width = rig.size_hw
     T_cam_ego = np.linalg.inv(rig.T_ego_cam.double().numpy())
@@ -98,7 +105,7 @@ def _windows(T_ego_unit: Float64[np.ndarray, "M 4 4"], sensors: SensorSuite) -> 
 def _pixels(
     windows: Int64[np.ndarray, "C 4"], size_hw: tuple[int, int]
 ) -> tuple[Int64[np.ndarray, "P"], Float32[np.ndarray, "P"]]:
-    """Flat indices of the pixels to look through, and how many pixels each stands for."""
+    """Return the flat indices of the sampled pixels, and the number of pixels that each one represents."""
     height, width = size_hw
     pixels, weights = [], []
     for c, (top, bottom, left, right) in enumerate(windows.tolist()):

@@ -1,1 +1,1 @@
-"""A town's map: lanes, stop zones and surfaces as the OpenDRIVE file has them."""
+"""The map of a town: lanes, stop zones and surfaces, read from its OpenDRIVE file."""

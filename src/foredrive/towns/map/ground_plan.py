@@ -1,7 +1,8 @@
-"""The plan of a town's roads: cross-section strips cut into pieces that no longer lie across each other.
+"""The ground plan of a town's roads: pieces of cross-section strips without overlaps.
 
 In junctions the strips of connecting roads overlap. Seen from above, each spot of a level belongs to the
-piece of the highest rank: lanes before shoulders before walkways. Levels (a road over another) stay apart.
+piece of the highest rank: lanes before shoulders before walkways. Levels (a road over another) are treated
+separately.
 """
 
 import itertools
@@ -17,11 +18,12 @@ from foredrive.towns.map.town_map import Points, Strip, StripKind, TownMap
 
 PIECE_SAMPLES = 8
 LEVEL_GAP_M = 2.5
-"""Pieces whose heights differ by more lie on different levels."""
+"""Height difference above which two pieces lie on different levels, m."""
 OVERLAP_M2 = 0.02
 BRIDGE_REACH_M = 14.0
 BANK_SLOPE = 0.5
-"""A road beside a lower one lies on an embankment down to this slope, on a bridge where it were steeper."""
+"""Maximum slope of an embankment. A road beside a lower road lies on an embankment down to the lower road if
+the slope is at most this value, and on a bridge otherwise."""
 JUNCTION_CLOSING_M = 2.0
 JUNCTION_HOLE_M2 = 150.0
 WALKWAY_RAISE_M = 0.15
@@ -43,26 +45,29 @@ RAISED = frozenset({StripKind.MEDIAN, StripKind.SIDEWALK})
 
 @dataclass(frozen=True)
 class Piece:
-    """A few metres of a strip."""
+    """A piece of a strip, a few metres long."""
 
     strip: Strip
     left_xyz: Points
     right_xyz: Points
     along_m: Float[np.ndarray, "N"]
-    """Distance of each sample from the start of the strip."""
+    """Distance of each sample from the start of the strip, m."""
     area: shapely.Geometry
-    """What is left of it, seen from above."""
+    """The area of the piece after clipping, seen from above."""
     whole: bool
-    """Nothing was cut off."""
+    """True if clipping removed nothing."""
     bridge: bool
 
     @property
     def raise_m(self) -> float:
-        """Height above the road."""
+        """Return the height above the road, m."""
         return WALKWAY_RAISE_M if self.strip.kind in RAISED else 0.0
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Height of the road at points of the piece: that of the nearest point of its middle line."""
+        """Return the height of the road at points of the piece.
+
+        The height is that of the nearest point of the piece's middle line.
+        """
         middle = 0.5 * (self.left_xyz + self.right_xyz)
         start, step = middle[:-1, :2], np.diff(middle[:, :2], axis=0)
         offset = xy[:, None] - start
@@ -76,22 +81,22 @@ class Piece:
 
 @dataclass(frozen=True)
 class GroundPlan:
-    """All pieces of a town, and what they cover."""
+    """All pieces of a town and the areas they cover."""
 
     pieces: tuple[Piece, ...]
     fills: tuple[shapely.Polygon, ...]
     """Asphalt between the lanes of a junction."""
     lanes: shapely.Geometry
-    """Driving lanes of every level."""
+    """Driving lanes of all levels."""
     ground: shapely.Geometry
-    """Everything paved that lies on the ground, walkways and fills included."""
+    """All paved area that lies on the ground, walkways and fills included."""
     bridges: shapely.Geometry
-    """Everything that is carried by bridges."""
+    """All area that bridges carry."""
     borders: "BorderHeights"
 
     @property
     def covered(self) -> shapely.Geometry:
-        """All that is paved, of every level."""
+        """Return all paved area of all levels."""
         return self.ground.union(self.bridges)
 
 
@@ -104,17 +109,20 @@ class BorderHeights:
     raised: Float[np.ndarray, "N"]
 
     def road(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Height of the road at its border sample nearest to each point."""
+        """Return the height of the road at the border sample that is nearest to each point."""
         return self.z[self.tree.query(xy)[1]]
 
     def top(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """The same for what lies there, walkways being higher than the road."""
+        """Return the height of the top surface at the nearest border sample.
+
+        Walkways are higher than the road.
+        """
         return self.raised[self.tree.query(xy)[1]]
 
 
-@lru_cache(maxsize=1)  # a town is often grown from several seeds in a row
+@lru_cache(maxsize=1)  # several worlds are often generated on one town in a row
 def make_ground_plan(town: TownMap) -> GroundPlan:
-    """Cut a town's strips into pieces, clip them, and fill its junctions."""
+    """Cut a town's strips into pieces, clip the pieces, and fill the junctions."""
     parts = [part for strip in town.strips for part in _cut(strip)]
     whole = np.array(
         [shapely.Polygon(np.concatenate([left, right[::-1]])[:, :2]) for _, left, right, _ in parts]
@@ -154,8 +162,11 @@ def _border_heights(pieces: list[Piece]) -> BorderHeights:
 
 
 def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N"]]]:
-    """Pieces of up to PIECE_SAMPLES stretches on which the markings do not change, without the samples that
-    lie on straight lines."""
+    """Cut a strip into pieces of at most PIECE_SAMPLES sample intervals, on each of which the markings do not
+    change.
+
+    Samples on straight lines are left out.
+    """
     middle = 0.5 * (strip.left_xyz + strip.right_xyz)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
     if np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1).max() < 0.05 or along[-1] < 0.05:
@@ -175,7 +186,7 @@ def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N
 
 
 def _on_bridges(area: np.ndarray, z: Float[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
-    """Whether a piece lies above, or close beside, a piece of a lower level."""
+    """Return for each piece whether it is on a bridge: above, or close beside, a piece of a lower level."""
     high = np.flatnonzero(z - z.min() > LEVEL_GAP_M)
     low = np.flatnonzero(z.max() - z > LEVEL_GAP_M)
     i, j = shapely.STRtree(area[low]).query(area[high], predicate="dwithin", distance=BRIDGE_REACH_M)
@@ -191,7 +202,7 @@ def _on_bridges(area: np.ndarray, z: Float[np.ndarray, "P"]) -> Bool[np.ndarray,
 def _clip(
     area: np.ndarray, z: Float[np.ndarray, "P"], rank: Int[np.ndarray, "P"]
 ) -> tuple[np.ndarray, Bool[np.ndarray, "P"]]:
-    """Take from each area what overlaps an area of a higher rank on its level."""
+    """Remove from each area its overlaps with areas of a higher rank on the same level."""
     i, j = shapely.STRtree(area).query(area, predicate="intersects")
     near = (rank[j] < rank[i]) & (np.abs(z[i] - z[j]) < LEVEL_GAP_M)
     i, j = i[near], j[near]
@@ -205,14 +216,14 @@ def _clip(
 
 
 def _polygons(geometry: shapely.Geometry) -> shapely.Geometry:
-    """Only the polygons of a geometry, without slivers."""
+    """Return only the polygons of a geometry, without slivers."""
     opened = geometry.buffer(-0.01).buffer(0.01, join_style="mitre")
     parts = shapely.get_parts(opened)
     return shapely.union_all([p for p in parts if p.geom_type == "Polygon" and p.area > OVERLAP_M2])
 
 
 def _fill_junctions(pieces: tuple[Piece, ...]) -> tuple[shapely.Polygon, ...]:
-    """The spots inside a junction that no strip covers."""
+    """Return the areas inside junctions that no strip covers."""
     areas = np.array([p.area for p in pieces])
     tree = shapely.STRtree(areas)
     by_junction: dict[int, list[shapely.Geometry]] = {}

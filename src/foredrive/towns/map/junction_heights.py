@@ -1,7 +1,7 @@
-"""Roads that cross in a junction, brought to one height.
+"""Height alignment of the roads that cross in a junction.
 
-The maps' connecting roads each have their own elevation profile, and where two of them cross these differ by
-up to half a metre (Town03, Town07).
+Each connecting road of the maps has its own elevation profile. Where two of them cross, the profiles differ
+by up to half a metre (Town03, Town07).
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,18 @@ Line = Float[np.ndarray, "_ 3"]
 
 REACH_M, SIGMA_M = 1.8, 0.7
 LEVEL_GAP_M = 1.5
-"""Points further apart in height belong to different levels."""
+"""Height difference above which points belong to different levels, m."""
 BLEND_M = 4.0
-"""Towards the ends of a road its own height returns, so that it meets the road outside."""
+"""Distance from the end of a road over which its own height returns, m, so that it meets the road outside."""
 STEP_M = 0.02
-"""Junctions whose roads differ by less are left alone."""
+"""Height range below which a junction is left unchanged, m."""
 
 
 def level_junction(roads: Sequence[tuple[Line, Line]]) -> list[tuple[Line, Line]]:
-    """Left and right borders of all strips of a junction, at heights that agree where strips overlap."""
+    """Align the heights of all strips of a junction where they overlap.
+
+    Takes and returns the left and right borders of each strip.
+    """
     middles = [0.5 * (left + right) for left, right in roads]
     points = np.concatenate([*(line for road in roads for line in road), *middles])
     if np.ptp(points[:, 2]) < STEP_M:
@@ -38,7 +41,7 @@ def level_junction(roads: Sequence[tuple[Line, Line]]) -> list[tuple[Line, Line]
 
 
 def _blend(line: Points) -> Float[np.ndarray, "N"]:
-    """0 at the ends of a line, 1 further than BLEND_M from them."""
+    """Return 0 at the ends of a line and 1 further than BLEND_M from them."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     t = np.clip(np.minimum(along, along[-1] - along) / BLEND_M, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
@@ -49,7 +52,7 @@ def _blended(line: Points, z: Float[np.ndarray, "N"], share: Float[np.ndarray, "
 
 
 def _mean_height(line: Points, points: Float[np.ndarray, "P 3"], tree: cKDTree) -> Float[np.ndarray, "N"]:
-    """Gaussian mean of the heights around each point of a line, of its own level."""
+    """Return the Gaussian mean of the heights around each point of a line, over points of the same level."""
     near = tree.query_ball_point(line[:, :2], REACH_M, return_sorted=True)
     row = np.repeat(np.arange(len(line)), [len(n) for n in near])
     other = points[np.concatenate(near).astype(int)]

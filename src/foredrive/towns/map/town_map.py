@@ -1,4 +1,4 @@
-"""CARLA's towns: lanes, cross-section strips, markings, crosswalks and stop zones, with heights.
+"""Maps of CARLA's towns: lanes, cross-section strips, markings, crosswalks and stop zones, with heights.
 
 The maps are the OpenDRIVE files in py123d's wheel (CARLA, CC BY 4.0), read with py123d's parser.
 """
@@ -33,7 +33,7 @@ Points = Float64[np.ndarray, "N 3"]
 
 
 class StripKind(enum.StrEnum):
-    """What one strip of a road's cross-section is for (OpenDRIVE's lane types)."""
+    """The use of one strip of a road's cross-section (OpenDRIVE's lane types)."""
 
     DRIVING = "driving"
     SHOULDER = "shoulder"
@@ -46,7 +46,7 @@ class StripKind(enum.StrEnum):
 
 
 class MarkingKind(enum.StrEnum):
-    """How a boundary is painted or built (OpenDRIVE's road mark types)."""
+    """The paint or kerb of a strip boundary (OpenDRIVE's road mark types)."""
 
     NONE = "none"
     SOLID = "solid"
@@ -59,7 +59,7 @@ class MarkingKind(enum.StrEnum):
 
 
 class StopZoneKind(enum.StrEnum):
-    """Why one has to stop."""
+    """The type of signal that makes vehicles stop."""
 
     TRAFFIC_LIGHT = "traffic_light"
     STOP_SIGN = "stop_sign"
@@ -71,17 +71,20 @@ class Marking:
     """A painted line or a kerb along a part of a strip's border."""
 
     start_m: float
-    """From the start of the strip, in the direction of travel."""
+    """Distance from the start of the strip in the direction of travel, m."""
     end_m: float
     kind: MarkingKind
-    """As seen from the strip: of two lines the own one first."""
+    """Kind as seen from the strip: of two lines, the strip's own line comes first."""
     yellow: bool
     width_m: float
 
 
 @dataclass(frozen=True)
 class Strip:
-    """One strip of a road's cross-section; both borders are sampled alike, in the direction of travel."""
+    """One strip of a road's cross-section.
+
+    Both borders have the same number of samples, in the direction of travel.
+    """
 
     id: str
     kind: StripKind
@@ -94,40 +97,41 @@ class Strip:
 
     @cached_property
     def outline_xyz(self) -> Points:
-        """The closed outline."""
+        """Return the closed outline."""
         return np.concatenate([self.left_xyz, self.right_xyz[::-1], self.left_xyz[:1]])
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
-        """The outline seen from above, made valid."""
+        """Return the outline seen from above, made valid."""
         return shapely.Polygon(self.outline_xyz[:, :2]).buffer(0)
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One driving lane, in the direction of travel. Ids are py123d's."""
+    """One driving lane, in the direction of travel. The ids are py123d's."""
 
     lane_id: str
     group_id: str
-    """The same for the lanes side by side in one direction."""
+    """Id shared by the lanes that lie side by side in one direction."""
     junction_id: int | None
     centreline_xyz: Points
     left_boundary_xyz: Points
     right_boundary_xyz: Points
     speed_limit_mps: float | None
     successor_ids: tuple[str, ...]
-    """Where two lanes merge a successor may begin half a lane or more to the side (once in Town03)."""
+    """Ids of the next lanes. Where two lanes merge, a successor may begin half a lane or more to the side
+    (once in Town03)."""
     predecessor_ids: tuple[str, ...]
     left_id: str | None
-    """The neighbour with the same direction of travel."""
+    """Id of the left neighbour with the same direction of travel."""
     right_id: str | None
     left_marking: MarkingKind
-    """At half length, seen from the lane: says whether the line may be crossed."""
+    """Marking at half length, as seen from the lane. It says whether the line may be crossed."""
     right_marking: MarkingKind
 
     @cached_property
     def width_m(self) -> float:
-        """Median width."""
+        """Return the median width, m."""
         return float(np.median(np.linalg.norm(self.left_boundary_xyz - self.right_boundary_xyz, axis=1)))
 
 
@@ -137,45 +141,46 @@ class Crosswalk:
 
     id: int
     outline_xyz: Points
-    """Closed."""
+    """Closed outline."""
 
 
 @dataclass(frozen=True)
 class StopZone:
-    """Where lanes end at a light or a sign: the half metre behind the line."""
+    """The half metre behind the stop line of a light or a sign."""
 
     id: int
     kind: StopZoneKind
     lane_ids: tuple[str, ...]
-    """The lanes that begin at the line (inside the junction)."""
+    """Ids of the lanes that begin at the line (inside the junction)."""
     outline_xyz: Points
-    """Closed."""
+    """Closed outline."""
     post_xyz: Float64[np.ndarray, "3"]
     """Foot of the post that holds the light or the sign."""
     post_yaw: float
-    """Direction of travel of the traffic that has to obey, rad: the signal faces the other way."""
+    """Direction of travel of the traffic that has to obey, rad. The signal faces the opposite way."""
 
 
-@dataclass(frozen=True, eq=False)  # itself alone: what is derived from it is kept by it
+@dataclass(frozen=True, eq=False)  # hashed by identity: derived values are cached by it
 class TownMap:
-    """A town's road network in the world frame (m, z up), the drives on the right."""
+    """A town's road network in the world frame (m, z up), with traffic on the right."""
 
     name: str
     lanes: tuple[Lane, ...]
     strips: tuple[Strip, ...]
-    """Every strip of every cross-section, driving lanes included."""
+    """All strips of all cross-sections, driving lanes included."""
     crosswalks: tuple[Crosswalk, ...]
     stop_zones: tuple[StopZone, ...]
     junctions: dict[int, shapely.Polygon | shapely.MultiPolygon]
     """Area of each junction's driving lanes, seen from above."""
 
     def strips_of(self, *kinds: StripKind) -> tuple[Strip, ...]:
-        """The strips of some kinds: SIDEWALK for walkways, PARKING for car parks."""
+        """Return the strips of the given kinds, for example SIDEWALK for walkways or PARKING for car
+        parks."""
         return tuple(strip for strip in self.strips if strip.kind in kinds)
 
     @cached_property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """Smallest x, y and largest x, y of all strips."""
+        """Return the smallest x, y and the largest x, y of all strips, m."""
         every = np.concatenate([strip.outline_xyz for strip in self.strips])
         (x0, y0), (x1, y1) = every[:, :2].min(0), every[:, :2].max(0)
         return float(x0), float(y0), float(x1), float(y1)
@@ -183,7 +188,7 @@ class TownMap:
 
 @lru_cache(maxsize=2)
 def load_town_map(name: str) -> TownMap:
-    """Read a town's map (.2 to 2 s).
+    """Read a town's map (takes 0.2 to 2 s).
 
     Raises:
         InputError: there is no such town.
@@ -209,8 +214,11 @@ def load_town_map(name: str) -> TownMap:
 
 
 def _with_road_height(helper: Any, xyz: Points, roads: dict[int, Any]) -> Points:
-    """Set z from the road's elevation profile, in which py123d looks up the outer borders of later lane
-    sections at the wrong place (up to 1 m off in Town04)."""
+    """Set z from the road's elevation profile.
+
+    py123d looks up the outer borders of later lane sections at a wrong place in the profile (errors of up to
+    1 m in Town04).
+    """
     profile = roads[int(helper.lane_id.split("_")[0])].elevation_profile.elevations
     s = np.linspace(helper.s_range[0], helper.s_range[1], len(xyz))
     starts = np.array([e.s for e in profile])
@@ -231,7 +239,8 @@ def _strip(
         inner_marks = centre_marks.get(section, [])
     else:
         inner_marks = [] if inward is None else inward.open_drive_lane.road_marks
-    # "solid broken" names the left line first on the reference line, the inner one elsewhere.
+    # On the reference line, "solid broken" names the left line first. Elsewhere it names the inner line
+    # first.
     swap_inner = abs(int(index)) > 1 or helper.id < 0
     return Strip(
         id=helper.lane_id,
@@ -260,7 +269,7 @@ def _level(strips: list[Strip]) -> tuple[Strip, ...]:
 
 
 def _beside(helper: Any, step: int) -> str:
-    """Id of the strip `step` further out from the road's reference line."""
+    """Return the id of the strip `step` places further out from the road's reference line."""
     group, index = helper.lane_id.rsplit("_", 1)
     return f"{group}_{int(index) + step * (1 if helper.id > 0 else -1)}"
 
@@ -272,7 +281,7 @@ _SWAPPED = {
 
 
 def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
-    """Road marks, given along the road's s, in the strip's direction of travel."""
+    """Convert road marks from the road's s coordinate to the strip's direction of travel."""
     length = float(helper.s_range[1] - helper.s_range[0])
     ends = [mark.s_offset for mark in marks[1:]] + [length]
     found = []
@@ -291,7 +300,7 @@ def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
 
 
 def marking_at(markings: tuple[Marking, ...], along_m: float) -> Marking | None:
-    """The marking at a distance from the start of its strip."""
+    """Return the marking at a distance (m) from the start of its strip, or None."""
     return next((m for m in markings if m.start_m <= along_m < m.end_m), None)
 
 

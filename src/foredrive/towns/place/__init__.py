@@ -1,1 +1,1 @@
-"""What stands in a town: roads, land, houses, street furniture, the shapes of road users."""
+"""The static content of a town (roads, land, houses, street furniture) and the shapes of road users."""

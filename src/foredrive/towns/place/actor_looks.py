@@ -1,16 +1,16 @@
-"""Looks that road users share, and the slots that each one's own paint fills."""
+"""Looks that all road users share, and placeholders for the paint of each one."""
 
 from dataclasses import dataclass
 
 from foredrive.towns.place.looks import RETROREFLECTIVE, Look, LookTable, Surface, Texture
 
 BODY, SECOND, THIRD, REAR_LIGHT = -1, -2, -3, -4
-"""Look numbers that an actor's own paint, and what its rear lights show, replace."""
+"""Look numbers that are replaced by an actor's own paint and by the state of its rear lights."""
 
 
 @dataclass
 class MeshLooks:
-    """Numbers of the looks that do not change from one road user to the next."""
+    """Numbers of the looks that are the same for all road users."""
 
     table: LookTable
 

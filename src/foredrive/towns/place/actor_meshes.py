@@ -16,7 +16,7 @@ SHAPES_OF_KIND = {
     "motorcycle": ("motorcycle", "scooter"),
     "bicycle": ("bicycle", "city_bike"),
 }
-"""Which shapes may stand for a kind of vehicle."""
+"""Shapes that can represent each kind of vehicle."""
 DRESSES = ("jacket", "coat", "backpack")
 
 

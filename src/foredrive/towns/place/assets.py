@@ -1,4 +1,4 @@
-"""What towns are furnished from: colours, façades, plants and vehicles; those for testing are kept apart."""
+"""Assets of towns: colours, façades, plants and vehicles. Assets for testing are kept separate."""
 
 import enum
 from dataclasses import dataclass, fields
@@ -11,7 +11,7 @@ Palette = tuple[Rgb, ...]
 
 
 class AssetSet(enum.StrEnum):
-    """Which assets a world is made from; nothing of TEST is ever seen in a world of TRAIN."""
+    """The assets from which a world is made. Nothing of TEST ever appears in a world of TRAIN."""
 
     TRAIN = "train"
     TEST = "test"
@@ -20,26 +20,26 @@ class AssetSet(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Assets:
-    """Everything to choose from; colours are reflectances as sRGB would show them under white light."""
+    """All assets to choose from. Colours are reflectances as sRGB would show them under white light."""
 
     walls: tuple[tuple[WallKind, Rgb], ...]
-    """Of houses and blocks."""
+    """Walls of houses and blocks."""
     windows: tuple[WindowKind, ...]
-    """Of blocks."""
+    """Windows of blocks."""
     curtain: Palette
-    """Frames of glass façades."""
+    """Colours of the frames of glass façades."""
     sheet: Palette
-    """Of halls."""
+    """Colours of the walls of halls."""
     roofs: Palette
     flat_roofs: Palette
     awnings: Palette
     accents: tuple[int, ...]
-    """Colours of doors, shutters and shop signs: rows of `facades.ACCENT_RGB`."""
+    """Colours of doors, shutters and shop signs, as rows of `facades.ACCENT_RGB`."""
     leaves: Palette
     needles: Palette
     trees: tuple[str, ...]
     vehicles: tuple[str, ...]
-    """Shapes: names in `actor_meshes.VEHICLES`."""
+    """Vehicle shapes, as names in `actor_meshes.VEHICLES`."""
     car_paints: Palette
     cargo_paints: Palette
     bus_paints: Palette
@@ -168,7 +168,7 @@ _TEST = Assets(
 
 
 def assets_of(chosen: AssetSet) -> Assets:
-    """The assets of a set; MIXED has those of both."""
+    """Return the assets of a set. MIXED has those of both sets."""
     if chosen is AssetSet.TRAIN:
         return _TRAIN
     if chosen is AssetSet.TEST:
@@ -178,5 +178,5 @@ def assets_of(chosen: AssetSet) -> Assets:
 
 
 def asset_set_of(town: str) -> AssetSet:
-    """The set that a town is furnished from unless one asks for another."""
+    """Return the default asset set of a town."""
     return AssetSet.TEST if town in TEST_TOWNS else AssetSet.TRAIN

@@ -1,4 +1,4 @@
-"""What buildings look like: houses, blocks, towers, halls and barns, each on its plot."""
+"""Meshes of buildings: houses, blocks, towers, halls and barns, each on its plot."""
 
 from dataclasses import dataclass, field
 
@@ -25,14 +25,14 @@ from foredrive.towns.place.styles import Style
 
 PARAPET_M = 0.5
 CORNER_M = 0.4
-"""At either end of a wall there are no windows."""
+"""Width without windows at either end of a wall, m."""
 FENCE_M, HEDGE_M = 1.0, 1.2
 BALCONY_M = 1.15
 
 
 @dataclass(frozen=True)
 class _Facade:
-    """What a façade's look holds, for things that hang on it."""
+    """The properties of a façade's look that attached parts need."""
 
     look: int
     storey_m: float
@@ -40,7 +40,7 @@ class _Facade:
     ground_m: float
 
     def centres(self, width_m: float) -> Float[np.ndarray, "n"]:
-        """Where the bays of a wall have their middle, as the texture has them."""
+        """Return the positions of the middles of a wall's bays, m, as in the texture."""
         usable = width_m - 2 * CORNER_M
         count = max(1, int(usable / self.bay_m + 0.3))
         return CORNER_M + (np.arange(count) + 0.5) * usable / count
@@ -48,7 +48,7 @@ class _Facade:
 
 @dataclass
 class BuildingMaker:
-    """Draws buildings in the style of a town from the assets it has."""
+    """A maker of building meshes in the style of a town, from the town's assets."""
 
     table: LookTable
     rng: np.random.Generator
@@ -66,11 +66,12 @@ class BuildingMaker:
         self._metal = self.table.add(Look(Surface.BUILDING, Texture.PLAIN, (0.20, 0.21, 0.22), 0.3))
 
     def build(self, kind: str, plot: Plot, base: float, detail: bool) -> Mesh:
-        """A building of a kind.
+        """Build the mesh of a building.
 
         Args:
-            base: height of the ground.
-            detail: whether it stands in the first row and so has balconies, cornices and the like.
+            kind: "house", "block", "tower", "hall" or "barn".
+            base: height of the ground, m.
+            detail: whether it stands in the first row, and so has balconies, cornices and similar parts.
         """
         if kind == "house":
             return self._house(plot, base)
@@ -81,7 +82,7 @@ class BuildingMaker:
         return self._block(plot, base, kind == "tower", detail)
 
     def border(self, kind: str, plot: Plot, ends: Float[np.ndarray, "2 2"], base: float) -> Mesh:
-        """A hedge or a fence between two local points of the same y."""
+        """Build a hedge or a fence between two local points with the same y."""
         (x0, y), (x1, _) = ends
         if kind == "hedge":
             ends_z = base - 0.4, base + HEDGE_M
@@ -124,7 +125,7 @@ class BuildingMaker:
         return options[int(self.rng.integers(len(options)))]
 
     def _house(self, plot: Plot, base: float) -> Mesh:
-        """One or two storeys under a gabled or hipped roof, with a chimney and a porch."""
+        """Build a house of one or two storeys with a gabled or hipped roof, a chimney and a porch."""
         rng = self.rng
         storeys, ground_m, storey_m = int(rng.integers(1, 3)), 2.9, 2.8
         facade = self._facade(
@@ -157,7 +158,7 @@ class BuildingMaker:
         return join(parts)
 
     def _barn(self, plot: Plot, base: float) -> Mesh:
-        """A farm's barn, often with a silo beside it."""
+        """Build a barn of a farm, often with a silo beside it."""
         rng, w, d = self.rng, plot.width_m, plot.depth_m
         rgb = self._choose(((0.45, 0.16, 0.13), (0.36, 0.28, 0.22), *self.assets.sheet[:1]))
         ground = float(rng.uniform(4.0, 5.5))
@@ -181,7 +182,7 @@ class BuildingMaker:
         return join(parts)
 
     def _hall(self, plot: Plot, base: float) -> Mesh:
-        """A warehouse with roller doors, or a market with shop windows and a sign."""
+        """Build a warehouse with roller doors, or a market with shop windows and a sign."""
         rng, w, d = self.rng, plot.width_m, plot.depth_m
         market = rng.random() < 0.4
         ground = float(rng.uniform(5.5, 9.0))
@@ -209,7 +210,7 @@ class BuildingMaker:
         return join(parts)
 
     def _block(self, plot: Plot, base: float, tower: bool, detail: bool) -> Mesh:
-        """Several storeys under a flat roof; some with a notch in the back."""
+        """Build a block of several storeys with a flat roof. Some blocks have a notch in the back."""
         rng, w, d = self.rng, plot.width_m, plot.depth_m
         low, high = self.style.storeys
         storeys = int(rng.integers(8, 17) if tower else rng.integers(low, high + 1))
@@ -240,7 +241,7 @@ class BuildingMaker:
         return join(parts)
 
     def _block_facade(self, tower: bool) -> tuple[_Facade, bool]:
-        """The façade, and whether people live behind it."""
+        """Return the façade, and whether people live behind it."""
         rng = self.rng
         storey, ground = float(rng.uniform(2.9, 3.4)), float(rng.uniform(3.6, 4.5))
         if rng.random() < (0.5 if tower else 0.08):
@@ -260,7 +261,7 @@ class BuildingMaker:
         return facade, windows not in (WindowKind.RIBBON, WindowKind.SLIT, WindowKind.GRID)
 
     def _balconies(self, plot: Plot, base: float, storeys: int, facade: _Facade) -> list[Mesh]:
-        """One above the other before some of the bays of the front."""
+        """Build balconies, one above the other, in front of some of the bays."""
         rng = self.rng
         centres = facade.centres(plot.width_m)
         slab, rail = self._plain((0.70, 0.69, 0.66), 0.4), self._metal
@@ -288,7 +289,7 @@ class BuildingMaker:
         return [plot.placed(join(parts))]
 
     def _roof_boxes(self, plot: Plot, z: float, look: int, count: int) -> list[Mesh]:
-        """Stairs, lifts and air conditioning on a flat roof."""
+        """Build boxes on a flat roof for stairs, lifts and air conditioning."""
         rng = self.rng
         parts = []
         for _ in range(count):

@@ -1,4 +1,4 @@
-"""Where buildings stand: along the roads and behind them, grown from a seed."""
+"""Placement of buildings along the roads and behind them, generated from a seed."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from foredrive.towns.place.styles import STYLES, Style
 SETBACK_M = 3.0
 CLEARANCE_M = 0.8
 GARDEN_M = 2.2
-"""A garden's fence stands this far in front of where the houses could begin."""
+"""Distance from a garden's fence to the line where the houses may begin, m."""
 SKYLINE_TRIES_PER_M2 = 1 / 900.0
 SKYLINE_NEAREST_M, SKYLINE_FURTHEST_M = 16.0, 75.0
 
@@ -40,7 +40,10 @@ _DEPTH_M = {
 def build_buildings(
     site: Site, town_name: str, assets: Assets, table: LookTable, rng: np.random.Generator
 ) -> Mesh:
-    """Rows of buildings along the frontages, then a looser second row; takes their plots from the site."""
+    """Build rows of buildings along the frontages, then a sparser second row.
+
+    The plots are taken from the site.
+    """
     style = STYLES[town_name]
     builder = _Builder(site, rng, style, BuildingMaker(table, rng, assets, style))
     parts = []
@@ -58,7 +61,7 @@ class _Builder:
     maker: BuildingMaker
 
     def row(self, frontage: Frontage) -> list[Mesh]:
-        """Buildings side by side along one line."""
+        """Build buildings side by side along one line."""
         rng, length = self.rng, frontage.line.length
         density = self.style.density if frontage.walkway else self.style.open_density
         parts, s = [], rng.uniform(0.0, 8.0)
@@ -82,7 +85,7 @@ class _Builder:
         return parts
 
     def skyline(self) -> list[Mesh]:
-        """Free-standing buildings behind the first row."""
+        """Build free-standing buildings behind the first row."""
         rng, terrain = self.rng, self.site.terrain
         lower = terrain.origin_xy + 20.0
         extent = np.array(terrain.z.shape[::-1]) * 4.0 - 40.0
@@ -127,7 +130,7 @@ class _Builder:
         return self.maker.build(kind, plot, float(self.site.height(corners).min()), detail)
 
     def _garden(self, plot: Plot, back_m: float) -> list[Mesh]:
-        """A hedge or a fence along the walkway, with a gap for the door."""
+        """Build a hedge or a fence along the walkway, with a gap for the door."""
         rng, y = self.rng, -back_m - GARDEN_M
         kind = rng.choice(["hedge", "fence", "none"], p=[0.35, 0.35, 0.3])
         if kind == "none":

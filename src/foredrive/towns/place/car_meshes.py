@@ -1,4 +1,4 @@
-"""Meshes of cars, lofted through cross-sections: in metres, x ahead, standing on z = 0."""
+"""Meshes of cars, lofted through cross-sections. Units are metres; x points ahead; cars stand on z = 0."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,23 +12,24 @@ from foredrive.towns.place.mesh import Mesh, box, frustum, join, quads, triangle
 HALF_WIDTH_M = 0.9
 PILLAR_M = 0.09
 _END_WIDTH = ((0.0, 0.84), (0.12, 0.94), (0.35, 1.0), (3.6, 1.0), (4.3, 0.95), (4.42, 0.84), (4.5, 0.7))
-"""Half the width as a share of the greatest, by the distance from the rear of a car of 4.5 m."""
+"""Half width as a fraction of the maximum, by the distance (m) from the rear of a car of 4.5 m."""
 
 
 @dataclass(frozen=True)
 class CarForm:
-    """The side view of a car of 4.5 m whose front is at x = 2.25."""
+    """The side view of a car of 4.5 m with its front at x = 2.25."""
 
     deck: tuple[tuple[float, float], ...]
-    """x, z of the upper edge of the body from the rear to the front: boot, belt, bonnet."""
+    """x, z of the upper edge of the body from the rear to the front, m: boot, belt, bonnet."""
     cabin: tuple[float, float, float, float]
-    """x of the rear window's foot, the roof's rear end, its front end and the windscreen's foot."""
+    """x of the lower edge of the rear window, the roof's rear end, its front end and the lower edge of the
+    windscreen, m."""
     roof_z: float
     clearance_m: float = 0.2
     cladding: bool = False
-    """Dark plastic around the sills, as on cars for rough roads."""
+    """Whether there is dark plastic around the sills, as on cars for rough roads."""
     bed: bool = False
-    """A load bed behind the cabin."""
+    """Whether there is a load bed behind the cabin."""
 
 
 FORMS = {
@@ -92,10 +93,13 @@ def loft(
     looks: Sequence[Sequence[int]],
     ends: tuple[int, int],
 ) -> Mesh:
-    """A closed solid through S cross-sections, each K points (y, z) counter-clockwise seen from ahead.
+    """Build a closed solid through S cross-sections.
+
+    Each cross-section has K points (y, z), counter-clockwise seen from ahead.
 
     Args:
-        looks: of each face, stretch by stretch from the rear, then around the ring from its first point on.
+        looks: looks of the faces, segment by segment from the rear, then around the ring from its first
+            point.
         ends: looks of the rear and the front face.
     """
     xyz = np.concatenate([np.broadcast_to(x[:, None, None], (*rings.shape[:2], 1)), rings], axis=-1)
@@ -113,7 +117,7 @@ def loft(
 def wheels(
     positions_m: Sequence[float], half_width: float, radius: float, looks: MeshLooks, arches: int | None
 ) -> Mesh:
-    """Pairs of wheels; with arches of a look on a body of this half width."""
+    """Build pairs of wheels. With the look `arches`, add wheel arches on a body of this half width."""
     parts = []
     for x in positions_m:
         for side in (-1.0, 1.0):
@@ -133,7 +137,7 @@ def wheels(
 
 
 def car(looks: MeshLooks, form: CarForm) -> Mesh:
-    """Body, cabin, wheels, lights, bumpers, plates and mirrors."""
+    """Build a car with body, cabin, wheels, lights, bumpers, plates and mirrors."""
     w, rear, front = HALF_WIDTH_M, -2.25, 2.25
     belt_z = float(np.interp(form.cabin[3], *np.array(form.deck).T))
     parts = [
@@ -163,7 +167,7 @@ def car(looks: MeshLooks, form: CarForm) -> Mesh:
 
 
 def _body(looks: MeshLooks, form: CarForm) -> Mesh:
-    """From the sills up to the belt, the boot and the bonnet."""
+    """Build the body, from the sills up to the belt, the boot and the bonnet."""
     from_rear, share = np.array(_END_WIDTH).T
     deck_x, deck_z = np.array(form.deck).T
     x = np.unique(np.concatenate([from_rear - 2.25, deck_x]).round(3))
@@ -180,7 +184,7 @@ def _body(looks: MeshLooks, form: CarForm) -> Mesh:
 
 
 def _cabin(looks: MeshLooks, form: CarForm) -> Mesh:
-    """Windows between pillars, under a roof."""
+    """Build the cabin: windows between pillars, under a roof."""
     a, b, c, d = form.cabin
     middle = 0.5 * (b + c) - 0.1
     x = np.array([a, b, b + PILLAR_M, middle, middle + PILLAR_M, c - 0.02, c, d])

@@ -1,4 +1,4 @@
-"""Farmland between the roads: crops in rows, meadows behind fences, bales on stubble."""
+"""Farmland between the roads: crops in rows, meadows behind fences, and bales on stubble."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from foredrive.towns.place.terrain import CELL_M, Field
 
 PARCEL_M = (55.0, 130.0)
 ROAD_SETBACK_M, CLEARANCE_M, HEDGE_M = 6.0, 4.0, 3.0
-"""How far fields keep from roads and from what stands; half of what is left between two of them."""
+"""Distances of fields, m: from roads, from standing objects, and half the gap between two fields."""
 LEAST_M2, LEAST_WIDTH_M = 700.0, 16.0
 POST_STEP_M, POST_M, RAILS_M = 3.0, 1.15, (0.55, 1.0)
 GATE_M = 6.0
 BALES_PER_M2 = 1 / 350.0
 BALE_M = (0.65, 1.2)
-"""Radius and length."""
+"""Radius and length of a bale, m."""
 
 _CROPS = {
     "wheat": (0.24, (0.73, 0.61, 0.33), (0.60, 0.48, 0.28), 0.2, 0.14),
@@ -29,12 +29,15 @@ _CROPS = {
     "ploughed": (0.16, (0.42, 0.32, 0.23), (0.29, 0.21, 0.15), 0.9, 0.5),
     "stubble": (0.16, (0.70, 0.61, 0.40), (0.52, 0.43, 0.29), 0.4, 0.2),
 }
-"""Share of the fields; colour of the crop and between its rows; distance and width of these."""
+"""Share of the fields, colour of the crop, colour between its rows, distance and width of the rows (m)."""
 _MEADOW = "meadow"
 
 
 def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tuple[Field, ...]:
-    """Fields on the land that is left; takes it from the site. Meadows have the land's own look."""
+    """Lay out fields on the remaining land and take it from the site.
+
+    Meadows have the same look as the land.
+    """
     low = site.terrain.origin_xy + 4.0 * CELL_M
     high = site.terrain.origin_xy + CELL_M * (np.array(site.terrain.z.shape[::-1]) - 5.0)
     paved = site.plan.covered.buffer(ROAD_SETBACK_M).simplify(1.0)
@@ -57,7 +60,7 @@ def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tu
 def build_on_fields(
     fields: Sequence[Field], site: Site, table: LookTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinThings]:
-    """Fences about meadows and bales on stubble."""
+    """Build fences around meadows and bales on stubble."""
     wood = table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.47, 0.40, 0.32), 0.4, params=(1.5,)))
     straw = table.add(Look(Surface.VEGETATION, Texture.PLAIN, (0.74, 0.63, 0.36), 0.5, params=(2.0,)))
     parts, points = [], []
@@ -74,7 +77,7 @@ def build_on_fields(
 def _parcels(
     low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], rng: np.random.Generator
 ) -> list[shapely.Polygon]:
-    """Columns of land, each cut on its own."""
+    """Divide the land into columns, each of which is divided separately."""
     parcels, x = [], float(low[0])
     while x < high[0]:
         right = min(x + float(rng.uniform(*PARCEL_M)), float(high[0]))
@@ -88,7 +91,7 @@ def _parcels(
 
 
 def _direction(area: shapely.Polygon) -> Float[np.ndarray, "2"]:
-    """Unit vector along the longer side of the rectangle about a field, which it is ploughed along."""
+    """Return the unit vector of ploughing: along the longer side of the rectangle around a field."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
     sides = np.diff(corners[:3], axis=0)
     side = sides[np.linalg.norm(sides, axis=1).argmax()]
@@ -104,7 +107,7 @@ def _look(kind: str, table: LookTable) -> int | None:
 
 
 def _fence(area: shapely.Polygon, site: Site, look: int) -> tuple[Mesh, Float[np.ndarray, "n 3"]]:
-    """Posts and rails about a meadow, with a gate left open, and points on them."""
+    """Build posts and rails around a meadow, with an open gate. Also return points on them."""
     ring = area.exterior
     count = max(int((ring.length - GATE_M) / POST_STEP_M), 1)
     along = GATE_M + (ring.length - GATE_M) * np.arange(count + 1) / count
@@ -124,7 +127,7 @@ def _fence(area: shapely.Polygon, site: Site, look: int) -> tuple[Mesh, Float[np
 
 
 def _bales(field: Field, site: Site, look: int, rng: np.random.Generator) -> list[Mesh]:
-    """Round bales where they were dropped."""
+    """Build round bales at random places of a field."""
     x0, y0, x1, y1 = field.area.bounds
     xy = rng.uniform((x0, y0), (x1, y1), (int((x1 - x0) * (y1 - y0) * BALES_PER_M2), 2))
     inside = field.area.buffer(-2.0)

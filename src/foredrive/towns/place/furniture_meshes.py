@@ -1,4 +1,7 @@
-"""Meshes of street furniture: in metres, x along the traffic, the road to the left, standing on z = 0."""
+"""Meshes of street furniture.
+
+Units are metres; x points along the traffic, the road lies to the left, and objects stand on z = 0.
+"""
 
 from dataclasses import dataclass
 
@@ -10,25 +13,25 @@ from foredrive.towns.place.mesh import Mesh, box, boxes, frustum, join, quads
 from foredrive.towns.place.props import POLE_SAMPLE_M
 
 SINK_M = 0.3
-"""What stands reaches this far into the ground."""
+"""Depth to which standing objects reach into the ground, m."""
 RAIL_STEP_M, RAIL_LOW_M, RAIL_HIGH_M = 4.0, 0.45, 0.75
 BARRIER_HEIGHT_M = 3.2
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A piece of furniture, ready to be placed."""
+    """A piece of furniture that is ready to be placed."""
 
     mesh: Mesh
     room_m: tuple[float, float]
-    """Half of what it needs along and across the road."""
+    """Half of the space that it needs along and across the road, m."""
     thin: tuple[tuple[Surface, Float[np.ndarray, "_ 3"]], ...] = ()
-    """Points on what is thinner than the grid of vertical rays that occupancy is made from."""
+    """Points on parts that are thinner than the grid of vertical rays from which occupancy is computed."""
 
 
 @dataclass
 class FurnitureLooks:
-    """Numbers of the looks that furniture is made of."""
+    """Numbers of the looks of furniture."""
 
     table: LookTable
 
@@ -65,20 +68,20 @@ class FurnitureLooks:
 
 
 def upright(x: float, y: float, height: float) -> Float[np.ndarray, "n 3"]:
-    """Points up a post."""
+    """Return points up a post."""
     z = np.arange(0.0, height, POLE_SAMPLE_M)
     return np.column_stack([np.full_like(z, x), np.full_like(z, y), z])
 
 
 def plate(x: float, y: tuple[float, float], z: tuple[float, float]) -> Float[np.ndarray, "n 3"]:
-    """Points over a plate across the road's direction."""
+    """Return points on a plate that stands across the road's direction."""
     ys, zs = (np.linspace(*span, int(np.ptp(span) / POLE_SAMPLE_M) + 2) for span in (y, z))
     grid_y, grid_z = np.meshgrid(ys, zs)
     return np.column_stack([np.full(grid_y.size, x), grid_y.ravel(), grid_z.ravel()])
 
 
 def things(looks: FurnitureLooks) -> dict[str, Thing]:
-    """All furniture that comes as one piece."""
+    """Return all furniture that consists of one piece."""
     return {
         "bench": _bench(looks),
         "bin": Thing(_post((0.22, 0.26), 0.9, looks.green, looks.iron), (0.4, 0.4)),
@@ -143,7 +146,7 @@ def _bollards(looks: FurnitureLooks) -> Thing:
 
 
 def _shelter(looks: FurnitureLooks) -> Thing:
-    """A bus shelter open to the road, with a seat, a poster and the stop's sign."""
+    """Build a bus shelter that is open to the road, with a seat, a poster and the sign of the stop."""
     parts = [
         box((-2.0, -0.75, 2.35), (2.0, 0.75, 2.5), looks.steel),
         box((-1.9, -0.68, 0.25), (1.9, -0.64, 2.2), looks.glass),
@@ -181,7 +184,7 @@ def _board(
     z: tuple[float, float],
     posts: tuple[float, ...],
 ) -> Thing:
-    """A sign with lines of writing, facing the traffic."""
+    """Build a sign with lines of text that faces the traffic."""
     parts = [box((-0.07, y[0], z[0]), (-0.04, y[1], z[1]), look)]
     lines = max(1, int(np.ptp(z) / 0.5))
     step, wide = np.ptp(z) / lines, np.ptp(y)
@@ -217,7 +220,7 @@ def _power_pole(looks: FurnitureLooks) -> Thing:
 
 
 def wires(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], look: int) -> Mesh:
-    """Three wires that sag between the cross-arms of two poles with these feet."""
+    """Build three sagging wires between the cross-arms of two poles with the given feet."""
     ahead = (end - start)[:2] / np.linalg.norm((end - start)[:2])
     left = np.array([-ahead[1], ahead[0], 0.0])
     share = np.linspace(0.0, 1.0, 5)[:, None]
@@ -250,7 +253,7 @@ def _billboard(looks: FurnitureLooks) -> Thing:
 
 
 def _building_site(looks: FurnitureLooks) -> Thing:
-    """A heap of earth and a container behind striped barriers and cones."""
+    """Build a building site: a heap of earth and a container behind striped barriers and cones."""
     parts = [
         frustum((1.6, -0.3, -0.2), (1.6, -0.3, 1.1), (1.5, 0.3), 9, looks.earth),
         box((-4.2, -1.2, -SINK_M), (-1.6, 1.0, 2.3), looks.yellow),
@@ -269,7 +272,7 @@ def _building_site(looks: FurnitureLooks) -> Thing:
 
 
 def guard_rail(feet: Float[np.ndarray, "N 3"], looks: FurnitureLooks) -> Mesh:
-    """A beam on posts along a line that has the road on its left."""
+    """Build a guard rail on posts along a line with the road on its left."""
     left = _left_of(feet)
     half = np.array([0.06, 0.05, 0.0])
     low, high = _raised(feet, -SINK_M), _raised(feet, RAIL_HIGH_M)
@@ -289,7 +292,7 @@ def guard_rail(feet: Float[np.ndarray, "N 3"], looks: FurnitureLooks) -> Mesh:
 
 
 def sound_barrier(feet: Float[np.ndarray, "N 3"], looks: FurnitureLooks) -> Mesh:
-    """A wall of panels along a line that has the road on its left."""
+    """Build a wall of panels along a line with the road on its left."""
     left = _left_of(feet)
     low, high = _raised(feet, -SINK_M), _raised(feet, BARRIER_HEIGHT_M)
     parts = []

@@ -1,4 +1,4 @@
-"""Meshes of vans, trucks and buses: in metres, x ahead, standing on z = 0."""
+"""Meshes of vans, trucks and buses. Units are metres; x points ahead; vehicles stand on z = 0."""
 
 import numpy as np
 
@@ -14,12 +14,14 @@ def taper(
     inset: tuple[float, float],
     looks: tuple[int, int, int],
 ) -> Mesh:
-    """A solid from a level rectangle up to a smaller one.
+    """Build a solid from a horizontal rectangle up to a smaller one.
 
     Args:
-        x: rear and front of the lower rectangle; `inset` is how far the upper one is drawn in at either end.
-        half_width: of the lower and of the upper rectangle.
-        looks: top, ends, sides.
+        x: rear and front of the lower rectangle, m.
+        z: heights of the two rectangles, m.
+        half_width: half widths of the lower and the upper rectangle, m.
+        inset: distances by which the upper rectangle is shorter at the rear and at the front, m.
+        looks: looks of the top, the ends and the sides.
     """
     (x0, x1), (z0, z1), (w0, w1) = x, z, half_width
     top, ends, sides = looks
@@ -32,7 +34,7 @@ def taper(
 
 
 def van(looks: MeshLooks) -> Mesh:
-    """A panel van with a sloping nose."""
+    """Build a panel van with a sloping nose."""
     w = 1.0
     parts = [
         taper((-2.7, 2.7), (0.25, 1.05), (w, w), (0.0, 0.12), (BODY, BODY, BODY)),
@@ -53,7 +55,7 @@ def van(looks: MeshLooks) -> Mesh:
 
 
 def panel_van(looks: MeshLooks) -> Mesh:
-    """A box-shaped van whose sides are windows."""
+    """Build a box-shaped van with windows along its sides."""
     w = 1.0
     parts = [
         taper((-2.6, 2.6), (0.25, 1.15), (w, w), (0.0, 0.03), (BODY, BODY, BODY)),
@@ -68,7 +70,7 @@ def panel_van(looks: MeshLooks) -> Mesh:
 
 
 def truck(looks: MeshLooks) -> Mesh:
-    """A cab before a box."""
+    """Build a truck: a cab in front of a box."""
     w = 1.2
     parts = [
         *_cab(looks, w),
@@ -77,13 +79,13 @@ def truck(looks: MeshLooks) -> Mesh:
         wheels((-2.4, 2.5), w, 0.5, looks, None),
         wheels((-1.3,), w, 0.5, looks, None),
     ]
-    for side in (-1.0, 1.0):  # a guard below the box
+    for side in (-1.0, 1.0):  # guard below the box
         parts.append(box((-0.7, side * 1.12 - 0.03, 0.5), (1.5, side * 1.12 + 0.03, 0.85), looks.dark))
     return join([*parts, *_fittings(looks, (-3.6, 3.6), w, 0.75, 0.82)])
 
 
 def tanker(looks: MeshLooks) -> Mesh:
-    """A cab before a round tank."""
+    """Build a tanker: a cab in front of a round tank."""
     w = 1.2
     parts = [
         *_cab(looks, w),
@@ -112,7 +114,7 @@ def _cab(looks: MeshLooks, w: float) -> list[Mesh]:
 
 
 def bus(looks: MeshLooks) -> Mesh:
-    """A city bus with doors on its right."""
+    """Build a city bus with doors on its right."""
     w = 1.23
     parts = [
         box((-5.2, -w, 0.35), (5.2, w, 1.15), BODY),
@@ -135,7 +137,7 @@ def bus(looks: MeshLooks) -> Mesh:
 
 
 def coach(looks: MeshLooks) -> Mesh:
-    """A touring coach with a raised floor."""
+    """Build a touring coach with a raised floor."""
     w = 1.24
     parts = [
         taper((-5.6, 5.6), (0.35, 1.6), (w, w), (0.0, 0.1), (BODY, BODY, BODY)),
@@ -152,7 +154,7 @@ def coach(looks: MeshLooks) -> Mesh:
 def _fittings(
     looks: MeshLooks, x: tuple[float, float], w: float, front_z: float, rear_z: float
 ) -> list[Mesh]:
-    """Lights, plates and mirrors."""
+    """Build lights, plates and mirrors."""
     rear, front = x
     parts = [
         box((rear - 0.05, -0.26, 0.62), (rear + 0.02, 0.26, 0.73), looks.plate),

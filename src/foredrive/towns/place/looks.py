@@ -1,4 +1,4 @@
-"""What things look like to a camera and to a lidar: surfaces, textures and the table of looks."""
+"""Looks of objects for a camera and a lidar: surfaces, textures and the table of looks."""
 
 import enum
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int64
 
 
 class Surface(enum.IntEnum):
-    """What a static thing is: the semantics of the town."""
+    """The class of a static object: the semantics of the town."""
 
     ROAD = 0
     SIDEWALK = 1
@@ -24,42 +24,43 @@ class Surface(enum.IntEnum):
     VEHICLE = 8
     PEDESTRIAN = 9
     HIDDEN = 10
-    """Under the road, where only a ray through a crack gets to."""
+    """Ground under the road, which only a ray through a crack reaches."""
     SIGNAL = 11
     """Heads of traffic lights."""
 
 
 class Texture(enum.IntEnum):
-    """Procedural patterns; `u, v, w` are the interpolated corner coordinates, `p` the look's parameters."""
+    """Procedural patterns. `u, v, w` are the interpolated corner coordinates, `p` the look's parameters."""
 
     PLAIN = 0
     """p0: strength of the mottling."""
     ROAD = 1
-    """Asphalt with lines. u, v: distance from the left and right border; w: along, all in m.
-    p0..p2: `LinePattern`, colour (0 white, 1 yellow), width of the left line; p3..p5: the right line."""
+    """Asphalt with lines. u, v: distance from the left and right border; w: distance along, all in m.
+    p0..p2: `LinePattern`, colour (0 white, 1 yellow) and width of the left line; p3..p5: the same of the
+    right line."""
     SLABS = 2
-    """u, v: distance from the left and right edge, where a kerb stone lies. p0: edge of the slabs, m."""
+    """u, v: distance from the left and right edge, where a kerb stone lies, m. p0: edge of the slabs, m."""
     GRASS = 3
     FACADE = 4
-    """u: from the wall's left end; v: above the ground; w: from its right end, m.
-    p0: storey height; p1: bay width; p2: share of the bay that is window; p3: of the storey;
-    p4: height of the ground floor; p5: `WallKind`; p6: `WindowKind`; p7: `GroundFloor`; p8: row of
-    `facades.ACCENT_RGB` for doors, shutters and signs."""
+    """u: distance from the wall's left end; v: height above the ground; w: distance from its right end, m.
+    p0: storey height; p1: bay width; p2: window width as a fraction of the bay; p3: window height as a
+    fraction of the storey; p4: height of the ground floor; p5: `WallKind`; p6: `WindowKind`; p7:
+    `GroundFloor`; p8: row of `facades.ACCENT_RGB` for doors, shutters and signs."""
     TILES = 5
-    """u: along the eaves; v: up the slope, m."""
+    """u: distance along the eaves; v: distance up the slope, m."""
     FOLIAGE = 6
     STRIPES = 7
-    """u: across the stripes, m. p0: period, p1: width of a stripe."""
+    """u: distance across the stripes, m. p0: period; p1: width of a stripe."""
     GLASS = 8
     GLOW = 9
-    """Shines by itself."""
+    """A surface that emits light."""
     FIELD = 10
-    """Crops. u: across the rows; v: along them; w: from the field's border inwards, m; grass outside.
+    """Crops, with grass outside. u: distance across the rows; v: along them; w: from the border inwards, m.
     p0: distance of the rows; p1: their width; p2..p4: linear colour between them."""
 
 
 class LinePattern(enum.IntEnum):
-    """Painted along the border of a lane."""
+    """The lines that are painted along the border of a lane."""
 
     NONE = 0
     SOLID = 1
@@ -69,7 +70,7 @@ class LinePattern(enum.IntEnum):
 
 
 class WallKind(enum.IntEnum):
-    """What a façade is made of."""
+    """The material of a façade."""
 
     PLASTER = 0
     BRICK = 1
@@ -81,14 +82,14 @@ class WallKind(enum.IntEnum):
 
 
 class WindowKind(enum.IntEnum):
-    """How the windows of a façade are made."""
+    """The windows of a façade."""
 
     CASEMENT = 0
-    """Two leaves over a sill."""
+    """Two leaves above a sill."""
     TALL = 1
-    """Down to the floor, behind a rail."""
+    """Windows down to the floor, behind a rail."""
     RIBBON = 2
-    """Side by side along the whole storey."""
+    """Windows side by side along the whole storey."""
     CURTAIN = 3
     """A wall of glass."""
     HALL = 4
@@ -97,11 +98,11 @@ class WindowKind(enum.IntEnum):
     GRID = 6
     """Many small panes."""
     SLIT = 7
-    """Two narrow ones in each bay."""
+    """Two narrow windows in each bay."""
 
 
 class GroundFloor(enum.IntEnum):
-    """What a façade's ground floor is."""
+    """The ground floor of a façade."""
 
     DOORS = 0
     SHOPS = 1
@@ -111,43 +112,43 @@ class GroundFloor(enum.IntEnum):
 
 PARAMETERS = 9
 GRASS_RGB = (0.40, 0.43, 0.26)
-"""Of the land."""
+"""Colour of the land."""
 ASPHALT_RGB = (0.36, 0.36, 0.365)
 RETROREFLECTIVE = 3.0
-"""Reflectivity of road signs and number plates, seen from where the light comes."""
+"""Reflectivity of road signs and number plates for a viewer at the light source."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How one part of a mesh looks."""
+    """The appearance of one part of a mesh."""
 
     surface: Surface
     texture: Texture
     rgb: tuple[float, float, float]
     """Reflectance as sRGB would show it under white light, 0 to 1."""
     reflectivity: float
-    """Of the lidar's infra-red light, 0 to 1; more for what throws it back to where it came from."""
+    """Reflectivity for the lidar's infra-red light, 0 to 1; higher for retroreflective surfaces."""
     gloss: float = 0.0
-    """Share of the sky that is mirrored head-on, 0 to 1."""
+    """Share of the sky that is mirrored at perpendicular incidence, 0 to 1."""
     params: tuple[float, ...] = ()
 
 
 @dataclass
 class LookTable:
-    """Looks by number; equal looks share theirs."""
+    """Looks by number. Equal looks have the same number."""
 
     looks: list[Look] = field(default_factory=list)
     numbers: dict[Look, int] = field(default_factory=dict)
 
     def add(self, look: Look) -> int:
-        """Number of a look."""
+        """Return the number of a look and add the look if it is new."""
         if look not in self.numbers:
             self.numbers[look] = len(self.looks)
             self.looks.append(look)
         return self.numbers[look]
 
     def arrays(self) -> "LookArrays":
-        """The table as arrays, for kernels."""
+        """Return the table as arrays, for compiled functions."""
         params = [(*look.params, *[0.0] * (PARAMETERS - len(look.params))) for look in self.looks]
         return LookArrays(
             surface=np.array([look.surface for look in self.looks], dtype=np.int64),
@@ -160,12 +161,12 @@ class LookTable:
 
 
 class LookArrays(NamedTuple):
-    """L looks, column by column."""
+    """L looks as one array per property."""
 
     surface: Int64[np.ndarray, "L"]
     texture: Int64[np.ndarray, "L"]
     albedo: Float32[np.ndarray, "L 3"]
-    """Linear."""
+    """Linear colour."""
     reflectivity: Float32[np.ndarray, "L"]
     gloss: Float32[np.ndarray, "L"]
     params: Float32[np.ndarray, "L P"]

@@ -1,7 +1,7 @@
-"""Triangle meshes and the primitives they are put together from.
+"""Triangle meshes and the primitives from which they are built.
 
-Meshes are triangle soups with outward normals (counter-clockwise seen from outside); whatever is solid is
-closed, which tells its inside from its outside.
+Meshes are unconnected triangles with outward normals (counter-clockwise seen from outside). Solid objects are
+closed, which distinguishes their inside from their outside.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ class Mesh:
     xyz: Float32[np.ndarray, "F 3 3"]
     """Corners, m."""
     uvw: Float32[np.ndarray, "F 3 3"]
-    """Texture coordinates of the corners; what they mean is up to the look's texture."""
+    """Texture coordinates of the corners. The look's texture defines their meaning."""
     look: Int32[np.ndarray, "F"]
     """Number in a `LookTable`."""
 
     def transformed(self, T: Float[np.ndarray, "4 4"]) -> "Mesh":
-        """Mapped by an affine transform that keeps orientation."""
+        """Return the mesh mapped by an affine transform that keeps orientation."""
         return Mesh((self.xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32), self.uvw, self.look)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of many."""
+    """Join many meshes into one."""
     if not meshes:
         return triangles(np.zeros((0, 3, 3)), 0)
     return Mesh(
@@ -44,7 +44,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 def triangles(
     xyz: Float[np.ndarray, "F 3 3"], look: int, uvw: Float[np.ndarray, "F 3 3"] | None = None
 ) -> Mesh:
-    """Triangles of one look; texture coordinates default to the corners' positions."""
+    """Build triangles of one look. Texture coordinates default to the positions of the corners."""
     xyz32 = np.ascontiguousarray(xyz, dtype=np.float32)
     uvw32 = xyz32 if uvw is None else np.ascontiguousarray(uvw, dtype=np.float32)
     return Mesh(xyz32, uvw32, np.full(len(xyz32), look, dtype=np.int32))
@@ -53,7 +53,7 @@ def triangles(
 def quads(
     corners: Float[np.ndarray, "Q 4 3"], look: int, uvw: Float[np.ndarray, "Q 4 3"] | None = None
 ) -> Mesh:
-    """Quads, two triangles each, corners counter-clockwise seen from outside."""
+    """Build quads of two triangles each, with corners counter-clockwise seen from outside."""
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     xyz = np.asarray(corners)[:, halves].reshape(-1, 3, 3)
     return triangles(xyz, look, None if uvw is None else np.asarray(uvw)[:, halves].reshape(-1, 3, 3))
@@ -65,7 +65,10 @@ def ribbon(
     look: int,
     uvw: tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]] | None = None,
 ) -> Mesh:
-    """The band between two lines; facing up when left lies to the left. `uvw` of the left and right line."""
+    """Build the band between two lines. It faces up if `left` lies to the left.
+
+    `uvw` holds the texture coordinates of the left and the right line.
+    """
 
     def corners(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1)
@@ -74,14 +77,14 @@ def ribbon(
 
 
 def polygon_cap(polygon: shapely.Polygon, z: float, look: int, up: bool = True) -> Mesh:
-    """A level face; texture coordinates are x, y."""
+    """Build a horizontal face with x, y as texture coordinates."""
     xy = polygon_triangles(polygon)
     xyz = np.concatenate([xy, np.full((*xy.shape[:2], 1), z)], axis=-1)
     return triangles(xyz if up else xyz[:, ::-1], look)
 
 
 def polygon_triangles(polygon: shapely.Geometry) -> Float[np.ndarray, "F 3 2"]:
-    """Constrained Delaunay triangulation of a polygon or several, counter-clockwise."""
+    """Return the constrained Delaunay triangulation of one or several polygons, counter-clockwise."""
     parts = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     if len(parts) == 0:
         return np.zeros((0, 3, 2))
@@ -98,9 +101,10 @@ def walls(
     z1: Float[np.ndarray, "N"] | float,
     look: int,
 ) -> Mesh:
-    """Vertical faces over a line; outside is on its right, so the ring of a solid runs counter-clockwise.
+    """Build vertical faces over a line.
 
-    Texture coordinates: from the start of each face, above its lower edge, from its end, m.
+    Outside is on the right of the line, so the ring of a solid runs counter-clockwise. Texture coordinates
+    are the distances from the start of each face, above its lower edge and from its end, m.
     """
     a, b = ring_xy[:-1], ring_xy[1:]
     low, high = np.broadcast_to(z0, len(ring_xy)), np.broadcast_to(z1, len(ring_xy))
@@ -121,14 +125,14 @@ def walls(
 
 
 def prism(polygon: shapely.Polygon, z0: float, z1: float, side_look: int, top_look: int) -> Mesh:
-    """A polygon without holes, extruded."""
+    """Build an extruded polygon without holes."""
     ring = shapely.get_coordinates(shapely.orient_polygons(polygon).exterior)
     top, bottom = polygon_cap(polygon, z1, top_look), polygon_cap(polygon, z0, side_look, up=False)
     return join([walls(ring, z0, z1, side_look), top, bottom])
 
 
 def box(lower: Vector, upper: Vector, look: int) -> Mesh:
-    """An axis-aligned box."""
+    """Build an axis-aligned box."""
     (x0, y0, z0), (x1, y1, z1) = lower, upper
     return hexahedron(
         [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]],
@@ -138,7 +142,7 @@ def box(lower: Vector, upper: Vector, look: int) -> Mesh:
 
 
 def boxes(lower: Float[np.ndarray, "B 3"], upper: Float[np.ndarray, "B 3"], look: int) -> Mesh:
-    """Many axis-aligned boxes."""
+    """Build many axis-aligned boxes."""
     ends = np.stack([lower, upper])
     which = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
     corners = ends[which, :, np.arange(3)].transpose(2, 0, 1)
@@ -149,17 +153,17 @@ _HEX_FACES = ((3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 
 
 
 def hexahedron(bottom: Sequence[Vector], top: Sequence[Vector], looks: Sequence[int]) -> Mesh:
-    """A solid between two quads, each counter-clockwise from above.
+    """Build a solid between two quads, each counter-clockwise seen from above.
 
     Args:
-        looks: of the bottom, the top, then the sides from corner 0–1 on.
+        looks: looks of the bottom, the top, then the sides from corner 0–1 on.
     """
     mesh = quads(np.array([*bottom, *top], dtype=float)[np.array(_HEX_FACES)], 0)
     return Mesh(mesh.xyz, mesh.uvw, np.repeat(np.array(looks, dtype=np.int32), 2))
 
 
 def frustum(bottom: Vector, top: Vector, radii: tuple[float, float], sides: int, look: int) -> Mesh:
-    """A closed cone frustum between two points; a top radius of 0 makes a cone."""
+    """Build a closed cone frustum between two points. A top radius of 0 gives a cone."""
     base, tip = np.asarray(bottom, dtype=float), np.asarray(top, dtype=float)
     axis = (tip - base) / np.linalg.norm(tip - base)
     helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""Parked cars: in the map's parking strips, and on small car parks beside the road."""
+"""Parked cars in the map's parking strips and on small car parks beside the road."""
 
 import numpy as np
 import shapely
@@ -12,7 +12,7 @@ from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
 from foredrive.towns.place.site import Frontage, Site, frontages
 
 FIRST_TRACK_ID = 50_000
-"""Parked cars are numbered from here on, so that they never share a number with traffic."""
+"""First track id of parked cars, so that they never share an id with traffic."""
 SHARE_OF_BAYS = 0.6
 KERB_BAY_M, KERB_WIDTH_M = 6.2, 2.0
 CROSS_BAY_M, CROSS_DEPTH_M = 2.8, 5.2
@@ -23,7 +23,7 @@ LOT_LIFT_M = 0.06
 
 
 def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[ActorState]:
-    """Cars on parking strips: along the kerb, or across it where the strip is deep; never on a lane."""
+    """Place cars on parking strips, along the kerb or, on deep strips, across it. No car stands on a lane."""
     lanes = site.plan.lanes
     shapely.prepare(lanes)
     cars: list[ActorState] = []
@@ -45,7 +45,10 @@ def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[
 
 
 def build_car_parks(site: Site, table: LookTable, rng: np.random.Generator) -> tuple[Mesh, list[ActorState]]:
-    """Paved lots between the buildings, with a row of marked bays; they take their plots from the site."""
+    """Build paved car parks between the buildings, each with a row of marked bays.
+
+    The plots are taken from the site.
+    """
     asphalt = table.add(Look(Surface.TERRAIN, Texture.ROAD, ASPHALT_RGB, 0.15))
     paint = table.add(Look(Surface.TERRAIN, Texture.PLAIN, (0.85, 0.85, 0.83), 0.7))
     parts, cars = [], []
@@ -62,7 +65,7 @@ def build_car_parks(site: Site, table: LookTable, rng: np.random.Generator) -> t
 
 
 def footprint(actor: ActorState) -> shapely.Polygon:
-    """An actor's box seen from above."""
+    """Return an actor's box seen from above."""
     ahead = np.array([np.cos(actor.yaw), np.sin(actor.yaw)])
     left = np.array([-ahead[1], ahead[0]])
     x, y = 0.5 * actor.size_lwh[0] * ahead, 0.5 * actor.size_lwh[1] * left
@@ -71,7 +74,7 @@ def footprint(actor: ActorState) -> shapely.Polygon:
 
 
 def numbered(cars: list[ActorState]) -> tuple[ActorState, ...]:
-    """Parked cars with their track ids."""
+    """Return parked cars with their track ids."""
     return tuple(
         ActorState(**{**vars(car), "track_id": FIRST_TRACK_ID + number}) for number, car in enumerate(cars)
     )
@@ -80,7 +83,7 @@ def numbered(cars: list[ActorState]) -> tuple[ActorState, ...]:
 def _pose_on(
     middle: Float[np.ndarray, "N 3"], along: Float[np.ndarray, "N"], s: float
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
-    """Point, heading and pitch on a strip."""
+    """Return the point, heading and pitch on a strip."""
     at, before, after = (
         np.array([np.interp(s + ds, along, middle[:, axis]) for axis in range(3)]) for ds in (0.0, -2.0, 2.0)
     )

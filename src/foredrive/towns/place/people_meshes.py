@@ -1,4 +1,4 @@
-"""Meshes of people, on foot and on two wheels: in metres, x ahead, standing on z = 0."""
+"""Meshes of people on foot and on two wheels. Units are metres; x points ahead; people stand on z = 0."""
 
 import math
 
@@ -10,9 +10,9 @@ from foredrive.towns.place.large_meshes import taper
 from foredrive.towns.place.mesh import Mesh, box, frustum, join, ribbon, triangles
 
 POSES = 8
-"""Of one double step."""
+"""Number of poses in one double step."""
 PEDESTRIAN_BOX = ((-0.36, -0.3, 0.0), (0.36, 0.3, 1.75))
-"""What is stretched to the size of a pedestrian, whatever the pose."""
+"""Box that is scaled to the size of a pedestrian in any pose, m."""
 HIP_M, THIGH_M, SHANK_M = 0.92, 0.44, 0.42
 HIP_SWING_RAD, KNEE_BEND_RAD, ARM_SWING_RAD = 0.42, 0.95, 0.45
 
@@ -23,10 +23,11 @@ def _ball(centre: tuple[float, float, float], radius: float, look: int) -> Mesh:
 
 
 def pedestrian(looks: MeshLooks, phase: float | None, dress: str) -> Mesh:
-    """Someone 1.75 m tall.
+    """Build a pedestrian who is 1.75 m tall.
 
     Args:
-        phase: of the double step, 0 to 1, the left foot going forward first; None for standing.
+        phase: phase of the double step, 0 to 1, which begins with the left foot moving forward. None:
+            standing.
         dress: "jacket", "coat" or "backpack".
     """
     legs, feet = [], []
@@ -91,7 +92,7 @@ def _hand(at: tuple[float, float, float]) -> Mesh:
 
 
 def _rim(x: float, radius: float, thick: float, look: int) -> Mesh:
-    """A tyre that one sees through, its axis along y."""
+    """Build an open tyre whose axis is along y."""
     angle = np.arange(15) * (2 * np.pi / 14)
     circle = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
     centre, aside = np.array([x, 0.0, radius]), np.array([0.0, thick, 0.0])
@@ -102,7 +103,7 @@ def _rim(x: float, radius: float, thick: float, look: int) -> Mesh:
 
 
 def _two_wheeler(looks: MeshLooks, wheel_m: float, thick: float, frame_look: int) -> Mesh:
-    """A bicycle or motorcycle with its rider."""
+    """Build a bicycle or motorcycle with its rider."""
     reach = 0.95 - wheel_m
     parts = []
     for x in (-reach, reach):
@@ -132,12 +133,12 @@ def _two_wheeler(looks: MeshLooks, wheel_m: float, thick: float, frame_look: int
 
 
 def bicycle(looks: MeshLooks) -> Mesh:
-    """A diamond frame."""
+    """Build a bicycle with a diamond frame."""
     return _two_wheeler(looks, 0.34, 0.02, looks.dark)
 
 
 def motorcycle(looks: MeshLooks) -> Mesh:
-    """A motorcycle and a rider with a helmet."""
+    """Build a motorcycle and a rider with a helmet."""
     bulk = [
         taper((-0.6, 0.5), (0.35, 0.85), (0.17, 0.12), (0.1, 0.2), (looks.tank, looks.tank, looks.dark)),
         box((0.5, -0.12, 0.85), (0.62, 0.12, 1.05), looks.front_light),
@@ -148,7 +149,7 @@ def motorcycle(looks: MeshLooks) -> Mesh:
 
 
 def city_bike(looks: MeshLooks) -> Mesh:
-    """A bicycle with mudguards, a basket and a rear rack."""
+    """Build a bicycle with mudguards, a basket and a rear rack."""
     reach = 0.95 - 0.34
     extra = [
         box((reach + 0.02, -0.17, 0.78), (reach + 0.3, 0.17, 1.0), looks.hub),
@@ -159,7 +160,7 @@ def city_bike(looks: MeshLooks) -> Mesh:
 
 
 def scooter(looks: MeshLooks) -> Mesh:
-    """A motor scooter with a leg shield and a top case."""
+    """Build a motor scooter with a leg shield and a top case."""
     extra = [
         taper((-0.85, -0.05), (0.3, 0.85), (0.2, 0.15), (0.1, 0.1), (looks.dark, looks.tank, looks.tank)),
         taper((0.4, 0.6), (0.25, 1.0), (0.22, 0.16), (0.02, 0.1), (looks.tank, looks.tank, looks.tank)),

@@ -1,4 +1,4 @@
-"""What stands on posts: traffic lights, signs that the map has, street lamps."""
+"""Objects on posts: traffic lights, signs of the map, and street lamps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ POLE_SAMPLE_M = 0.2
 
 @dataclass(frozen=True)
 class SignalHead:
-    """Where the lamps of one traffic light are in the look table: red, yellow, green."""
+    """The looks of one traffic light's lamps in the look table: red, yellow, green."""
 
     zone: int
     """Index into the town's stop zones."""
@@ -32,16 +32,16 @@ class SignalHead:
 
 @dataclass(frozen=True)
 class StreetLamps:
-    """What shines along the streets at night."""
+    """The light sources along the streets at night."""
 
     xyz: Float[np.ndarray, "N 3"]
     look: int
-    """Of what shines."""
+    """Look of the luminous part."""
 
 
 @dataclass(frozen=True)
 class Props:
-    """All props of a town."""
+    """All objects of a town that stand on posts."""
 
     mesh: Mesh
     heads: tuple[SignalHead, ...]
@@ -71,7 +71,10 @@ class _Looks:
 
 
 def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
-    """Traffic lights and signs where the map has them, if that is not on a lane; they come first."""
+    """Build traffic lights and signs at their places in the map, moved off the lanes.
+
+    They are placed first.
+    """
     looks = _Looks(table)
     parts, heads, poles = [], [], []
     lanes = site.plan.lanes
@@ -95,7 +98,7 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
 
 
 def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
-    """Lamps along the roads."""
+    """Build lamps along the roads."""
     looks = _Looks(table)
     parts, poles, lamps = [], [], []
     for frontage in frontages(site.plan, LAMP_SETBACK_M):
@@ -114,7 +117,10 @@ def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -
 
 
 def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
-    """The post's foot, moved to the right of the traffic until it is off the lanes; None if that is far."""
+    """Move the foot of a post to the right of the traffic until it is off the lanes.
+
+    Return None if that takes 4 m or more.
+    """
     right = np.array([np.sin(zone.post_yaw), -np.cos(zone.post_yaw), 0.0])
     for step in np.arange(0.0, 4.0, 0.25):
         foot = zone.post_xyz + step * right
@@ -124,7 +130,10 @@ def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"
 
 
 def _lamp_looks(table: LookTable, zone: int) -> tuple[int, int, int]:
-    """Looks of a light's own three lamps, unlit; the zone keeps them apart from those of other lights."""
+    """Return the looks of a light's three lamps, unlit.
+
+    The zone separates them from those of other lights.
+    """
     off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
     red, yellow, green = (
         table.add(Look(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
@@ -142,8 +151,11 @@ def _turned(mesh: Mesh, xyz: Float[np.ndarray, "3"], yaw: float) -> Mesh:
 def _traffic_light(
     town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks
 ) -> Mesh:
-    """A post with a head at eye level and, over several lanes, an arm with one head for each."""
-    # In the post's frame x points along the traffic, which sees the lights against that direction.
+    """Build a post with a head at eye level.
+
+    If it serves several lanes, add an arm with one head for each lane.
+    """
+    # In the post's frame x points along the traffic, so the lights face the negative x direction.
     parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, looks.metal)]
     parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, looks))
     lanes = {lane.lane_id: lane for lane in town.lanes}
@@ -188,7 +200,7 @@ def _stop_or_yield(zone: StopZone, foot: Float[np.ndarray, "3"], looks: _Looks) 
 
 
 def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"], looks: _Looks) -> Mesh:
-    """A street lamp whose arm reaches over the road, on the left of `ahead`."""
+    """Build a street lamp whose arm reaches over the road, to the left of `ahead`."""
     top = LAMP_HEIGHT_M
     parts = [
         frustum((0, 0, -0.5), (0, 0, top), (0.09, 0.05), 6, looks.metal),
@@ -199,17 +211,17 @@ def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"],
 
 
 def along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
-    """Points up a pole."""
+    """Return points up a pole."""
     up = np.arange(0.0, height, POLE_SAMPLE_M)
     return np.column_stack([np.full_like(up, foot[0]), np.full_like(up, foot[1]), z + up])
 
 
 def thin_things(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinThings:
-    """Points of one surface."""
+    """Return thin points of one surface."""
     xyz = np.concatenate([np.zeros((0, 3)), *lines])
     return ThinThings(xyz, np.full(len(xyz), int(surface)))
 
 
 def join_thin(parts: Sequence[ThinThings]) -> ThinThings:
-    """All points together."""
+    """Join thin points."""
     return ThinThings(np.concatenate([p.xyz for p in parts]), np.concatenate([p.surface for p in parts]))

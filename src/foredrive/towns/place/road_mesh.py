@@ -13,7 +13,7 @@ from foredrive.towns.place.mesh import Mesh, frustum, join, polygon_triangles, q
 
 KERB_FOOT_M = 0.3
 PAINT_M = 0.008
-"""Paint lies this much above the road."""
+"""Height of paint above the road, m."""
 STOP_LINE_M = 0.45
 STOP_LINE_GAP_M = 0.6
 STRIPE_PERIOD_M, STRIPE_M = 1.0, 0.5
@@ -36,7 +36,7 @@ CONCRETE_RGB = (0.60, 0.585, 0.56)
 
 @dataclass(frozen=True)
 class RoadLooks:
-    """Numbers of the looks that roads are made of."""
+    """Numbers of the looks of roads."""
 
     walkway: int
     kerb: int
@@ -63,7 +63,7 @@ def add_road_looks(table: LookTable) -> RoadLooks:
 
 
 def build_roads(town: TownMap, plan: GroundPlan, table: LookTable) -> Mesh:
-    """Everything of a town that is paved."""
+    """Build all paved surfaces of a town."""
     looks = add_road_looks(table)
     parts = [_surface(piece, looks, table) for piece in plan.pieces]
     parts += [_kerbs(piece, looks) for piece in plan.pieces if piece.raise_m > 0]
@@ -75,7 +75,7 @@ def build_roads(town: TownMap, plan: GroundPlan, table: LookTable) -> Mesh:
 
 
 def drape(area: shapely.Geometry, plan: GroundPlan, look: int, lift_m: float) -> Mesh:
-    """A polygon laid over the roads around it."""
+    """Lay a polygon over the surrounding roads."""
     xy = polygon_triangles(area)
     z = plan.borders.road(xy) + lift_m
     return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
@@ -122,7 +122,7 @@ def _surface(piece: Piece, looks: RoadLooks, table: LookTable) -> Mesh:
 
 
 def _kerbs(piece: Piece, looks: RoadLooks) -> Mesh:
-    """Vertical faces around a raised piece; those between two raised pieces are hidden."""
+    """Build vertical faces around a raised piece. Faces between two raised pieces are hidden."""
     if piece.whole:
         ring = np.concatenate([piece.right_xyz, piece.left_xyz[::-1], piece.right_xyz[:1]])
         z = ring[:, 2]
@@ -138,13 +138,13 @@ def _kerbs(piece: Piece, looks: RoadLooks) -> Mesh:
 
 
 def _rings(area: shapely.Geometry) -> list[shapely.LinearRing]:
-    """All rings, the solid on their left."""
+    """Return all rings, with the solid on their left."""
     oriented = shapely.get_parts(shapely.orient_polygons(area))
     return [ring for polygon in oriented for ring in (polygon.exterior, *polygon.interiors)]
 
 
 def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
-    """Stripes along the lanes, cut to what is not a walkway and laid over the road metre by metre."""
+    """Build stripes along the lanes, cut off at walkways and laid over the road metre by metre."""
     walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0])
     parts = []
     for crosswalk in town.crosswalks:
@@ -172,7 +172,8 @@ def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]
 
 
 def _stop_lines(town: TownMap, looks: RoadLooks) -> list[Mesh]:
-    """A line across each lane before a light or a stop sign, and before the crosswalk if there is one."""
+    """Build a line across each lane before a light or a stop sign, and before its crosswalk if there is
+    one."""
     crosswalks = shapely.union_all([shapely.Polygon(c.outline_xyz[:, :2]) for c in town.crosswalks])
     lanes = {lane.lane_id: lane for lane in town.lanes}
     entries = {i for zone in town.stop_zones for lane in zone.lane_ids for i in lanes[lane].predecessor_ids}
@@ -190,14 +191,14 @@ def _stop_lines(town: TownMap, looks: RoadLooks) -> list[Mesh]:
 
 
 def _before_end(line: Float[np.ndarray, "N 3"], gap_m: float) -> Float[np.ndarray, "2 3"]:
-    """The points STOP_LINE_M + gap and gap before the end of a line."""
+    """Return the points at STOP_LINE_M + gap and at gap before the end of a line."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     at = along[-1] - gap_m - np.array([STOP_LINE_M, 0.0])
     return np.column_stack([np.interp(at, along, line[:, axis]) for axis in range(3)])
 
 
 def _bridges(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
-    """Decks, parapets along their open sides, and pillars where there is room for them."""
+    """Build decks, parapets along their open sides, and pillars where there is room."""
     bridge = [piece for piece in plan.pieces if piece.bridge]
     if not bridge:
         return []
@@ -220,7 +221,7 @@ def _edge(
     plan: GroundPlan,
     looks: RoadLooks,
 ) -> list[Mesh]:
-    """Fascia and parapet along one ring of the decks; none where the road goes on."""
+    """Build fascia and parapet along one ring of the decks, with no parapet where the road continues."""
     nearest = top.query_nearest(shapely.points(ring), all_matches=False)[1]
     z = np.array([bridge[n].height(xy[None])[0] for n, xy in zip(nearest, ring, strict=True)])
     step = ring[1:] - ring[:-1]

@@ -9,7 +9,7 @@ EAVES_M = 0.45
 
 
 def gable_roof(plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> Mesh:
-    """Two slopes of look `roof` that reach out over the eaves, and gables of look `wall`."""
+    """Build two slopes of look `roof` that extend beyond the eaves, and gables of look `wall`."""
     w, d, e = plot.width_m, plot.depth_m, EAVES_M
     drop = (ridge - eaves) / (0.5 * d) * e
     slopes = []
@@ -32,7 +32,7 @@ def gable_roof(plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> 
 
 
 def hip_roof(plot: Plot, eaves: float, ridge: float, roof: int) -> Mesh:
-    """Four slopes; the plot is wider than deep."""
+    """Build four slopes on a plot that is wider than deep."""
     w, d, e = plot.width_m, plot.depth_m, EAVES_M
     a, b, c, f = [-e, -e, eaves], [w + e, -e, eaves], [w + e, d + e, eaves], [-e, d + e, eaves]
     p, q = [0.5 * d, 0.5 * d, ridge], [w - 0.5 * d, 0.5 * d, ridge]

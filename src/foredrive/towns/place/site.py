@@ -1,4 +1,4 @@
-"""Where things may stand: off the roads and clear of each other."""
+"""Free sites for objects: off the roads and clear of each other."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ GRID_M = 20.0
 
 @dataclass
 class Site:
-    """A town's free land and what has been put there."""
+    """A town's free land and the objects on it."""
 
     plan: GroundPlan
     terrain: Terrain
@@ -27,28 +27,28 @@ class Site:
         shapely.prepare(self._paved)
 
     def is_free(self, area: shapely.Geometry) -> bool:
-        """Whether an area touches neither road, walkway or bridge nor anything standing."""
+        """Return whether an area touches no road, walkway, bridge or object."""
         if self._paved.intersects(area):
             return False
         return not any(other.intersects(area) for other in self.near(area))
 
     def near(self, area: shapely.Geometry) -> list[shapely.Geometry]:
-        """What has been put near an area."""
+        """Return the areas that are taken near an area."""
         indices = {i for cell in self._cells_of(area) for i in self._cells.get(cell, ())}
         return [self.taken[i] for i in sorted(indices)]
 
     def take(self, area: shapely.Geometry) -> None:
-        """Mark an area as built on."""
+        """Mark an area as taken."""
         for cell in self._cells_of(area):
             self._cells.setdefault(cell, []).append(len(self.taken))
         self.taken.append(area)
 
     def distance_to_road(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Distance of points to what is paved, m."""
+        """Return the distance of points to the nearest paved area, m."""
         return shapely.distance(self._paved, shapely.points(xy))
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Height of the land: the terrain, or the walkway where there is one."""
+        """Return the height of the land: the walkway where there is one, the terrain elsewhere."""
         return np.where(self._on_ground(xy), self.plan.borders.top(xy), self.terrain.height(xy))
 
     def _on_ground(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
@@ -66,15 +66,15 @@ class Frontage:
 
     line: shapely.LineString
     walkway: bool
-    """Whether a walkway runs along it."""
+    """Whether a walkway runs along the line."""
 
     def at(self, along_m: float) -> Float[np.ndarray, "2"]:
-        """Point by arc length."""
+        """Return the point at an arc length."""
         return shapely.get_coordinates(shapely.line_interpolate_point(self.line, along_m))[0]
 
 
 def frontages(plan: GroundPlan, setback_m: float) -> list[Frontage]:
-    """Lines that keep a distance from all that is paved on the ground, in a fixed order."""
+    """Return lines at a distance from all pavement on the ground, in a fixed order."""
     walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0]).buffer(setback_m + 1.0)
     shapely.prepare(walkways)
     rings = []

@@ -1,4 +1,4 @@
-"""Where street furniture stands: behind the walkways, and beside roads without them."""
+"""Placement of street furniture behind the walkways, and beside roads without walkways."""
 
 import itertools
 from dataclasses import dataclass, field
@@ -21,10 +21,11 @@ WALKWAY_STEP_M, OPEN_STEP_M = (7.0, 22.0), (45.0, 140.0)
 POLE_STEP_M, POLE_ASIDE_M = 34.0, 2.0
 BILLBOARD_ASIDE_M, SITE_ASIDE_M = 5.0, 2.5
 FAST_MPS, FAST_WITHIN_M = 27.0, 14.0
-"""Roads as fast as this are motorways: they have guard rails."""
+"""Speed limit above which a road is a motorway, m/s, and the distance from it within which guard rails stand,
+m."""
 SECTION_M = 80.0
 RAILS, BARRIERS = 0.75, 0.12
-"""Shares of a motorway's sections."""
+"""Shares of a motorway's sections with guard rails and with sound barriers."""
 STEEP_M = 0.6
 
 _ON_WALKWAYS = {
@@ -45,7 +46,10 @@ _ON_OPEN_ROADS = {"speed_sign": 0.5, "direction_sign": 0.25, "information_sign":
 def build_street_furniture(
     town: TownMap, site: Site, table: LookTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinThings]:
-    """Guard rails, barriers, power lines, billboards, then the small things; takes their places."""
+    """Build guard rails, barriers, power lines, billboards, then small objects.
+
+    Their places are taken from the site.
+    """
     fast = [x.centreline_xyz[:, :2] for x in town.lanes if (x.speed_limit_mps or 0.0) > FAST_MPS]
     motorways = shapely.STRtree([shapely.LineString(line) for line in fast])
     fitter = _Fitter(site, motorways, STYLES[town.name], FurnitureLooks(table), rng)
@@ -75,7 +79,7 @@ class _Fitter:
         self._things = furniture_meshes.things(self.looks)
 
     def rails(self, frontage: Frontage) -> None:
-        """Guard rails or sound barriers along a motorway, section by section."""
+        """Build guard rails or sound barriers along a motorway, section by section."""
         count = int(frontage.line.length / RAIL_STEP_M)
         if count < 3:
             return
@@ -102,12 +106,12 @@ class _Fitter:
                     self.parts.append(furniture_meshes.sound_barrier(feet, self.looks))
 
     def _free_steps(self, xy: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
-        """Points from which the way to the next one is free."""
+        """Return for each point whether the way to the next point is free."""
         free = [self.site.is_free(shapely.LineString([a, b]).buffer(0.2)) for a, b in itertools.pairwise(xy)]
         return np.array([*free, False])
 
     def power_line(self, frontage: Frontage) -> None:
-        """Poles with wires from each to the next."""
+        """Build poles with wires from each pole to the next."""
         last: Float[np.ndarray, 3] | None = None
         for s in np.arange(self.rng.uniform(0.0, POLE_STEP_M), frontage.line.length, POLE_STEP_M):
             foot = self._place("power_pole", frontage, float(s), POLE_ASIDE_M)
@@ -117,7 +121,7 @@ class _Fitter:
             last = foot
 
     def large(self, frontage: Frontage) -> None:
-        """Billboards and building sites."""
+        """Build billboards and building sites."""
         for name, per_km, aside in (
             ("billboard", self.style.billboards, BILLBOARD_ASIDE_M),
             ("building_site", 0.5, SITE_ASIDE_M),
@@ -126,7 +130,7 @@ class _Fitter:
                 self._place(name, frontage, float(self.rng.uniform(0.0, frontage.line.length)), aside)
 
     def small(self, frontage: Frontage) -> None:
-        """One thing after another."""
+        """Build small objects one after another."""
         kinds = _ON_WALKWAYS if frontage.walkway else _ON_OPEN_ROADS
         step = WALKWAY_STEP_M if frontage.walkway else OPEN_STEP_M
         s = float(self.rng.uniform(*step))
@@ -137,7 +141,7 @@ class _Fitter:
     def _place(
         self, name: str, frontage: Frontage, s: float, aside_m: float
     ) -> Float[np.ndarray, "3"] | None:
-        """Put a thing beside a frontage if there is room; its foot, or None."""
+        """Place an object beside a frontage if there is room. Return its foot, or None."""
         thing: Thing = self._things[name]
         reach = min(s + 0.5, frontage.line.length)
         ahead = frontage.at(reach) - frontage.at(reach - 0.5)
@@ -166,6 +170,6 @@ class _Fitter:
 
 
 def _runs(usable: Bool[np.ndarray, "N"]) -> list[slice]:
-    """Stretches of points joined by usable steps, their last points included."""
+    """Return ranges of points joined by usable steps, with their last points included."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
     return [slice(int(a), int(b) + 1) for a, b in edges.reshape(-1, 2)]

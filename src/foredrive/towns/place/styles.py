@@ -1,4 +1,4 @@
-"""What each town builds, how densely, and what stands along its roads."""
+"""Styles of towns: the kinds and the density of buildings, and the objects along the roads."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ class Style:
     kinds: tuple[tuple[str, float], ...]
     """Shares of "house", "block", "tower", "hall" and "barn"."""
     storeys: tuple[int, int]
-    """Of blocks."""
+    """Minimum and maximum number of storeys of blocks."""
     density: float
     """Share of the frontage along walkways that is built on."""
     open_density: float
@@ -20,11 +20,11 @@ class Style:
     shops: float
     """Share of blocks with shops on the ground floor."""
     power_lines: float
-    """Share of the roads with wires on poles beside them, in place of street lamps."""
+    """Share of the roads with wires on poles beside them, instead of street lamps."""
     billboards: float
-    """Per kilometre of road."""
+    """Number of billboards per kilometre of road."""
     farmland: bool = False
-    """Whether the land between the roads is tilled."""
+    """Whether the land between the roads has fields."""
 
 
 _SMALL = (("house", 0.55), ("block", 0.45))

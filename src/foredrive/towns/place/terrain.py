@@ -16,7 +16,7 @@ CELL_M = 4.0
 MARGIN_M = 90.0
 HORIZON_M = 1500.0
 EDGE_DROP_M = 0.02
-"""The land begins this much below a road's edge."""
+"""Height of a road's edge above the start of the land, m."""
 ROAD_REACH_M = 1.5
 SUNK_M = 0.5
 DECK_CLEARANCE_M = 2.0
@@ -25,7 +25,7 @@ HILL_M, HILL_WAVE_M = 1.6, 45.0
 HILL_START_M, HILL_RAMP_M = 30.0, 60.0
 TILE_CELLS = 10
 GAP_M2 = 12.0
-"""Between lanes, what the map leaves open and is smaller than this is paved."""
+"""Area below which a gap between lanes is paved, m²."""
 
 Grid = Float[np.ndarray, "Y X"]
 
@@ -38,27 +38,27 @@ class Terrain:
     z: Grid
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Height of the land, bilinear between the nodes."""
+        """Return the height of the land, bilinear between the nodes."""
         rows_columns = ((xy - self.origin_xy) / CELL_M).T[::-1]
         return map_coordinates(self.z, rows_columns, order=1, mode="nearest")
 
 
 @dataclass(frozen=True)
 class Field:
-    """A piece of farmland, at least a cell's diagonal from roads and other fields."""
+    """A piece of farmland, at least the diagonal of a grid cell away from roads and other fields."""
 
     area: shapely.Polygon
     along: Float[np.ndarray, "2"]
     """Unit direction of its rows."""
     kind: str
     look: int | None
-    """None for what looks like the rest of the land."""
+    """Number of its look, or None if it looks like the rest of the land."""
 
 
 def make_terrain(
     plan: GroundPlan, bounds_m: tuple[float, float, float, float], rng: np.random.Generator
 ) -> Terrain:
-    """Land that is level with the roads on the ground and rolls gently further away."""
+    """Make land that is level with the roads on the ground and has gentle hills further away."""
     origin = np.array(bounds_m[:2]) - MARGIN_M
     columns, rows = np.ceil((np.array(bounds_m[2:]) + MARGIN_M - origin) / CELL_M).astype(int) + 1
     y, x = np.meshgrid(np.arange(rows) * CELL_M, np.arange(columns) * CELL_M, indexing="ij")
@@ -73,9 +73,10 @@ def make_terrain(
 
 
 def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable, fields: Sequence[Field] = ()) -> Mesh:
-    """Mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon.
+    """Build the mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon.
 
-    Below the roads it goes on, sunk, for rays that slip through a crack between the roads' pieces.
+    Below the roads the land continues at a lower height, for rays that pass through a crack between the
+    pieces of the road.
     """
     sunk = table.add(Look(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
     look = table.add(Look(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45))
@@ -111,7 +112,7 @@ def _inside(area: shapely.Geometry, xy: Float[np.ndarray, "Y X 2"]) -> Bool[np.n
 
 
 def _spread(z: Grid, known: Bool[np.ndarray, "Y X"]) -> Grid:
-    """Fill what is unknown smoothly (Laplace's equation), starting from the nearest known heights."""
+    """Fill unknown heights smoothly (Laplace's equation), starting from the nearest known heights."""
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = z[tuple(nearest)]
     for sigma in (16.0, 8.0, 4.0, 2.0):
@@ -124,7 +125,7 @@ def _spread(z: Grid, known: Bool[np.ndarray, "Y X"]) -> Grid:
 
 
 def _below_decks(z: Grid, xy: Float[np.ndarray, "Y X 2"], plan: GroundPlan) -> Grid:
-    """Lower the land under bridges that it would reach."""
+    """Lower the land under bridges that it would otherwise reach."""
     decks = [piece for piece in plan.pieces if piece.bridge]
     if not decks:
         return z
@@ -150,7 +151,7 @@ def _cell_corners(terrain: Terrain, j: np.ndarray, i: np.ndarray) -> Float[np.nd
 
 
 def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], look: int) -> Mesh:
-    """Cells of a field, with the border of its crop in their texture coordinates."""
+    """Build the cells of a field, with the distance to its border in their texture coordinates."""
     xy = corners[..., :2]
     points = shapely.points(xy)
     within = shapely.distance(field.area.exterior, points)
@@ -162,7 +163,10 @@ def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], look: int) -> Mes
 
 
 def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.ndarray, look: int) -> Mesh:
-    """What the roads leave of the cells on their edges: nodes keep their height, the cut has the road's."""
+    """Build the remainder of the cells that the roads cut.
+
+    Nodes keep their height. Points on the cut have the height of the road.
+    """
     tiles, tile_of_cell = np.unique(index // TILE_CELLS, axis=0, return_inverse=True)
     low = terrain.origin_xy + tiles[:, ::-1] * TILE_CELLS * CELL_M - 0.5
     high = low + TILE_CELLS * CELL_M + 1.0
@@ -180,7 +184,7 @@ def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.
 
 
 def _paved_in_gaps(land: Mesh, plan: GroundPlan, look: int) -> Mesh:
-    """The same with small gaps between lanes paved."""
+    """Return the land with small gaps between lanes paved."""
     rings = [ring for part in shapely.get_parts(plan.ground) for ring in part.interiors]
     gaps = [gap for gap in map(shapely.Polygon, rings) if gap.area < GAP_M2]
     middle = land.xyz[..., :2].mean(axis=1)
@@ -191,7 +195,7 @@ def _paved_in_gaps(land: Mesh, plan: GroundPlan, look: int) -> Mesh:
 
 
 def _horizon(terrain: Terrain, look: int) -> Mesh:
-    """A far plain around the grid."""
+    """Build a far plain around the grid."""
     rows, columns = terrain.z.shape
     ring = [(0, i) for i in range(columns)] + [(j, columns - 1) for j in range(1, rows)]
     ring += [(rows - 1, i) for i in range(columns - 2, -1, -1)] + [(j, 0) for j in range(rows - 2, -1, -1)]

@@ -19,12 +19,12 @@ TREE_SPACING_M = (7.0, 15.0)
 STREET_TREES, OPEN_TREES_PER_M2 = 0.6, 1 / 260.0
 FIRST_TREE_M, LAST_TREE_M = 5.0, 80.0
 NEAR_M = 22.0
-"""Trees further from the roads have no leaves that stick out."""
+"""Maximum distance from the roads at which trees have leaves that stick out, m."""
 TRUNK_M = 2.0
 CROWN_SPREAD = 1.35
 VARIANTS = 5
 BARK, LEAVES = 0, 1
-"""Stand for the looks of a tree until it is placed."""
+"""Placeholders for the looks of a tree until it is placed."""
 
 RADIUS_M = {
     "round": (1.6, 2.8),
@@ -37,14 +37,14 @@ RADIUS_M = {
     "hedge_ball": (0.6, 0.9),
 }
 _LOW = ("bush", "conifer", "hedge_ball")
-"""Kinds whose leaves reach so far down that nobody walks below."""
+"""Kinds whose leaves reach so far down that people cannot walk below them."""
 _SPHERE, _COARSE = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.icosahedron()
 
 
 def build_vegetation(
     site: Site, assets: Assets, table: LookTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinThings]:
-    """Plants on what is still free; takes their places from the site."""
+    """Place plants on the land that is still free and take their places from the site."""
     nursery = _Nursery(assets, table, rng)
     parts, trunks = [], []
     spots = np.array(_street_tree_spots(site, rng) + _open_tree_spots(site, rng)).reshape(-1, 2)
@@ -73,7 +73,7 @@ def _street_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.nd
 
 
 def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
-    """Trees in clumps on the land that is left."""
+    """Return spots for clumps of trees on the remaining land."""
     terrain = site.terrain
     extent = np.array(terrain.z.shape[::-1]) * 4.0
     count = int(extent.prod() * OPEN_TREES_PER_M2)
@@ -98,7 +98,7 @@ def _has_room(site: Site, xy: Float[np.ndarray, "2"], kind: str, radius: float) 
 
 @dataclass
 class _Nursery:
-    """A few plants of each kind, of which each tree is a turned and stretched copy."""
+    """A few plants of each kind. Each placed plant is a rotated and scaled copy of one of them."""
 
     assets: Assets
     table: LookTable
@@ -119,7 +119,7 @@ class _Nursery:
         return self.table.add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, reflectivity))
 
     def plant(self, kind: str, foot: Float[np.ndarray, "3"], radius: float, detail: bool) -> Mesh:
-        """A plant whose crown has about this radius."""
+        """Return a plant whose crown has about this radius (m)."""
         rng = self.rng
         grown = self._grown[kind, detail][int(rng.integers(VARIANTS))]
         angle, rise = rng.uniform(0.0, 2.0 * np.pi), radius * rng.uniform(0.85, 1.2)
@@ -134,7 +134,7 @@ class _Nursery:
 
 
 def _grow(kind: str, detail: bool, rng: np.random.Generator) -> Mesh:
-    """A plant with a crown of radius 1 on z = 0."""
+    """Build a plant on z = 0 with a crown of radius 1."""
     if kind in ("bush", "hedge_ball"):
         return _crown((0.0, 0.0, 0.55), (1.0, 1.0, 0.75 if kind == "bush" else 1.0), detail, rng)
     if kind == "conifer":
@@ -191,7 +191,7 @@ def _crown(
     detail: bool,
     rng: np.random.Generator,
 ) -> Mesh:
-    """A lumpy ball of leaves; with detail, twigs stand out of it."""
+    """Build an irregular ball of leaves. With detail, twigs stick out of it."""
     ball = _SPHERE if detail else _COARSE
     inner = 0.9 if detail else 1.05
     lumps = inner * rng.uniform(0.8, 1.15, (len(ball.vertices), 1))
@@ -215,7 +215,7 @@ _OCTAHEDRON = np.array(
 def _leaf(
     root: Float[np.ndarray, "3"], tip: Float[np.ndarray, "3"], width: float, rng: np.random.Generator
 ) -> Mesh:
-    """A clump of leaves: a flat octahedron from root to tip."""
+    """Build a clump of leaves: a flat octahedron from root to tip."""
     along = 0.5 * (tip - root)
     across = np.cross(along, rng.normal(size=3))
     across *= width / max(float(np.linalg.norm(across)), 1e-6)

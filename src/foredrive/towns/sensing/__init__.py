@@ -1,1 +1,1 @@
-"""What cameras and lidars make of a town: rays, light and returns."""
+"""Simulation of the cameras and the lidar in a town: rays, light and lidar returns."""

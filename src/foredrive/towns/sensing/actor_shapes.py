@@ -1,4 +1,7 @@
-"""Shapes of road users, each in the unit box about the origin, x ahead: stretched to size when placed."""
+"""Shapes of road users.
+
+Each one fits the unit box around the origin, x ahead, and is scaled when it is placed.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,9 +22,9 @@ from foredrive.towns.sensing.raycast import TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
 PAINTS, SLOTS = 3, 4
-"""Of the slots that shapes leave open, the last is that of the rear lights."""
+"""Number of paints, and of slots that shapes leave open. The last slot is for the rear lights."""
 SOLID_CELL_M = 0.15
-"""Shapes are sampled about this finely for occupancy."""
+"""Approximate sampling distance of shapes for occupancy, m."""
 _USUAL_SIZE_M = {
     "bus": (11.0, 2.6),
     "coach": (11.0, 2.6),
@@ -32,7 +35,7 @@ _USUAL_SIZE_M = {
 }
 VAN_LENGTH_M, VAN_HEIGHT_M, HIGH_CAR_M = 5.0, 1.9, 1.58
 STRIDE_M = 1.4
-"""Length of a double step."""
+"""Length of a double step, m."""
 WALKING_MPS = 0.3
 
 _SKINS = ((0.90, 0.72, 0.60), (0.78, 0.57, 0.44), (0.55, 0.38, 0.28), (0.40, 0.27, 0.20))
@@ -40,14 +43,14 @@ _SKINS = ((0.90, 0.72, 0.60), (0.78, 0.57, 0.44), (0.55, 0.38, 0.28), (0.40, 0.2
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape and the part of the library's soup that it is."""
+    """One shape and its part of the library's triangles."""
 
     scene: TriangleScene
     mesh: Mesh
     first: int
-    """First triangle in the soup."""
+    """Index of its first triangle in the library's triangles."""
     solid: Intervals
-    """Matter in the unit box."""
+    """Solid parts in the unit box."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,10 @@ class ShapeLibrary:
     shapes: dict[str, Shape]
     soup: Mesh
     paints: dict[str, Int32[np.ndarray, "_"]]
-    """Looks to paint with, by palette."""
+    """Looks for painting, by palette."""
 
     def shape_of(self, actor: ActorState) -> Shape:
-        """The shape of a road user; one who walks is in one of a few poses."""
+        """Return the shape of a road user. A walking person has one of a few poses."""
         if actor.category is Category.PEDESTRIAN:
             return self.shapes[_person(actor)]
         kind = _kind_of(actor)
@@ -70,7 +73,7 @@ class ShapeLibrary:
         return self.shapes[options[actor.style % len(options)]]
 
     def paint_of(self, actor: ActorState, rear_light: int) -> Int32[np.ndarray, "4"]:
-        """Looks for the paint slots; `rear_light` is that for the lights at the rear."""
+        """Return the looks of the paint slots. `rear_light` is the look of the rear lights."""
         if actor.category is Category.PEDESTRIAN or actor.category in (Category.BICYCLE, Category.MOTORCYCLE):
             palettes = ("clothes", "clothes", "skin")
         elif actor.category is Category.BUS:
@@ -84,7 +87,7 @@ class ShapeLibrary:
 
 @lru_cache(maxsize=4096)
 def _mixed(style: int) -> tuple[float, ...]:
-    """Uniform random numbers, one for each paint slot."""
+    """Return uniform random numbers, one for each paint slot."""
     return tuple(np.random.default_rng(style).random(PAINTS).tolist())
 
 
@@ -120,7 +123,7 @@ def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:
 
 
 def _person(actor: ActorState) -> str:
-    """Dress and pose: the legs follow the distance walked along the heading."""
+    """Return the name of dress and pose. The legs follow the distance walked along the heading."""
     dress = DRESSES[actor.style % len(DRESSES)]
     if np.linalg.norm(actor.velocity_mps) < WALKING_MPS:
         return f"{dress}_standing"
@@ -129,7 +132,7 @@ def _person(actor: ActorState) -> str:
 
 
 def _kind_of(actor: ActorState) -> str:
-    """Which kind of shape fits a road user that is no pedestrian."""
+    """Return the kind of shape for a road user that is not a pedestrian."""
     if actor.category is Category.CAR:
         length, _, height = actor.size_lwh
         if length > VAN_LENGTH_M and height > VAN_HEIGHT_M:
@@ -148,7 +151,7 @@ _KIND_OF_CATEGORY = {
 
 
 def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
-    """The affine map from the unit box to an actor's box."""
+    """Return the affine map from the unit box to an actor's box."""
     cos, sin = np.cos(actor.yaw), np.sin(actor.yaw)
     up, ahead = np.sin(actor.pitch), np.cos(actor.pitch)
     yaw = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -160,7 +163,10 @@ def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
 
 
 def _solid(scene: TriangleScene, size_m: tuple[float, float]) -> Intervals:
-    """Matter in the unit box, from the lowest to the highest face, for something of about this size."""
+    """Return the solid parts in the unit box, from the lowest to the highest face.
+
+    `size_m` is the approximate size of the object and sets the sampling.
+    """
     counts = [int(np.ceil(edge / SOLID_CELL_M)) for edge in size_m]
     x, y = (a.ravel() for a in np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in counts)))
     ends = []
@@ -177,7 +183,7 @@ def _solid(scene: TriangleScene, size_m: tuple[float, float]) -> Intervals:
 def _into_unit_box(
     mesh: Mesh, bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None
 ) -> Mesh:
-    """Map `bounds`, by default those of the mesh, to the unit box about the origin."""
+    """Map `bounds`, by default the bounds of the mesh, to the unit box around the origin."""
     corners = mesh.xyz.reshape(-1, 3)
     low, high = np.array(bounds) if bounds else (corners.min(0), corners.max(0))
     xyz = ((mesh.xyz - 0.5 * (low + high)) / (high - low)).clip(-0.5, 0.5)

@@ -1,4 +1,4 @@
-"""Beams of lamps in fog: light that droplets scatter once, on its way to the eye."""
+"""Beams of lamps in fog: light that droplets scatter once on its way to the viewer."""
 
 import math
 from typing import no_type_check
@@ -9,19 +9,19 @@ import numpy as np
 from foredrive.towns.sensing.lamps import DIPPED_RAD, HEAD, beam
 
 ASYMMETRY = 0.54
-"""Of the phase function (Henyey & Greenstein, Astrophysical Journal 93, 1941): with it fog sends
-straight back what lidars see of it, `air.BACKSCATTER_RATIO`."""
+"""Asymmetry of the phase function (Henyey & Greenstein, Astrophysical Journal 93, 1941). With this value the
+fog's backscatter agrees with that for lidars, `air.BACKSCATTER_RATIO`."""
 ASIDE_M = np.array([16.0, 25.0, 3.0], dtype=np.float32)
-"""Of the kinds of lamps: rays that pass one further away show nothing of it; less where fog dims it."""
+"""Distance from a lamp beyond which a ray shows nothing of its beam, by kind of lamp, m. Fog reduces it."""
 SPREAD_M = np.array([0.25, 0.8, 0.8], dtype=np.float32)
-"""Half the width of the kinds of lamps: those of a vehicle stand for a pair."""
+"""Half the width of a lamp, by kind of lamp, m. The lamps of a vehicle represent a pair."""
 STEPS = np.array([5, 8, 3])
-"""Along a ray; above the cut-off of headlights there are `STRAY_STEPS`."""
+"""Steps along a ray, by kind of lamp. Above the cut-off of headlights there are `STRAY_STEPS`."""
 STRAY_STEPS = 3
 EDGE_SLOPE = 0.7 * DIPPED_RAD
-"""Of where headlights are cut off."""
+"""Slope of the cut-off of headlights."""
 DEPTHS = 3.0
-"""Nothing is seen beyond as many optical depths."""
+"""Optical depth beyond which nothing is visible."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
@@ -29,7 +29,8 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 @_kernel
 @no_type_check
 def phase(cosine):
-    """Share of scattered light that goes on at this angle from where it was going, 1/sr."""
+    """Return the phase function: the share of scattered light per solid angle, 1/sr, at a deflection
+    angle."""
     square = 1.0 + ASYMMETRY * ASYMMETRY - 2.0 * ASYMMETRY * cosine
     return (1.0 - ASYMMETRY * ASYMMETRY) / (4.0 * math.pi * square * math.sqrt(square))
 
@@ -37,7 +38,7 @@ def phase(cosine):
 @_kernel
 @no_type_check
 def _within_sight(lamps, extinction_per_m, origin):
-    """Indices of the lamps that rays from about there can see anything of."""
+    """Return the indices of the lamps whose light can be visible for rays from about there."""
     index = np.empty(len(lamps.xyz), np.int64)
     count = 0
     for k in range(len(lamps.xyz) if len(origin) > 0 else 0):
@@ -51,13 +52,15 @@ def _within_sight(lamps, extinction_per_m, origin):
 @_kernel
 @no_type_check
 def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
-    """Add to radiance [N 3] what lamps send along rays by way of the air.
+    """Add to `radiance` [N 3] the light of lamps that the air scatters along rays.
 
     Args:
         lamps: `LampArrays`.
-        t: [N] where rays end, m.
-        origin: [N 3] where they start: within metres of one another.
-        known: [N 3] not negative for rays to be left as they are; or [0 3].
+        extinction_per_m: extinction of visible light, 1/m.
+        t: [N] distances at which the rays end, m.
+        origin: [N 3] starts of the rays, within metres of one another.
+        direction: [N 3] unit directions of the rays.
+        known: [N 3] not negative for rays that do not change; or [0 3].
     """
     seen = _within_sight(lamps, extinction_per_m, origin)
     for i in range(len(t)):
@@ -84,11 +87,12 @@ def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
 @_kernel
 @no_type_check
 def _scattered(lamps, k, extinction_per_m, px, py, pz, dx, dy, dz, along, near, end):
-    """What a ray gathers of the k-th lamp at (px, py, pz) from the eye, as the radiance of a white surface.
+    """Return the light of the k-th lamp that a ray collects, as the radiance of a white surface.
 
-    Its point nearest to the lamp lies `along` it, at the square root of `near`. Equal angles seen from the
-    lamp hold equal shares of its light (Kulla & Fajardo, Importance sampling techniques for path tracing in
-    participating media, 2012); most of a headlight's falls just below its cut-off.
+    The lamp is at (px, py, pz) from the ray's origin. The point of the ray nearest to the lamp is at distance
+    `along` on the ray, and `near` is its squared distance from the lamp. Equal angles seen from the lamp
+    contain equal shares of its light (Kulla & Fajardo, Importance sampling techniques for path tracing in
+    participating media, 2012). Most light of a headlight is just below its cut-off.
     """
     hx, hy, kind = lamps.heading[k, 0], lamps.heading[k, 1], lamps.kind[k]
     aside = math.sqrt(near + SPREAD_M[kind] ** 2)

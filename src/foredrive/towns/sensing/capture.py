@@ -1,4 +1,4 @@
-"""What cameras and a lidar sense of a town at one moment."""
+"""Simulated camera images and lidar sweeps of a town at one moment."""
 
 import math
 from dataclasses import dataclass, field
@@ -31,12 +31,12 @@ Times = Float32[np.ndarray, "N"]
 
 
 class EgoRays(NamedTuple):
-    """Rays in the ego frame of the time at which each of them looks."""
+    """Rays in the ego frame of the time at which each of them is measured."""
 
     origin: Rays
     direction: Rays
     dt_s: Times
-    """Relative to the frame's time."""
+    """Time relative to the frame's time, s."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +44,26 @@ class SensorSuite:
     """The sensors of the recording vehicle."""
 
     rig: CameraRig
-    """Without leading dimensions."""
+    """Cameras, without leading dimensions."""
     lidar: SpinningLidar
     samples_per_outline_pixel: int = 4
-    """A square number. One ray sees a pixel, textures being filtered; where outlines or shadows run through
-    it there are this many."""
+    """Number of rays of an outline pixel, a square number. Other pixels have one ray, because textures are
+    filtered. Pixels with an outline or a shadow edge have this many."""
     optics: CameraOptics = field(default_factory=CameraOptics)
 
     @cached_property
     def pixel_rays(self) -> EgoRays:
-        """The pixels' central rays: cameras, rows, columns."""
+        """Return the central rays of the pixels, ordered by camera, row and column."""
         return _flat_rays(self.rig, 1)
 
     @cached_property
     def outline_rays(self) -> EgoRays:
-        """The same with the rays of an outline pixel next to each other."""
+        """Return the rays of the pixels for outlines, with the rays of one pixel next to each other."""
         return _flat_rays(self.rig, self.samples_per_outline_pixel)
 
     @cached_property
     def pixel_rad(self) -> Float32[np.ndarray, "P"]:
-        """Angle between neighbouring pixels, one for each."""
+        """Return the angle between neighbouring pixels at each pixel, rad."""
         height, width = self.rig.size_hw
         return (1.0 / self.rig.K[:, 0, 0]).repeat_interleave(height * width).numpy()
 
@@ -80,25 +80,25 @@ class WorldRays(NamedTuple):
     origin: Rays
     direction: Rays
     dt_s: Times | None
-    """When each looks, relative to the frame's time; None: all at that time."""
+    """Time of each ray relative to the frame's time, s; None: all at that time."""
 
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Where the vehicle is at the frame's time, and how it moves about then."""
+    """The pose of the vehicle at the frame's time, and its motion around that time."""
 
     T_world_ego: Float64[np.ndarray, "4 4"]
     twist_ego: Float[np.ndarray, "6"]
     """Velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes."""
 
     def now(self, rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
-        """Some of many rays given in the ego frame of the frame's time; all look at that time."""
+        """Transform the rays `rows` from the ego frame of the frame's time to the world, all at that time."""
         T = np.ascontiguousarray(self.T_world_ego[:3], dtype=np.float32)
         origin, direction = shading.move_rays(T, rays.origin, rays.direction, rows)
         return WorldRays(origin, direction, None)
 
     def then(self, rays: EgoRays) -> WorldRays:
-        """Rays given in the ego frame of the time at which each of them looks."""
+        """Transform rays from the ego frame of the time at which each of them is measured to the world."""
         if not self.twist_ego.any():
             return self.now(rays, np.arange(len(rays.dt_s)))._replace(dt_s=rays.dt_s)
         dt_s, row = np.unique(rays.dt_s, return_inverse=True)
@@ -110,20 +110,23 @@ class EgoMotion:
 
 @dataclass(frozen=True)
 class Moment:
-    """A town with its road users where they are at one time, and how they move about then."""
+    """A town with its road users at their positions at one time, and their motion around that time."""
 
     scene: shading.Scene
     surroundings: Surroundings
     light: LightArrays
 
     def cast(self, rays: WorldRays) -> shading.Hits:
-        """Nearest hits."""
+        """Return the nearest hits."""
         return self.surroundings.cast(*rays)
 
     def look(
         self, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
     ) -> tuple[shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
-        """What rays meet, and whether the sun shines there. `ray_rad` is the angle between neighbours."""
+        """Return the hits of rays, the surfaces there, and whether the sun shines there.
+
+        `ray_rad` is the angle between neighbouring rays, rad.
+        """
         hits = self.cast(rays)
         found = shading.surfaces(self.scene, hits, rays.origin, rays.direction, ray_rad)
         return hits, found, self.sunlit(found, hits, rays.dt_s)
@@ -137,7 +140,10 @@ class Moment:
         ray_rad: Float32[np.ndarray, "N"],
         known: Float32[np.ndarray, "M 3"] = NOT_KNOWN,
     ) -> Rays:
-        """Radiance along rays. Where `known` is not negative it is that; it may have no rows."""
+        """Return the radiance along rays.
+
+        Where `known` is not negative, it is the result. It may have no rows.
+        """
         mirrored = self.mirrored(found, hits, rays, ray_rad)
         looks, light = self.scene.looks, self.light
         out = shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
@@ -149,7 +155,7 @@ class Moment:
     def sunlit(
         self, found: shading.Surfaces, hits: shading.Hits, dt_s: Times | None
     ) -> Bool[np.ndarray, "N"]:
-        """Which hits the sun shines on."""
+        """Return whether the sun shines on each hit."""
         start = np.empty_like(found.xyz)
         facing = shading.sun_rays(found, hits.t, self.light.sun, start)
         to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
@@ -161,7 +167,10 @@ class Moment:
     def mirrored(
         self, found: shading.Surfaces, hits: shading.Hits, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
     ) -> Float32[np.ndarray, "M 3"]:
-        """What water on the ground mirrors, -1 where there is none; no rows where all is dry."""
+        """Return the radiance that water on the ground mirrors, -1 where there is no water.
+
+        The result has no rows if the ground is dry.
+        """
         if self.light.air.wetness == 0.0:
             return NOT_KNOWN
         out = np.full((len(hits.t), 3), -1.0, np.float32)
@@ -176,7 +185,7 @@ class Moment:
 
 
 class Film:
-    """What falls on the pixels of all cameras, on its way to 8-bit images."""
+    """The light on the pixels of all cameras, from radiance to 8-bit images."""
 
     def __init__(self, optics: CameraOptics, metered: float, count: int) -> None:
         self._optics, self._exposure = optics, metered * 2.0**optics.exposure_ev
@@ -185,7 +194,7 @@ class Film:
         self._linear = np.empty((count, 3), np.float32) if noisy else None
 
     def expose(self, pixels: slice | Int64[np.ndarray, "n"], radiance: Rays, samples: int) -> None:
-        """Let in the light of pixels, of `samples` rays each."""
+        """Set the light of pixels, from `samples` rays for each."""
         if self._linear is None:
             self._rgb[pixels] = shading.develop(radiance, self._exposure, samples)
         else:
@@ -193,11 +202,11 @@ class Film:
 
     @property
     def shown(self) -> UInt8[np.ndarray, "P 3"]:
-        """The pixels' colours so far, without the sensor's noise."""
+        """Return the present colours of the pixels, without sensor noise."""
         return self._rgb if self._linear is None else shading.develop(self._linear, 1.0, 1)
 
     def develop(self, rng: np.random.Generator) -> UInt8[np.ndarray, "P 3"]:
-        """The pixels' colours, with the sensor's noise if it has any."""
+        """Return the colours of the pixels, with sensor noise if the cameras have any."""
         if self._linear is None:
             return self._rgb
         return shading.develop(self._optics.with_noise(self._linear, rng), 1.0, 1)
@@ -206,10 +215,11 @@ class Film:
 def see(
     moment: Moment, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
-    """Images of all cameras, and what each pixel's central ray met [C·H·W] in the middle of its exposure.
+    """Render images of all cameras.
 
-    Each row is seen from where the vehicle is at the time of its readout, with the road users where they are
-    then: they move on straight ahead.
+    Also return the hits of the pixels' central rays [C·H·W] in the middle of their exposure. Each row is
+    rendered from the pose of the vehicle at its readout time. The road users are at their positions at that
+    time; they move straight ahead.
     """
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
@@ -222,7 +232,7 @@ def see(
 
 
 def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
-    """One ray for each pixel, then several where outlines run."""
+    """Render one ray per pixel, then several rays for pixels on outlines."""
     count, samples = len(seen.look), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
     rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
@@ -259,7 +269,7 @@ def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film,
 
 
 def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
-    """The mean of the light at several instants, each through another part of the pixel."""
+    """Render the mean of the light at several instants, each through a different part of the pixel."""
     optics, samples = sensors.optics, sensors.samples_per_outline_pixel
 
     def job(start: int, stop: int) -> None:
@@ -283,9 +293,10 @@ def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Fil
 def sweep(
     moment: Moment, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[LidarSweep, Seen]:
-    """One revolution, and what its beams met; road users move on straight ahead meanwhile.
+    """Simulate one revolution of the lidar, and return the sweep and the hits of its beams.
 
-    A beam that is not returned although it met something is free up to there.
+    Road users move straight ahead during the revolution. A beam without a return is free up to the surface
+    that it hit.
     """
     beams = lidar.beams(torch.from_numpy(np.asarray(ego.twist_ego, dtype=np.float32)))
     rays, n = lidar.footprints(beams), lidar.rays_per_beam

@@ -1,4 +1,4 @@
-"""Solid matter above each spot of a town, as vertical intervals: what exact occupancy is made from."""
+"""Solid matter above each spot of a town as vertical intervals, from which exact occupancy is computed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,23 +16,23 @@ from foredrive.towns.sensing.shading import MISS
 TILE_M = 32.0
 COLUMN_M = 0.25
 EDGE_SPLIT = 4
-"""Columns on the edge of something solid are split into this many along x and y."""
+"""Number of columns along x and y into which a column on the edge of a solid object is split."""
 EDGE_M = 0.4
 WALL_SPACING_M = 0.2
 UPRIGHT = 0.3
-"""Largest vertical part of a wall's unit normal."""
+"""Maximum vertical component of a wall's unit normal."""
 MOST_LAYERS = 40
 STEP_M = 2e-3
 DECK_DEPTH_M = 1.5
-"""An underside this far below a road is that of the road's deck."""
+"""Maximum depth below a road, m, at which an underside belongs to the road's deck."""
 
 _GROUND = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN)
 _PASSED = (Surface.HIDDEN, Surface.VEHICLE, Surface.PEDESTRIAN)
-"""Parked cars are looked after as road users are."""
+"""Surfaces that rays pass. Parked cars are handled like road users."""
 
 
 class Intervals(NamedTuple):
-    """N vertical stretches of matter; those of surfaces without depth have low = high."""
+    """N vertical intervals of matter. Surfaces without depth have low = high."""
 
     x: Float32[np.ndarray, "N"]
     y: Float32[np.ndarray, "N"]
@@ -43,14 +43,14 @@ class Intervals(NamedTuple):
 
 @dataclass
 class TownColumns:
-    """Columns of a town in square tiles, worked out when first asked for and kept."""
+    """Columns of a town in square tiles. Each tile is computed when it is first requested, and kept."""
 
     scene: TriangleScene
     faces: "Faces"
     top_m: float
-    """Above everything."""
+    """Height above everything, m."""
     unmet: Intervals
-    """Of what rays from above do not meet: upright faces, and things thinner than a column."""
+    """Intervals of matter that rays from above miss: upright faces, and objects thinner than a column."""
     _tiles: dict[tuple[int, int], Intervals] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,7 +61,8 @@ class TownColumns:
         self._unmet = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
 
     def below(self, xy: Float[np.ndarray, "P 2"], yaw: float) -> list[Intervals]:
-        """All tiles that meet the rectangle about some points whose sides stand at an angle to world x."""
+        """Return all tiles that overlap the rectangle around some points, whose sides have the angle `yaw` to
+        world x."""
         cos, sin = np.cos(yaw), np.sin(yaw)
         axes = np.array([[1.0, 0.0], [0.0, 1.0], [cos, sin], [-sin, cos]])
         low, high = (xy @ axes.T).min(axis=0), (xy @ axes.T).max(axis=0)
@@ -96,11 +97,13 @@ class TownColumns:
 def make_columns(
     mesh: Mesh, scene: TriangleScene, surface_of_look: Int[np.ndarray, "L"], thin: ThinThings
 ) -> TownColumns:
-    """Columns of all that stands in a town.
+    """Prepare the columns of all static objects of a town.
 
     Args:
-        scene: the mesh to be cast at.
-        thin: what the columns would miss.
+        mesh: the triangles of the town.
+        scene: the same mesh for ray casting.
+        surface_of_look: the `Surface` of each look.
+        thin: points on objects that the columns would miss.
     """
     faces = faces_of(mesh, surface_of_look)
     x, y, z = thin.xyz.T.astype(np.float32)
@@ -115,14 +118,14 @@ def _join(parts: Sequence[Intervals]) -> Intervals:
 
 @dataclass(frozen=True)
 class Faces:
-    """What columns need to know of the triangles of a mesh."""
+    """Properties of the triangles of a mesh that columns need."""
 
     upward: Bool[np.ndarray, "F"]
     surface: Int[np.ndarray, "F"]
 
 
 def faces_of(mesh: Mesh, surface_of_look: Int[np.ndarray, "L"]) -> Faces:
-    """Orientation and surface of each triangle."""
+    """Return the orientation and the surface of each triangle."""
     a, b = mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]
     upward = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
     return Faces(upward, surface_of_look[mesh.look])
@@ -135,10 +138,10 @@ def columns(
     y: Float[np.ndarray, "C"],
     top_m: float,
 ) -> tuple[Intervals, Int[np.ndarray, "N"]]:
-    """Matter below `top_m` at each x, y, and which of them each interval belongs to.
+    """Return the matter below `top_m` at each x, y, and the index of the column of each interval.
 
-    A ray straight down enters a closed mesh through a face that looks up and leaves it through one that
-    looks down. The ground is a surface without depth; it also ends what reaches into it.
+    A ray straight down enters a closed mesh through a face that points up and leaves it through a face that
+    points down. The ground is a surface without depth. It also ends any object that reaches into it.
     """
     count = len(x)
     origin = np.column_stack([x, y, np.full(count, top_m)]).astype(np.float32)
@@ -164,7 +167,7 @@ def columns(
         solid = ~ground & ~np.isin(surface, _PASSED)
         enters, leaves = solid & upward, solid & ~upward
         closing = (ground & (depth[ray] > 0)) | (leaves & (depth[ray] == 1))
-        # A ray that grazed a crown's rim has lost count: leaves do not reach the ground.
+        # A ray that grazed the rim of a crown has a wrong count: leaves do not reach the ground.
         leafy = ground & (opened_as[ray] == Surface.VEGETATION)
         end = np.where(leafy, last_solid[ray], z)
         emit(ray[closing], end[closing], opened[ray[closing]], opened_as[ray[closing]])
@@ -183,7 +186,7 @@ def columns(
 
 
 def wall_intervals(mesh: Mesh, faces: Faces) -> Intervals:
-    """The upright faces of what is built, as vertical intervals WALL_SPACING_M apart."""
+    """Return the upright faces of buildings and structures as vertical intervals WALL_SPACING_M apart."""
     built = np.isin(faces.surface, (Surface.BUILDING, Surface.STRUCTURE))
     normal = np.cross(mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0])
     upright = np.abs(normal[:, 2]) < UPRIGHT * np.linalg.norm(normal, axis=1)
@@ -211,7 +214,7 @@ def wall_intervals(mesh: Mesh, faces: Faces) -> Intervals:
 
 
 def _edges(height: Float[np.ndarray, "Y X"]) -> Bool[np.ndarray, "Y X"]:
-    """Where the height changes to a neighbour."""
+    """Return whether the height at each place differs from that of a neighbour by more than EDGE_M."""
     edge = np.zeros(height.shape, dtype=bool)
     for axis in (0, 1):
         step = np.abs(np.diff(height, axis=axis)) > EDGE_M

@@ -1,4 +1,4 @@
-"""From the rays of a beam's footprint to the one echo that a lidar reports."""
+"""Echoes of a lidar: from the rays of a beam's footprint to the one echo that the lidar reports."""
 
 from typing import no_type_check
 
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 Echoes = tuple[Float32[np.ndarray, "_"], Bool[np.ndarray, "_"], Float32[np.ndarray, "_"]]
-"""Range (m), whether it returned, and intensity."""
+"""Range (m), whether the beam returned, and intensity."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -15,10 +15,11 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 @_kernel
 @no_type_check
 def group_echoes(t, pulse_m):
-    """Which rays of each beam make one echo: those that end within a pulse's depth of each other.
+    """Group the rays of each beam into echoes: rays that end within a pulse's depth make one echo.
 
     Args:
-        t: [B n] where the rays of B beams end, m; infinite where they meet nothing.
+        t: [B n] distances at which the rays of B beams end, m; infinite where they hit nothing.
+        pulse_m: depth of a pulse, m.
 
     Returns:
         group [B n], numbered by range; share [B n] of the beam's rays that belong to a ray's echo.
@@ -43,10 +44,10 @@ def group_echoes(t, pulse_m):
 def chance_of_shares(
     chance: Float32[np.ndarray, "B K"], share: Float32[np.ndarray, "B n"]
 ) -> Float32[np.ndarray, "R K"]:
-    """What chances to ask of whole beams for the R = B · n rays of their footprints.
+    """Convert the random numbers of whole beams to those of the R = B · n rays of their footprints.
 
-    The first is of the loss: a beam with an echo e is lost by a chance c above e / (e + T), and an echo s · e
-    by the same c whose odds c / (1 - c) are 1/s times as high.
+    The first number decides the loss. A beam with an echo e is lost if its number c is above e / (e + T). An
+    echo s · e is lost by the same c with odds c / (1 - c) that are 1/s times as high.
     """
     of_rays = np.repeat(chance, share.shape[1], axis=0)
     c = of_rays[:, 0]
@@ -86,19 +87,20 @@ def _pick(group, range_m, returned, intensity, last, out_range, out_returned, ou
 def pick_echo(
     group: Int64[np.ndarray, "B n"], of_rays: Echoes, last: bool
 ) -> tuple[Echoes, Int64[np.ndarray, "B"]]:
-    """The strongest echo of each beam, or the last.
+    """Return the strongest or the last echo of each beam.
 
-    Within an echo ranges are averaged by intensity, which gives the points between an edge and what lies
-    close behind it that real lidars see; the intensity is that of the part of the footprint that returned.
+    Ranges within an echo are averaged with the intensity as weight. This gives the points between an edge and
+    a surface close behind it that real lidars measure. The intensity is that of the part of the footprint
+    that returned.
 
     Args:
-        group: from `group_echoes`.
-        of_rays: of the R = B · n rays, those of a beam next to each other.
-        last: the last echo instead of the strongest.
+        group: groups from `group_echoes`.
+        of_rays: echoes of the R = B · n rays, with those of a beam next to each other.
+        last: take the last echo instead of the strongest.
 
     Returns:
-        The echoes of the beams, with the range of the nearest ray where nothing returned; and which of the R
-        rays contributed most to each.
+        The echoes of the beams, with the range of the nearest ray where nothing returned; and for each beam
+        the index of the ray (of R) that contributed most.
     """
     beams, n = group.shape
     echo = (np.empty(beams, np.float32), np.empty(beams, np.bool_), np.empty(beams, np.float32))

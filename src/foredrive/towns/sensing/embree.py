@@ -1,7 +1,7 @@
-"""Embree by its C interface, in packets of rays.
+"""Bindings of Embree's C interface, in packets of rays.
 
-The library is the one that embreex' wheel brings along. Its Python interface casts ray by ray and knows no
-instances; coherent packets are four times as fast. Scenes are handles; who makes one releases it.
+The library is the one in embreex' wheel. Its Python interface casts single rays and has no instances;
+coherent packets are four times as fast. Scenes are handles. The caller that creates a scene releases it.
 """
 
 import ctypes
@@ -23,26 +23,26 @@ from foredrive.towns.sensing.shading import MISS, Hits
 Rays = Float32[np.ndarray, "N 3"]
 Times = Float32[np.ndarray, "_"]
 Scenes = UInt64[np.ndarray, "S"]
-"""Handles."""
+"""Scene handles."""
 
 EMBREE, EMBREEX = 404, "4.4.0"
-"""The release of Embree (major · 100 + minor) that `_Arguments` and the enums come from, and the embreex that
-brings it along."""
+"""Release of Embree (major · 100 + minor) from which `_Arguments` and the enums come, and the embreex that
+contains it."""
 WIDTH = 16
-"""Rays of a packet."""
+"""Number of rays in a packet."""
 
 _TRIANGLES, _INSTANCE = 0, 121
 _INDICES, _VERTICES = 0, 1
 _UINT3, _FLOAT3, _FLOAT3X4 = 0x5003, 0x9003, 0x9134
 _ROBUST = 1 << 2
-"""No leaks along shared edges."""
+"""Flag against leaks along shared edges."""
 _COHERENT = 1 << 16
 _ALIGNMENT = 64
 _VERSION = 0
 
 
 class _Arguments(ctypes.Structure):
-    """RTCIntersectArguments, and RTCOccludedArguments alike."""
+    """RTCIntersectArguments. RTCOccludedArguments has the same layout."""
 
     _fields_ = (
         ("flags", ctypes.c_int),
@@ -58,7 +58,10 @@ _arguments = _Arguments(flags=_COHERENT, feature_mask=0xFFFFFFFF)
 
 
 def _load() -> ctypes.CDLL:
-    """The library that embreex has loaded: among what its module depends on, else (Windows) beside it."""
+    """Find the library that embreex has loaded.
+
+    It is a dependency of embreex' module or, on Windows, a file beside it.
+    """
     found = ctypes.CDLL(rtcore_scene.__file__)
     if hasattr(found, "rtcNewDevice"):
         return found
@@ -89,7 +92,7 @@ for _name, _result, _parameters in (
 ):
     _function = getattr(_lib, _name)
     _function.restype, _function.argtypes = _result, _parameters
-for _name in ("rtcIntersect16", "rtcOccluded16"):  # for the kernels below, compiled or from numba's cache
+for _name in ("rtcIntersect16", "rtcOccluded16"):  # for the compiled functions below, also from numba's cache
     llvmlite.binding.add_symbol(_name, ctypes.cast(getattr(_lib, _name), ctypes.c_void_p).value)
 _packet_call = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
 _intersect = types.ExternalFunction("rtcIntersect16", _packet_call)
@@ -104,13 +107,13 @@ def _device() -> int:
 
 
 def check_release(version: int) -> None:
-    """Refuse an Embree whose structs may be others than those that are mirrored here.
+    """Refuse an Embree whose structs may differ from those in this module.
 
     Args:
-        version: as `rtcGetDeviceProperty` tells it: major · 10000 + minor · 100 + patch.
+        version: version from `rtcGetDeviceProperty`: major · 10000 + minor · 100 + patch.
 
     Raises:
-        InputError: it is of another minor release.
+        InputError: it is another minor release.
     """
     if version // 100 != EMBREE:
         found = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
@@ -121,9 +124,10 @@ def check_release(version: int) -> None:
 
 
 def new_triangles(xyz: Float32[np.ndarray, "V 3"], faces: UInt32[np.ndarray, "F 3"]) -> int:
-    """A scene of triangles. Both arrays are shared: keep them, unchanged, while the scene lives.
+    """Create a scene of triangles.
 
-    One float must follow the last vertex in memory, since Embree reads four at a time.
+    Both arrays are shared with Embree: keep them unchanged for the lifetime of the scene. One float must
+    follow the last vertex in memory, because Embree reads four at a time.
     """
     geometry = _lib.rtcNewGeometry(_device(), _TRIANGLES)
     for kind, form, array in ((_VERTICES, _FLOAT3, xyz), (_INDICES, _UINT3, faces)):
@@ -132,9 +136,10 @@ def new_triangles(xyz: Float32[np.ndarray, "V 3"], faces: UInt32[np.ndarray, "F 
 
 
 def new_instances(scenes: list[int], T: Float[np.ndarray, "A K 3 4"]) -> int:
-    """A scene of other scenes, each moved by K affine maps: at even steps of time 0 to 1, linear between.
+    """Create a scene of other scenes, each moved by K affine maps.
 
-    Maps that are all the same cost no more than one.
+    The maps apply at even steps of time from 0 to 1, with linear interpolation between them. If all maps of a
+    scene are equal, they cost no more than one.
     """
     geometries = []
     for scene, steps in zip(scenes, np.ascontiguousarray(T, dtype=np.float32), strict=True):
@@ -149,7 +154,7 @@ def new_instances(scenes: list[int], T: Float[np.ndarray, "A K 3 4"]) -> int:
 
 
 def release(scene: int) -> None:
-    """Give back a scene's memory, once no other scene uses it."""
+    """Release the memory of a scene that no other scene uses."""
     _lib.rtcReleaseScene(scene)
 
 
@@ -166,7 +171,7 @@ def _scene_of(geometries: list[int]) -> int:
     return int(scene)
 
 
-# Words of a packet (RTCRayHit16), each of `WIDTH` lanes.
+# Words of a packet (RTCRayHit16), each with `WIDTH` lanes.
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 _U, _V, _TRIANGLE, _GEOMETRY, _ACTOR, _WORDS = 15, 16, 17, 18, 19, 24
 
@@ -176,7 +181,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 @_kernel
 @no_type_check
 def _aligned(words):
-    """Memory that Embree takes: 32-bit words from a multiple of 64 bytes on."""
+    """Return memory for Embree: 32-bit words that start at a multiple of 64 bytes."""
     memory = np.zeros(words + _ALIGNMENT // 4, np.float32)
     skip = (-memory.ctypes.data % _ALIGNMENT) // 4
     return memory[skip : skip + words]
@@ -185,7 +190,7 @@ def _aligned(words):
 @_kernel
 @no_type_check
 def _fill(packet, valid, origin, direction, time, first):
-    """Lanes of a packet with rays from `first` on; those beyond the last are not valid."""
+    """Fill the lanes of a packet with rays from `first` on. Lanes beyond the last ray are not valid."""
     whole = packet.view(np.int32)
     for lane in range(WIDTH):
         i = first + lane
@@ -233,17 +238,18 @@ def _occluded_all(scenes, origin, direction, time, out, arguments):
 
 
 def intersect(scenes: Scenes, origin: Rays, direction: Rays, time: Times, hits: Hits) -> None:
-    """Fill in the nearest hits of rays with several scenes at once.
+    """Write the nearest hits of rays with several scenes into `hits`.
 
     Args:
-        time: in 0 to 1, or without elements: .5 throughout.
-        hits: `actor` is the number of the instance, `MISS` in a scene of triangles.
+        scenes: handles of the scenes.
+        time: times in 0 to 1; without elements: 0.5 for all rays.
+        hits: its `actor` is the number of the instance, `MISS` in a scene of triangles.
     """
     _intersect_all(scenes, origin, direction, time, hits, ctypes.addressof(_arguments))
 
 
 def occluded(scenes: Scenes, origin: Rays, direction: Rays, time: Times) -> Bool[np.ndarray, "N"]:
-    """Which rays hit anything in the scenes; arguments as for `intersect`."""
+    """Return whether each ray hits anything in the scenes. The arguments are as for `intersect`."""
     out = np.empty(len(origin), np.bool_)
     _occluded_all(scenes, origin, direction, time, out, ctypes.addressof(_arguments))
     return out

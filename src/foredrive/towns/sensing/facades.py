@@ -1,4 +1,7 @@
-"""The texture of façades: walls, windows, doors, shop fronts. Compiled by numba, called once for each hit."""
+"""The texture of façades: walls, windows, doors, shop fronts.
+
+The functions are compiled by numba and called once for each hit.
+"""
 
 import math
 from typing import no_type_check
@@ -41,7 +44,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 @_kernel
 @no_type_check
 def _ground_floor(p, look, x_in, y, bay, column, span, du, dv, out):
-    """Openings below the first storey; `_openings` says what is written to out."""
+    """Compute the openings below the first storey. `_openings` describes what is written to `out`."""
     ground, kind = p[look, 4], int(p[look, 7])
     pick = lattice(int(column), int(span * 10.0), 11)
     if kind == _GATES:
@@ -82,7 +85,7 @@ def _ground_floor(p, look, x_in, y, bay, column, span, du, dv, out):
 @_kernel
 @no_type_check
 def _shutters(x, y, left, wide, low, high, du, dv):
-    """Share of the footprint that shutters on both sides of a window fill."""
+    """Return the share of the footprint that shutters on both sides of a window fill."""
     leaf = 0.45 * wide
     share = band(x, left - leaf, left, du) + band(x, left + wide, left + wide + leaf, du)
     return share * band(y, low, low + high, dv) * (1.0 - 0.3 * bands(y, 0.12, 0.04, dv))
@@ -91,7 +94,7 @@ def _shutters(x, y, left, wide, low, high, du, dv):
 @_kernel
 @no_type_check
 def _rail(x, y, left, wide, du, dv, out):
-    """Put a rail before a window that reaches down to the floor."""
+    """Add a rail in front of a window that reaches down to the floor."""
     rail = band(x, left - 0.1, left + wide + 0.1, du) * band(y, 0.12, 1.05, dv)
     rail = min(rail * (bands(x, 0.14, 0.03, du) + band(y, 1.0, 1.05, dv)), 1.0)
     out[0], out[1], out[2] = out[0] * (1.0 - rail), out[1] * (1.0 - rail), rail
@@ -100,14 +103,14 @@ def _rail(x, y, left, wide, du, dv, out):
 @_kernel
 @no_type_check
 def _openings(p, look, u, v, w, du, dv, out):
-    """What fills a façade's footprint besides its wall.
+    """Compute the parts of a façade's footprint that are not wall.
 
     Args:
-        out: [4] filled with the shares of glass, of frames, of what has the accent colour, and the brightness
-            of the glass below its lintel.
+        out: [4] receives the shares of glass, of frames and of the accent colour, and the brightness of the
+            glass below its lintel.
 
     Returns:
-        The number of the window, 0 where there is none or too many.
+        The number of the window, 0 where there is none or where there are too many.
     """
     storey, nominal_bay, wide_share, high_share = p[look, 0], p[look, 1], p[look, 2], p[look, 3]
     ground, kind = p[look, 4], int(p[look, 6])
@@ -125,7 +128,7 @@ def _openings(p, look, u, v, w, du, dv, out):
     x = u - 0.4
     column = min(max(math.floor(x / bay), 0.0), count - 1.0)
     x_in = x - column * bay
-    if x < 0.0 or w < 0.4:  # the corners stay wall
+    if x < 0.0 or w < 0.4:  # the corners are wall
         return 0
     if v < ground:
         _ground_floor(p, look, x_in, v, bay, column, u + w, du, dv, out)
@@ -163,7 +166,7 @@ def _openings(p, look, u, v, w, du, dv, out):
 @_kernel
 @no_type_check
 def _wall(p, look, u, v, du, dv):
-    """Brightness of what a façade is made of: joints, single bricks and slabs, ribs."""
+    """Return the brightness of a façade's material: joints, single bricks and slabs, ribs."""
     kind = int(p[look, 5])
     if kind == _BRICK and du < 0.4:
         course = math.floor(v / 0.15)
@@ -187,12 +190,12 @@ def _wall(p, look, u, v, du, dv):
 @_kernel
 @no_type_check
 def facade(p, look, x, y, uvw, extent, i, out):
-    """Walls with windows, doors, shop fronts, a plinth and a ledge above the ground floor."""
+    """Compute walls with windows, doors, shop fronts, a plinth and a ledge above the ground floor."""
     u, v, w = uvw[i, 0], uvw[i, 1], uvw[i, 2]
     du, dv = extent[i, 0], extent[i, 1]
     a = u + 0.37 * (x - y)
     tint = 1.0 + 0.07 * noise(a / 3.0, v / 3.0, du / 3.0, 6) + 0.05 * noise(a * 2.0, v * 2.0, du * 2.0, 7)
-    tint += 0.05 * noise(a * 1.2, v / 6.0, du * 1.2, 14)  # streaks that the rain leaves
+    tint += 0.05 * noise(a * 1.2, v / 6.0, du * 1.2, 14)  # streaks from rain
     tint *= 0.84 + 0.16 * min(1.0, v / 1.2)
     tint *= _wall(p, look, u, v, du, dv)
     if int(p[look, 7]) != _GATES:

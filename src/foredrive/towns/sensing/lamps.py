@@ -1,4 +1,4 @@
-"""Light of street lamps and vehicles: who shines where, and what falls on a point."""
+"""Light of street lamps and vehicles: the lamps near a place, and their light on a point."""
 
 import math
 from collections.abc import Sequence
@@ -13,36 +13,36 @@ from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 
 UNIT_LUX = 65_000.0
-"""A white diffuse surface under it has radiance 1."""
+"""Illuminance under which a white diffuse surface has radiance 1, lx."""
 STREET, HEAD, TAIL = 0, 1, 2
 STREET_CD = 3200.0
-"""Straight down and all the way out to where it is cut off."""
+"""Intensity of a street lamp, cd: constant from straight down to the cut-off."""
 STREET_RGB, HEAD_RGB, TAIL_RGB = (1.0, 0.80, 0.55), (1.0, 0.94, 0.84), (1.0, 0.06, 0.03)
 HEAD_CD = 40_000.0
-"""Brightest part of a pair of dipped headlights (UN Regulation 112 asks for 10 to 44 klx·m² each)."""
+"""Maximum intensity of a pair of dipped headlights, cd (UN Regulation 112 requires 10 to 44 klx·m² each)."""
 TAIL_CD = 20.0
 DIPPED_RAD = math.radians(1.2)
 HEAD_SPREAD_RAD, HEAD_DEPTH_RAD = math.radians(23.0), math.radians(3.6)
 ABOVE_CUT_OFF = 0.012
 REACH_M = (26.0, 70.0, 9.0)
-"""Of the kinds of lamps; beyond there is nothing worth the time."""
+"""Range of lamps by kind, m. Beyond it their light is negligible."""
 CELL_M, CELLS = 10.0, 40
-"""The grid about the vehicle in which lamps are looked up."""
+"""Cell size (m) and number of cells per side of the grid around the vehicle in which lamps are looked up."""
 LIT_CATEGORIES = (Category.CAR, Category.TRUCK, Category.BUS, Category.MOTORCYCLE)
 
 
 class LampArrays(NamedTuple):
-    """K lamps and, for each cell of a grid, those that reach it."""
+    """K lamps and, for each cell of a grid, the lamps whose light reaches it."""
 
     xyz: Float32[np.ndarray, "K 3"]
     heading: Float32[np.ndarray, "K 2"]
-    """Unit vector that a headlight or tail light points along."""
+    """Unit direction of a headlight or tail light."""
     rgb: Float32[np.ndarray, "K 3"]
-    """Intensity over `UNIT_LUX`, m²."""
+    """Intensity divided by `UNIT_LUX`, m²."""
     kind: Int32[np.ndarray, "K"]
     origin_xy: Float64[np.ndarray, "2"]
     first: Int32[np.ndarray, "cells+1"]
-    """Where the lamps of each cell start in `near`."""
+    """Index in `near` at which the lamps of each cell start."""
     near: Int32[np.ndarray, "n"]
 
 
@@ -54,7 +54,7 @@ def gather_lamps(
     actors: Sequence[ActorState],
     T_world_ego: Float64[np.ndarray, "4 4"],
 ) -> LampArrays:
-    """Lamps near the vehicle: those of the street, of those who drive, and its own."""
+    """Gather the lamps near the vehicle: street lamps, lamps of other vehicles, and its own."""
     centre = T_world_ego[:2, 3]
     origin = centre - 0.5 * CELL_M * CELLS
     close = (np.abs(street_xyz[:, :2] - centre) < 0.5 * CELL_M * CELLS + REACH_M[STREET]).all(1)
@@ -81,7 +81,7 @@ def gather_lamps(
 def _pair(
     middle: Float[np.ndarray, "3"], yaw: float, length: float
 ) -> list[tuple[Sequence[float], Sequence[float], int]]:
-    """Head and tail lights of a vehicle, each pair as one lamp."""
+    """Return the head and tail lights of a vehicle, each pair as one lamp."""
     heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     front, rear = middle + 0.52 * length * heading, middle - 0.52 * length * heading
     return [
@@ -93,7 +93,10 @@ def _pair(
 @_kernel
 @no_type_check
 def _into_cells(xyz, kind, heading, origin, reach_m):
-    """Lists of the lamps that reach each cell; headlights and tail lights do so ahead of themselves."""
+    """Return lists of the lamps that reach each cell.
+
+    Headlights and tail lights reach only cells ahead of them.
+    """
     counts = np.zeros(CELLS * CELLS + 1, np.int32)
     near = np.empty(0, np.int32)
     half = 0.7072 * CELL_M
@@ -120,7 +123,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
         if not fill:
             counts = np.cumsum(counts).astype(np.int32)
             near = np.empty(counts[-1], np.int32)
-    first = np.empty_like(counts)  # filling moved each cell's start to its end
+    first = np.empty_like(counts)  # filling moved the start of each cell to its end
     first[0] = 0
     first[1:] = counts[:-1]
     return first, near
@@ -129,7 +132,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
 @_kernel
 @no_type_check
 def beam(kind, hx, hy, lx, ly, lz):
-    """Share of a lamp's intensity that leaves it along the unit vector (lx, ly, lz)."""
+    """Return the share of a lamp's intensity that it emits along the unit vector (lx, ly, lz)."""
     if kind == STREET:  # cut off at 78° from straight down
         return min(max(5.0 * (-lz - 0.2), 0.0), 1.0)
     ahead = lx * hx + ly * hy
@@ -147,14 +150,16 @@ def beam(kind, hx, hy, lx, ly, lz):
 @_kernel
 @no_type_check
 def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
-    """What lamps send to a point.
+    """Compute the light of lamps at a point.
 
     Args:
         lamps: `LampArrays`.
-        x, nx, dx: and the like: the point, its unit normal, and the unit direction in which it is looked at.
+        x, y, z: the point, m.
+        nx, ny, nz: its unit normal.
+        dx, dy, dz: the unit viewing direction.
         shine: exponent of the mirrored highlight (Blinn-Phong); 0 for none.
-        out: [6] filled with irradiance as the radiance of a white surface, then the highlight's radiance
-            as for a surface that mirrors all.
+        out: [6] receives the irradiance as the radiance of a white surface, then the radiance of the
+            highlight as for a perfect mirror.
     """
     for c in range(6):
         out[c] = 0.0

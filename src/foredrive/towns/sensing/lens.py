@@ -1,4 +1,5 @@
-"""What rain and darkness do before the lens and on it: streaks, drops, and a glow about what is bright."""
+"""Effects of rain and darkness in front of the lens and on it: streaks, drops, and glare around bright
+areas."""
 
 from functools import lru_cache
 
@@ -9,22 +10,22 @@ from jaxtyping import Float32, UInt8
 from foredrive.towns.conditions import Conditions
 
 FALL_MPS = 7.0
-"""Of drops of 2 mm (Gunn & Kinzer, J. Meteorology 6, 1949)."""
+"""Speed of falling drops of 2 mm, m/s (Gunn & Kinzer, J. Meteorology 6, 1949)."""
 EXPOSURE_S = 1 / 60
 DROP_M = 2e-3
 STREAKS_PER_PIXEL = 1.1e-3
-"""At 10 mm/h, among drops near enough to be seen by themselves."""
+"""Streaks per pixel at 10 mm/h, from drops that are close enough to be visible one by one."""
 NEAREST_M, FURTHEST_M = 0.8, 7.0
 LENS_DROPS = 9
 DROP_RADIUS = (0.006, 0.024)
-"""Of the drops on the lens, by the image's width."""
+"""Minimum and maximum radius of drops on the lens, as a fraction of the image width."""
 GLARE_LEVEL, GLARE_SHARE, GLARE_WIDTH = 200, 0.55, 0.012
 
 Image = UInt8[np.ndarray, "H W 3"]
 
 
 def add_glare(image: Image) -> Image:
-    """Let what is brightest spill over, as lenses do at night."""
+    """Spread the light of the brightest areas, as lenses do at night."""
     bright = np.maximum(image, GLARE_LEVEL) - np.uint8(GLARE_LEVEL)
     spilt = cv2.GaussianBlur(bright, (0, 0), GLARE_WIDTH * image.shape[1])
     return np.asarray(cv2.addWeighted(image, 1.0, spilt, GLARE_SHARE * 255 / (255 - GLARE_LEVEL), 0.0))
@@ -38,12 +39,12 @@ def add_rain(
     lens_seed: int,
     rng: np.random.Generator,
 ) -> Image:
-    """Streaks of falling drops, which show the sky's colour, then drops that sit on the lens.
+    """Add streaks of falling drops, which have the colour of the sky, then drops on the lens.
 
     Args:
-        rgb: of the sky, where a drop refracts it to the camera.
-        lens_seed: where drops sit.
-        rng: of those that fall.
+        rgb: colour of the sky, which a drop refracts to the camera.
+        lens_seed: seed of the drops on the lens.
+        rng: random numbers of the falling drops.
     """
     share = _streaks(image.shape[:2], conditions.rain_mmph, focal_px, rng)[..., None]
     falling = (image + share * (rgb - image.astype(np.float32))).astype(np.uint8)
@@ -57,7 +58,7 @@ def add_rain(
 def _streaks(
     size_hw: tuple[int, int], rain_mmph: float, focal_px: float, rng: np.random.Generator
 ) -> Float32[np.ndarray, "H W"]:
-    """Share of each pixel that is hidden by drops on their way: the number of drops grows with R^0.63."""
+    """Return the share of each pixel that falling drops hide. The number of drops grows with R^0.63."""
     height, width = size_hw
     count = round(STREAKS_PER_PIXEL * height * width * (rain_mmph / 10.0) ** 0.63)
     distance_m = rng.uniform(NEAREST_M, FURTHEST_M, count)
@@ -82,7 +83,8 @@ def _streaks(
 def _lens_drops(
     size_hw: tuple[int, int], seed: int
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W 1"]]:
-    """Where light comes from that passes a drop, which shows the scene upside down, and the drops' share."""
+    """Return the source positions of light through drops, which show the scene upside down, and the drops'
+    share."""
     rng = np.random.default_rng(seed)
     height, width = size_hw
     y, x = np.mgrid[:height, :width].astype(np.float32)

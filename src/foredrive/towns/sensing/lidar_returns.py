@@ -1,4 +1,4 @@
-"""What comes back to a lidar: from surfaces, and from the air before them."""
+"""Lidar returns from surfaces and from the air in front of them."""
 
 import math
 from typing import no_type_check
@@ -13,20 +13,22 @@ from foredrive.towns.sensing.wet import LEVEL_COS, is_paved, water_film
 
 MISS = -1
 GLASS_LOSS = 0.8
-"""Share of a lidar pulse that a window lets through or mirrors away."""
+"""Share of a lidar pulse that a window transmits or mirrors away."""
 LIDAR_REFERENCE_M = 45.0
-"""At this distance half of the pulses from a surface of 2 % reflectivity, met head-on, are lost."""
+"""Distance, m, at which half of the pulses are lost for 2 % reflectivity at perpendicular incidence."""
 LIDAR_THRESHOLD = 0.02
 INTENSITY_OF_WHITE = 100.0 / 255.0
 RETROREFLECTED = 0.3
-"""How little it matters to painted lines, which hold glass beads, at what angle they are met."""
+"""Independence of painted lines, which contain glass beads, from the angle of incidence, 0 to 1."""
 FOLIAGE_DEPTH_M = 0.25
 WET_LIDAR_LOSS, FILM_LIDAR_LOSS = 0.35, 0.75
-"""Of what a dry surface would send back: soaked, and below a film of water."""
+"""Share of the dry surface's echo that is lost: on a soaked surface, and below a film of water."""
 NEAREST_CLUTTER_M, CLUTTER_DEPTH_M = 1.2, 9.0
-"""Nearer, the laser does not overlap with what the detector sees; further, clutter is too weak."""
+"""Range of clutter, m. Closer, the laser does not overlap with the detector's field of view. Further away,
+clutter is too weak."""
 DROP_MMPH = 150.0
-"""At e-fold of this rain rate every pulse meets a drop that is large enough to be seen by itself."""
+"""Scale of the rain rate R, mm/h. The share of pulses that hit a drop large enough to be measured is
+1 - exp(-R / `DROP_MMPH`)."""
 
 _FOLIAGE = int(Texture.FOLIAGE)
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -35,19 +37,24 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 @_kernel
 @no_type_check
 def lidar_returns(looks, found, t, max_range_m, chance, air):
-    """Which beams return, how strongly and from where.
+    """Compute which beams return, their ranges and their intensities.
 
-    The echo of a surface of reflectivity ρ met at an angle θ falls with ρ cos θ exp(-2 α r) / r² in air that
-    takes α from the pulse for each metre; it is lost with a probability that rises as the echo falls to the
-    detector's threshold. A film of water mirrors most of the pulse away from what is level.
+    The echo of a surface of reflectivity ρ at an angle of incidence θ is proportional to ρ cos θ exp(-2 α r)
+    / r², where α is the extinction of the air, 1/m. The echo is lost with a probability that rises as it
+    falls to the detector's threshold. A film of water mirrors most of the pulse away from level ground.
 
     Args:
+        looks: `LookArrays`.
+        found: `Surfaces` that the beams hit.
+        t: [N] distances of the hits, m.
+        max_range_m: maximum range, m.
         chance: [N 2] uniform random numbers: for the loss, and for the depth within foliage.
+        air: `AirArrays`.
 
     Returns:
-        range [N] m, up to the surface where a beam was lost; returned [N]; intensity [N] in 0..1: what a
-        white matt surface met head-on would have to reflect to look as bright, in percent of 255, as the
-        makers of real lidars calibrate it. Only what throws light back where it came from exceeds 100/255.
+        range [N] m, up to the surface if a beam was lost; returned [N]; intensity [N] in 0..1, calibrated as
+        by the makers of real lidars. It is the reflectance, in percent of 255, of a white matt surface that
+        looks equally bright at perpendicular incidence. Only retroreflective surfaces exceed 100/255.
     """
     count = len(t)
     range_m = np.empty(count, np.float32)
@@ -85,20 +92,21 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
 @_kernel
 @no_type_check
 def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity):
-    """Replace returns by those that fog and rain send back before the surface; the stronger echo counts.
+    """Replace returns by echoes of fog and rain in front of the surface if those are stronger.
 
-    A pulse whose length in the air is 2 ΔR meets at r what looks like a surface of reflectivity π β ΔR, with
-    β the air's backscatter (the lidar equation for an extended target). Fog sends a curtain whose strength
-    fluctuates; in rain that is gathered in the few pulses that meet a large drop.
+    For a pulse of length 2 ΔR, the air at range r acts like a surface of reflectivity π β ΔR, where β is the
+    air's backscatter (the lidar equation for an extended target). Fog gives a continuous echo with
+    fluctuating strength. In rain the echo is concentrated in the few pulses that hit a large drop.
 
     Args:
         air: `AirArrays`.
         chance: [N 4] uniform random numbers.
-        pulse_m: ΔR.
-        range_m: [N] and `returned`, `intensity`: of the surfaces, changed in place.
+        pulse_m: ΔR, m.
+        max_range_m: maximum range, m.
+        range_m: [N] range of the surface, changed in place; `returned` and `intensity` likewise.
 
     Returns:
-        [N] which beams return from the air.
+        [N] whether each beam returns from the air.
     """
     count = len(range_m)
     from_air = np.zeros(count, np.bool_)

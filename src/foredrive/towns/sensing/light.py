@@ -1,4 +1,4 @@
-"""The light of a time of day and a weather: sun, sky, haze, and how cameras expose for it."""
+"""The light of a time of day and a weather: sun, sky, haze, and the exposure of the cameras."""
 
 import math
 from typing import NamedTuple
@@ -15,35 +15,35 @@ Rgb = Float32[np.ndarray, "3"]
 
 NOON_ELEVATION_DEG = 60.0
 SUN_OUTSIDE_RGB = (1.93, 1.96, 1.93)
-"""Before the air takes its share: 127.5 klx (IES Lighting Handbook, 2000)."""
+"""Sunlight before it passes the air: 127.5 klx (IES Lighting Handbook, 2000)."""
 AIR_DEPTH_RGB = (0.17, 0.21, 0.29)
-"""Optical depth of clear air at the zenith."""
+"""Optical depth of clear air at the zenith, by colour."""
 _ELEVATION_DEG = (-18.0, -12.0, -6.0, 0.0, 5.0, 15.0, 30.0, 60.0)
 _SKY_LUX = (1e-3, 8e-3, 3.4, 450.0, 5.4e3, 8.7e3, 1.18e4, 1.52e4)
-"""Of a clear sky on level ground: 0.8 + 15.5 √sin h klx (IES Lighting Handbook, 2000); twilight: Explanatory
-Supplement to the Astronomical Almanac, 1992."""
+"""Light of a clear sky on level ground, lx: 0.8 + 15.5 √sin h klx (IES Lighting Handbook, 2000); twilight:
+Explanatory Supplement to the Astronomical Almanac, 1992."""
 SUNLIT_CLOUD = 0.45
-"""How bright clouds are from below that the sun shines on, by level white ground in it."""
+"""Brightness of sunlit clouds from below, relative to level white ground in the same light."""
 TOWN_GLOW_LUX, TOWN_GLOW_CLOUDED_LUX = 0.12, 0.5
-"""What the sky above a lit town sends back at night."""
+"""Light that the sky above a lit town scatters back at night, lx: clear and overcast."""
 STREET_LUX = 6.5
-"""Of a lit street and the dark about it, which cameras expose for at night."""
+"""Mean light of a lit street and its dark surroundings, lx. Cameras expose for it at night."""
 GREY_SKY_METERED = 0.18
-"""By how much cameras darken what stands before a sky that is brighter than all else."""
+"""Reduction of the exposure under an overcast sky that is brighter than everything else."""
 LIT_STREET_AMBIENT_LUX = 0.9
-"""What lit roads and walls scatter about them."""
+"""Light that lit roads and walls scatter to their surroundings, lx."""
 LAMPS_BELOW_LUX, HEADLIGHTS_BELOW_LUX = 500.0, 9e3
 HEADLIGHTS_BELOW_M = 3000.0
-"""Drivers turn their lights on when they see no further."""
+"""Visibility below which drivers turn their lights on, m."""
 NOON_WHITE, NOON_EXPOSURE = 1.6, 0.6
 NOON_SKY = 0.32
-"""Light of a clear sky whose colours are as `_sky_colours` has them."""
+"""Light of a clear sky that has the colours of `_sky_colours`."""
 ADAPTATION = 0.82
-"""1 would show every night as bright as day."""
+"""Exponent of the cameras' adaptation. With 1, every night would look as bright as day."""
 
 
 class LightArrays(NamedTuple):
-    """Linear radiances in units of a white diffuse surface under `UNIT_LUX`."""
+    """Light as linear radiances. The unit is the radiance of a white diffuse surface under `UNIT_LUX`."""
 
     sun: Rgb
     """Unit direction towards the sun; zeros where it casts no shadows."""
@@ -51,35 +51,37 @@ class LightArrays(NamedTuple):
     sunward: Rgb
     """Unit direction towards the brightest part of the sky."""
     glow_rgb: Rgb
-    """Of the sky about the sun."""
+    """Glow of the sky around the sun."""
     zenith: Rgb
     horizon: Rgb
     cloud_rgb: Rgb
     clouds: float
-    """0 clear, 1 overcast."""
+    """Cloud cover, 0 (clear) to 1 (overcast)."""
     sky_rgb: Rgb
-    """Light from above that falls on a level surface in the shade."""
+    """Light from above on a level surface in the shade."""
     bounce_rgb: Rgb
     """Light from below."""
     street_rgb: Rgb
-    """What level rays are taken to meet in a mirror."""
+    """Radiance that horizontal rays show in a mirror."""
     haze_rgb: Rgb
     air: AirArrays
     lamps: LampArrays
-    """Of streets and vehicles; none by day."""
+    """Lamps of streets and vehicles; none by day."""
     lit_windows: float
-    """Share of the windows behind which somebody has the light on."""
+    """Share of the windows with a lit room behind them."""
     glow: float
-    """Radiance of what shines by itself and is white: bright on the image, by day and by night."""
+    """Radiance of white surfaces that emit light. They are bright in the image by day and by night."""
     exposure: float
-    """Of the cameras."""
+    """Exposure of the cameras."""
 
 
 def sun_direction(hour: float, east_rad: float) -> Rgb:
-    """Unit vector towards the sun at a solar time: it rises in the east at 6, sets in the west at 18.
+    """Return the unit vector towards the sun at a solar time.
 
-    At noon it stands 60° high in the south, as on an equinox at 30° north. `east_rad` is where east lies,
-    counter-clockwise from the world's x.
+    The sun rises in the east at 6 and sets in the west at 18.
+
+    At noon it stands 60° high in the south, as on an equinox at 30° north. `east_rad` is the direction of
+    east, counter-clockwise from the world's x, rad.
     """
     angle, highest = np.pi * (hour - 6.0) / 12.0, np.deg2rad(NOON_ELEVATION_DEG)
     east, south = np.cos(angle), np.sin(angle) * np.cos(highest)
@@ -91,24 +93,24 @@ def sun_direction(hour: float, east_rad: float) -> Rgb:
 class _Daylight(NamedTuple):
     elevation_deg: float
     beam: Rgb
-    """The sun, before clouds and fog."""
+    """Sunlight before clouds and fog."""
     through: float
-    """Share of it that gets through them."""
+    """Share of the sunlight that passes clouds and fog."""
     clear: float
-    """What falls from a clear sky on level ground."""
+    """Light of a clear sky on level ground."""
     cloud: float
     """Radiance of the clouds."""
     sky: float
-    """What falls from the sky as it is on level ground."""
+    """Light of the present sky on level ground."""
     white: float
     """Radiance of level white ground."""
 
 
 def _daylight(conditions: Conditions) -> _Daylight:
-    """Light of sun and sky.
+    """Compute the light of sun and sky.
 
-    Clouds dim both together by 1 - 0.75 N^3.4 (Kasten & Czeplak, Solar Energy 24, 1980); more than half of
-    them begin to hide the sun.
+    Clouds attenuate both together by 1 - 0.75 N^3.4 (Kasten & Czeplak, Solar Energy 24, 1980). A cloud cover
+    above one half begins to hide the sun.
     """
     height = float(sun_direction(conditions.hour, 0.0)[2])
     elevation_deg, clouds = math.degrees(math.asin(height)), conditions.clouds
@@ -125,12 +127,12 @@ def _daylight(conditions: Conditions) -> _Daylight:
 
 
 def daylight_lux(conditions: Conditions) -> float:
-    """What sun and sky shed on level ground."""
+    """Return the light of sun and sky on level ground, lx."""
     return _daylight(conditions).white * UNIT_LUX
 
 
 def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
-    """The light of a time of day under a sky, before any lamps are lit."""
+    """Compute the light of a time of day and a weather, without lamps."""
     toward, clouds = sun_direction(conditions.hour, east_rad), conditions.clouds
     fall = _daylight(conditions)
     beam, sky, through, white_lux = fall.beam, fall.sky, fall.through, fall.white * UNIT_LUX
@@ -168,12 +170,12 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
 
 
 def is_dark(conditions: Conditions) -> bool:
-    """Whether street lamps are on."""
+    """Return whether street lamps are on."""
     return daylight_lux(conditions) < LAMPS_BELOW_LUX
 
 
 def drive_lit(conditions: Conditions) -> bool:
-    """Whether drivers have their lights on."""
+    """Return whether drivers have their lights on."""
     hidden = conditions.rain_mmph > 0.0 or conditions.visibility_m < HEADLIGHTS_BELOW_M
     return hidden or daylight_lux(conditions) < HEADLIGHTS_BELOW_LUX
 
@@ -187,7 +189,8 @@ class _SkyColours(NamedTuple):
 
 
 def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
-    """Colours as of a sky of noon's brightness: blue by day, warm where a low sun is, grey under clouds.
+    """Return the colours of a sky with the brightness of noon: blue by day, warm with a low sun, grey under
+    clouds.
 
     An overcast sky is three times as bright at the zenith as at the horizon (CIE standard overcast sky).
     """
@@ -208,7 +211,10 @@ def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
 
 
 def _sun_rgb(elevation_deg: float) -> Rgb:
-    """The sun through the air, whose mass is that of Kasten & Young (Applied Optics 28, 1989)."""
+    """Return the sunlight after its way through the air.
+
+    The air mass is that of Kasten & Young (Applied Optics 28, 1989).
+    """
     if elevation_deg < -0.5:
         return _rgb(0.0, 0.0, 0.0)
     height = max(elevation_deg, 0.0)

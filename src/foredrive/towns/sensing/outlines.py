@@ -1,4 +1,4 @@
-"""Where one ray is too few for a pixel, and what several need not find out again."""
+"""Outlines: pixels for which one ray is not enough, and the results that their additional rays can reuse."""
 
 from typing import NamedTuple, no_type_check
 
@@ -10,13 +10,13 @@ from foredrive.towns.sensing.shading import MISS
 
 CREASE_COS = 0.8
 CONTRAST = 12
-"""Of 255: what stands out less from its neighbour needs no smooth edge."""
+"""Contrast of 255 below which an edge need not be smooth."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Looked(NamedTuple):
-    """What the central rays of P pixels found."""
+    """The results of the central rays of P pixels."""
 
     radiance: Float32[np.ndarray, "P 3"]
     normal: Float32[np.ndarray, "P 3"]
@@ -27,7 +27,8 @@ class Looked(NamedTuple):
 @_kernel
 @no_type_check
 def outlines(seen, centre, rgb, shape):
-    """Pixels [C·H·W] on an edge that can be seen: of a thing, of a shadow, or where a surface bends.
+    """Return which pixels [C·H·W] lie on a visible edge: of an object, of a shadow, or at a bend of a
+    surface.
 
     Args:
         seen: look and actor of each pixel.
@@ -56,13 +57,14 @@ def outlines(seen, centre, rgb, shape):
 @_kernel
 @no_type_check
 def same_as_centre(pixels, samples, found, actor, lit, seen, centre):
-    """Radiance [n·samples 3] of rays that find what their pixel's central ray found, -1 for the others.
+    """Return the radiance [n·samples 3] of rays that find the same as their pixel's central ray, -1 for
+    others.
 
-    Textures are filtered over the pixel already: only what differs is worth another look.
+    Textures are filtered over the pixel already, so only rays with another result need to be shaded.
 
     Args:
-        pixels: [n], each of which has `samples` rays.
-        found: the rays' `Surfaces`; `actor` and `lit` likewise.
+        pixels: [n], with `samples` rays for each.
+        found: the `Surfaces` of the rays; `actor` and `lit` likewise.
     """
     out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
     for i in range(len(out)):

@@ -1,7 +1,7 @@
-"""Patterns that procedural textures are made of, filtered over the footprint of a pixel.
+"""Patterns of which procedural textures consist, filtered over the footprint of a pixel.
 
-Bands whose share of the footprint is known in closed form, and value noise that fades out as the footprint
-outgrows it, so that what is far away does not sparkle.
+There are bands, whose share of the footprint has a closed form, and value noise. The noise fades out as the
+footprint grows, so that distant surfaces do not flicker.
 """
 
 import math
@@ -12,12 +12,12 @@ import numpy as np
 
 TEXTURED = 6
 TEXTURE_WORDS = TEXTURED + 4
-"""Of the array that a texture is written to."""
+"""Number of elements of the array that a texture writes."""
 
 _TABLE_BITS = 12
 _TABLE_MASK = (1 << _TABLE_BITS) - 1
 _NOISE = np.random.default_rng(20).random(1 << _TABLE_BITS).astype(np.float32)
-"""Random numbers that lattice points are hashed to."""
+"""Random numbers to which lattice points are hashed."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
@@ -25,7 +25,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 @_kernel
 @no_type_check
 def lattice(ix: int, iy: int, seed: int) -> float:
-    """A random number in 0..1 for a lattice point."""
+    """Return a random number in 0..1 for a lattice point."""
     h = ix * 73856093 ^ iy * 19349663 ^ seed * 83492791
     h ^= (h >> 15) & 0x1FFFF
     h *= 668265263
@@ -35,7 +35,8 @@ def lattice(ix: int, iy: int, seed: int) -> float:
 @_kernel
 @no_type_check
 def noise(x: float, y: float, footprint: float, seed: int) -> float:
-    """Value noise of wavelength 1 in -1..1, 0 where the footprint (same unit as x) blurs it away."""
+    """Return value noise of wavelength 1 in -1..1, or 0 where the footprint (in the unit of x) blurs it
+    away."""
     fade = 1.0 - footprint
     if fade <= 0.0:
         return 0.0
@@ -51,7 +52,7 @@ def noise(x: float, y: float, footprint: float, seed: int) -> float:
 @_kernel
 @no_type_check
 def band(x: float, low: float, high: float, footprint: float) -> float:
-    """Share of the footprint about x that lies between low and high."""
+    """Return the share of the footprint around x that lies between low and high."""
     half = 0.5 * footprint + 1e-4
     return max(0.0, min(high, x + half) - max(low, x - half)) / (2.0 * half)
 
@@ -59,7 +60,7 @@ def band(x: float, low: float, high: float, footprint: float) -> float:
 @_kernel
 @no_type_check
 def bands(x: float, period: float, width: float, footprint: float) -> float:
-    """Share of the footprint about x that lies in [k·period, k·period + width] for any k."""
+    """Return the share of the footprint around x that lies in [k·period, k·period + width] for any k."""
     half = 0.5 * footprint + 1e-4
     a, b = x - half, x + half
     ka, kb = math.floor(a / period), math.floor(b / period)

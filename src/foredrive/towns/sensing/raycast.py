@@ -1,8 +1,7 @@
-"""Rays against a town: one tree for the static world, one over instances of the actors' shapes.
+"""Ray casting in a town: one tree for the static world, one tree over instances of the actors' shapes.
 
-An actor's shape is built once and for all in its unit box; a ray is taken into that box, where distances stay
-what they are. A ray that looks at another time than that of the scene meets an actor that moves on straight
-ahead.
+An actor's shape is built once, in its unit box. A ray is transformed into that box, where distances keep
+their values. For a ray at another time than that of the scene, the actors have moved straight ahead.
 """
 
 import weakref
@@ -19,12 +18,12 @@ Rays = Float32[np.ndarray, "N 3"]
 Times = Float32[np.ndarray, "N"]
 
 LOOKAHEAD_S = 0.5
-"""Rays look at most this far before or after the time at which actors are where they were placed."""
+"""Maximum time between a ray and the actors' placement, s, before or after."""
 _ALWAYS = np.zeros(0, np.float32)
 
 
 class TriangleScene:
-    """The tree over one mesh."""
+    """The search tree over one mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
         padding = np.zeros((1, 3), np.float32)  # Embree reads past the last vertex
@@ -34,21 +33,21 @@ class TriangleScene:
         weakref.finalize(self, embree.release, self.handle)
 
     def cast(self, origin: Rays, direction: Rays) -> Hits:
-        """Nearest hits; directions need not have unit length, distances are multiples of them."""
+        """Return the nearest hits. Directions need not have unit length; distances are multiples of them."""
         return _intersect([self.handle], origin, direction, None)
 
     def occluded(self, origin: Rays, direction: Rays) -> Bool[np.ndarray, "N"]:
-        """Whether rays hit anything."""
+        """Return whether rays hit anything."""
         return embree.occluded(_scenes([self.handle]), origin, direction, _ALWAYS)
 
 
 class PlacedShapes:
-    """A actors in the world, ready to be met by rays.
+    """A actors in the world, ready for ray casting.
 
     Args:
-        scenes: the shape of each actor, in the unit box about the origin.
+        scenes: the shape of each actor, in the unit box around the origin.
         T_world_unit: affine maps from the unit boxes to the world.
-        velocity_mps: along the world's axes.
+        velocity_mps: velocities along the world's axes, m/s.
     """
 
     def __init__(
@@ -73,16 +72,16 @@ class Surroundings:
     placed: PlacedShapes
 
     def cast(self, origin: Rays, direction: Rays, dt_s: Times | None = None) -> Hits:
-        """Nearest hits of unit rays.
+        """Return the nearest hits of unit rays.
 
         Args:
-            dt_s: when each ray looks, relative to the time at which the actors are where they were placed, at
-                most `LOOKAHEAD_S` away; None: all at that time.
+            dt_s: time of each ray relative to the time of the actors' placement, s, at most `LOOKAHEAD_S`
+                away. None: all at that time.
         """
         return _intersect(self._handles, origin, direction, dt_s)
 
     def occluded(self, origin: Rays, direction: Rays, dt_s: Times | None = None) -> Bool[np.ndarray, "N"]:
-        """Whether unit rays hit anything; `dt_s` as in `cast`."""
+        """Return whether unit rays hit anything. `dt_s` is as in `cast`."""
         return embree.occluded(_scenes(self._handles), origin, direction, _time(dt_s))
 
     @property
@@ -103,5 +102,5 @@ def _scenes(handles: list[int]) -> embree.Scenes:
 
 
 def _time(dt_s: Times | None) -> embree.Times:
-    """Embree's time, from 0 to 1."""
+    """Convert to Embree's time, from 0 to 1."""
     return _ALWAYS if dt_s is None else dt_s * np.float32(0.5 / LOOKAHEAD_S) + np.float32(0.5)

@@ -1,4 +1,5 @@
-"""The recording vehicle's sensors: six cameras like nuScenes', and a spinning lidar on the roof."""
+"""Sensors of the recording vehicle: six cameras similar to those of nuScenes, and a spinning lidar on the
+roof."""
 
 import math
 from collections.abc import Callable
@@ -27,13 +28,15 @@ LIDARS: dict[str, Callable[[Float[Tensor, "4 4"], float], SpinningLidar]] = {
     "pandar64": pandar64,
     "vlp16": vlp16,
 }
-"""Real lidars by name, made of where they are mounted and how often a second they turn."""
+"""Real lidars by name, as functions of the mounting pose and the rate of revolution, Hz."""
 
 
 def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:
-    """Six cameras all around, without leading dimensions; the principal point is the image's centre.
+    """Return six cameras in all directions, without leading dimensions.
 
-    Rows are read from the top within `readout_s`, the middle one at the frame's time; 0: a global shutter.
+    The principal point is the image's centre.
+
+    Rows are read from the top within `readout_s`, the middle row at the frame's time. 0: a global shutter.
     """
     height, width = size_hw
     K, T_ego_cam = [], []
@@ -53,7 +56,10 @@ def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:
 
 
 def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:
-    """A lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°); channel 0 looks lowest."""
+    """Return a lidar with the field of view of Velodyne's HDL-32E (10.67° to -30.67°).
+
+    Channel 0 is the lowest.
+    """
     elevation_deg = torch.linspace(-30.67, 10.67, channels)
     return SpinningLidar(
         elevation_rad=tuple(elevation_deg.deg2rad().tolist()),
@@ -67,7 +73,7 @@ def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10
 
 
 def find_lidar(name: str, rate_hz: float = 10.0) -> SpinningLidar:
-    """A real lidar on the roof, one of `LIDARS`.
+    """Return a real lidar on the roof, one of `LIDARS`.
 
     Raises:
         InputError: there is no such lidar.

@@ -1,4 +1,4 @@
-"""What rays met, and whose it is."""
+"""Records of the surfaces that rays hit."""
 
 from typing import NamedTuple, no_type_check
 
@@ -10,24 +10,24 @@ from foredrive.towns.sensing.shading import MISS, Hits
 
 
 class Seen(NamedTuple):
-    """What rays met: which triangle of which actor, as in `Hits`."""
+    """The triangles and actors that rays hit, as in `Hits`."""
 
     triangle: Int32[np.ndarray, "N"]
     actor: Int32[np.ndarray, "N"]
     look: Int32[np.ndarray, "N"]
-    """`MISS` where a ray met nothing."""
+    """Look, `MISS` where a ray hit nothing."""
     range_m: Float32[np.ndarray, "N"]
-    """Along the ray; infinite where it met nothing."""
+    """Distance along the ray, m; infinite where it hit nothing."""
 
 
 def nothing_seen(count: int) -> Seen:
-    """Room for what rays will have met."""
+    """Return an empty record for `count` rays."""
     triangle, actor, look = (np.empty(count, np.int32) for _ in range(3))
     return Seen(triangle, actor, look, np.empty(count, np.float32))
 
 
 def note(seen: Seen, part: slice, hits: Hits, look: Int32[np.ndarray, "n"]) -> None:
-    """Write down what some of the rays met."""
+    """Record the hits of some of the rays."""
     seen.triangle[part], seen.actor[part], seen.look[part] = hits.triangle, hits.actor, look
     seen.range_m[part] = np.where(look == MISS, np.inf, hits.t)
 
@@ -35,7 +35,8 @@ def note(seen: Seen, part: slice, hits: Hits, look: Int32[np.ndarray, "n"]) -> N
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def track_ids(seen, of_actor, of_triangle, nobody):
-    """Whose it is that rays met [N]: track ids of actors [A], of the static world's triangles [F]."""
+    """Return the track id of each hit [N], from those of actors [A] and of the static world's triangles
+    [F]."""
     out = np.empty(len(seen.triangle), np.int64)
     for i in range(len(out)):
         triangle, actor = seen.triangle[i], seen.actor[i]
@@ -49,7 +50,7 @@ def track_ids(seen, of_actor, of_triangle, nobody):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def surface_ids(seen, of_look, sky):
-    """What it is made of [N], by the surfaces of looks [L]."""
+    """Return the surface of each hit [N], from the surfaces of looks [L]."""
     out = np.empty(len(seen.look), np.int8)
     for i in range(len(out)):
         out[i] = sky if seen.look[i] == MISS else of_look[seen.look[i]]

@@ -1,4 +1,4 @@
-"""From hits to colours, by numba kernels that release the GIL."""
+"""Shading: from hits to colours, in numba functions that release the GIL."""
 
 import math
 from typing import NamedTuple, no_type_check
@@ -25,14 +25,14 @@ from foredrive.towns.sensing.wet import (
 MISS = -1
 SHADOW_OFFSET_M = 4e-3
 WINDOW_RGB = (0.36, 0.24, 0.12)
-"""Of a room with the light on, beside what shines on its own."""
+"""Colour of a lit room, relative to surfaces that emit light."""
 
 CLEAR_MIRROR = 0.25
-"""What mirrors less of the light than this is too rough to show clouds."""
+"""Minimum gloss of a surface that mirrors single clouds. Less glossy surfaces are too rough."""
 
 _FACADE, _FOLIAGE, _GLOW = int(Texture.FACADE), int(Texture.FOLIAGE), int(Texture.GLOW)
 _ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
-"""8-bit values of display brightness by its 12-bit linear value."""
+"""8-bit values of display brightness by 12-bit linear value."""
 
 
 class Soup(NamedTuple):
@@ -44,7 +44,7 @@ class Soup(NamedTuple):
 
 
 class ActorArrays(NamedTuple):
-    """A actors, each a shape of the actors' soup that is moved, stretched and painted."""
+    """A actors. Each one is a moved, scaled and painted shape from the triangles of all shapes."""
 
     T_world_unit: Float32[np.ndarray, "A 3 4"]
     first: Int32[np.ndarray, "A"]
@@ -54,12 +54,13 @@ class ActorArrays(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Where N rays end."""
+    """The ends of N rays."""
 
     t: Float32[np.ndarray, "N"]
     """Distance, m."""
     triangle: Int32[np.ndarray, "N"]
-    """Of the static soup, or counted from the first triangle of the actor's shape; MISS for none."""
+    """Triangle of the static world, or counted from the first triangle of the actor's shape; MISS for
+    none."""
     actor: Int32[np.ndarray, "N"]
     """Row of `ActorArrays`, -1 for the static world."""
     u: Float32[np.ndarray, "N"]
@@ -68,7 +69,7 @@ class Hits(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """All that rays can meet."""
+    """Everything that rays can hit."""
 
     static: Soup
     shapes: Soup
@@ -77,19 +78,19 @@ class Scene(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """What N rays found where they ended; meaningless for a ray that missed."""
+    """The surfaces at the ends of N rays. Without meaning for a ray that missed."""
 
     look: Int32[np.ndarray, "N"]
     """MISS for a ray that missed."""
     xyz: Float32[np.ndarray, "N 3"]
     normal: Float32[np.ndarray, "N 3"]
-    """Unit, against the ray."""
+    """Unit normal against the ray."""
     cosine: Float32[np.ndarray, "N"]
-    """Of the angle at which the surface is met."""
+    """Cosine of the angle of incidence."""
     uvw: Float32[np.ndarray, "N 3"]
     """Texture coordinates."""
     extent: Float32[np.ndarray, "N 4"]
-    """Of the ray's footprint: in the three texture coordinates, and on the surface, m."""
+    """Extent of the ray's footprint: in the three texture coordinates, and on the surface, m."""
 
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -98,7 +99,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 @_kernel
 @no_type_check
 def move_rays(T, origin, direction, rows):
-    """Origins and directions [n 3] of some of N rays in the frame that T [3 4] leads to."""
+    """Transform the origins and directions [n 3] of the rays `rows` by T [3 4]."""
     origins, directions = np.empty((len(rows), 3), np.float32), np.empty((len(rows), 3), np.float32)
     for i in range(len(rows)):
         row = rows[i]
@@ -117,7 +118,7 @@ def surfaces(
     direction: Float32[np.ndarray, "N 3"],
     ray_rad: Float32[np.ndarray, "N"],
 ) -> Surfaces:
-    """Look up what rays met. `ray_rad` is the angle between a ray and its neighbours."""
+    """Look up the surfaces that rays hit. `ray_rad` is the angle between a ray and its neighbours, rad."""
     count = len(hits.t)
     out = Surfaces(
         np.full(count, MISS, np.int32),
@@ -178,8 +179,8 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         out.xyz[i, 0] = origin[i, 0] + t * dx
         out.xyz[i, 1] = origin[i, 1] + t * dy
         out.xyz[i, 2] = origin[i, 2] + t * dz
-        # With g the gradient of a coordinate within the triangle's plane, a ray that moves sideways by δ ⟂ d
-        # shifts the hit by δ - d (n·δ)/(n·d), hence the coordinate by h·δ, h = g - n (g·d)/(n·d).
+        # Let g be the gradient of a coordinate within the triangle's plane. A ray that moves sideways by δ ⟂
+        # d shifts the hit by δ - d (n·δ)/(n·d), and so the coordinate by h·δ, h = g - n (g·d)/(n·d).
         pp, pq, qq = px * px + py * py + pz * pz, px * qx + py * qy + pz * qz, qx * qx + qy * qy + qz * qz
         inverse = 1.0 / max(pp * qq - pq * pq, 1e-20)
         pd, qd = px * dx + py * dy + pz * dz, qx * dx + qy * dy + qz * dz
@@ -198,7 +199,8 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
 @_kernel
 @no_type_check
 def sun_rays(found, t, sun, out_origin):
-    """Indices of the hits that face the sun; out_origin is filled with where rays towards it start."""
+    """Return the indices of the hits that face the sun, and fill out_origin with the starts of rays towards
+    it."""
     index = np.empty(len(t), np.int64)
     count = 0
     for i in range(len(t)):
@@ -218,14 +220,15 @@ def sun_rays(found, t, sun, out_origin):
 @_kernel
 @no_type_check
 def _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, out):
-    """Fill out [3] with what a surface of this gloss mirrors: the sky, or the street where that is low."""
+    """Fill out [3] with the mirrored radiance of a surface of this gloss: the sky, or the street for low
+    rays."""
     rise = dz + 2.0 * cosine * nz
     mx, my, upward = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, max(rise, 0.05)
     if gloss > CLEAR_MIRROR:
         sky(light, mx, my, upward, out)
     else:
         blurred_sky(light, mx, my, upward, out)
-    open_sky = min(max(3.0 * rise, 0.0), 1.0)  # nearer the horizon a street mirrors its other side
+    open_sky = min(max(3.0 * rise, 0.0), 1.0)  # close to the horizon a street mirrors its other side
     for c in range(3):
         out[c] = open_sky * min(out[c], 3.0) + (1.0 - open_sky) * light.street_rgb[c]
 
@@ -233,7 +236,7 @@ def _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, out):
 @_kernel
 @no_type_check
 def _lit_window(light, glass, chance):
-    """How brightly a room shines through a window; `chance` is the window's own random number, 0 for many."""
+    """Return the brightness of a room behind a window. `chance` is the window's random number, 0 for many."""
     if glass <= 0.0:
         return 0.0
     if chance <= 0.0:
@@ -244,12 +247,17 @@ def _lit_window(light, glass, chance):
 @_kernel
 @no_type_check
 def shade(looks, found, t, direction, lit, light, mirrored, known):
-    """Radiance [N 3] along rays.
+    """Return the radiance [N 3] along rays.
 
     Args:
-        lit: which hits the sun shines on.
-        mirrored: [N 3] radiance that comes from where water mirrors to, or [0 3] to take the sky's.
-        known: [N 3] radiance of rays that need no more work, -1 for the others; or [0 3].
+        looks: `LookArrays`.
+        found: `Surfaces` that the rays hit.
+        t: [N] distances of the hits, m.
+        direction: [N 3] unit directions of the rays.
+        lit: [N] whether the sun shines on each hit.
+        light: `LightArrays`.
+        mirrored: [N 3] radiance from the direction in which water mirrors, or [0 3] to use the sky's.
+        known: [N 3] radiance of rays that need no shading, -1 for the others; or [0 3].
     """
     out = np.empty((len(t), 3), np.float32)
     colour, lamp = np.empty(TEXTURE_WORDS, np.float32), np.zeros(6, np.float32)
@@ -306,7 +314,7 @@ def shade(looks, found, t, direction, lit, light, mirrored, known):
 @_kernel
 @no_type_check
 def develop(radiance, exposure, samples):
-    """8-bit sRGB [pixels 3] of radiances of which `samples` in a row belong to one pixel."""
+    """Convert radiances to 8-bit sRGB [pixels 3]. Each `samples` radiances in a row belong to one pixel."""
     count = len(radiance) // samples
     out = np.empty((count, 3), np.uint8)
     for pixel in range(count):

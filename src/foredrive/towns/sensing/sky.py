@@ -8,7 +8,7 @@ import numba
 from foredrive.towns.sensing.patterns import noise
 
 FOG_TOP_M = 100.0
-"""Fog, rain and haze reach this high."""
+"""Upper limit of fog, rain and haze, m."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
@@ -16,7 +16,8 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 @_kernel
 @no_type_check
 def sky(light, dx, dy, dz, out):
-    """Fill out [3] with a gradient, a glow about the sun, clouds, and the haze before all of it."""
+    """Fill out [3] with the sky: a gradient, a glow around the sun, clouds, and haze in front of all of
+    it."""
     cloud = 0.0
     if dz > 0.02:
         x, y = dx / (dz + 0.12) * 1.3, dy / (dz + 0.12) * 1.3
@@ -30,7 +31,7 @@ def sky(light, dx, dy, dz, out):
 @_kernel
 @no_type_check
 def blurred_sky(light, dx, dy, dz, out):
-    """Fill out [3] with what a rough mirror shows of the sky: its clouds run into one veil."""
+    """Fill out [3] with the sky as a rough mirror shows it: its clouds are blurred into one layer."""
     _air_and_sun(light, dx, dy, dz, light.clouds * min(1.0, 6.0 * dz), out)
 
 

@@ -1,4 +1,7 @@
-"""Procedural textures: roads, ground, plants, plain things. Compiled by numba, called once for each hit."""
+"""Procedural textures: roads, ground, plants, plain objects.
+
+The functions are compiled by numba and called once for each hit.
+"""
 
 import math
 from typing import no_type_check
@@ -17,7 +20,7 @@ ASPHALT = 0.10
 """Linear reflectance between the stripes of a crosswalk."""
 KERB_STONE_M = 0.16
 TRAMLINES_M, TRACK_M, RUT_M = 18.0, 1.8, 0.4
-"""Ruts of tractors in fields: distance of the pairs, of the two of a pair, and their width."""
+"""Ruts of tractors in fields, m: distance between pairs, distance within a pair, and width."""
 _GRASS_RGB = srgb_to_linear([GRASS_RGB])[0]
 
 _ROAD, _SLABS, _GRASS = int(Texture.ROAD), int(Texture.SLABS), int(Texture.GRASS)
@@ -32,7 +35,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 @_kernel
 @no_type_check
 def _line(distance: float, along: float, du: float, dw: float, pattern: int, width: float) -> float:
-    """Share of the footprint that is painted, at a distance from the border it follows."""
+    """Return the painted share of the footprint at a distance from the border that the line follows."""
     if pattern == _LINE_NONE:
         return 0.0
     if pattern >= _LINE_DOUBLE:
@@ -48,7 +51,7 @@ def _line(distance: float, along: float, du: float, dw: float, pattern: int, wid
 @_kernel
 @no_type_check
 def _road(p, look, x, y, uvw, extent, i, out):
-    """Asphalt: grain, wear along the wheel tracks, patches, lines."""
+    """Compute asphalt: grain, wear along the wheel tracks, patches, lines."""
     size = extent[i, 3]
     shade = 1.0 + 0.10 * noise(x / 11.0, y / 11.0, size / 11.0, 1)
     shade += 0.08 * noise(x / 2.3, y / 2.3, size / 2.3, 2) + 0.10 * noise(x * 4.0, y * 4.0, size * 4.0, 3)
@@ -79,7 +82,7 @@ def _road(p, look, x, y, uvw, extent, i, out):
 @_kernel
 @no_type_check
 def _grass(x, y, size):
-    """Factors on red, green and blue of the land."""
+    """Return factors on red, green and blue of the land."""
     wide = noise(x / 23.0, y / 23.0, size / 23.0, 21)
     fine = noise(x * 1.7, y * 1.7, size * 1.7, 22) + 0.6 * noise(x * 6.0, y * 6.0, size * 6.0, 23)
     dry = 0.5 + 0.5 * noise(x / 5.0, y / 5.0, size / 5.0, 24) + 0.3 * wide
@@ -90,7 +93,7 @@ def _grass(x, y, size):
 @_kernel
 @no_type_check
 def _field(p, look, x, y, uvw, extent, i, out):
-    """Rows of crops with the ruts of tractors; grass beyond the border."""
+    """Compute rows of crops with the ruts of tractors, and grass beyond the border."""
     u, size = uvw[i, 0], extent[i, 3]
     crop = bands(u + 0.06 * noise(x, y, size, 26), p[look, 0], p[look, 1], extent[i, 0])
     rut = bands(u, TRAMLINES_M, RUT_M, extent[i, 0]) + bands(u + TRACK_M, TRAMLINES_M, RUT_M, extent[i, 0])
@@ -112,7 +115,7 @@ def _field(p, look, x, y, uvw, extent, i, out):
 @_kernel
 @no_type_check
 def _tint(kind, p, look, xyz, uvw, extent, i):
-    """Factors on red, green and blue of the simpler textures."""
+    """Return factors on red, green and blue of the simpler textures."""
     x, y, z, size = xyz[i, 0], xyz[i, 1], xyz[i, 2], extent[i, 3]
     if kind == _GRASS:
         return _grass(x, y, size)
@@ -152,12 +155,14 @@ def texture(looks, look, xyz, uvw, extent, i, out):
 
     Args:
         looks: `LookArrays`.
+        look: number of the look.
         xyz: [N 3] positions, m.
         uvw: [N 3] texture coordinates.
         extent: [N 4] extent of a pixel's footprint in the texture coordinates, and on the surface, m.
-        out: [`TEXTURE_WORDS`]; the first six are filled with red, green, blue (linear), share of glass, share
-            of paint, and a random number in 0..1 that the window has to itself, 0 where there is none or too
-            many. The others are room to work in.
+        i: index of the hit.
+        out: [`TEXTURE_WORDS`]. The first six receive red, green, blue (linear), the share of glass, the share
+            of paint, and a random number in 0..1 of the window, 0 where there is none or where there are too
+            many. The others are working memory.
     """
     kind, p = looks.texture[look], looks.params
     x, y = xyz[i, 0], xyz[i, 1]

@@ -1,4 +1,4 @@
-"""Water on the ground: where it stands and what it does to light."""
+"""Water on the ground: where it stands and its effects on light."""
 
 import math
 from typing import no_type_check
@@ -10,16 +10,17 @@ from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.patterns import noise
 
 LEVEL_COS = 0.9
-"""Water stands on what is this level."""
+"""Minimum vertical component of the unit normal of ground on which water stands."""
 WATER_MIRROR = 0.02
-"""Share of light that water mirrors head-on (Fresnel, n = 1.33)."""
+"""Share of light that water mirrors at perpendicular incidence (Fresnel, n = 1.33)."""
 WET_DARKENING = 0.5
-"""Of porous ground: light is caught below the film (Lekner & Dorf, Applied Optics 27, 1988)."""
+"""Darkening of wet porous ground: light is trapped below the film (Lekner & Dorf, Applied Optics 27,
+1988)."""
 WET_SHINE = 120.0
-"""How sharp lamps are mirrored, as a Blinn-Phong exponent."""
+"""Sharpness of mirrored lamps, as a Blinn-Phong exponent."""
 PUDDLE_M = 3.0
 _DRY_DEPTH = 1.12
-"""How deep a hollow must be to hold water on ground that is all but dry; the deepest has 1.4."""
+"""Minimum depth of a hollow that holds water on almost dry ground. The deepest hollow has 1.4."""
 THIN_FILM = 0.28
 RIPPLES = 0.008
 FAINTEST_MIRROR = 0.015
@@ -31,16 +32,17 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 @_kernel
 @no_type_check
 def is_paved(surface):
-    """Whether water gathers on a `Surface`."""
+    """Return whether water gathers on a `Surface`."""
     return surface in (_ROAD, _SIDEWALK)
 
 
 @_kernel
 @no_type_check
 def water_film(wetness, surface, xyz, extent, i):
-    """Share of paved ground at the i-th hit that is under water, 0 to 1: puddles, and a thin film between.
+    """Return the share of paved ground under water at the i-th hit, 0 to 1: puddles, and a thin film between
+    them.
 
-    Walkways slope and drain: there are no puddles.
+    Walkways have no puddles because they slope and drain.
     """
     x, y, size = xyz[i, 0], xyz[i, 1], extent[i, 3]
     film = THIN_FILM * wetness * wetness * (1.0 + 0.4 * noise(x * 2.0, y * 2.0, size * 2.0, 93))
@@ -55,16 +57,16 @@ def water_film(wetness, surface, xyz, extent, i):
 @_kernel
 @no_type_check
 def water_mirror(cosine):
-    """Share of light that water mirrors (Schlick's approximation of Fresnel's equations, 1994)."""
+    """Return the share of light that water mirrors (Schlick's approximation of Fresnel's equations, 1994)."""
     return WATER_MIRROR + (1.0 - WATER_MIRROR) * (1.0 - cosine) ** 5
 
 
 @_kernel
 @no_type_check
 def mirror_rays(looks, found, t, direction, wetness, out_origin, out_direction):
-    """Indices of the hits whose water mirrors enough to be followed; the rest is filled with those rays.
+    """Return the indices of the hits whose water mirrors enough to be followed.
 
-    Ripples turn each ray a little.
+    Fill out_origin and out_direction with the mirrored rays. Ripples deflect each ray slightly.
     """
     index = np.empty(len(t), np.int64)
     count = 0

@@ -1,1 +1,1 @@
-"""What moves in a town: vehicles, people, lights, and the expert who drives through them."""
+"""The moving parts of a town: vehicles, people, lights, and the expert that drives through the traffic."""

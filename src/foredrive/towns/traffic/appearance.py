@@ -1,4 +1,4 @@
-"""What the renderer and the labels get to see of traffic."""
+"""Actors of traffic for the renderer and the labels."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -10,16 +10,17 @@ from foredrive.towns.traffic.strays import Stray
 from foredrive.towns.traffic.vehicles import MOTION_S, Poses, Vehicles
 
 BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
-"""Drivers have a foot on the brake when they slow down by more than the engine does, and when they stand."""
+"""Deceleration above which brake lights are on, m/s², because the engine alone slows less; and the speed
+below which a standing vehicle has them on, m/s."""
 
 
 def vehicle_actors(
     v: Vehicles, poses: Poses, around: tuple[Poses, Poses], kept: Bool[np.ndarray, "N"]
 ) -> list[ActorState]:
-    """Some vehicles.
+    """Return the actors of the vehicles in `kept`.
 
     Args:
-        around: what `motion` tells.
+        around: the result of `motion`.
     """
     before, after = around
     velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
@@ -43,7 +44,7 @@ def vehicle_actors(
 
 
 def people_actors(p: Pedestrians) -> list[ActorState]:
-    """All people on walkways and crossings."""
+    """Return the actors of all people on walkways and crossings."""
     return [
         ActorState(
             track_id=int(p.track_id[i]),
@@ -61,7 +62,7 @@ def people_actors(p: Pedestrians) -> list[ActorState]:
 
 
 def stray_actor(stray: Stray) -> ActorState:
-    """Somebody who goes where no walkway leads."""
+    """Return the actor of a stray."""
     return ActorState(
         track_id=stray.track_id,
         category=stray.category,

@@ -1,4 +1,4 @@
-"""How fast a driver wants to go: the intelligent driver model and its integration in time."""
+"""The intelligent driver model (IDM): the acceleration that a driver wants."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,9 +11,9 @@ JERK_DOWN_MPS3 = 5.0
 JERK_EMERGENCY_MPS3 = 40.0
 SOFT_STOP_S = 0.35
 CRAWL_MPS = 0.02
-"""Braking fades with the speed in `SOFT_STOP_S`; what is slower than this stands."""
+"""Time in which braking fades with the speed, s, and the speed below which a vehicle stands, m/s."""
 EMERGENCY_MPS2 = 3.5
-"""A wish to brake harder than this is followed at once, without regard to comfort."""
+"""Deceleration above which braking is applied at once, without regard to comfort, m/s²."""
 
 
 def free_acceleration(
@@ -22,11 +22,12 @@ def free_acceleration(
     accel_mps2: Float64[np.ndarray, "*n"],
     decel_mps2: Float64[np.ndarray, "*n"],
 ) -> Float64[np.ndarray, "*n"]:
-    """Acceleration on an open road, m/s².
+    """Return the acceleration on an open road, m/s².
 
-    Up to the wanted speed that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4). Above it, where
-    their model brakes without bound, the excess is taken off within `SLOWING_TIME_S`, no harder than twice
-    the comfortable deceleration: the wanted speed falls before curves and has to be kept up with.
+    Up to the wanted speed it is that of Treiber, Hennecke & Helbing (2000), a (1 - (v / v0)^4). Above it
+    their model brakes without bound. Here the excess speed is removed within `SLOWING_TIME_S`, with at most
+    twice the comfortable deceleration, because the wanted speed falls before curves and drivers have to
+    follow it.
     """
     wanted = np.maximum(wanted_mps, 0.1)
     below = accel_mps2 * (1 - (np.minimum(speed_mps, wanted) / wanted) ** EXPONENT)
@@ -44,15 +45,15 @@ def follow_acceleration(
     accel_mps2: Float64[np.ndarray, "*n"],
     decel_mps2: Float64[np.ndarray, "*n"],
 ) -> Float64[np.ndarray, "*n"]:
-    """Acceleration behind something, m/s²: the improved IDM (Treiber & Kesting 2013, eq. 11.26).
+    """Return the acceleration behind a leader, m/s²: the improved IDM (Treiber & Kesting 2013, eq. 11.26).
 
     The desired gap is s* = s0 + max(0, v T + v Δv / (2 √(a b))) (Treiber et al. 2000, eq. 3). In contrast to
-    the first model, whoever follows at the wanted speed keeps exactly this gap.
+    the first model, a vehicle that follows at the wanted speed keeps exactly this gap.
 
     Args:
-        free_mps2: what `free_acceleration` gives.
-        closing_mps: own speed minus that of what is ahead.
-        gap_m: bumper to bumper; infinite for an open road.
+        free_mps2: the result of `free_acceleration`.
+        closing_mps: own speed minus the leader's speed.
+        gap_m: gap from bumper to bumper; infinite for an open road.
     """
     dynamic = speed_mps * time_gap_s + speed_mps * closing_mps / (2 * np.sqrt(accel_mps2 * decel_mps2))
     z = (standstill_m + np.maximum(0.0, dynamic)) / np.maximum(gap_m, 0.05)

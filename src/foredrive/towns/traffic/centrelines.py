@@ -1,4 +1,4 @@
-"""The middles of lanes: without gaps, evenly sampled, how they bend, and how fast that can be driven."""
+"""Centrelines of lanes: joined without gaps, evenly sampled, with curvatures and speed profiles."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,18 +10,20 @@ from foredrive.towns.map.town_map import Lane
 SAMPLE_M = 0.5
 SMOOTHED_SAMPLES = 7
 CUBIC_SAMPLES = 9
-"""Centrelines are smoothed by cubics through this many samples (Savitzky & Golay 1964), a few centimetres."""
+"""Number of samples in the cubic smoothing of centrelines (Savitzky & Golay 1964). It moves them by a few
+centimetres."""
 LATERAL_MPS2 = 2.0
-"""Comfortable lateral acceleration in curves."""
+"""Comfortable lateral acceleration in curves, m/s²."""
 SLOWING_MPS2 = 1.5
-"""Comfortable deceleration towards a curve or a lower limit."""
+"""Comfortable deceleration before a curve or a lower limit, m/s²."""
 ASIDE_M = 0.02
 
 
 def joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
-    """Centrelines without gaps: each is led over to where the next lane begins, and from where the last ends.
+    """Return centrelines without gaps: each begins where the last lane ends and ends where the next lane
+    begins.
 
-    Where two lanes merge, that may be to the side.
+    Where two lanes merge, that point may lie to the side.
     """
     lines = [lane.centreline_xyz for lane in lanes]
     for i, lane in enumerate(lanes):
@@ -34,7 +36,7 @@ def joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray,
 def _led_over(
     line: Float64[np.ndarray, "n 3"], beginnings: list[Float64[np.ndarray, "3"]]
 ) -> Float64[np.ndarray, "_ 3"]:
-    """A line that ends in the nearest of some points."""
+    """Bend a line so that it ends in the nearest of some points."""
     aside = min((begin - line[-1] for begin in beginnings), key=np.linalg.norm, default=np.zeros(3))
     if np.linalg.norm(aside) < ASIDE_M:
         return line
@@ -45,7 +47,7 @@ def _led_over(
 
 
 def resampled(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
-    """The line evenly sampled, at most `SAMPLE_M` apart, and smoothed; its ends stay where they are."""
+    """Sample a line evenly, at most `SAMPLE_M` apart, and smooth it. Its ends do not move."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
     s = np.linspace(0.0, along[-1], count)
@@ -58,13 +60,14 @@ def resampled(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
 
 
 def headings(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "_"]:
-    """Heading of each stretch between two samples, unwrapped."""
+    """Return the heading of each segment between two samples, rad, unwrapped."""
     d = np.diff(line, axis=0)
     return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
 
 
 def bends(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    """Curvature at each sample, 1/m, over some metres: the maps' polylines have corners."""
+    """Return the curvature at each sample, 1/m, averaged over some metres because the maps' polylines have
+    corners."""
     if len(line) < 3:
         return np.zeros(len(line))
     step_m = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
@@ -76,7 +79,8 @@ def bends(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
 def speed_profile(
     bend: Float64[np.ndarray, "n"], limit_mps: Float64[np.ndarray, "n"], length_m: float
 ) -> Float64[np.ndarray, "n"]:
-    """Speed to drive at each sample: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds backwards."""
+    """Return the driving speed at each sample, m/s: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds
+    backwards."""
     step_m = length_m / (len(bend) - 1)
     square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(bend).clip(1e-6))
     to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(bend))

@@ -1,9 +1,9 @@
-"""Vehicle 0 driven from outside: what the others make of a vehicle that does as it likes.
+"""Vehicle 0 driven from outside, as the other road users see it.
 
-Where it follows a lane it is taken for one of them, with its way ahead. Besides, a shadow lies on every other
-lane that its outline is in the way of: a vehicle that drives along that lane as fast as this one does. All
-rules hold towards shadows as towards vehicles, so that nobody needs rules of his own for who stands across
-lanes, drives against them or comes out of nowhere.
+Where it follows a lane, the others treat it as a normal vehicle with its path ahead. In addition, it has a
+shadow on every other lane that its outline blocks. A shadow is a vehicle that drives along that lane as fast
+as vehicle 0 does. All rules hold for shadows as for vehicles, so no special rules are needed for a vehicle
+that stands across lanes, drives against them or appears suddenly.
 """
 
 import dataclasses
@@ -23,49 +23,52 @@ from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slo
 LANE_REACH_M = 2.5
 MOST_TURNED_RAD = np.deg2rad(60.0)
 TURNED_M = 2.0
-"""A heading that is off by one radian counts as much as so many metres to the side."""
+"""Lateral distance that counts as much as a heading error of one radian, m."""
 KNOWN_M = 0.6
-"""Lanes of the path that is known count as so much nearer,"""
+"""Bonus for lanes of the known path, m: they count as this much closer."""
 KNOWN_INSIDE_M, MOST_TURNED_INSIDE_RAD = 3.0, np.deg2rad(90.0)
-"""in junctions so much, turned by up to so much: who turns in wide is not taken to have changed his mind."""
+"""The same bonus (m) and the maximum heading error (rad) inside junctions. They are larger, so that a vehicle
+that turns in wide is not assigned another path."""
 PATH_LOOK = 4
 HALF_CORRIDOR_M = 1.3
-"""What is nearer to the middle of a lane is in the way there."""
+"""Half the width of the corridor around the middle of a lane, m. Anything inside it blocks the lane."""
 SOON_S = 1.0
-"""Outside of junctions drivers see so early that a vehicle comes into their lane,"""
+"""Time ahead, s, at which drivers see that a vehicle comes into their lane (outside of junctions)."""
 STRAYS_SOON_S = (1.0, 2.0, 3.0)
-"""and up to so early that somebody on foot or on a bicycle does."""
+"""The same for people on foot or on a bicycle, s."""
 SLOWEST_MPS = 0.5
 HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
-"""Whoever could not stop for a line even so is on its way into the junction, whatever the light shows."""
+"""Deceleration and reaction time of hard braking. A vehicle that cannot stop for a line even so is considered
+to enter the junction, whatever the light shows."""
 COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
-"""Others stand back only for somebody who comes at this speed, and will be at the line within this time,"""
+"""Minimum speed and maximum time to the line at which vehicle 0 counts as approaching. The others yield only
+to an approaching vehicle or to one that waits at the line."""
 AT_LINE_M, TURN_S, MISSED_S = 4.0, 8.0, 4.0
-"""or stands so near to it and waits his turn. He may not want to go: who has not used it for so long has to
-wait for so long before he gets another."""
+"""Maximum distance to the line at which vehicle 0 counts as waiting, m, and the length of its turn, s. It may
+not want to go: if it does not use its turn within `TURN_S`, it gets the next one only after `MISSED_S`."""
 RUN_OVER_S = 1.5
 BESIDE_M = 0.5
-"""People do not step to where a vehicle will be in this time, or this near beside it."""
+"""Time (s) and lateral margin (m) of the region around a vehicle that people do not step into."""
 
 
 @dataclass(frozen=True)
 class Driven:
-    """How vehicle 0 stands and moves now."""
+    """The present pose and motion of vehicle 0."""
 
     axle_xyz: Float64[np.ndarray, "3"]
-    """The ground point below the rear axle, world frame."""
+    """Ground point below the rear axle, world frame, m."""
     yaw_rad: float
     speed_mps: float
     turn_radps: float = 0.0
-    """Positive to the left."""
+    """Turn rate, rad/s, positive to the left."""
 
     @property
     def forward(self) -> Float64[np.ndarray, "3"]:
-        """Unit heading, seen from above."""
+        """Return the unit heading, seen from above."""
         return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad), 0.0])
 
     def later(self, seconds: float) -> "Driven":
-        """Where it will be at this speed and turn rate."""
+        """Return the pose after a time (s) at this speed and turn rate."""
         turned = self.turn_radps * seconds
         along = self.yaw_rad + 0.5 * turned
         moved = self.speed_mps * seconds * np.array([np.cos(along), np.sin(along), 0.0])
@@ -74,24 +77,26 @@ class Driven:
 
 @dataclass(frozen=True)
 class SeenDriven:
-    """What the others see of vehicle 0."""
+    """Vehicle 0 as the other road users see it."""
 
     driven: Driven
     everyone: Vehicles
-    """All vehicles, then the shadows. Vehicle 0 is on the lane it follows; not active if it follows none."""
+    """All vehicles, then the shadows. Vehicle 0 is on the lane it follows, and not active if it follows
+    none."""
     count: int
-    """Of them without the shadows."""
+    """Number of vehicles without the shadows."""
     route_passed: int
     may_ask: Bool[np.ndarray, "M"]
-    """Whose requests for right of way count: those of vehicle 0 only while it really comes."""
+    """Vehicles whose requests for right of way count. Those of vehicle 0 count only while it approaches or
+    waits at the line."""
 
     @property
     def centre_m(self) -> Float64[np.ndarray, "3"]:
-        """The middle of vehicle 0 on the ground."""
+        """Return the middle of vehicle 0 on the ground, m."""
         return self.driven.axle_xyz + self.everyone.axle_to_centre_m[0] * self.driven.forward
 
     def danger(self, xy: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Which points are where vehicle 0 is, or soon will be."""
+        """Return for each point whether vehicle 0 is there or soon will be."""
         forward, offset = self.driven.forward[:2], xy - self.centre_m[:2]
         aside = np.abs(offset @ [-forward[1], forward[0]])
         half_length, half_width = 0.5 * self.everyone.size_lwh[0, :2]
@@ -100,7 +105,10 @@ class SeenDriven:
         return np.asarray((along > -half_length) & (along < ahead) & (aside < half_width + BESIDE_M))
 
     def without_shadows(self, moved: Vehicles) -> Vehicles:
-        """The vehicles alone, once all have moved; vehicle 0 stays in its slot, wherever it is."""
+        """Return the vehicles without the shadows after all have moved.
+
+        Vehicle 0 stays in its slot, wherever it is.
+        """
         return _replaced(moved.first(self.count), active=True)
 
 
@@ -113,10 +121,10 @@ def see_driven(
     route_passed: int,
     time_s: float,
 ) -> SeenDriven:
-    """Vehicle 0 where somebody outside has driven it.
+    """Return the view of vehicle 0 at the pose to which it has been driven from outside.
 
     Args:
-        route: as in `TrafficState`; off it, vehicle 0 is taken to go on as straight as it can.
+        route: as in `TrafficState`. Off its route, vehicle 0 is assumed to go as straight as it can.
     """
     centre = driven.axle_xyz + vehicles.axle_to_centre_m[0] * driven.forward
     known = vehicles.path[0, BEHIND : BEHIND + PATH_LOOK]
@@ -144,7 +152,7 @@ def see_driven(
 
 
 def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
-    """Vehicles with other values for the first."""
+    """Return the vehicles with other values for the first one."""
     values = {}
     for name, value in changes.items():
         values[name] = getattr(vehicles, name).copy()
@@ -159,12 +167,14 @@ def find_lane(
     known: Int[np.ndarray, "k"],
     inside: Int[np.ndarray, "j"],
 ) -> tuple[int, float] | None:
-    """The lane that somebody follows, and the arc length beside him; None if he follows none.
+    """Find the lane that a vehicle follows and the arc length beside it.
+
+    Return None if it follows no lane.
 
     Args:
-        centre: his middle, on the ground.
-        known: lanes that he is likely to follow.
-        inside: those of them that are in junctions.
+        centre: the middle of the vehicle on the ground.
+        known: lanes that it is likely to follow.
+        inside: those of the known lanes that are in junctions.
     """
     samples = near.within(centre, LANE_REACH_M)
     turned = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
@@ -184,8 +194,10 @@ def find_lane(
 def _route_from(
     graph: LaneGraph, route: Int[np.ndarray, "R"], passed: int, lane: int
 ) -> tuple[int, Int[np.ndarray, "_"]]:
-    """How many stretches of its route vehicle 0 has behind it, and those from the one it is on; none if it is
-    off its route."""
+    """Return how many stretches of the route lie behind vehicle 0, and the stretches from the current one on.
+
+    The second value is empty if it is off its route.
+    """
     abreast = {lane}
     for side in graph.sides.lane:
         beside = int(side[lane])
@@ -201,7 +213,7 @@ def _route_from(
 def _path_on(
     graph: LaneGraph, path: Int[np.ndarray, "W"], lane: int, to_come: Int[np.ndarray, "R"]
 ) -> tuple[Int[np.ndarray, "W"], int]:
-    """The path of who has come to a lane, and how many lanes further on that is."""
+    """Return the path of a vehicle that has come to a lane, and the number of lanes it has advanced."""
     ahead = np.flatnonzero(path[BEHIND:] == lane)
     passed = int(ahead[0]) if len(ahead) else WINDOW
     if len(ahead):
@@ -223,7 +235,7 @@ def _path_on(
 
 
 def stray_shadows(graph: LaneGraph, near: NearLanes, strays: Sequence[Stray]) -> Vehicles:
-    """Vehicles on the lanes that strays under way are in the way of, or soon will be."""
+    """Return shadow vehicles on the lanes that moving strays block or soon will block."""
     shadows, nobodys = empty_slots(0), np.zeros(0, dtype=np.int64)
     for stray in strays:
         if stray.is_under_way:
@@ -242,7 +254,7 @@ def _shadows(
     own: Int[np.ndarray, "k"],
     soon_s: tuple[float, ...] = (SOON_S,),
 ) -> Vehicles:
-    """Vehicles on the lanes that somebody is in the way of, besides those of his own."""
+    """Return shadow vehicles on the lanes that a vehicle blocks, without its own lanes."""
     half = 0.5 * size_lwh[:2]
     rows: dict[int, tuple[float, float, float]] = {}
     times_s = (0.0, *soon_s) if driven.speed_mps > SLOWEST_MPS else (0.0,)
@@ -258,7 +270,7 @@ def _shadows(
             on_it = samples[near.lane[samples] == here]
             first, last = near.along_m[on_it[0]], near.along_m[on_it[-1]]
             mps = float(driven.speed_mps * np.cos(then.yaw_rad - near.heading[on_it[0]]))
-            if here not in rows:  # it is seen where it would be now, were it in that lane already
+            if here not in rows:  # placed where it would be now if it were in that lane already
                 rows[here] = float(first) - mps * time_s, float(last) - mps * time_s, mps
     one = empty_slots(len(rows))
     table = np.array(list(rows.values())).reshape(-1, 3)
@@ -285,8 +297,10 @@ def _is_crossed(
     yaw_rad: float,
     half: Float64[np.ndarray, "2"],
 ) -> Bool[np.ndarray, "n"]:
-    """At which samples an oriented box reaches into the lane's corridor: the line across it, clipped by the
-    box's two pairs of sides (Liang & Barsky 1984)."""
+    """Return for each sample whether an oriented box reaches into the lane's corridor.
+
+    The line across the corridor is clipped by the box's two pairs of sides (Liang & Barsky 1984).
+    """
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     R_box_world = np.array([[cos, sin], [-sin, cos]])
     at = (near.xyz[samples, :2] - centre[:2]) @ R_box_world.T
@@ -302,8 +316,10 @@ def _is_crossed(
 def _on_its_way(
     graph: LaneGraph, everyone: Vehicles, time_s: float
 ) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
-    """Grant vehicle 0 the junction that it can no longer stop for or drives through; who may ask for right of
-    way."""
+    """Grant vehicle 0 the junction that it drives through or can no longer stop for.
+
+    Also return which vehicles may request right of way.
+    """
     may_ask = np.ones(len(everyone.active), dtype=np.bool_)
     speed, path = float(everyone.speed_mps[0]), everyone.path[0]
     contested = graph.contested[path] & (path >= 0)
@@ -313,7 +329,7 @@ def _on_its_way(
         return everyone, may_ask
     gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
     comes = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
-    granted_s = float(everyone.rank[0])  # when its last turn came; 0: it has had none
+    granted_s = float(everyone.rank[0])  # time at which its last turn began; 0 if it has had none
     has_missed = granted_s > 0 and TURN_S <= time_s - granted_s < TURN_S + MISSED_S
     may_ask[0] = comes or (speed <= COMES_MPS and gap_m < AT_LINE_M and not has_missed)
     if not may_ask[0]:

@@ -1,4 +1,4 @@
-"""What drivers have ahead, how they accelerate for it, and how their vehicles move on."""
+"""Drivers: the situation ahead of them, their accelerations, and the motion of their vehicles."""
 
 import dataclasses
 from typing import NamedTuple
@@ -25,31 +25,34 @@ LINE_STANDSTILL_M = 1.0
 
 
 class Situation(NamedTuple):
-    """What N drivers have ahead of them."""
+    """The situation ahead of N drivers."""
 
     free_mps2: Float64[np.ndarray, "N"]
-    """Acceleration on an open road."""
+    """Acceleration on an open road, m/s²."""
     ahead: Ahead
     halt_mps2: Float64[np.ndarray, "N"]
-    """Acceleration towards lines and crossings alone."""
+    """Acceleration for stop lines and crossings alone, m/s²."""
 
     def wanted_mps2(self, vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
-        """The acceleration that drivers want."""
+        """Return the acceleration that the drivers want, m/s²."""
         every, ahead = np.arange(len(self.free_mps2)), self.ahead
         following = behind(vehicles, every, self.free_mps2, ahead.limiting, ahead.limiting_gap_m)
         return np.minimum(following, self.halt_mps2)
 
 
 class Choice(NamedTuple):
-    """What N drivers decide."""
+    """The decisions of N drivers."""
 
     standing: dict[str, np.ndarray]
-    """Their new `granted`, `asked_s`, `rank` and `has_stopped`."""
+    """New values of `granted`, `asked_s`, `rank` and `has_stopped`."""
     wanted_mps2: Float64[np.ndarray, "N"]
     situation: Situation
 
     def where(self, who: Bool[np.ndarray, "N"], other: "Choice") -> "Choice":
-        """For some drivers what is decided otherwise; the situation stays that of all."""
+        """Return the choice with the decisions of the drivers `who` taken from `other`.
+
+        The situation does not change.
+        """
         standing = {name: np.where(who, other.standing[name], value) for name, value in self.standing.items()}
         return Choice(standing, np.where(who, other.wanted_mps2, self.wanted_mps2), self.situation)
 
@@ -61,11 +64,11 @@ def see_ahead(
     ahead: Ahead,
     halt_gap_m: Float64[np.ndarray, "N"],
 ) -> Situation:
-    """The situation of drivers who have to halt after a distance (infinite: they need not)."""
+    """Return the situation of drivers that have to stop after a distance (infinite: they need not stop)."""
     v = vehicles
     wanted = speed_to_drive(graph, v, starts_m)
     free = free_acceleration(v.speed_mps, wanted, v.accel_mps2, v.decel_mps2)
-    # A line needs no time gap: nothing moves there.
+    # A line needs no time gap because it does not move.
     at_line = np.full(len(wanted), LINE_STANDSTILL_M)
     driver = (0.3 * v.time_gap_s, v.accel_mps2, v.decel_mps2)
     halt = follow_acceleration(free, v.speed_mps, v.speed_mps, halt_gap_m, at_line, *driver)
@@ -79,7 +82,7 @@ def behind(
     leader: Int[np.ndarray, "N"],
     gap_m: Float64[np.ndarray, "N"],
 ) -> Float64[np.ndarray, "N"]:
-    """Acceleration that drivers `who` would want behind `leader` (-1: nobody)."""
+    """Return the acceleration that the drivers `who` would want behind `leader` (-1: none), m/s²."""
     v, speed = vehicles, vehicles.speed_mps[who]
     closing = speed - np.where(leader >= 0, v.speed_mps[leader], speed)
     gap = np.where(leader >= 0, gap_m, np.inf)
@@ -89,9 +92,12 @@ def behind(
 
 
 def drive(v: Vehicles, wanted_mps2: Float64[np.ndarray, "N"], dt_s: float) -> Vehicles:
-    """Change speed as wanted, within comfortable jerk unless it is an emergency; ballistic update."""
+    """Change the speed as wanted and move by a ballistic update.
+
+    The jerk is comfortable except in an emergency.
+    """
     wanted = np.clip(wanted_mps2, -HARDEST_BRAKING_MPS2, v.accel_mps2)
-    gentle = np.maximum(wanted, -v.speed_mps / SOFT_STOP_S)  # no jolt at the end
+    gentle = np.maximum(wanted, -v.speed_mps / SOFT_STOP_S)  # no jolt at the end of a stop
     wanted = np.where(wanted < -EMERGENCY_MPS2, wanted, gentle)
     down = np.where(wanted < -EMERGENCY_MPS2, JERK_EMERGENCY_MPS3, JERK_DOWN_MPS3)
     a = np.clip(wanted, v.acceleration_mps2 - down * dt_s, v.acceleration_mps2 + JERK_UP_MPS3 * dt_s)

@@ -1,7 +1,9 @@
-"""The privileged driver: it follows a route as vehicle 0 of the traffic, and everybody reacts to it.
+"""The expert: a privileged driver that follows a route as vehicle 0 of the traffic.
+
+All others react to it.
 
 It plans its speed as all drivers do, from the exact state of the others, the lights and the curves ahead
-(car_following, right_of_way), changes lanes for its route and to pass slow vehicles (lane_changes), and
+(car_following, right_of_way). It changes lanes for its route and to pass slow vehicles (lane_changes). It
 steers so that the rear axle stays on its path.
 """
 
@@ -32,37 +34,41 @@ LONGEST_STEP_S = 0.1
 SETTLE_S = 6.0
 LONGEST_SETTLE_S = 30.0
 MOVING_MPS = 3.0
-"""A drive begins once traffic has left its first, unlikely state and the ego vehicle moves."""
+"""Conditions for the start of a drive: traffic has left its unrealistic initial state, and the ego vehicle
+moves."""
 BEYOND_M = 60.0
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The world at one time of a drive."""
+    """The state of the world at one time of a drive."""
 
     t_s: float
     T_world_ego: Float64[np.ndarray, "4 4"]
     twist_ego: Float64[np.ndarray, "6"]
     """Velocity (m/s) of the ego frame's origin, then turn rate (rad/s), in the ego axes.
 
-    In curves the velocity points to the side, as the heading is that of the chord between the axles.
+    In curves the velocity has a lateral component, because the heading is that of the chord between the
+    axles.
     """
     acceleration_ego_mps2: Float64[np.ndarray, "3"]
-    """Along the road by the engine and the brakes, to the side by the curve; gravity is not in it."""
+    """Acceleration: longitudinal from the engine and the brakes, lateral from the curve, without gravity."""
     actors: list[ActorState]
-    """All road users that move or could, but the ego vehicle."""
+    """All road users that move or could move, without the ego vehicle."""
     lights: Int[np.ndarray, "Z"]
-    """A `Light` for each of the town's stop zones."""
+    """`Light` of each of the town's stop zones."""
 
 
 class Drive:
-    """One drive of the expert in one town: a route and the moments along it; `state` is the traffic's now.
+    """One drive of the expert in one town: a route and the moments along it.
+
+    `state` is the present traffic.
 
     Args:
-        traffic: the town's traffic; its seed decides the route, too.
-        seconds: how long the drive will be, so that the route is long enough and turns within it.
-        steering_noise: standard deviation, rad, of what disturbs the steering now and then (.02 pushes the
-            vehicle some decimetres off its lane's middle); the expert steers back. 0: it drives flawlessly.
+        traffic: the town's traffic. Its seed also decides the route.
+        seconds: the duration of the drive, s, so that the route is long enough and turns within it.
+        steering_noise: standard deviation, rad, of the occasional steering disturbance (.02 pushes the
+            vehicle some decimetres off the middle of its lane). The expert steers back. 0: no disturbance.
 
     Raises:
         InputError: the noise is negative.
@@ -83,7 +89,7 @@ class Drive:
         self._rng = np.random.default_rng((traffic.seed, 4))
 
     def moments(self, count: int, dt_s: float) -> Iterator[Moment]:
-        """`count` moments of the drive, `dt_s` apart."""
+        """Yield `count` moments of the drive, `dt_s` apart."""
         steps = max(1, int(np.ceil(dt_s / LONGEST_STEP_S - 1e-9)))
         for index in range(count):
             if index:
@@ -92,14 +98,15 @@ class Drive:
             yield self._moment(index * dt_s)
 
     def step(self, dt_s: float) -> None:
-        """Drive on, for no longer than `LONGEST_STEP_S`."""
+        """Drive on for at most `LONGEST_STEP_S`."""
         self.state = self._traffic.step(self.state, dt_s)
         if self._steering_noise > 0:
             speed, wheelbase = (float(x[0]) for x in (self._ego.speed_mps, self._ego.wheelbase_m))
             self._sway = step_sway(self._sway, speed, wheelbase, self._steering_noise, dt_s, self._rng)
 
     def poses(self) -> Poses:
-        """Poses of all vehicles of `state`, with the ego vehicle where it sways to."""
+        """Return the poses of all vehicles of `state`, with the steering disturbance applied to the ego
+        vehicle."""
         poses, ego = self._traffic.poses(self.state), self._ego
         T_world_ego = _axle_pose(poses) @ _beside(self._sway)
         to_centre_ego = [float(ego.axle_to_centre_m[0]), 0.0, 0.5 * ego.size_lwh[0, 2], 1.0]
@@ -108,7 +115,7 @@ class Drive:
         return poses
 
     def commands_met(self) -> list[Command]:
-        """What was done at the forks that were passed since the drive began."""
+        """Return the commands at the forks that were passed since the drive began."""
         return self.route.commands_on(self._traffic.lanes, 0, self.state.route_passed - self._passed)
 
     @property
@@ -120,7 +127,7 @@ class Drive:
         return self.state.time_s > (SETTLE_S if moving else LONGEST_SETTLE_S)
 
     def _remaining(self) -> Route:
-        """The route from where the ego vehicle is now."""
+        """Return the route from the present position of the ego vehicle."""
         axle_m = float(self.state.vehicles.s_m[0] - self.state.vehicles.axle_to_centre_m[0])
         to_come = slice(self.state.route_passed, None)
         entered = self._planned.entered[to_come].copy()
@@ -144,7 +151,7 @@ class Drive:
         )
 
     def _twist(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
-        """How the ego frame moves, exactly 0 while it stands."""
+        """Return the motion of the ego frame, exactly 0 while it stands."""
         half_m = 0.5 * MOTION_S * float(self._ego.speed_mps[0])
         if half_m == 0:
             return np.zeros(6)
@@ -156,21 +163,21 @@ class Drive:
 
 
 def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> Route:
-    """The route of a drive, which depends on nothing else."""
+    """Plan the route of a drive. It depends on the arguments alone."""
     rng = np.random.default_rng((seed, 3))
     fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
     return draw_route(lanes, starts, rng, fastest_m, SETTLE_S, SETTLE_S + seconds)
 
 
 def _beside(sway: Sway) -> Float64[np.ndarray, "4 4"]:
-    """The ego frame in that of the path."""
+    """Return the pose of the ego frame in the frame of the path."""
     T, cos, sin = np.eye(4), np.cos(sway.yaw_rad), np.sin(sway.yaw_rad)
     T[:2, :2], T[1, 3] = [[cos, -sin], [sin, cos]], sway.aside_m
     return T
 
 
 def _axle_pose(poses: Poses) -> Float64[np.ndarray, "4 4"]:
-    """The ego frame: on the road below the rear axle, x forward along the slope."""
+    """Return the pose of the ego frame: on the road below the rear axle, x forward along the slope."""
     forward = poses.forward[0]
     left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
     T = np.eye(4)

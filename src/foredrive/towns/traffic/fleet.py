@@ -1,4 +1,5 @@
-"""Which vehicles drive: kinds with their shares, sizes and drivers, and where new ones may start."""
+"""The fleet: kinds of vehicles with their shares, sizes and drivers, and the points where new ones may
+start."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -14,13 +15,13 @@ from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slo
 LARGE_RADIUS_M = 9.0
 START_SPACING_M = 2.0
 CLEAR_OF_END_M = 8.0
-"""New vehicles start this far from the end of their lane, so that they can stop at its line."""
+"""Minimum distance of new vehicles from the end of their lane, m, so that they can stop at its line."""
 BRAKING_MPS2 = 2.0
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of vehicle; sizes and top speeds are drawn evenly from their ranges."""
+    """A kind of vehicle. Sizes and top speeds are drawn uniformly from their ranges."""
 
     category: Category
     share: float
@@ -29,12 +30,12 @@ class Kind:
     accel_mps2: float
     decel_mps2: float
     wheelbase: float = 0.6
-    """As a fraction of the length."""
+    """Wheelbase as a fraction of the length."""
     top_speed_mps: tuple[float, float] = (36.0, 44.0)
     is_large: bool = False
-    """It keeps to lanes without tight curves."""
+    """Whether it keeps to lanes without tight curves."""
     aside_m: float = 0.0
-    """How far right of the centreline it keeps."""
+    """Offset to the right of the centreline, m."""
 
 
 _HEAVY_MPS = (22.0, 24.0)
@@ -47,7 +48,7 @@ KINDS = (
     Kind(Category.BICYCLE, 0.07, (1.65, 0.55, 1.6), (1.85, 0.7, 1.8), 1.0, 1.8, 0.6, (4.5, 7.0), aside_m=0.9),
 )
 """Cars, vans, trucks, buses, motorcycles and bicycles with their riders. Accelerations are those of city
-drivers (Treiber & Kesting 2013, table 11.2 gives 1.0 and 1.5 m/s²), somewhat brisker for cars."""
+drivers (Treiber & Kesting 2013, table 11.2 gives 1.0 and 1.5 m/s²), slightly higher for cars."""
 
 
 def draw_fleet(
@@ -56,7 +57,10 @@ def draw_fleet(
     for_large: Bool[np.ndarray, "k"],
     for_bicycles: Bool[np.ndarray, "k"],
 ) -> Vehicles:
-    """k vehicles with their drivers, not yet placed; large ones and bicycles only where there may be any."""
+    """Draw k vehicles with their drivers, not yet placed.
+
+    Large ones and bicycles appear only where they are allowed.
+    """
     count = len(track_ids)
     share = np.array([kind.share for kind in KINDS])
     large = np.array([kind.is_large for kind in KINDS])
@@ -66,7 +70,7 @@ def draw_fleet(
     kinds = np.argmax(cumulated > rng.random((count, 1)) * cumulated[:, -1:], axis=1)
     low = np.array([[*kind.smallest_lwh, kind.top_speed_mps[0]] for kind in KINDS])[kinds]
     high = np.array([[*kind.largest_lwh, kind.top_speed_mps[1]] for kind in KINDS])[kinds]
-    u = np.repeat(rng.random((count, 2)), [3, 1], axis=1)  # long vehicles are wide and high
+    u = np.repeat(rng.random((count, 2)), [3, 1], axis=1)  # long vehicles are also wide and high
     drawn = low + u * (high - low)
     wheelbase = np.array([kind.wheelbase for kind in KINDS])[kinds] * drawn[:, 0]
     aside = np.array([kind.aside_m for kind in KINDS])[kinds]
@@ -93,14 +97,14 @@ def draw_fleet(
 
 
 def is_large(vehicles: Vehicles) -> Bool[np.ndarray, "N"]:
-    """Vehicles that keep to lanes without curves tighter than `LARGE_RADIUS_M`."""
+    """Return which vehicles keep to lanes without curves tighter than `LARGE_RADIUS_M`."""
     large = {kind.category for kind in KINDS if kind.is_large}
     return np.array([Category(c) in large for c in range(len(Category))])[vehicles.category]
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Points of lanes outside junctions where a vehicle may begin."""
+    """Points of lanes outside junctions where a vehicle may start."""
 
     lane: Int[np.ndarray, "K"]
     s_m: Float64[np.ndarray, "K"]
@@ -109,7 +113,7 @@ class Starts:
 
 
 def find_starts(graph: LaneGraph) -> Starts:
-    """All starts of a town, `START_SPACING_M` apart."""
+    """Find all starts of a town, `START_SPACING_M` apart."""
     lanes, along = [], []
     for lane in np.flatnonzero((graph.junction < 0) & ~graph.contested):
         s = np.arange(CLEAR_OF_END_M, graph.length_m[lane] - CLEAR_OF_END_M, START_SPACING_M)
@@ -124,9 +128,9 @@ def find_starts(graph: LaneGraph) -> Starts:
 def place(
     graph: LaneGraph, vehicles: Vehicles, lane: Int[np.ndarray, "k"], s_m: Float64[np.ndarray, "k"]
 ) -> Vehicles:
-    """Put vehicles on lanes, at the speed to drive there, but able to stop at the end of the lane.
+    """Place vehicles on lanes at the driving speed, but slow enough to stop at the end of the lane.
 
-    Of the path only the lanes behind and the current one are set.
+    Of the path only the lanes behind and the current lane are set.
     """
     path = np.full((len(lane), WINDOW), -1)
     path[:, BEHIND] = lane
@@ -139,7 +143,7 @@ def place(
 
 
 def ego_vehicle(graph: LaneGraph, lane: Int[np.ndarray, "1"], s_m: Float64[np.ndarray, "1"]) -> Vehicles:
-    """The recording vehicle with a calm driver, on a lane."""
+    """Return the recording vehicle with a calm driver, on a lane."""
     driver = dataclasses.replace(
         empty_slots(1),
         active=np.array([True]),

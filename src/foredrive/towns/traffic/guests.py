@@ -1,4 +1,4 @@
-"""Vehicles that somebody puts on the road for a purpose."""
+"""Guests: vehicles that a caller places on the road for a purpose."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from foredrive.towns.traffic.vehicles import AHEAD, BEHIND
 
 CANDIDATES = 16
 ACCELERATION_MPS2, TIME_GAP_S, HASTE = 3.0, 1.0, 1.1
-"""They can be where they are wanted in time."""
+"""Values of a guest's driver, so that it reaches a wanted place in time."""
 CLEAR_M = 7.0
 
 
 def point_on(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[int, float]:
-    """Which of some lanes in a row a way leads to, and the arc length on that."""
+    """Return the index of the lane at a distance along a row of lanes, and the arc length on it, m."""
     starts_m = np.append(0.0, np.cumsum(graph.length_m[list(lanes)]))
     at = min(max(int(np.searchsorted(starts_m, along_m, side="right")) - 1, 0), len(lanes) - 1)
     return at, along_m - float(starts_m[at])
@@ -30,7 +30,7 @@ def point_on(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[in
 def points_on(
     graph: LaneGraph, lanes: Sequence[int], along_m: Float64[np.ndarray, "n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Points along some lanes in a row."""
+    """Return points at distances along a row of lanes."""
     at = [point_on(graph, lanes, m) for m in along_m.tolist()]
     return graph.position(np.array([lanes[k] for k, _ in at]), np.array([s for _, s in at]))
 
@@ -38,7 +38,7 @@ def points_on(
 def invited(
     traffic: Traffic, state: TrafficState, slot: int, lanes: Sequence[int], along_m: float, speed_mps: float
 ) -> TrafficState:
-    """With a car in a slot, so far along some lanes in a row, which it will follow."""
+    """Return the state with a car in a slot, at a distance along a row of lanes that it will follow."""
     graph = traffic.lanes
     rng = np.random.default_rng((traffic.seed, 3, state.step_index, slot))
     no = np.zeros(CANDIDATES, dtype=np.bool_)
@@ -67,10 +67,10 @@ def invited(
 def cleared(
     traffic: Traffic, state: TrafficState, xyz: Float64[np.ndarray, "n 3"], seen_within_m: float
 ) -> TrafficState | None:
-    """Without the vehicles near some points; None if one of them could be seen to vanish.
+    """Return the state without the vehicles near some points; None if one of them could be seen to vanish.
 
     Args:
-        seen_within_m: how near to vehicle 0 things are seen.
+        seen_within_m: the distance from vehicle 0 within which things are visible, m.
     """
     v, centre = state.vehicles, traffic.poses(state).centre_m
     near = (np.linalg.norm(centre[:, None] - xyz, axis=2) < CLEAR_M).any(axis=1) & v.active
@@ -80,8 +80,7 @@ def cleared(
 
 
 def granted_through(traffic: Traffic, state: TrafficState, slot: int, lane: int) -> TrafficState:
-    """With right of way, before everybody else, for a vehicle up to a lane of its path and out of that
-    junction."""
+    """Grant a vehicle right of way before all others, up to a lane of its path and out of that junction."""
     v, graph = state.vehicles, traffic.lanes
     ahead = v.path[slot, BEHIND:]
     if lane not in ahead:

@@ -1,4 +1,4 @@
-"""Lane changes: who wants one and may have it, by MOBIL (Kesting, Treiber & Helbing 2007), and its begin."""
+"""Lane changes: incentive and safety by MOBIL (Kesting, Treiber & Helbing 2007), and their start."""
 
 import dataclasses
 from typing import NamedTuple, no_type_check
@@ -18,45 +18,51 @@ POLITENESS = 0.3
 THRESHOLD_MPS2 = 0.2
 SAFE_BRAKING_MPS2 = 3.0
 KEEP_RIGHT_MPS2 = 0.3
-"""On motorways, for the right lane and against the left."""
+"""Bias on motorways for the right lane and against the left lane, m/s²."""
 CHANGE_S = 3.5
 SHORTEST_CHANGE_M = 16.0
 STOPPING_MPS2 = 2.5
-"""Whoever need not change does so only where there is room to stop this gently after it."""
+"""Deceleration of a gentle stop, m/s². A vehicle that need not change lanes does so only where there is room
+for such a stop afterwards."""
 NEAREST_M = 2.0
 COURTEOUS_MPS2, COURTEOUS_TO_STANDING_MPS2 = 1.5, 3.0
-"""Drivers brake no harder than this to let somebody in who has to change lanes: who stands there would
-have to wait for ever for one who is slow."""
+"""Maximum deceleration, m/s², to let in a vehicle that has to change lanes: if that vehicle moves, and if it
+stands. A standing vehicle would otherwise have to wait for ever."""
 STANDS_MPS = 0.5
 COURTEOUS_GAP_M = 1.0
-"""And leave this much more room than they would behind somebody in their lane."""
+"""Additional gap to the vehicle that is let in, m, compared with the gap to a leader in the driver's own
+lane."""
 SETTLED_M = 60.0
-"""Drivers stay in a lane for this long before they change again, unless they have to."""
+"""Minimum distance between two lane changes, m, unless a vehicle has to change."""
 LONGEST_STRETCH_M = 600.0
 URGENT_S = 12.0
-"""Whoever has to leave a lane wants to do it this long before its end, or `SETTLED_M` before."""
+"""Time before the end of a lane, in addition to `SETTLED_M`, at which a vehicle that has to leave it wants to
+do so, s."""
 HAS_TO_MPS2 = 4.0
 LIKES_TO_MPS2 = 0.5
-"""What it is worth to be in the lane of one's route, towards its end and far from it."""
+"""Value of being in the lane of the route, m/s²: towards the lane's end, and far from it."""
 FLAT_M = 0.3
-"""Lanes further apart in height are not side by side."""
+"""Height difference above which lanes are not side by side, m."""
 TIGHTEST_M = 30.0
-"""Nobody changes lanes where one of them has a curve of a smaller radius: they are not equally long there."""
+"""Smallest radius of the two lanes of a lane change, m. In tighter curves neighbouring lanes differ in
+length."""
 
 
 class Stretches(NamedTuple):
-    """For the left and the right side of L lanes, how far one may change to the neighbour."""
+    """For the left and the right side of L lanes, the distance in which a lane change is possible."""
 
     target: Int[np.ndarray, "2 L"]
-    """The neighbour, -1 if one may not change."""
+    """Neighbour; -1 if a change is not possible."""
     room_m: Float64[np.ndarray, "2 L"]
-    """From the start of the lane to where one may no longer, over the ends of lanes; 0 if one may not."""
+    """Distance from the start of the lane to the last possible change, m, across the ends of lanes; 0 if none
+    is possible."""
     goes_back: Bool[np.ndarray, "2 L"]
-    """Whether both lanes side by side begin where two others side by side end."""
+    """Whether the two lanes continue two other lanes that lie side by side."""
 
 
 class Gaps(NamedTuple):
-    """Whom N vehicles would have ahead and behind in another lane (-1: nobody), and the gaps to them, m."""
+    """The vehicles ahead and behind that N vehicles would have in another lane (-1 for none), and the gaps,
+    m."""
 
     leader: Int[np.ndarray, "N"]
     leader_gap_m: Float64[np.ndarray, "N"]
@@ -65,8 +71,11 @@ class Gaps(NamedTuple):
 
 
 def find_stretches(graph: LaneGraph) -> Stretches:
-    """Where lanes may be changed: outside of junctions and tight curves, over lines that may be crossed, with
-    room to wait."""
+    """Find where lane changes are possible.
+
+    They are possible outside of junctions and tight curves, over lines that may be crossed, with room to
+    wait.
+    """
     sides = graph.sides.lane
     level = np.abs(graph.xyz[graph.first, 2] - graph.xyz[graph.first[sides], 2]) < FLAT_M
     possible = ~graph.contested & (graph.tightest_m >= TIGHTEST_M)
@@ -93,7 +102,8 @@ def find_stretches(graph: LaneGraph) -> Stretches:
 
 
 def change_length_m(vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
-    """Length of a lane change: `CHANGE_S` at the present speed, but as long as steering can be gentle."""
+    """Return the length of a lane change, m: `CHANGE_S` at the present speed, but at least
+    `SHORTEST_CHANGE_M` so that steering stays gentle."""
     return np.maximum(CHANGE_S * vehicles.speed_mps, SHORTEST_CHANGE_M)
 
 
@@ -104,7 +114,10 @@ def who_may_change(
     fits: Bool[np.ndarray, "N L"],
     has_to: Bool[np.ndarray, "2 N"],
 ) -> Bool[np.ndarray, "2 N"]:
-    """Who may change to the left, to the right, as far as the road goes; `fits` are the lanes for each."""
+    """Return which vehicles may change to the left and to the right, judged by the road alone.
+
+    `fits` states which lanes each vehicle can use.
+    """
     v, lane = vehicles, vehicles.lane
     need = change_length_m(v) + v.wheelbase_m + v.axle_to_centre_m
     stops = v.speed_mps**2 / (2 * STOPPING_MPS2)
@@ -127,7 +140,10 @@ def find_gaps(
     target: Int[np.ndarray, "N"],
     side: int,
 ) -> Gaps:
-    """Ahead and behind in the lanes `target` (-1: not asked for); what overlaps has a negative gap."""
+    """Find the vehicles ahead and behind in the lanes `target` (-1: not requested).
+
+    Overlapping vehicles have a negative gap.
+    """
     lanes = (graph.length_m, graph.sides, graph.successors)
     return Gaps(*_find_gaps(motion_of(vehicles, starts_m), lanes, target, side))
 
@@ -176,7 +192,8 @@ def _find_gaps(motion, lanes, target, side):
                     over = k > BEHIND and -front_j > motion.to_clear_m[j]
                     if over or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
                         continue
-                    # From its rear, as above: else nobody would be ahead of it or behind in a curve.
+                    # Measured from its rear, as above. Otherwise in a curve no vehicle would be ahead of it
+                    # or behind it.
                     length_j = front[j] - rear[j]
                     front_j = abreast(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
                 is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
@@ -189,10 +206,11 @@ def _find_gaps(motion, lanes, target, side):
 def incentive(
     vehicles: Vehicles, now: Situation, gaps: Gaps, free_mps2: Float64[np.ndarray, "N"]
 ) -> Float64[np.ndarray, "N"]:
-    """MOBIL: what N drivers and, by politeness, those behind them would gain, m/s²; -inf where it is unsafe.
+    """Return the MOBIL gain, m/s², of N vehicles and, weighted by politeness, of their followers; -inf where
+    unsafe.
 
-    ã_c - a_c + p (ã_n - a_n + ã_o - a_o), Kesting et al. (2007), eq. 2 and 3: c changes, n and o follow in
-    the new and the old lane.
+    ã_c - a_c + p (ã_n - a_n + ã_o - a_o), Kesting et al. (2007), eq. 2 and 3. Vehicle c changes lanes; n and
+    o follow in the new and the old lane.
 
     Args:
         free_mps2: acceleration on an open road in the new lane.
@@ -212,7 +230,7 @@ def incentive(
 
 
 def _followers(ahead: Ahead) -> Int[np.ndarray, "N"]:
-    """Who follows each vehicle nearest, -1 for nobody."""
+    """Return the nearest follower of each vehicle, -1 for none."""
     follower = np.full(len(ahead.leader), -1)
     led = np.flatnonzero(ahead.leader >= 0)
     led = led[np.argsort(-ahead.leader_gap_m[led], kind="stable")]  # the nearest is written last
@@ -223,9 +241,10 @@ def _followers(ahead: Ahead) -> Int[np.ndarray, "N"]:
 def room_to_change_m(
     graph: LaneGraph, stretches: Stretches, vehicles: Vehicles, lane: int
 ) -> tuple[int, float] | None:
-    """To which side vehicle 0 has to go to be in `lane`, and how far it can drive before it has to begin.
+    """Return the side to which vehicle 0 has to go to reach `lane`, and the distance in which it has to
+    begin, m.
 
-    None: it is there, or there is no way.
+    Return None if it is in that lane already or cannot reach it.
     """
     here = int(vehicles.lane[0])
     for side in (LEFT, RIGHT):
@@ -246,13 +265,13 @@ def choose_change(
     may: Bool[np.ndarray, "2 N"],
     urge_mps2: Float64[np.ndarray, "2 N"],
 ) -> tuple[int, int] | None:
-    """The vehicle that gains most by a lane change, and to which side; None if nobody gains enough.
+    """Return the vehicle that gains most from a lane change, and the side; None if no gain is large enough.
 
-    One at a time: no two drivers take the same gap.
+    Only one vehicle changes at a time, so that no two vehicles take the same gap.
 
     Args:
-        may: who may change to the left, to the right.
-        urge_mps2: what it is worth to them beside acceleration.
+        may: which vehicles may change to the left and to the right.
+        urge_mps2: the value of the change to them, in addition to acceleration.
     """
     if not may.any():
         return None
@@ -286,8 +305,12 @@ def let_in(
     target: Int[np.ndarray, "N"],
     side: int,
 ) -> Float64[np.ndarray, "N"]:
-    """Accelerations that N drivers do not exceed, so that those who have to change to the lanes `target` (-1:
-    they need not) find a gap; infinite for all but the ones behind those gaps."""
+    """Return upper limits of N accelerations that open gaps for vehicles that have to change to the lanes
+    `target`.
+
+    A `target` of -1 means that the vehicle need not change. The limit is infinite for all vehicles except
+    those behind the gaps.
+    """
     limit = np.full(len(target), np.inf)
     gaps = find_gaps(graph, vehicles, starts_m, target, side)
     who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= NEAREST_M))
@@ -299,9 +322,9 @@ def let_in(
 
 
 def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> Vehicles:
-    """The path moves to the neighbour at once; the vehicle follows.
+    """Begin a lane change: move the path to the neighbour at once; the vehicle follows gradually.
 
-    It stays beside the old path for as long as there are lanes; those beyond are not known yet.
+    The new path stays beside the old one as long as there are such lanes. The lanes beyond are not known yet.
     """
     v, row = vehicles, np.array([who])
     old, path = v.path[who], np.full(WINDOW, -1)

@@ -1,4 +1,5 @@
-"""A town's lanes as flat arrays: geometry by arc length, neighbours, where paths meet, what guards them."""
+"""A town's lanes as flat arrays: geometry by arc length, neighbours, places where paths meet, and
+controls."""
 
 import dataclasses
 import enum
@@ -17,12 +18,13 @@ from foredrive.towns.traffic.meetings import Meetings, find_meetings
 
 TURN_RAD = np.deg2rad(30.0)
 CITY_SPEED_MPS = 13.9
-"""The towns' files give most city streets the 55 mph of their OpenDRIVE road type; traffic there keeps to
-50 km/h. Lanes whose limit is above `MOTORWAY_LIMIT_MPS` are driven as posted."""
+"""Maximum speed in the city, m/s. The towns' files give most city streets the 55 mph of their OpenDRIVE road
+type; traffic there drives at most 50 km/h. Lanes with a limit above `MOTORWAY_LIMIT_MPS` are driven as
+posted."""
 MOTORWAY_LIMIT_MPS = 26.0
 BEFORE_LIGHT_M = 40.0
-"""From here to a light traffic keeps to `CITY_SPEED_MPS`: whoever comes faster can neither stop for it nor
-pass it while it is yellow."""
+"""Distance before a light in which traffic drives at most `CITY_SPEED_MPS`, m. A faster vehicle could neither
+stop for the light nor pass it while it is yellow."""
 WAITING_ROOM_M = 12.0
 NARROWEST_M = 2.8
 CROSSABLE = (
@@ -31,11 +33,11 @@ CROSSABLE = (
     MarkingKind.BROKEN_BROKEN,
     MarkingKind.BROKEN_SOLID,
 )
-"""Lines between lanes of one direction that may be crossed from the lane that they are seen from."""
+"""Lines between lanes of one direction that may be crossed, as seen from the lane."""
 
 
 class Control(enum.IntEnum):
-    """What a driver meets at the start of a lane."""
+    """The control at the start of a lane."""
 
     NONE = 0
     LIGHT = 1
@@ -51,12 +53,12 @@ CONTROL_OF_ZONE = {
 
 
 class Sides(NamedTuple):
-    """Left and right neighbours as kernels take them."""
+    """Left and right neighbours, as arguments of compiled functions."""
 
     lane: Int[np.ndarray, "2 L"]
-    """-1 for none."""
+    """Neighbour, -1 for none."""
     abreast_m: Float64[np.ndarray, "2 P"]
-    """Arc length on the neighbour of the point next to each sample of a lane."""
+    """Arc length on the neighbour of the point beside each sample of a lane, m."""
     first: Int[np.ndarray, "L"]
     sample_count: Int[np.ndarray, "L"]
     step_m: Float64[np.ndarray, "L"]
@@ -64,65 +66,68 @@ class Sides(NamedTuple):
 
 @dataclass(frozen=True)
 class LaneGraph:
-    """L lanes. Centrelines are resampled evenly, at most `SAMPLE_M` apart, and laid end to end in `xyz`."""
+    """L lanes. Centrelines are sampled evenly, at most `SAMPLE_M` apart, and stored end to end in `xyz`."""
 
     ids: tuple[str, ...]
-    """The map's; a way through a junction that the map has in pieces is one lane here, named by its first."""
+    """Lane ids of the map. Where the map cuts a path through a junction into pieces, it is one lane here,
+    with the id of the first piece."""
     xyz: Float64[np.ndarray, "P 3"]
     speed_mps: Float64[np.ndarray, "P"]
-    """Speed to drive: the limit and comfort in curves, slowing in time for what comes within the lane."""
+    """Driving speed, m/s: the minimum of the limit and of comfort in curves, reduced in time for later parts
+    of the lane."""
     first: Int[np.ndarray, "L"]
     count: Int[np.ndarray, "L"]
     step_m: Float64[np.ndarray, "L"]
     length_m: Float64[np.ndarray, "L"]
     limit_mps: Float64[np.ndarray, "L"]
-    """What traffic takes the limit to be (see `CITY_SPEED_MPS`)."""
+    """Speed limit that traffic obeys, m/s (see `CITY_SPEED_MPS`)."""
     width_m: Float64[np.ndarray, "L"]
     tightest_m: Float64[np.ndarray, "L"]
-    """Smallest radius of the centreline."""
+    """Smallest radius of the centreline, m."""
     turn_rad: Float64[np.ndarray, "L"]
-    """How far the heading turns over the lane, positive to the left."""
+    """Change of the heading over the lane, rad, positive to the left."""
     successors: Int[np.ndarray, "L S"]
-    """Padded with -1."""
+    """Successors, padded with -1."""
     successor_count: Int[np.ndarray, "L"]
     predecessors: Int[np.ndarray, "L Q"]
     left: Int[np.ndarray, "L"]
-    """Neighbour of the same direction, -1 for none; `right` likewise."""
+    """Left neighbour of the same direction, -1 for none; `right` likewise."""
     right: Int[np.ndarray, "L"]
     sides: Sides
     may_cross: Bool[np.ndarray, "2 L"]
-    """Whether one may change to the left, to the right neighbour: not over solid lines, not in junctions."""
+    """Whether a vehicle may change to the left and the right neighbour: not over solid lines, not in
+    junctions."""
     junction: Int[np.ndarray, "L"]
-    """-1 outside junctions."""
+    """Junction id, -1 outside junctions."""
     control: Int[np.ndarray, "L"]
-    """A `Control`, met at the start of the lane."""
+    """`Control` at the start of the lane."""
     zone: Int[np.ndarray, "L"]
     """Index of the stop zone that guards the lane, -1 for none."""
     siblings: Meetings
-    """Lanes that part from a common start: the car ahead stays ahead until it is clear."""
+    """Lanes that part from a common start. A vehicle ahead on a sibling stays a leader until it is clear."""
     conflicts: Meetings
-    """Lanes that cross or merge: only one at a time."""
+    """Lanes that cross or merge. Only one vehicle at a time may use such a place."""
 
     contested: Bool[np.ndarray, "L"]
-    """Lanes that may be entered only by right of way: those that others cross, and those before them that
-    leave no room to wait."""
+    """Lanes that may be entered only with right of way: lanes that others cross, and the lanes before them
+    that leave no room to wait."""
 
     def position(
         self, lane: Int[np.ndarray, "*n"], s_m: Float64[np.ndarray, "*n"]
     ) -> Float64[np.ndarray, "*n 3"]:
-        """Points on centrelines by arc length, clamped to the lane."""
+        """Return points on centrelines at given arc lengths, clamped to the lane."""
         i, fraction = self._sample(lane, s_m)
         a = self.xyz[i]
         return a + fraction[..., None] * (self.xyz[i + 1] - a)
 
     def speed(self, lane: Int[np.ndarray, "*n"], s_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-        """Speed to drive at points of lanes."""
+        """Return the driving speed at points of lanes, m/s."""
         i, fraction = self._sample(lane, s_m)
         a = self.speed_mps[i]
         return a + fraction * (self.speed_mps[i + 1] - a)
 
     def samples(self, lane: int) -> Float64[np.ndarray, "n 3"]:
-        """The centreline of one lane."""
+        """Return the centreline of one lane."""
         return self.xyz[self.first[lane] : self.first[lane] + self.count[lane]]
 
     def _sample(self, lane: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,7 +136,7 @@ class LaneGraph:
         return self.first[lane] + i, steps - i
 
     def command(self, lane: int) -> Command:
-        """Which way traffic turns on a lane: by its change of heading, within junctions only."""
+        """Return the command of a lane by its change of heading, STRAIGHT outside junctions."""
         if self.junction[lane] < 0 or abs(self.turn_rad[lane]) < TURN_RAD:
             return Command.STRAIGHT
         return Command.LEFT if self.turn_rad[lane] > 0 else Command.RIGHT
@@ -139,7 +144,7 @@ class LaneGraph:
 
 @lru_cache(maxsize=1)  # several drives in a row are often in one town
 def build_lane_graph(town: TownMap) -> LaneGraph:
-    """Lane graph of a town."""
+    """Build the lane graph of a town."""
     lanes, index = _whole_connectors(town.lanes)
     lines = [resampled(line) for line in joined(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
@@ -191,9 +196,10 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
 
 
 def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, int]]:
-    """Lanes, with the pieces of each way through a junction put together; the index of every original lane.
+    """Join the pieces of each path through a junction into one lane.
 
-    Maps cut lanes where the cross-section of the road changes. What crosses a lane would be cut as well.
+    Also return the new index of every original lane. Maps cut lanes where the cross-section of the road
+    changes; the places where other lanes cross would be cut as well.
     """
     by_id = {lane.lane_id: lane for lane in lanes}
 
@@ -226,7 +232,7 @@ def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
 
 
 def _chained(lines: list[Float64[np.ndarray, "_ 3"]]) -> Float64[np.ndarray, "_ 3"]:
-    """Lines that continue each other as one."""
+    """Join lines that continue each other into one."""
     return np.concatenate([lines[0]] + [line[1:] for line in lines[1:]])
 
 
@@ -237,9 +243,10 @@ def _contested(
     predecessors: list[list[int]],
     junction: Int[np.ndarray, "L"],
 ) -> Bool[np.ndarray, "L"]:
-    """Extend lanes that are crossed back to where a vehicle can wait with its tail out of the junction."""
+    """Extend the crossed lanes back to a point where a vehicle can wait with its rear outside the
+    junction."""
     contested = crossed.copy()
-    room_m = np.full(len(length_m), WAITING_ROOM_M)  # taken back step by step
+    room_m = np.full(len(length_m), WAITING_ROOM_M)  # reduced step by step
     changed = True
     while changed:
         changed = False
@@ -263,7 +270,8 @@ def _limit(posted_mps: float | None) -> float:
 def _to_light_m(
     has_light: Bool[np.ndarray, "L"], length_m: Float64[np.ndarray, "L"], successors: list[list[int]]
 ) -> Float64[np.ndarray, "L"]:
-    """How far it is from the end of each lane to the next light, as far as `BEFORE_LIGHT_M`."""
+    """Return the distance from the end of each lane to the next light, m; infinite beyond
+    `BEFORE_LIGHT_M`."""
     to_light = np.full(len(length_m), np.inf)
     changed = True
     while changed:
@@ -279,7 +287,7 @@ def _to_light_m(
 def _limits(
     limit_mps: float, length_m: float, line: Float64[np.ndarray, "n 3"], to_light_m: float
 ) -> Float64[np.ndarray, "n"]:
-    """The limit at each sample of a lane."""
+    """Return the speed limit at each sample of a lane, m/s."""
     before_light = to_light_m + np.linspace(length_m, 0.0, len(line)) < BEFORE_LIGHT_M
     return np.where(before_light, min(limit_mps, CITY_SPEED_MPS), limit_mps)
 
@@ -309,7 +317,8 @@ def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m:
 
 
 def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
-    """Whether there is a full lane to the left, to the right of each, and the line between may be crossed."""
+    """Return whether each lane has a full lane to the left and to the right, with a line that may be
+    crossed."""
     starts = {lane.lane_id: (lane.centreline_xyz[0], lane.centreline_xyz[-1]) for lane in lanes}
 
     def is_open(lane: Lane, beside: str | None, marking: MarkingKind) -> bool:
@@ -317,7 +326,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
         if ends is None or marking not in CROSSABLE:
             return False
         gaps = [np.linalg.norm(lane.centreline_xyz[i] - end) for i, end in zip((0, -1), ends, strict=True)]
-        return bool(min(gaps) > NARROWEST_M)  # lanes that begin or end grow from nothing
+        return bool(min(gaps) > NARROWEST_M)  # lanes that begin or end there grow from zero width
 
     return np.array(
         [
@@ -328,7 +337,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
 
 
 def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:
-    """Lanes from which one can drive on for ever without a curve tighter than this."""
+    """Return the lanes from which a vehicle can drive on for ever without a curve tighter than a radius."""
     kept = graph.tightest_m >= min_radius_m
     while True:
         onward = (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)

@@ -1,4 +1,4 @@
-"""Who is ahead: the vehicles on each lane, and the nearest one on a vehicle's path."""
+"""Leaders: the vehicles on each lane, and the nearest vehicle ahead on each path."""
 
 from typing import NamedTuple, no_type_check
 
@@ -15,18 +15,23 @@ STANDSTILL_M = 2.0
 
 
 class Ahead(NamedTuple):
-    """What N vehicles have ahead of them on their paths: indices (-1: nobody), and gaps bumper to bumper."""
+    """The vehicles ahead of N vehicles on their paths: indices (-1 for none) and gaps from bumper to
+    bumper."""
 
     leader: Int[np.ndarray, "N"]
-    """The nearest one."""
+    """Nearest vehicle ahead."""
     leader_gap_m: Float64[np.ndarray, "N"]
     limiting: Int[np.ndarray, "N"]
-    """The one that makes a driver brake most: during a lane change that may be one further away."""
+    """Vehicle ahead that requires the hardest braking. During a lane change it may be further away than the
+    nearest one."""
     limiting_gap_m: Float64[np.ndarray, "N"]
 
 
 class Motion(NamedTuple):
-    """Where N vehicles are on their paths, as kernels take it; arc lengths as in `Vehicles`."""
+    """Positions of N vehicles on their paths, as arguments of compiled functions.
+
+    Arc lengths are as in `Vehicles`.
+    """
 
     active: Bool[np.ndarray, "N"]
     path: Int[np.ndarray, "N W"]
@@ -41,8 +46,8 @@ class Motion(NamedTuple):
 class Occupants(NamedTuple):
     """Linked lists of the vehicles on each lane: head[lane], then following[entry], until -1.
 
-    An entry is of vehicle who[entry], on column where[entry] of its path or, while it changes lanes, beside
-    that. Its rear is at rear_m[entry] on the lane.
+    An entry belongs to vehicle who[entry]. The lane is column where[entry] of its path or, while it changes
+    lanes, the lane beside that column. The rear of the vehicle is at rear_m[entry] on the lane.
     """
 
     head: Int[np.ndarray, "L"]
@@ -55,7 +60,7 @@ class Occupants(NamedTuple):
 
 
 def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motion:
-    """What kernels need to know of vehicles."""
+    """Return the motion of vehicles as arguments of compiled functions."""
     return Motion(
         active=vehicles.active,
         path=vehicles.path,
@@ -69,10 +74,11 @@ def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motio
 
 
 def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Ahead:
-    """Who is ahead on each path.
+    """Find the vehicle ahead on each path.
 
-    Vehicles that have just turned off onto a sibling lane count for as long as they are in the way. Those
-    that change lanes are on both, and keep behind what they would reach before they have left the old one.
+    Vehicles that have just turned off onto a sibling lane count as long as they block the path. A vehicle
+    that changes lanes is on both lanes. It also keeps its distance to vehicles on the old lane that it would
+    reach before it has left that lane.
     """
     driver = (vehicles.time_gap_s, 2 * np.sqrt(vehicles.accel_mps2 * vehicles.decel_mps2))
     motion = motion_of(vehicles, starts_m)
@@ -82,8 +88,8 @@ def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndar
 @numba.njit(cache=True)
 @no_type_check
 def link_occupants(motion, length, sides, granted):
-    """Who is on which lane; vehicle i also counts on the next granted[i] lanes of its path."""
-    size = 3 * len(motion.active) * WINDOW  # every lane may be granted once more, or straddled
+    """Link the vehicles on each lane. Vehicle i also counts on the next granted[i] lanes of its path."""
+    size = 3 * len(motion.active) * WINDOW  # each lane may count once more, by a grant or by a lane change
     following, who, where = np.empty((3, size), np.int64)
     head, used = np.full(len(length), -1), np.zeros(1, np.int64)
     occupants = Occupants(head, following, who, where, np.empty(size), used)
@@ -107,14 +113,15 @@ def link_occupants(motion, length, sides, granted):
 @numba.njit(cache=True)
 @no_type_check
 def lane_beside(lane, beside, sides):
-    """The neighbour to the left (beside 1) or the right (-1); -1: there is none, or none is asked for."""
+    """Return the left (beside 1) or the right neighbour (-1) of a lane; -1 if there is none or beside is
+    0."""
     return -1 if beside == 0 else sides.lane[0 if beside > 0 else 1, lane]
 
 
 @numba.njit(cache=True)
 @no_type_check
 def abreast(lane, s, beside, sides):
-    """Arc length on the neighbour of the point next to one on a lane; straight on beyond its ends."""
+    """Return the arc length on the neighbour of the point beside `s`, continued straight beyond the ends."""
     side = 0 if beside > 0 else 1
     steps = s / sides.step_m[lane]
     i = min(max(int(steps), 0), sides.sample_count[lane] - 2)
@@ -125,7 +132,7 @@ def abreast(lane, s, beside, sides):
 @numba.njit(cache=True)
 @no_type_check
 def add_occupant(occupants, lane, vehicle, column, rear_m):
-    """Note that a vehicle is on a lane, which is on one column of its path or beside it."""
+    """Add a vehicle to a lane, which is a column of the vehicle's path or beside it."""
     entry = occupants.used[0]
     occupants.who[entry], occupants.where[entry] = vehicle, column
     occupants.rear_m[entry] = rear_m
@@ -180,7 +187,10 @@ def _find_leaders(motion, driver, length, sides, siblings):
 @numba.njit(cache=True)
 @no_type_check
 def _desired_gap_m(i, j, speed_mps, driver):
-    """The gap that vehicle i wants to j, as in `car_following`; the less it has of it, the more it brakes."""
+    """Return the gap that vehicle i wants to j, as in `car_following`.
+
+    The smaller the present gap is in comparison, the harder i brakes.
+    """
     time_gap_s, braking_mps2 = driver
     closing = speed_mps[i] - speed_mps[j]
     return STANDSTILL_M + max(0.0, speed_mps[i] * (time_gap_s[i] + closing / braking_mps2[i]))

@@ -1,4 +1,4 @@
-"""Traffic lights with fixed cycles: what shows at a lane is a function of time alone."""
+"""Traffic lights with fixed cycles. Their state is a function of time alone."""
 
 import enum
 from dataclasses import dataclass
@@ -13,11 +13,12 @@ YELLOW_S = 4.0
 ALL_RED_S = 1.0
 PHASE_S = GREEN_S + YELLOW_S + ALL_RED_S
 SAME_AXIS_COS = 0.7
-"""Approaches within 45 degrees of one axis, from either end, have green together."""
+"""Cosine of the maximum angle between approaches with a common green phase: 45 degrees to one axis, from
+either end."""
 
 
 class Light(enum.IntEnum):
-    """What a light shows."""
+    """The state of a light."""
 
     NONE = 0
     RED = 1
@@ -27,14 +28,14 @@ class Light(enum.IntEnum):
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """For each lane that a light guards: when in the cycle of its junction it is green."""
+    """For each lane that a light guards, the green time in the cycle of its junction."""
 
     guarded: Bool[np.ndarray, "L"]
     green_from_s: Float64[np.ndarray, "L"]
     cycle_s: Float64[np.ndarray, "L"]
 
     def shows(self, time_s: float) -> Int[np.ndarray, "L"]:
-        """The `Light` at the start of each lane."""
+        """Return the `Light` at the start of each lane."""
         into_s = (time_s - self.green_from_s) % self.cycle_s
         light = np.where(
             into_s < GREEN_S, Light.GREEN, np.where(into_s < GREEN_S + YELLOW_S, Light.YELLOW, Light.RED)
@@ -43,7 +44,7 @@ class SignalPlan:
 
 
 def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:
-    """One phase per axis of a junction, in turn; junctions start at random points of their cycles."""
+    """Plan one phase per axis of a junction, in turn. Each junction starts at a random point of its cycle."""
     guarded = graph.control == Control.LIGHT
     green_from_s = np.zeros(len(guarded))
     cycle_s = np.full(len(guarded), PHASE_S)
@@ -58,7 +59,7 @@ def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:
             if not along:
                 axes.append(angle)
             phase[k] = along[0] if along else len(axes) - 1
-        # A junction with one axis shows red for as long as a second one would have green.
+        # A junction with one axis shows red for as long as a second axis would have green.
         cycle_s[lanes] = PHASE_S * max(2, len(axes))
         green_from_s[lanes] = phase * PHASE_S + rng.uniform(0, cycle_s[lanes[0]])
     return SignalPlan(guarded, green_from_s, cycle_s)

@@ -1,4 +1,4 @@
-"""Where the traffic of two lanes meets: lanes that part from a common start, cross, or merge."""
+"""Meetings of two lanes: lanes that part from a common start, cross, or merge."""
 
 from typing import NamedTuple
 
@@ -7,24 +7,25 @@ import shapely
 from jaxtyping import Bool, Float64, Int
 
 APART_M = 3.4
-"""Vehicles whose reference lines are this far apart pass each other in a junction, long ones included."""
+"""Distance between reference lines at which all vehicles, long ones included, pass each other in a junction,
+m."""
 APART_ABREAST_M = 2.9
-"""The same for lanes that run side by side."""
+"""The same for lanes that run side by side, m."""
 OVERPASS_M = 3.0
-"""Lanes further apart in height do not meet."""
+"""Height difference above which lanes do not meet, m."""
 
 
 class Meetings(NamedTuple):
-    """For each lane the lanes its traffic meets, in compressed rows: lane i has first[i]:first[i+1]."""
+    """The lanes that each lane meets, in compressed rows: lane i has first[i]:first[i+1]."""
 
     first: Int[np.ndarray, "L_1"]
     other: Int[np.ndarray, "M"]
     enter_m: Float64[np.ndarray, "M"]
-    """Arc length on this lane from which on its traffic is in the way of the other's."""
+    """Arc length on this lane from which its traffic blocks the other lane, m."""
     other_enter_m: Float64[np.ndarray, "M"]
-    """Arc length on the other lane from which on its traffic is in the way of this one's."""
+    """Arc length on the other lane from which its traffic blocks this lane, m."""
     other_clear_m: Float64[np.ndarray, "M"]
-    """Arc length on the other lane from which on its traffic is out of the way; infinite: at its end."""
+    """Arc length on the other lane from which its traffic is out of the way, m; infinite: at its end."""
 
 
 def find_meetings(
@@ -35,14 +36,14 @@ def find_meetings(
     junction: Int[np.ndarray, "L"],
     groups: list[str],
 ) -> tuple[Meetings, Meetings]:
-    """Siblings (lanes that part from a common start) and conflicts (lanes that cross or merge).
+    """Find siblings (lanes that part from a common start) and conflicts (lanes that cross or merge).
 
-    Lanes meet within a junction, or outside of one where they share an end; lanes that follow each other do
-    not meet, nor does a lane that passes over another.
+    Lanes meet within a junction, or outside of junctions where they share an end. Lanes that follow each
+    other do not meet, nor does a lane that passes over another.
 
     Args:
         lines: centrelines, sampled finely and evenly.
-        groups: lanes of one group run side by side.
+        groups: group of each lane. Lanes of one group run side by side.
     """
     parted, crossed = _Rows(), _Rows()
     flat = [shapely.LineString(line[:, :2]) for line in lines]
@@ -70,7 +71,7 @@ def _near(a: Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "m 3"], apart_m:
 
 
 def _first_stretch(near: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Lanes with a common start are near each other from there up to where they part."""
+    """Return the samples from the common start up to the point where the lanes part."""
     return np.logical_and.accumulate(near)
 
 
@@ -83,7 +84,8 @@ class _Rows:
     def add(
         self, a: int, b: int, near_a: np.ndarray, near_b: np.ndarray, lengths_m: Float64[np.ndarray, "L"]
     ) -> None:
-        """Note the stretches of two lanes, as masks over their samples, on which they are near each other."""
+        """Add the stretches of two lanes, as masks over their samples, on which they are close to each
+        other."""
         if not near_a.any() or not near_b.any():
             return
         enter_a, clear_a = _span_m(near_a, lengths_m[a])
@@ -91,7 +93,7 @@ class _Rows:
         self._rows += [(a, b, enter_a, enter_b, clear_b), (b, a, enter_b, enter_a, clear_a)]
 
     def compressed(self, lane_count: int) -> Meetings:
-        """The rows sorted by lane."""
+        """Return the rows sorted by lane."""
         table = np.array(sorted(self._rows)).reshape(-1, 5)
         counts = np.bincount(table[:, 0].astype(np.int64), minlength=lane_count)
         return Meetings(
@@ -102,7 +104,8 @@ class _Rows:
 
 
 def _span_m(near: Bool[np.ndarray, "n"], length_m: float) -> tuple[float, float]:
-    """First and last arc length of the samples that are near; infinite if they reach to the end."""
+    """Return the first and the last arc length of the samples that are near, m; infinite if they reach the
+    end."""
     first, last = np.flatnonzero(near)[[0, -1]]
     step_m = length_m / (len(near) - 1)
     return float(first * step_m), float("inf") if last + 1 >= len(near) else float((last + 1) * step_m)

@@ -1,4 +1,4 @@
-"""Which lanes are where: the samples of all centrelines, found by place."""
+"""Spatial search in the samples of all centrelines."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from foredrive.towns.traffic.lane_graph import LaneGraph
 
 LEVEL_M = 2.5
-"""Lanes whose heights differ by more from a point are on another level than it."""
+"""Height difference between a lane and a point above which they are on different levels, m."""
 HEIGHT_SAMPLES = 8
-"""So many of the nearest samples are asked for one of the right level."""
+"""Number of nearest samples that are searched for one on the right level."""
 
 
 @dataclass(frozen=True)
@@ -21,23 +21,25 @@ class NearLanes:
     xyz: Float64[np.ndarray, "P 3"]
     lane: Int[np.ndarray, "P"]
     along_m: Float64[np.ndarray, "P"]
-    """Arc length on the lane."""
+    """Arc length on the lane, m."""
     ahead: Float64[np.ndarray, "P 2"]
     """Unit heading, seen from above."""
     heading: Float64[np.ndarray, "P"]
     slope: Float64[np.ndarray, "P"]
     tree: cKDTree
-    """Seen from above."""
+    """Search tree of the samples, seen from above."""
 
     def within(self, xyz: Float64[np.ndarray, "3"], reach_m: float) -> Int[np.ndarray, "K"]:
-        """The samples within a distance, seen from above, of a point of the same level; sorted by lane."""
+        """Return the samples on the level of a point within a distance of it, seen from above, sorted by
+        lane."""
         found = np.array(self.tree.query_ball_point(xyz[:2], reach_m, return_sorted=True), dtype=np.int64)
         return found[np.abs(self.xyz[found, 2] - xyz[2]) < LEVEL_M]
 
     def height_m(self, xy: Float64[np.ndarray, "n 2"], about_m: float) -> Float64[np.ndarray, "n"]:
-        """Height of the road at points, on the level of a height nearby; beside it the same as on it.
+        """Return the height of the road at points, on the level of the height `about_m`.
 
-        Where no lane of that level is near, the height asked about.
+        Beside the road the height is the same as on it. Where no lane of that level is close, it is
+        `about_m`.
         """
         found = np.asarray(self.tree.query(xy, HEIGHT_SAMPLES)[1])
         level = np.abs(self.xyz[found, 2] - about_m) < LEVEL_M
@@ -48,7 +50,7 @@ class NearLanes:
 
 
 def near_lanes_of(graph: LaneGraph) -> NearLanes:
-    """The samples of a graph's lanes."""
+    """Build the search for the samples of a graph's lanes."""
     lane = np.repeat(np.arange(len(graph.ids)), graph.count)
     at = np.arange(len(lane))
     last = at == (graph.first + graph.count - 1)[lane]

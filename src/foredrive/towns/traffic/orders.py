@@ -1,4 +1,4 @@
-"""Orders from outside for some of the traffic: what scenarios are made of."""
+"""Orders for road users, from which scenarios are made."""
 
 from dataclasses import dataclass
 
@@ -8,27 +8,28 @@ from jaxtyping import Bool, Float64
 
 @dataclass(frozen=True)
 class Orders:
-    """For N vehicle slots and all strays. Whatever is not ordered, drivers decide as ever."""
+    """Orders for N vehicle slots and all strays. Without an order, drivers decide as usual."""
 
     most_mps2: Float64[np.ndarray, "N"]
-    """Nobody accelerates more than this; infinite: as he likes. Who is held back changes no lanes."""
+    """Maximum acceleration of each vehicle, m/s²; infinite for no limit. A limited vehicle does not change
+    lanes."""
     blind: Bool[np.ndarray, "N"]
-    """Who drives as if vehicle 0 were not there."""
+    """Vehicles that drive as if vehicle 0 were not there."""
     runs: Bool[np.ndarray, "N"]
-    """Who enters junctions whatever a light shows."""
+    """Vehicles that enter junctions whatever a light shows."""
     pace_mps: tuple[float, ...] = ()
-    """How fast each stray goes."""
+    """Speed of each stray, m/s."""
     change: tuple[int, int] | None = None
-    """Who changes lanes now, and to which side."""
+    """Vehicle that changes lanes now, and the side."""
 
     @classmethod
     def none(cls, count: int) -> "Orders":
-        """Everybody as he likes; strays stand."""
+        """Return no orders: all drive freely, and strays stand."""
         free = np.zeros(count, dtype=np.bool_)
         return cls(np.full(count, np.inf), free, free.copy())
 
     def padded(self, count: int) -> "Orders":
-        """The same with free vehicles behind, `count` in all."""
+        """Return the orders for `count` vehicles, with the additional ones free."""
         more = count - len(self.blind)
         return Orders(
             np.pad(self.most_mps2, (0, more), constant_values=np.inf),

@@ -1,4 +1,4 @@
-"""The ways of vehicles: which lane they take at each fork."""
+"""Paths of vehicles: the lanes they take at forks."""
 
 import dataclasses
 
@@ -17,11 +17,11 @@ def extend_paths(
     route: Int[np.ndarray, "R"],
     rng: np.random.Generator,
 ) -> Vehicles:
-    """Fill in the lanes ahead that are not known yet: the route's, or a random turn.
+    """Fill in the unknown lanes ahead, from the route or by random turns.
 
     Args:
-        for_large: the lanes that large vehicles keep to.
-        route: where vehicle 0 has to be at the end of each stretch, from the one it is on.
+        for_large: lanes that large vehicles keep to.
+        route: the lane in which vehicle 0 has to be at the end of each stretch, from its current stretch on.
     """
     v, path = vehicles, vehicles.path.copy()
     fits = for_large | ~is_large(v)[:, None]
@@ -42,7 +42,8 @@ def extend_paths(
 
 
 def towards(graph: LaneGraph, lane: int, wanted: int, otherwise: int) -> int:
-    """The lane after one that is `wanted`, or one beside it; `otherwise` if none is."""
+    """Return the successor of `lane` that is `wanted` or a lane beside it, or `otherwise` if there is
+    none."""
     options = graph.successors[lane, : graph.successor_count[lane]].tolist()
     for side in graph.sides.lane:
         beside = wanted

@@ -1,4 +1,5 @@
-"""People on foot: they wander over walkways, wait for a gap in the traffic, and go first while crossing."""
+"""People on foot: they walk randomly over walkways, wait for a gap in the traffic, and have priority while
+they cross."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,33 +16,35 @@ from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 from foredrive.towns.traffic.walkways import WalkGraph
 
 CATCH_UP = 1.3
-"""Where walks meet at an angle, people cut the corner, at most this much faster than they walk."""
+"""Maximum speed where people cut the corner between two walks, as a multiple of their walking speed."""
 ACCEPTED_BRAKING_MPS2 = 2.0
 REACTION_S = 1.0
 MARGIN_M = 1.0
 YIELD_BRAKING_MPS2, EMERGENCY_BRAKING_MPS2 = 3.0, 4.0
-"""Drivers stop for people who come to their lane if they need not brake harder than the first once they have
-reacted, `YIELD_S` later; else those wait. In their lane: if they need not brake harder than the second."""
+"""Maximum decelerations with which drivers stop for people, m/s²: for people who approach the lane (after the
+reaction time `YIELD_S`), and for people in the lane. If drivers would have to brake harder than the first
+value, approaching people wait."""
 YIELD_S = 0.5
 IN_THE_WAY_M = 0.3
 ALONG_CROSSING_M = 4.0
 SLOW_MPS = 3.0
 SPARE_S = 2.0
-"""Drivers pass before people who reach their lane this long after they have cleared the crossing."""
+"""Time margin with which drivers pass before people reach their lane, s."""
 AT_LANE_M = 0.5
 BEYOND_LIGHT_M = 8.0
-"""A crossing within this distance behind the line of a light goes with that light."""
+"""Maximum distance of a crossing behind the line of a light, m, for the crossing to depend on that light."""
 PATIENCE_S = 25.0
-"""People who found no gap for this long walk elsewhere."""
+"""Waiting time after which people walk elsewhere, s."""
 HESITATE_S = 0.4
-"""People stop so long before they would step in front of a vehicle that is no part of the traffic."""
+"""Time, s, by which people stop early before they would step in front of a vehicle that is driven from
+outside."""
 
 Danger = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
 class Pedestrians:
-    """N pedestrian slots. A slot that is not `active` holds nothing of meaning."""
+    """N pedestrian slots. The values of a slot that is not `active` have no meaning."""
 
     active: Bool[np.ndarray, "N"]
     track_id: Int[np.ndarray, "N"]
@@ -49,20 +52,20 @@ class Pedestrians:
     size_lwh: Float64[np.ndarray, "N 3"]
     pace_mps: Float64[np.ndarray, "N"]
     aside: Float64[np.ndarray, "N"]
-    """Which part of the half width to the right of a walk's middle is kept to, 0 to 1."""
+    """Lateral position to the right of a walk's middle, as a fraction (0 to 1) of the half width."""
     walk: Int[np.ndarray, "N"]
     s_m: Float64[np.ndarray, "N"]
     onward: Int[np.ndarray, "N"]
-    """1 along the walk, -1 against it."""
+    """Direction of walking: 1 along the walk, -1 against it."""
     next_walk: Int[np.ndarray, "N"]
     waited_s: Float64[np.ndarray, "N"]
     xyz: Float64[np.ndarray, "N 3"]
-    """Where the feet are."""
+    """Position of the feet, m."""
     velocity_mps: Float64[np.ndarray, "N 3"]
     yaw: Float64[np.ndarray, "N"]
 
     def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Pedestrians") -> "Pedestrians":
-        """These people with some slots taken over by the k people of `other`."""
+        """Return the people with the slots `rows` replaced by the k people of `other`."""
         changed = {}
         for field in dataclasses.fields(self):
             changed[field.name] = getattr(self, field.name).copy()
@@ -71,7 +74,7 @@ class Pedestrians:
 
 
 def empty_pavement(count: int) -> Pedestrians:
-    """Slots without people."""
+    """Return `count` empty slots."""
     values = {field.name: np.zeros(count) for field in dataclasses.fields(Pedestrians)}
     values["active"] = np.zeros(count, dtype=np.bool_)
     for name in ("track_id", "style", "walk", "onward", "next_walk"):
@@ -88,7 +91,7 @@ def draw_people(
     walk: Int[np.ndarray, "k"],
     s_m: Float64[np.ndarray, "k"],
 ) -> Pedestrians:
-    """k people, standing on walks."""
+    """Draw k people who stand on walks."""
     count = len(track_ids)
     height = np.clip(rng.normal(1.7, 0.1, count), 1.3, 1.95)
     size = np.stack([rng.uniform(0.4, 0.6, count), rng.uniform(0.45, 0.65, count), height], axis=1)
@@ -121,11 +124,12 @@ def step_pedestrians(
     rng: np.random.Generator,
     danger: Danger | None = None,
 ) -> Pedestrians:
-    """Where people are one time step later.
+    """Return the people one time step later.
 
     Args:
-        light: what shows at the start of each lane.
-        danger: tells of points, seen from above, where nobody should step; who is there already walks on.
+        light: the light at the start of each lane.
+        danger: states for points, seen from above, whether people must not step there. People who are already
+            in danger walk on.
     """
     if not len(people.active) or not len(graph.length_m):
         return people
@@ -176,7 +180,7 @@ def _follow_way(graph: WalkGraph, people: Pedestrians, dt_s: float) -> Pedestria
 
 
 def _way(graph: WalkGraph, people: Pedestrians) -> Float64[np.ndarray, "N 3"]:
-    """Where on the pavement people want to be: to the right of the middle, as they walk."""
+    """Return the positions where people want to walk: to the right of the middle, in their direction."""
     offset = people.onward * people.aside * graph.half_width_m[people.walk]
     middle = graph.position(people.walk, people.s_m)
     return middle + offset[:, None] * graph.right_of(people.walk, people.s_m)
@@ -188,10 +192,13 @@ def _choose_next(
     onward: Int[np.ndarray, "n"],
     u: Float64[np.ndarray, "n"],
 ) -> Int[np.ndarray, "n"]:
-    """A walk that leaves the place ahead, other than the one people come on unless there is none."""
+    """Choose a walk that leaves the place ahead.
+
+    It is the walk on which people arrive only if there is no other.
+    """
     options = graph.incident[graph.ends[walk, (onward > 0).astype(np.int64)]]
     allowed = (options >= 0) & (options != walk[:, None])
-    allowed[~allowed.any(axis=1), 0] = True  # a dead end: back
+    allowed[~allowed.any(axis=1), 0] = True  # dead end: turn back
     pick = (u * allowed.sum(axis=1)).astype(np.int64)
     column = np.argmax(np.cumsum(allowed, axis=1) > pick[:, None], axis=1)
     return options[np.arange(len(walk)), column]
@@ -200,7 +207,8 @@ def _choose_next(
 def crossing_gap(
     graph: WalkGraph, people: Pedestrians, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
 ) -> Float64[np.ndarray, "N"]:
-    """Gap from each front bumper to the crossing at which it has to wait for people, m (infinite: none)."""
+    """Return the gap from each front bumper to the crossing where it has to wait for people, m (infinite:
+    none)."""
     if not len(graph.lane) or not people.active.any():
         return np.full(len(vehicles.active), np.inf)
     passing = (graph.lane, graph.crossing, graph.lane_span_m, graph.walk_span_m)
@@ -248,7 +256,8 @@ def _may_cross(
     starts_m: Float64[np.ndarray, "N W"],
     light: Int[np.ndarray, "L"],
 ) -> Bool[np.ndarray, "n"]:
-    """Whether no light is green for those who would cross, and every vehicle can stop or has passed."""
+    """Return whether no light is green or yellow for the crossed lanes, and every vehicle can stop or has
+    passed."""
     may = np.ones(len(walk), dtype=np.bool_)
     moving = light[graph.lane] > Light.RED
     released = np.unique(graph.crossing[moving & (graph.lane_span_m[:, 0] < BEYOND_LIGHT_M)])
@@ -267,7 +276,8 @@ def _may_cross(
 def _walks_into_vehicle(
     graph: WalkGraph, people: Pedestrians, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
 ) -> Bool[np.ndarray, "K"]:
-    """Who is about to step in front of a vehicle that stands on the crossing or can no longer stop."""
+    """Return which people are about to step in front of a vehicle that stands on the crossing or cannot
+    stop."""
     blocked = np.zeros(len(people.active), dtype=np.bool_)
     for i in np.flatnonzero(people.active & graph.is_crossing[people.walk]):
         ahead = people.onward[i] * (graph.walk_span_m - people.s_m[i])

@@ -1,6 +1,6 @@
 """Recoveries: the steering is disturbed for a while, and the expert steers back to its path.
 
-A policy that imitates flawless driving never sees how to get back (Codevilla et al. 2018, sec. IV-C). The
+A policy that imitates flawless driving never sees how to recover (Codevilla et al. 2018, sec. IV-C). The
 disturbance is temporally correlated noise on the steering wheel, an Ornstein-Uhlenbeck process.
 """
 
@@ -12,35 +12,37 @@ import numpy as np
 CORRELATION_S = 0.8
 DISTURBED_S = 1.6
 RECOVERY_S = 5.0
-"""From the end of one disturbance to the next, at least; as long again on average."""
+"""Minimum time from the end of one disturbance to the next, s. The mean is twice as long."""
 RETURN_M, RETURN_S = 4.0, 0.8
-"""The expert steers back within a few times 4 m, and a few times .8 s."""
+"""Length scale of the return to the path: `RETURN_M` (m), plus the distance that is driven in `RETURN_S`
+(s)."""
 STEEPEST_PER_M = 0.12
-"""Curvature that steering adds at most."""
+"""Maximum curvature that steering adds, 1/m."""
 LATERAL_MPS2 = 2.5
 DISTURBING = 0.4
-"""The disturbance adds no more than this part of what the expert has to steer back."""
+"""Maximum curvature of the disturbance, as a fraction of the maximum curvature of the steering back."""
 FARTHEST_M = 0.8
-"""Where a disturbance would push the vehicle further than this in a moment, the expert takes over."""
+"""Predicted offset at which the expert takes over from the disturbance, m."""
 
 
 @dataclass(frozen=True)
 class Sway:
-    """Where the vehicle is beside its path, and what disturbs it."""
+    """The deviation of the vehicle from its path, and the disturbance."""
 
     aside_m: float = 0.0
-    """Rear axle to the left of the path."""
+    """Offset of the rear axle to the left of the path, m."""
     yaw_rad: float = 0.0
-    """Heading to the left of that of the path."""
+    """Heading to the left of the path's heading, rad."""
     curvature: float = 0.0
-    """Of the way driven, less that of the path, 1/m."""
+    """Curvature of the driven path minus that of the planned path, 1/m."""
     noise: float = 0.0
-    """Angle of the steering that is not the driver's, rad."""
+    """Steering angle of the disturbance, rad."""
     next_s: float = 2.0
-    """Time until the next disturbance begins; negative while there is one."""
+    """Time until the next disturbance begins, s; negative during a disturbance."""
 
     def moved(self, distance_m: float) -> "Sway":
-        """Further along as steered now; backwards where negative."""
+        """Return the deviation after a distance at the present steering; a negative distance moves
+        backwards."""
         yaw_rad = self.yaw_rad + distance_m * self.curvature
         aside_m = self.aside_m + distance_m * float(np.sin(0.5 * (self.yaw_rad + yaw_rad)))
         return dataclasses.replace(self, aside_m=aside_m, yaw_rad=yaw_rad)
@@ -49,14 +51,15 @@ class Sway:
 def step_sway(
     sway: Sway, speed_mps: float, wheelbase_m: float, noise_rad: float, dt_s: float, rng: np.random.Generator
 ) -> Sway:
-    """The sway one step later: a kinematic bicycle along its path, steered by feedback of offset and heading.
+    """Return the deviation one step later: a kinematic bicycle that is steered by feedback of offset and
+    heading.
 
-    d aside = v sin(yaw) dt and d yaw = v κ dt, with κ = tan(noise) / wheelbase while it is disturbed, then
-    κ = -aside / ℓ² - 2 yaw / ℓ: critically damped over the length ℓ. Noise: dx = -x dt / τ + σ √(2 / τ) dW,
+    d aside = v sin(yaw) dt and d yaw = v κ dt. While it is disturbed, κ = tan(noise) / wheelbase. Afterwards
+    κ = -aside / ℓ² - 2 yaw / ℓ, critically damped over the length ℓ. Noise: dx = -x dt / τ + σ √(2 / τ) dW,
     exact for the step.
 
     Args:
-        noise_rad: standard deviation σ of the disturbance.
+        noise_rad: standard deviation σ of the disturbance, rad.
     """
     next_s = sway.next_s - dt_s if speed_mps > 1.0 or sway.next_s < 0 else sway.next_s
     if next_s < -DISTURBED_S:

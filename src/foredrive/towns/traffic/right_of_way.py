@@ -1,12 +1,12 @@
-"""Who may enter a junction, and who goes first inside.
+"""Right of way: which vehicles may enter a junction, and which go first inside.
 
-A vehicle may enter lanes that others cross only once it has been granted its whole way through the
-junction. Requests are served in the order of arrival. A grant needs a green light (or a stop made at a stop
-sign), room beyond the junction, and that vehicles granted before will be out of the way when this one gets
-there. Should one of them be held up after all, the later one waits inside the junction, before their paths
-meet. The one granted first is thus never held up by others in the junction, which rules out deadlock. A
-request that has to wait holds back later ones that conflict with it, but not for long: where junctions touch,
-those may be what it waits for.
+Some lanes are crossed by others. A vehicle may enter them only after it has been granted its whole path
+through the junction. Requests are served in the order of arrival. A grant needs a green light (or a completed
+stop at a stop sign) and room beyond the junction. Vehicles with earlier grants must also be out of the way
+when this one arrives. If one of them is delayed after all, the later one waits inside the junction, before
+their paths meet. So the vehicle with the first grant is never delayed by others in the junction, which rules
+out deadlock. A request that has to wait blocks later requests that conflict with it, but only for a limited
+time: where junctions touch, it may be waiting for those.
 """
 
 from dataclasses import dataclass
@@ -22,37 +22,42 @@ from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 EARLY_M = 12.0
 PLANNED_BRAKING_MPS2 = 1.5
-"""Right of way is asked for `EARLY_M` before one would have to brake this hard for the line."""
+"""Vehicles request right of way `EARLY_M` before they would have to brake this hard for the line."""
 LIGHT_BRAKING_MPS2 = 3.0
-"""Whoever would have to brake harder than this for a yellow light drives on."""
+"""Maximum deceleration for a yellow light, m/s². A vehicle that would have to brake harder drives on."""
 REACTION_S = 0.5
 YIELD_BRAKING_MPS2 = 3.0
-"""Inside, rank does not count for whoever would have to brake harder than this: the other waits."""
+"""Maximum deceleration for priority inside a junction, m/s². If the vehicle that has to yield would have to
+brake harder, the other one waits."""
 LEFT_WAITS_S = 2.0
 RIGHT_WAITS_S = 0.5
-"""Turning vehicles are served as if they had arrived this much later."""
+"""Delays of turning vehicles in the order of requests, s: they are served as if they had arrived this much
+later."""
 MOVING_ON_S = 1.5
-"""Room beyond a junction is judged by where the vehicles in it will be after this time."""
+"""Time after which the positions of vehicles decide whether there is room beyond a junction, s."""
 ENOUGH_ROOM_M = 60.0
 BRISK_MPS2 = 2.0
 SLOW_MPS = 2.0
-"""Others are taken to leave at this speed at least, oneself to arrive with this acceleration."""
+"""Assumptions about timing: others leave at least at `SLOW_MPS`, and the vehicle itself arrives with
+acceleration `BRISK_MPS2`."""
 INSIDE_M = 0.2
 PATIENCE_S = 15.0
-"""After this time a request no longer stands back for older ones."""
+"""Time after which a request no longer yields to older ones, s."""
 
 
 @dataclass(frozen=True)
 class RightOfWay:
-    """The outcome for N vehicles: their new `granted`, `asked_s` and `rank`, and where they have to wait."""
+    """The result for N vehicles: the new `granted`, `asked_s` and `rank`, and the points where they have to
+    wait."""
 
     granted: Int[np.ndarray, "N"]
     asked_s: Float64[np.ndarray, "N"]
     rank: Float64[np.ndarray, "N"]
     line_gap_m: Float64[np.ndarray, "N"]
-    """From the front bumper to the line of the next junction, infinite if it may be passed."""
+    """Gap from the front bumper to the line of the next junction, m; infinite if it may be passed."""
     inside_gap_m: Float64[np.ndarray, "N"]
-    """From the front bumper to where somebody with priority crosses, infinite if nobody does."""
+    """Gap from the front bumper to the point where a vehicle with priority crosses, m; infinite without
+    one."""
 
 
 def claim_junctions(
@@ -68,9 +73,9 @@ def claim_junctions(
     """Serve the requests for right of way.
 
     Args:
-        green: the lanes that no light forbids to enter.
-        may_ask: whose requests count; None: everybody's.
-        runs: who does not heed lights; None: nobody.
+        green: lanes that no light forbids to enter.
+        may_ask: vehicles whose requests count. None: all.
+        runs: vehicles that ignore lights. None: none.
     """
     runs = np.zeros(len(vehicles.active), dtype=np.bool_) if runs is None else runs
     kept = np.where(runs, vehicles.granted, _withdraw(graph, vehicles, starts_m, green))
@@ -114,10 +119,10 @@ def claim_junctions(
 def _is_cut_off(
     graph: LaneGraph, vehicles: Vehicles, granted: Int[np.ndarray, "N"], line_column: Int[np.ndarray, "N"]
 ) -> Bool[np.ndarray, "N"]:
-    """Whose way through a junction goes on beyond what has been granted of it: it was longer than the path
-    known then, or there is a light within it.
+    """Return which vehicles have been granted only a part of their path through a junction.
 
-    All others ask for one junction at a time.
+    The path was longer than the part known at the time of the grant, or there is a light within it. All other
+    vehicles request one junction at a time.
     """
     before_line = vehicles.path[np.arange(len(granted)), line_column - 1]
     need_m = vehicles.size_lwh[:, 0] + STANDSTILL_M
@@ -128,7 +133,8 @@ def _is_cut_off(
 def _next_line(
     graph: LaneGraph, path: np.ndarray, granted: np.ndarray, starts_m: np.ndarray, front_m: np.ndarray
 ) -> tuple[Int[np.ndarray, "N"], Float64[np.ndarray, "N"]]:
-    """Column of the next lane that may not be entered yet (0: none in sight), and the gap to its start."""
+    """Return the column of the next lane that may not be entered yet (0: none in sight), and the gap to its
+    start."""
     ahead = (np.arange(WINDOW) > BEHIND + granted[:, None]) & (path >= 0)
     closed = ahead & graph.contested[path]
     first = np.argmax(closed, axis=1)
@@ -139,7 +145,10 @@ def _next_line(
 def _is_green(
     graph: LaneGraph, path: np.ndarray, column: np.ndarray, green: np.ndarray
 ) -> Bool[np.ndarray, "N"]:
-    """Whether all lights of a way through a junction let one go; some stand within it."""
+    """Return whether all lights of a path through a junction are open.
+
+    Some lights stand within the junction.
+    """
     before = np.arange(WINDOW) < column[:, None]
     on_the_way = np.logical_and.accumulate(before | (graph.contested[path] & (path >= 0)), axis=1) & ~before
     return ~(on_the_way & ~green[path]).any(axis=1)
@@ -148,9 +157,9 @@ def _is_green(
 def _withdraw(
     graph: LaneGraph, vehicles: Vehicles, starts_m: np.ndarray, green: np.ndarray
 ) -> Int[np.ndarray, "N"]:
-    """Grants, but for those of vehicles that can still stop for a light which has turned.
+    """Return the grants, without those of vehicles that can still stop for a light that has changed.
 
-    They wait before the junction, or if they are in it already, before the light itself.
+    These vehicles wait before the junction or, if they are in it already, before the light itself.
     """
     nothing = np.zeros_like(vehicles.granted)
     column, gap = _next_line(graph, vehicles.path, nothing, starts_m, vehicles.front_m)
@@ -178,7 +187,7 @@ def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
     granted = granted.copy()
     on = link_occupants(motion, length, sides, granted)
     promised, waited_for = np.zeros(len(length)), np.zeros(len(length), np.bool_)
-    for j in range(len(granted)):  # room beyond the junction that is spoken for
+    for j in range(len(granted)):  # room beyond the junction that is already promised
         k = BEHIND + granted[j] + 1
         on_its_way = motion.active[j] and k < WINDOW and (granted[j] > 0 or contested[path[j, BEHIND]])
         if on_its_way and path[j, k] >= 0 and front[j] < starts[j, k]:
@@ -207,7 +216,7 @@ def _serve(motion, lanes, granted, order, line_column, goes_on, impatient):
 @numba.njit(cache=True)
 @no_type_check
 def _room(i, begin, motion, lanes, on):
-    """Free length beyond a junction in a moment, up to the next vehicle or junction."""
+    """Return the free length beyond a junction after `MOVING_ON_S`, m, up to the next vehicle or junction."""
     length, _, contested, _ = lanes
     room = 0.0
     for k in range(begin, WINDOW):
@@ -230,7 +239,8 @@ def _room(i, begin, motion, lanes, on):
 @numba.njit(cache=True)
 @no_type_check
 def _is_clear(i, begin, end, motion, lanes, on, waited_for):
-    """Whether all who have been granted conflicting lanes are out of the way when vehicle i gets there."""
+    """Return whether all vehicles with grants on conflicting lanes are out of the way when vehicle i
+    arrives."""
     length, _, _, conflicts = lanes
     speed = motion.speed_mps
     for k in range(begin, end):
@@ -284,7 +294,10 @@ def _inside_gap(motion, lanes, granted, rank):
 @numba.njit(cache=True)
 @no_type_check
 def _goes_before(i, granted, to_stop, motion, conflicts, on):
-    """Whom vehicle i is in the way of, or soon will be: who waits for it there goes first nowhere else."""
+    """Return which vehicles have vehicle i in their way, now or soon.
+
+    A vehicle that waits for i there has no priority over i elsewhere.
+    """
     goes_before = np.zeros(len(motion.active), np.bool_)
     for k in range(BEHIND, BEHIND + granted + 1):
         lane, start = motion.path[i, k], motion.starts_m[i, k]
@@ -306,7 +319,7 @@ def _goes_before(i, granted, to_stop, motion, conflicts, on):
 @numba.njit(cache=True)
 @no_type_check
 def _is_behind(j, at, i, path, starts, rear):
-    """Whether vehicle j will pass where vehicle i is now before it comes to its column `at`."""
+    """Return whether vehicle j passes the present position of vehicle i before it reaches its column `at`."""
     for k in range(BEHIND, at + 1):
         if path[j, k] == path[i, BEHIND] and starts[j, k] + rear[i] > rear[j]:
             return True

@@ -1,4 +1,4 @@
-"""Routes to follow: random ways over the lane graph that turn left, right and go straight alike."""
+"""Routes: random ways over the lane graph with balanced left turns, right turns and straight ways."""
 
 import itertools
 from collections import Counter
@@ -16,31 +16,35 @@ from foredrive.towns.traffic.leaders import abreast
 CANDIDATES = 48
 ROUTE_SPACING_M = 1.0
 PLANNED_CHANGE_S, SHORTEST_CHANGE_M = 4.0, 45.0
-"""Routes change lanes over so long: on any shorter way 3.5 m aside would look like a turn."""
+"""Duration (s) and minimum length (m) of a lane change on a route. On a shorter way a shift of 3.5 m would
+look like a turn."""
 CHANGE_ROOM_M = 30.0
 CHANGE_ROOM_S = 5.0
-"""Routes change lanes where a lane is this long and takes this much longer to drive."""
+"""Minimum length of a lane in which a route may change lanes: this distance plus this driving time."""
 BUSY = 1.3
 LIGHT_S, GIVE_WAY_S = 15.0, 6.0
-"""What other traffic makes of the time that a route takes, and what it takes longer for each light and each
-sign to wait at: means over hours in all towns, from 30 % less (Town02) to 60 % more (Town05)."""
+"""Factor of other traffic on the driving time, and the additional time per light and per sign, s. These are
+means over hours in all towns, which range from 30 % less (Town02) to 60 % more (Town05)."""
 LONG_DRIVE_M = 600.0
-"""Routes of longer drives have all commands, of shorter ones two."""
+"""Driven distance above which a drive is long, m. Routes of long drives have all commands, others two."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """Lanes that follow each other, from a point on the first one; some are to be changed on the way."""
+    """Lanes that follow each other from a point on the first one, with lane changes on some of them."""
 
     lanes: Int[np.ndarray, "R"]
-    """Where to be at the end of each stretch."""
+    """Lane at the end of each stretch."""
     start_m: float
-    """Arc length on the first lane at which the route begins."""
+    """Arc length on the first lane at which the route begins, m."""
     entered: Int[np.ndarray, "R"]
-    """Where to be at its start: the same lane, or a neighbour of it."""
+    """Lane at the start of each stretch: the same lane or a neighbour of it."""
 
     def polyline(self, graph: LaneGraph) -> Float64[np.ndarray, "M 3"]:
-        """Points along the centrelines, `ROUTE_SPACING_M` apart; lanes are changed early on their stretch."""
+        """Return points along the centrelines, `ROUTE_SPACING_M` apart.
+
+        Lane changes come early on their stretch.
+        """
         length = graph.length_m[self.lanes]
         begins = np.cumsum(length) - length
         s = np.arange(self.start_m, begins[-1] + length[-1], ROUTE_SPACING_M)
@@ -61,14 +65,14 @@ class Route:
         return points
 
     def commands(self, graph: LaneGraph, until_m: float, from_m: float = 0.0) -> list[Command]:
-        """What to do at each fork that is met between two distances from the start."""
+        """Return the command at each fork between two distances (m) from the start."""
         length = graph.length_m[self.lanes]
         begins = np.cumsum(length) - length - self.start_m
         first, end = np.searchsorted(begins[1:], [from_m, until_m])
         return self.commands_on(graph, int(first), int(end))
 
     def commands_on(self, graph: LaneGraph, first: int, end: int) -> list[Command]:
-        """What to do at each fork on the way from lane number `first` to number `end`."""
+        """Return the command at each fork on the way from lane number `first` to number `end`."""
         return [
             graph.command(int(lane))
             for before, lane in itertools.pairwise(self.lanes[first : end + 1])
@@ -76,7 +80,8 @@ class Route:
         ]
 
     def driven_m(self, graph: LaneGraph, seconds: float) -> float:
-        """About how much of the route is driven in a time, others on the road and lights included."""
+        """Return the approximate distance that is driven in a time, m, with delays by other traffic and
+        lights."""
         pace_s = np.add.reduceat(1 / graph.speed_mps, graph.first) / graph.count
         length = graph.length_m[self.lanes].copy()
         length[0] -= self.start_m
@@ -91,11 +96,12 @@ class Route:
 def draw_route(
     graph: LaneGraph, starts: Starts, rng: np.random.Generator, length_m: float, from_s: float, until_s: float
 ) -> Route:
-    """A random route of at least `length_m`.
+    """Draw a random route of at least `length_m`.
 
-    Of some random starts the first is taken whose route turns and also goes on in another way, or on long
-    drives in all ways, in what is driven of it from `from_s` to `until_s`; if there is none, the one with
-    most ways, and if there is but one way, with one drawn at random.
+    Routes from random starts are tried. The part that counts is driven from `from_s` to `until_s`. The first
+    route is taken that has a turn and at least two different commands, or on long drives all commands. If
+    there is none, the route with the most different commands is taken. Ties go to routes that contain a
+    command drawn at random, then to routes with more turns.
     """
     best, most = None, (-1, False, -1)
     wanted = rng.choice(list(Command))
@@ -121,7 +127,8 @@ def _roll_out(
     rng: np.random.Generator,
     length_m: float,
 ) -> Route:
-    """At each fork take the command taken least often, from the next lane if need be; ties at random."""
+    """Extend a route: at each fork take the least used command, from a neighbouring lane if needed; ties at
+    random."""
     lanes, entered, to_go = [lane], [lane], length_m + start_m - graph.length_m[lane]
     taken: Counter[Command] = Counter()
     while to_go > 0:
@@ -143,8 +150,10 @@ def _roll_out(
 
 
 def _ways_on(graph: LaneGraph, stretches: Stretches, lane: int, may_change: bool) -> list[tuple[int, int]]:
-    """The lanes to be in at the end of a stretch, each with one that follows it: before junctions also those
-    of the neighbours."""
+    """Return pairs of a lane at the end of the stretch and a successor of it.
+
+    Before junctions the neighbouring lanes count as well.
+    """
     ends = [lane]
     onward = graph.successors[lane, : graph.successor_count[lane]]
     enough_m = CHANGE_ROOM_M + CHANGE_ROOM_S * graph.limit_mps[lane]

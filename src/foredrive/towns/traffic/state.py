@@ -1,4 +1,4 @@
-"""Everything that changes in traffic from step to step."""
+"""The state of traffic: everything that changes from step to step."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ class TrafficState:
     people: Pedestrians
     next_track_id: int
     route: Int[np.ndarray, "R"]
-    """Lanes in which vehicle 0 has to be at the end of each stretch of its way; empty if it wanders like the
-    others."""
+    """Lanes in which vehicle 0 has to be at the end of each stretch of its route. Empty if it takes random
+    turns like the others."""
     route_passed: int
-    """How many it has left behind."""
+    """Number of stretches of the route that lie behind."""
     strays: tuple[Stray, ...] = ()
-    """Whoever goes where no walkway leads."""
+    """People and cyclists that move off the walkways."""

@@ -1,4 +1,7 @@
-"""People and cyclists on ways of their own, off walkways and across lanes: they go as somebody tells them."""
+"""Strays: people and cyclists on paths of their own, off walkways and across lanes.
+
+The caller sets their speed.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -10,46 +13,46 @@ from foredrive.scene import Category
 
 ACCELERATION_MPS2 = 4.0
 FIRST_TRACK_ID = 40_000
-"""Strays are numbered from here on: neither traffic nor parked cars have these numbers."""
+"""First track id of strays. Neither traffic nor parked cars use ids from here on."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stray:
-    """Somebody on a way of his own; equal ways and paces give equal motion."""
+    """A person or a cyclist on a path of its own. Equal paths and speeds give equal motion."""
 
     track_id: int
     category: Category
     style: int
     size_lwh: Float64[np.ndarray, "3"]
     way_xyz: Float64[np.ndarray, "W 3"]
-    """World frame, m, on the ground; no two points coincide."""
+    """Points of the path, world frame, m, on the ground. No two points coincide."""
     s_m: float = 0.0
-    """How far along the way, seen from above."""
+    """Distance along the path, seen from above, m."""
     speed_mps: float = 0.0
 
     @property
     def arc_m(self) -> Float64[np.ndarray, "W"]:
-        """Of the way's points."""
+        """Return the arc length of the path's points, m."""
         return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.way_xyz[:, :2], axis=0).T)))
 
     @property
     def length_m(self) -> float:
-        """Of the way."""
+        """Return the length of the path, m."""
         return float(self.arc_m[-1])
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it has left the way's begin and not come to its end."""
+        """Return whether it has left the start of the path and has not reached the end."""
         return 0.0 < self.s_m < self.length_m
 
     @property
     def xyz(self) -> Float64[np.ndarray, "3"]:
-        """Where the feet are."""
+        """Return the position of the feet, m."""
         return np.array([np.interp(self.s_m, self.arc_m, axis) for axis in self.way_xyz.T])
 
     @property
     def ahead(self) -> Float64[np.ndarray, "2"]:
-        """Unit heading, seen from above."""
+        """Return the unit heading, seen from above."""
         arc_m = self.arc_m
         leg = min(int(np.searchsorted(arc_m, self.s_m, side="right")), len(arc_m) - 1)
         step = (self.way_xyz[leg] - self.way_xyz[leg - 1])[:2]
@@ -57,11 +60,14 @@ class Stray:
 
     @property
     def yaw_rad(self) -> float:
-        """The heading about z."""
+        """Return the heading about z, rad."""
         return float(np.arctan2(*self.ahead[::-1]))
 
     def moved(self, pace_mps: float, dt_s: float) -> "Stray":
-        """Later, having gone on towards a pace, or back if that is negative; it stands where its way ends."""
+        """Return the stray one time step later, with its speed changed towards `pace_mps`.
+
+        A negative speed moves it backwards. It stands at the ends of its path.
+        """
         most = ACCELERATION_MPS2 * dt_s
         speed = min(max(pace_mps, self.speed_mps - most), self.speed_mps + most)
         s_m = self.s_m + 0.5 * (self.speed_mps + speed) * dt_s
@@ -71,6 +77,6 @@ class Stray:
 
 
 def moved_strays(strays: tuple[Stray, ...], pace_mps: tuple[float, ...], dt_s: float) -> tuple[Stray, ...]:
-    """All strays later; without paces they stand."""
+    """Return all strays one time step later. Without speeds they stand."""
     paces = pace_mps or (0.0,) * len(strays)
     return tuple(stray.moved(pace, dt_s) for stray, pace in zip(strays, paces, strict=True))

@@ -1,4 +1,4 @@
-"""Traffic on a town's lanes and walkways: one pure step from state to state."""
+"""Traffic on a town's lanes and walkways, as a pure function from one state to the next."""
 
 import dataclasses
 from functools import cached_property
@@ -48,25 +48,26 @@ from foredrive.towns.traffic.vehicles import (
 from foredrive.towns.traffic.walkways import WalkGraph, build_walk_graph
 
 HALT_MPS = 0.4
-"""Who is slower than this waits at a line, not comes to it."""
+"""Speed below which a vehicle near a line waits there, m/s. A faster vehicle is still approaching."""
 STOPPED_MPS = 0.1
-"""As leaderboards want it at stop signs."""
+"""Speed below which a vehicle counts as stopped at a stop sign, m/s, as in the rules of leaderboards."""
 LACKS_ROOM_M = 1.0
-"""With less way left to begin a lane change in, vehicle 0 has no room for it any more."""
+"""Minimum distance in which vehicle 0 can still begin a lane change, m. With less, it has no room for the
+change."""
 
 
 class Traffic:
-    """The rules of traffic in one town: `step` is a pure function of the state.
+    """The rules of traffic in one town. `step` is a pure function of the state.
 
-    Vehicle 0 is the one the world turns around: traffic appears and disappears out of its sight. It drives as
-    the others do, or from outside.
+    Vehicle 0 is the centre of the simulated region: traffic appears and disappears out of its sight. It
+    drives by the same rules as the others, or it is driven from outside.
 
     Args:
         town: the map.
-        seed: everything random follows from it.
+        seed: the seed of everything random.
         vehicle_count: vehicles on the road at one time, vehicle 0 included.
         people_count: people on foot at one time, where the town has walkways.
-        guest_count: slots, behind those of the vehicles, for what somebody else puts on the road.
+        guest_count: additional slots, after those of the vehicles, for vehicles that the caller adds.
     """
 
     def __init__(
@@ -87,16 +88,16 @@ class Traffic:
 
     @cached_property
     def near_lanes(self) -> NearLanes:
-        """The town's lanes by place."""
+        """Return the town's lanes, searchable by position."""
         return near_lanes_of(self.lanes)
 
     def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
-        """Vehicles and people at their start.
+        """Return the initial state, with vehicles and people placed.
 
         Args:
-            ego: a placed vehicle to be vehicle 0; without one, traffic fills the whole town.
-            route: where vehicle 0 has to be at the end of each stretch, beginning with the one it is on;
-                after the last it wanders.
+            ego: a placed vehicle that becomes vehicle 0. Without one, traffic fills the whole town.
+            route: the lane in which vehicle 0 has to be at the end of each stretch, from its current stretch
+                on. After the last one it takes random turns.
         """
         rng = np.random.default_rng((self.seed, 1))
         lanes = np.zeros(0, dtype=np.int64) if route is None else route
@@ -118,13 +119,13 @@ class Traffic:
     def step(
         self, state: TrafficState, dt_s: float, ego: Driven | None = None, orders: Orders | None = None
     ) -> TrafficState:
-        """The state one time step later; equal arguments give equal results.
+        """Return the state one time step later. Equal arguments give equal results.
 
         Args:
-            ego: where vehicle 0 is at the time of `state` if somebody outside drives it, on the road or off
-                it: all others react to that, and what becomes of it is not decided here. None: it drives
-                itself, as the others do.
-            orders: for some of the others; None: there are none, and strays stand still.
+            ego: the pose and motion of vehicle 0 at the time of `state` if it is driven from outside, on the
+                road or off it. All others react to it, and its motion is not decided here. None: it drives by
+                the same rules as the others.
+            orders: orders for some of the other road users. None: no orders, and strays stand still.
         """
         rng = np.random.default_rng((self.seed, 2, state.step_index))
         driven = None if ego is None else self._see_driven(state, ego)
@@ -169,13 +170,14 @@ class Traffic:
         return self._turnover.renew(state, rng, None if driven is None else driven.centre_m)
 
     def taken_over(self, state: TrafficState, ego: Driven) -> TrafficState:
-        """The state in which vehicle 0, driven from outside until now, is left to drive itself from there."""
+        """Return the state in which vehicle 0, driven from outside until now, drives itself again from
+        there."""
         seen = self._see_driven(state, ego)
         vehicles = seen.without_shadows(seen.everyone)
         return dataclasses.replace(state, vehicles=vehicles, route_passed=seen.route_passed)
 
     def stands_back(self, state: TrafficState) -> bool:
-        """Whether vehicle 0 stands at a line that it has not been given the right of way at."""
+        """Return whether vehicle 0 stands at a line without right of way."""
         v = state.vehicles
         if v.speed_mps[0] > HALT_MPS or v.granted[0] > 0:
             return False
@@ -185,13 +187,16 @@ class Traffic:
         return bool((contested & (gap_m < AT_LINE_M)).any()) and not self.lanes.contested[v.lane[0]]
 
     def lacks_room(self, state: TrafficState) -> bool:
-        """Whether vehicle 0 needs another lane for its route where a lane change no longer fits."""
+        """Return whether vehicle 0 needs another lane for its route where a lane change no longer fits."""
         to_route = self._to_route(state)
         return to_route is not None and to_route[1] < LACKS_ROOM_M
 
     def to_light_m(self, state: TrafficState, in_s: float = 0.0) -> float:
-        """The way of vehicle 0 to the next junction of its route; infinite in junctions, and if no light will
-        close that one."""
+        """Return the distance of vehicle 0 to the next junction of its route, m.
+
+        The distance is infinite inside a junction. It is also infinite if that junction has no light, or if
+        its light is green `in_s` seconds from now.
+        """
         v, ahead = state.vehicles, state.route[state.route_passed :]
         on_it = np.flatnonzero(self.lanes.contested[ahead])
         shows = self.signals.shows(state.time_s + in_s)
@@ -208,7 +213,7 @@ class Traffic:
         may_ask: Bool[np.ndarray, "M"] | None,
         runs: Bool[np.ndarray, "M"],
     ) -> Choice:
-        """What all drivers make of their situation."""
+        """Choose the acceleration and the right of way of all vehicles from their situations."""
         v = state.vehicles
         ahead = find_leaders(self.lanes, v, starts_m)
         green = (light == Light.NONE) | (light == Light.GREEN)
@@ -235,18 +240,18 @@ class Traffic:
         return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, *known)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
-        """The `Light` of each of the town's stop zones."""
+        """Return the `Light` of each of the town's stop zones."""
         guarded = np.flatnonzero(self.signals.guarded)
         lights = np.full(self._zone_count, int(Light.NONE))
         lights[self.lanes.zone[guarded]] = self.signals.shows(time_s)[guarded]
         return lights
 
     def poses(self, state: TrafficState) -> Poses:
-        """Poses of all vehicle slots."""
+        """Return the poses of all vehicle slots."""
         return vehicle_poses(self.lanes, state.vehicles)
 
     def actors(self, state: TrafficState) -> list[ActorState]:
-        """All road users; vehicle 0 is left out where it is the ego vehicle."""
+        """Return all road users, without vehicle 0 if it is the ego vehicle."""
         v = state.vehicles
         kept = v.active.copy()
         kept[0] &= len(state.route) == 0
@@ -259,7 +264,10 @@ class Traffic:
     def _begin_change(
         self, state: TrafficState, situation: Situation, driven: SeenDriven | None, orders: Orders
     ) -> Vehicles | None:
-        """Let the one driver who has to, or gains most by it, change lanes; None if nobody does."""
+        """Begin the lane change of the one vehicle that has to change or gains most.
+
+        Return None if there is none.
+        """
         v = state.vehicles
         if orders.change is not None:
             return begin_change(self.lanes, v, *orders.change)
@@ -274,11 +282,11 @@ class Traffic:
             return None
         begun = begin_change(self.lanes, v, *change)
         if change[0] == 0 and state.route_passed < len(state.route):
-            begun.path[0, BEHIND + 1 :] = -1  # where to go from the new lane, the route says
+            begun.path[0, BEHIND + 1 :] = -1  # the route decides where to go from the new lane
         return begun
 
     def _route_urge(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
-        """What lane changes are worth to vehicle 0 for its route."""
+        """Return the value of lane changes to the left and to the right for the route of vehicle 0, m/s²."""
         v, urge = state.vehicles, np.zeros((2, len(state.vehicles.active)))
         if state.route_passed >= len(state.route):
             return urge
@@ -300,7 +308,8 @@ class Traffic:
         situation: Situation,
         starts_m: Float64[np.ndarray, "N W"],
     ) -> Float64[np.ndarray, "N"]:
-        """What accelerations are limited to, so that vehicle 0 can change lanes where it soon has to."""
+        """Return upper limits of the accelerations that let vehicle 0 change lanes where it soon has to,
+        m/s²."""
         if to_route is None or to_route[1] > SETTLED_M + URGENT_S * v.speed_mps[0]:
             return np.full(len(v.active), np.inf)
         side, target = to_route[0], np.full(len(v.active), -1)
@@ -308,7 +317,8 @@ class Traffic:
         return let_in(self.lanes, v, starts_m, situation, target, side)
 
     def _to_route(self, state: TrafficState) -> tuple[int, float] | None:
-        """To which side vehicle 0 has to change for its route, and how far ahead it can still begin."""
+        """Return the side to which vehicle 0 has to change for its route, and the distance in which it can
+        still begin."""
         if state.route_passed >= len(state.route) or not state.vehicles.active[0]:
             return None
         wanted = int(state.route[state.route_passed])

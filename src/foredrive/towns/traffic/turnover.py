@@ -1,4 +1,4 @@
-"""Who comes and who goes: vehicles and people appear and disappear out of the ego vehicle's sight."""
+"""Turnover of traffic: vehicles and people appear and disappear out of the ego vehicle's sight."""
 
 import dataclasses
 
@@ -23,14 +23,17 @@ PEOPLE_BORN_WITHIN_M = 95.0
 PEOPLE_GONE_BEYOND_M = 110.0
 CLEAR_M = 10.0
 CLEAR_S = 3.5
-"""New vehicles keep `CLEAR_M` from all others, and `CLEAR_S` more from those ahead of and behind them."""
+"""Minimum distances of a new vehicle: `CLEAR_M` to all others, and `CLEAR_S` more to those ahead and
+behind."""
 TRIES = 12
 NEWCOMER_BRAKING_MPS2 = 1.0
-"""Nobody starts where it or the one behind it would have to brake harder than this."""
+"""Maximum deceleration, m/s², of a new vehicle and of the one behind it. A vehicle does not start where one
+of them would have to brake harder."""
 
 
 class Turnover:
-    """Fills the free slots of a town's traffic, of vehicles the first `vehicle_count`."""
+    """The turnover of a town's traffic: it fills free slots, of the vehicle slots only the first
+    `vehicle_count`."""
 
     def __init__(
         self,
@@ -47,7 +50,7 @@ class Turnover:
         self._walk_weight = walkable / max(walkable.sum(), 1e-9)
 
     def fill(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
-        """Vehicles and people in all slots, as far as there is room."""
+        """Place vehicles and people in all free slots, as far as there is room."""
         ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0] if len(state.route) else None
         state = self._put_vehicles(state, 0.0, len(state.vehicles.active), rng, ego_m)
         return self._put_people(state, 0.0, len(state.people.active), rng, ego_m)
@@ -58,11 +61,13 @@ class Turnover:
         rng: np.random.Generator,
         ego_m: Float64[np.ndarray, "3"] | None = None,
     ) -> TrafficState:
-        """Let what is far from the ego vehicle go, and let one vehicle and one person appear out of its
-        sight; without an ego vehicle all stay.
+        """Remove road users that are far from the ego vehicle, and add up to one vehicle and one person out
+        of its sight.
+
+        Without an ego vehicle all stay.
 
         Args:
-            ego_m: where the ego vehicle is if it is driven from outside.
+            ego_m: position of the ego vehicle if it is driven from outside, m.
         """
         if not len(state.route):
             return state
@@ -85,7 +90,8 @@ class Turnover:
         rng: np.random.Generator,
         ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
-        """New vehicles in up to `most` free slots, at least `beyond_m` from an ego vehicle."""
+        """Place new vehicles in up to `most` free slots, at least `beyond_m` from the ego vehicle, if there
+        is one."""
         rows = np.flatnonzero(~state.vehicles.active[: self._vehicle_count])[:most]
         places = np.arange(len(self._starts.lane))
         if ego_m is not None and len(rows):
@@ -104,7 +110,8 @@ class Turnover:
         return dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
 
     def _is_free(self, vehicles: Vehicles, starts: Int[np.ndarray, "k"]) -> Bool[np.ndarray, "k"]:
-        """Which starts are far from all vehicles, and in time from those ahead and behind."""
+        """Return for each start whether it is far enough from all vehicles, and in time from those ahead and
+        behind."""
         centres = vehicle_poses(self._lanes, vehicles).centre_m[vehicles.active]
         offset = centres[None] - self._starts.xyz[starts][:, None]
         forward = self._starts.forward[starts][:, None]
@@ -118,9 +125,10 @@ class Turnover:
     def _join(
         self, vehicles: Vehicles, row: int, start: int, track_id: int, rng: np.random.Generator
     ) -> Vehicles | None:
-        """The vehicles with a new one in a slot, no faster than it can brake for what is ahead of it.
+        """Return the vehicles with a new one in a slot, slow enough that it can brake for the vehicle ahead
+        of it.
 
-        None: somebody would have to brake for another.
+        Return None if one vehicle would have to brake for another.
         """
         lane = self._starts.lane[[start]]
         one = draw_fleet(rng, np.array([track_id]), self._for_large[lane], self._for_bicycles[lane])
@@ -137,7 +145,7 @@ class Turnover:
             leader_mps = v.speed_mps[ahead.leader[row]]
             speed[row] = min(speed[row], np.sqrt(leader_mps**2 + 2 * NEWCOMER_BRAKING_MPS2 * room_m))
         v = dataclasses.replace(v, speed_mps=speed)
-        ahead = find_leaders(self._lanes, v, starts_m)  # whom others brake for depends on its speed
+        ahead = find_leaders(self._lanes, v, starts_m)  # the leaders of the others depend on its speed
         no_halt = np.full(len(speed), np.inf)
         wanted = see_ahead(self._lanes, v, starts_m, ahead, no_halt).wanted_mps2(v)
         concerned = ((ahead.leader == row) | (ahead.limiting == row)) & v.active
@@ -152,7 +160,7 @@ class Turnover:
         rng: np.random.Generator,
         ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
-        """People in up to `most` free slots."""
+        """Place people in up to `most` free slots."""
         rows = np.flatnonzero(~state.people.active)[:most]
         if not len(rows):
             return state

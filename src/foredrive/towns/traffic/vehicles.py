@@ -1,4 +1,4 @@
-"""Vehicles on lanes: who they are, where along their paths, and the poses that follow from that."""
+"""Vehicles on lanes: their properties, their positions along their paths, and their poses."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,18 +13,21 @@ from foredrive.towns.traffic.lane_graph import LaneGraph
 BEHIND = 4
 AHEAD = 11
 CLEAR_OF_LANE = 0.64
-"""At this part of a lane change three quarters of the way over are done: others can pass on the old lane."""
+"""Fraction of a lane change after which the old lane is free for others. Three quarters of the lateral shift
+are done there."""
 CHANGE_LATERAL_MPS2 = 2.5
-"""A lane change as long as it has been begun is driven no faster than this allows."""
+"""Maximum lateral acceleration in a lane change of a given length, m/s². It limits the speed."""
 MOTION_S = 0.05
-"""Velocities are taken over this long: in less, the samples of the centrelines would show."""
+"""Time over which velocities are taken, s. Over less time the sampling of the centrelines would be
+visible."""
 WINDOW = BEHIND + 1 + AHEAD
-"""Lanes of its path that a vehicle knows: some behind (where its rear may still be), its own, some ahead."""
+"""Number of lanes of its path that a vehicle knows: some behind (its rear may still be there), the current
+one, and some ahead."""
 
 
 @dataclass(frozen=True)
 class Vehicles:
-    """N vehicle slots. A slot that is not `active` holds nothing of meaning."""
+    """N vehicle slots. The values of a slot that is not `active` have no meaning."""
 
     active: Bool[np.ndarray, "N"]
     track_id: Int[np.ndarray, "N"]
@@ -33,96 +36,100 @@ class Vehicles:
     size_lwh: Float64[np.ndarray, "N 3"]
     wheelbase_m: Float64[np.ndarray, "N"]
     axle_to_centre_m: Float64[np.ndarray, "N"]
-    """From the rear axle forward to the centre of the box."""
+    """Distance from the rear axle forward to the centre of the box, m."""
     lateral_m: Float64[np.ndarray, "N"]
-    """Offset of the whole path to the left of the centreline."""
+    """Lateral offset of the whole path, m, positive to the left of the centreline."""
     top_speed_mps: Float64[np.ndarray, "N"]
     haste: Float64[np.ndarray, "N"]
-    """Factor on the speed to drive."""
+    """Factor on the driving speed."""
     time_gap_s: Float64[np.ndarray, "N"]
     accel_mps2: Float64[np.ndarray, "N"]
     decel_mps2: Float64[np.ndarray, "N"]
     path: Int[np.ndarray, "N 16"]
-    """Lanes behind, at (column `BEHIND`) and ahead; -1 where there is none."""
+    """Lanes of the path: behind, current (column `BEHIND`) and ahead; -1 for none."""
     s_m: Float64[np.ndarray, "N"]
-    """Arc length of the box centre on the lane it is at."""
+    """Arc length of the box centre on the current lane, m."""
     speed_mps: Float64[np.ndarray, "N"]
     acceleration_mps2: Float64[np.ndarray, "N"]
     granted: Int[np.ndarray, "N"]
-    """Up to how many lanes ahead right of way has been granted."""
+    """Number of lanes ahead for which right of way has been granted."""
     asked_s: Float64[np.ndarray, "N"]
-    """Since when right of way has been asked for; infinite if it is not."""
+    """Time since which right of way has been requested, s; infinite without a request."""
     rank: Float64[np.ndarray, "N"]
-    """When right of way was granted: in a junction the lower goes first."""
+    """Time at which right of way was granted, s. In a junction the lower rank goes first."""
     has_stopped: Bool[np.ndarray, "N"]
-    """Whether the vehicle has come to a halt at the line ahead of it."""
+    """Whether the vehicle has stopped at the line ahead of it."""
     shift_m: Float64[np.ndarray, "N"]
-    """How far left of the path the latest lane change began, negative: right; 0 before the first."""
+    """Lateral position at which the latest lane change began, m, positive to the left of the path; 0 before
+    the first lane change."""
     change_length_m: Float64[np.ndarray, "N"]
     changed_m: Float64[np.ndarray, "N"]
-    """How far into its lane change the rear axle is; counts on after the end."""
+    """Distance of the rear axle into its lane change, m. It keeps growing after the end of the change."""
 
     @property
     def lane(self) -> Int[np.ndarray, "N"]:
-        """The lane each box centre is on."""
+        """Return the lane of each box centre."""
         return self.path[:, BEHIND]
 
     @property
     def front_m(self) -> Float64[np.ndarray, "N"]:
-        """Arc length of the front bumper, counted from the start of `lane`."""
+        """Return the arc length of the front bumper from the start of `lane`, m."""
         return self.s_m + 0.5 * self.size_lwh[:, 0]
 
     @property
     def rear_m(self) -> Float64[np.ndarray, "N"]:
-        """Arc length of the rear bumper, counted from the start of `lane`."""
+        """Return the arc length of the rear bumper from the start of `lane`, m."""
         return self.s_m - 0.5 * self.size_lwh[:, 0]
 
     @property
     def beside(self) -> Int[np.ndarray, "N"]:
-        """On which side of the path is the lane that a vehicle has not left yet: 1 left, -1 right, 0 none."""
+        """Return the side of the path on which the lane lies that a vehicle has not left yet: 1 left, -1
+        right, 0 none."""
         return np.where(self.to_clear_m > 0, np.sign(self.shift_m), 0.0).astype(np.int64)
 
     @property
     def to_clear_m(self) -> Float64[np.ndarray, "N"]:
-        """How far to drive until the lane that one comes from is free."""
+        """Return the distance to drive until the old lane of a lane change is free, m."""
         to_go = CLEAR_OF_LANE * self.change_length_m - self.changed_m
         return np.where(self.shift_m != 0, np.maximum(to_go, 0.0), 0.0)
 
     @property
     def steerable_mps(self) -> Float64[np.ndarray, "N"]:
-        """How fast the present lane change can be driven, which is as long as it is; infinite without one.
+        """Return the maximum speed in the present lane change, given its length, m/s; infinite without one.
 
-        The quintic of `offset_m` bends most at (3 - √3) / 6 of its length, by 10 / √3 shift / length².
+        The quintic of `offset_m` has its maximum curvature, 10 / √3 shift / length², at (3 - √3) / 6 of its
+        length.
         """
         curved = np.where(self.changed_m < self.change_length_m, np.abs(self.shift_m), 0.0)
         curvature = 10 / np.sqrt(3) * curved / self.change_length_m**2
         return np.sqrt(CHANGE_LATERAL_MPS2 / np.maximum(curvature, 1e-9))
 
     def offset_m(self, ahead_m: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
-        """How far left of the path a point is that lies ahead of the rear axle.
+        """Return the lateral offset from the path, m to the left, of a point ahead of the rear axle.
 
-        Lane changes follow the quintic with no lateral speed or acceleration at either end (Takahashi et al.
-        1989, with fixed ends), over a length instead of a time: a vehicle that stands does not slide.
+        Lane changes follow the quintic with zero lateral speed and acceleration at both ends (Takahashi et
+        al. 1989, with fixed ends). It is a function of distance instead of time, so that a standing vehicle
+        does not slide.
         """
         x = np.clip((self.changed_m + ahead_m) / self.change_length_m, 0.0, 1.0)
         return self.lateral_m + self.shift_m * (1 - x**3 * (10 - 15 * x + 6 * x**2))
 
     def moved(self, distance_m: Float64[np.ndarray, "N"]) -> "Vehicles":
-        """These vehicles further along."""
+        """Return the vehicles moved forward by a distance (m)."""
         return dataclasses.replace(self, s_m=self.s_m + distance_m, changed_m=self.changed_m + distance_m)
 
     def first(self, count: int) -> "Vehicles":
-        """The first so many of them."""
+        """Return the first `count` vehicles."""
         return Vehicles(**{name: value[:count] for name, value in vars(self).items()})
 
     def and_more(self, more: "Vehicles") -> "Vehicles":
-        """With others behind them."""
+        """Return the vehicles with those of `more` appended."""
         return Vehicles(
             **{name: np.concatenate([value, getattr(more, name)]) for name, value in vars(self).items()}
         )
 
     def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Vehicles") -> "Vehicles":
-        """These vehicles with some slots taken over by the k vehicles of `other`."""
+        """Return the vehicles with the slots `rows` replaced by the k vehicles of `other`."""
         changed = {}
         for field in dataclasses.fields(self):
             changed[field.name] = getattr(self, field.name).copy()
@@ -135,25 +142,25 @@ class Poses:
     """Poses of N rigid bodies on the ground, world frame."""
 
     axle_xyz: Float64[np.ndarray, "N 3"]
-    """The ground point below the rear axle."""
+    """Ground point below the rear axle, m."""
     centre_m: Float64[np.ndarray, "N 3"]
-    """Box centre."""
+    """Box centre, m."""
     forward: Float64[np.ndarray, "N 3"]
-    """Unit heading, along the slope of the ground."""
+    """Unit heading along the slope of the ground."""
 
     @property
     def yaw(self) -> Float64[np.ndarray, "N"]:
-        """Heading about z, rad."""
+        """Return the heading about z, rad."""
         return np.arctan2(self.forward[:, 1], self.forward[:, 0])
 
     @property
     def pitch(self) -> Float64[np.ndarray, "N"]:
-        """About the left axis: positive is nose down, rad."""
+        """Return the pitch about the left axis, rad, positive with the nose down."""
         return -np.arcsin(np.clip(self.forward[:, 2], -1, 1))
 
 
 def empty_slots(count: int) -> Vehicles:
-    """Slots without vehicles."""
+    """Return `count` empty slots."""
     values = {
         field.name: np.zeros((count, 3)) if field.name == "size_lwh" else np.zeros(count)
         for field in dataclasses.fields(Vehicles)
@@ -170,7 +177,7 @@ def empty_slots(count: int) -> Vehicles:
 
 
 def path_starts(graph: LaneGraph, path: Int[np.ndarray, "N W"]) -> Float64[np.ndarray, "N W"]:
-    """Where each lane of a path starts, in arc length from the start of the current lane."""
+    """Return the arc length at which each lane of a path starts, m from the start of the current lane."""
     length = np.where(path >= 0, graph.length_m[path], np.inf)
     length[:, :BEHIND] = np.where(path[:, :BEHIND] >= 0, length[:, :BEHIND], 0.0)
     start = np.zeros(path.shape)
@@ -185,7 +192,10 @@ def along_path(
     starts_m: Float64[np.ndarray, "N W"],
     s_m: Float64[np.ndarray, "N"],
 ) -> Float64[np.ndarray, "N 3"]:
-    """Points on paths, by arc length from the start of the current lane; straight on beyond the ends."""
+    """Return points on paths at arc lengths from the start of the current lane.
+
+    Paths continue straight beyond their ends.
+    """
     column = np.where(path >= 0, starts_m <= s_m[:, None], False)
     column = np.where(
         column.any(1), WINDOW - 1 - np.argmax(column[:, ::-1], axis=1), np.argmax(path >= 0, axis=1)
@@ -203,7 +213,10 @@ def along_path(
 
 
 def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
-    """Both axles on the path, so that bodies turn as vehicles do; slots not active are at the origin."""
+    """Return the poses of vehicles whose two axles both lie on the path, as in real vehicles.
+
+    Slots that are not active are at the origin.
+    """
     live = np.flatnonzero(vehicles.active)
     path = vehicles.path[live]
     starts = path_starts(graph, path)
@@ -224,7 +237,10 @@ def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
 
 
 def motion(graph: LaneGraph, vehicles: Vehicles) -> tuple[Poses, Poses]:
-    """Poses half of `MOTION_S` earlier and later at the present speeds: the difference is how bodies move."""
+    """Return the poses half of `MOTION_S` earlier and later at the present speeds.
+
+    Their difference gives the motion of the bodies.
+    """
     half_m = 0.5 * MOTION_S * vehicles.speed_mps
     return vehicle_poses(graph, vehicles.moved(-half_m)), vehicle_poses(graph, vehicles.moved(half_m))
 
@@ -237,7 +253,10 @@ def _left_of(forward: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 def _up_of(
     forward: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Forward × left, of which left is level; NumPy's takes much longer for a few vectors."""
+    """Return forward × left, where left is horizontal.
+
+    NumPy's cross product is much slower for a few vectors.
+    """
     (fx, fy, fz), (lx, ly, _) = forward.T, left.T
     return np.stack([-fz * ly, fz * lx, fx * ly - fy * lx], axis=1)
 
@@ -245,9 +264,9 @@ def _up_of(
 def speed_to_drive(
     graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
 ) -> Float64[np.ndarray, "N"]:
-    """The wanted speed: the profile where the vehicle is, and slowing in time for the lanes ahead of it.
+    """Return the wanted speed, m/s: the speed profile at the vehicle, lowered in time for the lanes ahead.
 
-    Drivers look `SLOWING_TIME_S` ahead: so much later they drive the speed that they want now.
+    Drivers look `SLOWING_TIME_S` ahead, because they reach the speed that they want now only after this time.
     """
     soon_m = vehicles.s_m + SLOWING_TIME_S * vehicles.speed_mps
     here = np.minimum(graph.speed(vehicles.lane, vehicles.s_m), graph.speed(vehicles.lane, soon_m))

@@ -1,4 +1,4 @@
-"""Where people walk: walkways joined into a graph, and crossings with the lanes they cross."""
+"""A graph of walkways and of crossings, with the lanes that the crossings cross."""
 
 import itertools
 from dataclasses import dataclass
@@ -16,63 +16,68 @@ from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.traffic.lane_graph import Control, LaneGraph
 
 JOIN_M = 1.5
-"""Ends of walkways this close are one place."""
+"""Distance below which ends of walkways are one place, m."""
 REACH_M = 7.0
-"""How far from a walkway a crosswalk may end."""
+"""Maximum distance from the end of a crosswalk to a walkway, m."""
 MARKED_NEARBY_M = 15.0
 PAST_LINE_M = 1.5
 LONGEST_CROSSING_M = 28.0
 NEAREST_KERB_M = 1.0
 SHORTEST_WALK_M = 0.5
 ALONG_LANE_M = 1.7
-"""Half the stretch of a lane that people on a crossing may occupy."""
+"""Half the length of lane that people on a crossing may occupy, m."""
 ACROSS_LANE_M = 2.2
-"""Half the stretch of a crossing that vehicles on a lane may occupy, with room to spare."""
+"""Half the length of crossing that vehicles on a lane may occupy, with a margin, m."""
 
 
 @dataclass(frozen=True)
 class WalkGraph:
-    """E straight-legged walks between places. Vertices are laid end to end in `xyz`, as in a lane graph."""
+    """A graph of E walks (polylines) between V places.
+
+    The vertices are stored end to end in `xyz`, as in a lane graph.
+    """
 
     xyz: Float64[np.ndarray, "P 3"]
     along_m: Float64[np.ndarray, "P"]
-    """Arc length of each vertex on its walk."""
+    """Arc length of each vertex on its walk, m."""
     first: Int[np.ndarray, "E_1"]
     length_m: Float64[np.ndarray, "E"]
     ends: Int[np.ndarray, "E 2"]
     """Places at the start and the end of each walk."""
     is_crossing: Bool[np.ndarray, "E"]
     half_width_m: Float64[np.ndarray, "E"]
-    """How far to either side one may walk."""
+    """Maximum distance of people from the middle of the walk, m, to either side."""
     incident: Int[np.ndarray, "V I"]
     """Walks that meet at each place, padded with -1."""
     crossing: Int[np.ndarray, "K"]
-    """Where crossings and lanes meet, K times: the walk; sorted by lane."""
+    """Walk of each of the K places where a crossing and a lane meet, sorted by lane."""
     lane: Int[np.ndarray, "K"]
     lane_span_m: Float64[np.ndarray, "K 2"]
-    """Stretch of the lane on which people cross."""
+    """Arc length range on the lane in which people cross, m."""
     walk_span_m: Float64[np.ndarray, "K 2"]
-    """Stretch of the crossing on which vehicles pass."""
+    """Arc length range on the crossing in which vehicles pass, m."""
 
     def position(
         self, walk: Int[np.ndarray, "n"], s_m: Float64[np.ndarray, "n"]
     ) -> Float64[np.ndarray, "n 3"]:
-        """Points on walks by arc length."""
+        """Return points on walks at given arc lengths."""
         point, _ = self._locate(walk, s_m)
         return point
 
     def right_of(
         self, walk: Int[np.ndarray, "n"], s_m: Float64[np.ndarray, "n"]
     ) -> Float64[np.ndarray, "n 3"]:
-        """Horizontal unit vectors to the right of the walks' direction."""
+        """Return horizontal unit vectors to the right of the walks' direction."""
         _, ahead = self._locate(walk, s_m)
         right = np.stack([ahead[:, 1], -ahead[:, 0], np.zeros(len(ahead))], axis=1)
         return right / np.linalg.norm(right, axis=1, keepdims=True).clip(1e-9)
 
     @cached_property
     def _axis(self) -> tuple[Float64[np.ndarray, "E"], Float64[np.ndarray, "P"]]:
-        """One sorted axis for all walks, walk e on [origin[e], origin[e] + length[e]]: origins, and
-        the vertices on it."""
+        """Return one sorted axis for all walks: the origins of the walks and the vertices on the axis.
+
+        Walk e covers [origin[e], origin[e] + length[e]].
+        """
         origin = np.cumsum(self.length_m + 1.0) - self.length_m - 1.0
         return origin, self.along_m + np.repeat(origin, np.diff(self.first))
 
@@ -87,7 +92,8 @@ class WalkGraph:
 
 
 def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
-    """Walkways, marked crosswalks, and unmarked crossings at lights that have no crosswalk."""
+    """Build the graph from walkways, marked crosswalks, and unmarked crossings at lights that have no
+    crosswalk."""
     strips = [s for s in town.strips_of(StripKind.SIDEWALK) if len(s.left_xyz) > 1]
     walks = [0.5 * (s.left_xyz + s.right_xyz) + [0.0, 0.0, WALKWAY_RAISE_M] for s in strips]
     widths = [float(np.linalg.norm(s.left_xyz - s.right_xyz, axis=1).min()) for s in strips]
@@ -125,7 +131,7 @@ def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
 class _Crossing:
     xyz: Float64[np.ndarray, "_ 3"]
     attached: tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]
-    """The walkways it joins and where."""
+    """Walkways that the crossing joins, each with its joining point."""
 
 
 def _crossings(
@@ -156,7 +162,7 @@ def _crossings(
 
 
 def _chord(outline: Float64[np.ndarray, "_ 3"], walkways: shapely.STRtree) -> np.ndarray | None:
-    """Middle line of a crosswalk: between the two opposite sides that lie nearer to walkways."""
+    """Return the middle line of a crosswalk, between the two opposite sides that are closer to walkways."""
     box = shapely.minimum_rotated_rectangle(shapely.Polygon(outline[:, :2]))
     if not isinstance(box, shapely.Polygon):
         return None
@@ -173,7 +179,7 @@ def _perpendicular(
     walkways: shapely.STRtree,
     widths_m: list[float],
 ) -> np.ndarray | None:
-    """A way straight across the road, from kerb to kerb."""
+    """Return a line straight across the road, from kerb to kerb, or None."""
     ahead = (lane[1] - lane[0])[:2] / np.linalg.norm((lane[1] - lane[0])[:2])
     here, ends = shapely.Point(start[:2]), []
     for side in (np.array([-ahead[1], ahead[0]]), np.array([ahead[1], -ahead[0]])):
@@ -221,7 +227,7 @@ def _without_repeats(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_
 
 
 def _cut(line: Float64[np.ndarray, "_ 3"], at_flat_m: list[float]) -> list[Float64[np.ndarray, "_ 3"]]:
-    """The pieces of a walk between the points (arc length seen from above) at which crossings join it."""
+    """Cut a walk at the points (arc length seen from above, m) where crossings join it."""
     along = _along(line)
     flat = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
     stops = np.unique(np.interp([0.0, *at_flat_m, flat[-1]], flat, along))
@@ -233,7 +239,7 @@ def _cut(line: Float64[np.ndarray, "_ 3"], at_flat_m: list[float]) -> list[Float
 
 
 def _join(walks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Places at the ends of walks, and the walks that meet at each place."""
+    """Return the places at the ends of the walks, and the walks that meet at each place."""
     if not walks:
         return np.zeros((0, 2), dtype=np.int64), np.zeros((0, 1), dtype=np.int64)
     tips = np.concatenate([line[[0, -1]] for line in walks])
@@ -250,7 +256,7 @@ def _join(walks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lane_meetings(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: LaneGraph) -> np.ndarray:
-    """Rows of crossing, lane, stretch of the lane, stretch of the crossing; sorted by lane."""
+    """Return rows of crossing, lane, range on the lane and range on the crossing, sorted by lane."""
     rows = []
     lines = [shapely.LineString(lanes.samples(i)[:, :2]) for i in range(len(lanes.ids))]
     tree = shapely.STRtree(lines)
