@@ -42,7 +42,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of a way: along one lane from one arc length to another, both in m."""
+    """Part of a way: along one lane, from one arc length to another (both m)."""
 
     lane: int
     from_m: float

@@ -31,7 +31,7 @@ class Straight:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Who drives as the log was driven, from wherever that has led; at its end it stands."""
+    """Agent that replays the logged drive from wherever it is. At the end of the log it stands still."""
 
     drive: LoggedDrive
     clock: Callable[[], float]
