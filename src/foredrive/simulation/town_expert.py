@@ -46,7 +46,8 @@ CLEAR_M = 0.5
 LOOK_M = 2.0
 """Look-ahead distance on the route from which the heading is taken in this case, m."""
 LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
-"""A vehicle further than this from its planned position restarts its plan from its current lane, m."""
+"""If the vehicle is further than this from its planned position, m (longitudinal, lateral), the plan
+restarts from its current lane."""
 
 
 class TownExpert:

@@ -68,7 +68,7 @@ def _checked(
 ) -> tuple[RouteWaypoints, DriveRoute] | None:
     """Return a route as waypoints and as `snap_route` reads them.
 
-    Returns None if these take another way, or if the length is out of range.
+    Returns None if there is no such route, if it takes another way, or if its length is out of range.
     """
     ends_m = np.append(0.0, np.cumsum(graph.length_m[drawn.lanes])) - drawn.start_m
     last = int(np.flatnonzero((ends_m[:-1] < length_m) & (graph.junction[drawn.lanes] < 0))[-1])

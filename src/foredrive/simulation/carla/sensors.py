@@ -19,8 +19,7 @@ PIXEL_TOLERANCE = 0.01
 
 
 def camera_specs(rig: CameraRig, T_actor_ego: Float64[np.ndarray, "4 4"]) -> list[dict[str, Any]]:
-    """Return the cameras of a rig in the form of the leaderboard's `sensors()`, in m and degrees on the
-    actor.
+    """Return a rig's camera specs as in the leaderboard's `sensors()`: m and degrees on CARLA's actor.
 
     Args:
         rig: rig without leading dimensions.

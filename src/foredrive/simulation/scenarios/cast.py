@@ -48,9 +48,9 @@ def can_drive_ahead(ground: Ground, from_m: float, to_m: float) -> bool:
 
 
 def _is_far(ground: Ground, ahead_m: Float64[np.ndarray, "n"], behind_m: Float64[np.ndarray, "n"]) -> bool:
-    """Return whether, for any pair of points on a route, one cannot be seen from the other.
+    """Return whether at least one of some pairs of points on a route is too far apart for sight.
 
-    Two points further apart than `BORN_BEYOND_M` count as such.
+    Two points cannot be seen from each other if they are further apart than `BORN_BEYOND_M`.
     """
     xy, arc_m = ground.route.xyz.T[:2], ground.route.arc_m
     there, here = (np.stack([np.interp(m, arc_m, axis) for axis in xy]) for m in (ahead_m, behind_m))

@@ -13,7 +13,7 @@ SLOWS_MPS2 = 2.0
 def stopping_m(speed_mps: float, acceleration_mps2: float = 0.0) -> float:
     """Return the stopping distance of an attentive driver, m.
 
-    Until the reaction the vehicle keeps its acceleration, if that is positive.
+    Until the brakes take effect the vehicle keeps its acceleration, if that is positive.
     """
     gaining = max(acceleration_mps2, 0.0)
     until_s = REACTION_S + BITES_S

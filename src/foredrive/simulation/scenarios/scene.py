@@ -42,7 +42,8 @@ class Play:
     """Speed of a vehicle that is on its way to meet the ego vehicle, m/s, kept once the scenario has
     begun."""
     waited_s: float = 0.0
-    """Time for which it has been waited for, s."""
+    """Time for which the scenario's waiting condition has held, s: the ego vehicle follows, stands behind,
+    or is waited for."""
     holds_up_s: float = 0.0
     """Time for which others have stood behind its vehicles, s."""
     begun: tuple[tuple[int, float], ...] = ()
@@ -84,7 +85,7 @@ class Ego(NamedTuple):
     def front_gap_m(self, at_m: float) -> float:
         """Return the distance from the bumper to a place of the route, m.
 
-        It is rounded down, because the position on the route is known to the metre only.
+        `ROUNDED_M` is subtracted, because the position on the route is known to the metre only.
         """
         return at_m - self.done_m - FRONT_M - ROUNDED_M
 
