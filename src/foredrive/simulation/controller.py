@@ -41,8 +41,10 @@ class Following:
     """Time at which each plan becomes available, s, and the plan. Sorted by time."""
 
     def expecting(self, plan: Plan, ready_s: float) -> "Following":
-        """Return the state with one more plan, which becomes available at `ready_s` because of the
-        latency."""
+        """Return the state with one more plan.
+
+        The plan becomes available at `ready_s` because of the agent's latency.
+        """
         coming = sorted([*self.coming, (ready_s, plan)], key=lambda item: item[0])
         return dataclasses.replace(self, coming=tuple(coming))
 

@@ -1,5 +1,4 @@
-"""Writes drives in towns and in rebuilt logs as 123D logs, one frame per key frame that the agent
-observed."""
+"""Writes drives in towns and in rebuilt logs as 123D logs, one frame per observed key frame."""
 
 import dataclasses
 from pathlib import Path

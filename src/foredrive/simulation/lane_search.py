@@ -67,8 +67,7 @@ _Node = tuple[int, _Part]
 
 
 def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
-    """Return the places on the graph that a waypoint may mean: on the nearest lane and on other near
-    lanes."""
+    """Return the places on the graph that a waypoint may mean: on the nearest lane and others nearby."""
     distance = np.linalg.norm(graph.xyz - xyz, axis=1)
     nearest = np.minimum.reduceat(distance, graph.first)
     places = []
@@ -251,8 +250,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
 
 
 def _opposite(graph: LaneGraph, end: Place, lanes: list[int]) -> float:
-    """Return the arc length, on the first of several lanes side by side, that lies next to the end on the
-    last."""
+    """Return the arc length on the first of several lanes side by side, next to the end on the last."""
     at_m = end.s_m
     for lane, before in itertools.pairwise(reversed(lanes)):
         at_m = abreast(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)

@@ -35,8 +35,10 @@ class Teacher(Protocol):
     """The expert: it knows what to do, as `TownExpert` does."""
 
     def plan(self) -> Trajectory:
-        """Return the plan of the expert from now on, in the ego frame. Repeated calls at one time give the
-        same plan."""
+        """Return the plan of the expert from now on, in the ego frame.
+
+        Repeated calls at one time give the same plan.
+        """
         ...
 
 

@@ -29,8 +29,10 @@ class Plan:
     horizon_s: float
 
     def progress_m(self, after_s: float) -> float:
-        """Return the planned distance along the path, m. From the horizon on it stays at the last
-        waypoint."""
+        """Return the planned distance along the path, m.
+
+        From the horizon on it stays at the last waypoint.
+        """
         return float(self.progress(min(max(after_s, 0.0), self.horizon_s)))
 
     def speed_mps(self, after_s: float) -> float:

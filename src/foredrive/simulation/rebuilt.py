@@ -1,5 +1,4 @@
-"""Simulator over a rebuilt log: the ego vehicle drives at 20 Hz, actors replay the log, sensors are
-rendered."""
+"""Simulator over a rebuilt log: the ego vehicle drives at 20 Hz, actors replay, sensors are rendered."""
 
 import dataclasses
 from dataclasses import dataclass, field

@@ -67,8 +67,10 @@ class TownExpert:
         return self.plan()
 
     def plan(self) -> Trajectory:
-        """Return the plan from the simulator's current state. Repeated calls in one state give the same
-        plan."""
+        """Return the plan from the simulator's current state.
+
+        Repeated calls in one state give the same plan.
+        """
         if self._planned is None or self._planned[0] is not self._simulator.state:
             self._planned = self._simulator.state, self._plan()
         return self._planned[1]
@@ -187,8 +189,7 @@ def _is_free(
 
 
 def _is_too_late(traffic: Traffic, state: TrafficState) -> bool:
-    """Return whether the vehicle (nearly) stands at a light that is not green long enough to cross the
-    line."""
+    """Return whether the vehicle is at rest, or nearly, at a light that is not green long enough to cross."""
     to_light_m = min(traffic.to_light_m(state, in_s) for in_s in (0.0, SETS_OFF_S))
     return bool(state.vehicles.speed_mps[0] < SETS_OFF_MPS and to_light_m < AT_LIGHT_M)
 

@@ -42,8 +42,10 @@ KINDS = {"training-short": Kind(8, 80.0, 150.0), "training-long": Kind(3, 500.0,
 
 
 def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
-    """Draw routes that are spread over a town, with an even mix of turns, straight crossings and lane
-    changes."""
+    """Draw routes that are spread over a town.
+
+    Turns, straight crossings and lane changes are mixed as evenly as possible.
+    """
     graph = build_lane_graph(load_town_map(town))
     starts, rng = find_starts(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []

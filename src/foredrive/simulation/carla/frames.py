@@ -46,8 +46,10 @@ def xyz_of(vector: Any) -> Float64[np.ndarray, "3"]:
 
 
 def matrix_of(transform: Any) -> Float64[np.ndarray, "4 4"]:
-    """Convert a `carla.Transform` to a matrix from an actor's or sensor's axes to the world's, all
-    right-handed."""
+    """Convert a `carla.Transform` to a matrix.
+
+    It maps an actor's or sensor's axes to the world's, all right-handed.
+    """
     return MIRROR @ np.array(transform.get_matrix()) @ MIRROR
 
 

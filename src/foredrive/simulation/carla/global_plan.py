@@ -62,6 +62,8 @@ class GlobalPlan:
     def target_xy(
         self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> Float64[np.ndarray, "2"]:
-        """Return the target point on the route in the ego frame, m. The route is straight between its
-        points."""
+        """Return the target point on the route in the ego frame, m.
+
+        The route is straight between its points.
+        """
         return self._line.target_xy(progress, T_world_ego)

@@ -282,8 +282,7 @@ def _sweep(measurement: Any, lidar: SpinningLidar) -> LidarSweep:
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> CarlaPose:
-    """Return the pose of CARLA's actor at which the rear axle stands at the route's beginning, along the
-    route."""
+    """Return the pose of CARLA's actor that puts the rear axle on the route's start, along the route."""
     forward = first_step(route_xyz)
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(*forward[:2])

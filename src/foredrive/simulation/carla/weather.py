@@ -14,8 +14,10 @@ FOG_VISIBILITY_M = 1000.0
 
 
 def weather_of(conditions: Conditions) -> Any:
-    """Return similar `carla.WeatherParameters`. CARLA's percentages have no unit, so the conversion is
-    approximate."""
+    """Return similar `carla.WeatherParameters`.
+
+    CARLA's percentages have no unit, so the conversion is approximate.
+    """
     carla = import_carla()
     phase = math.cos(2 * math.pi * (conditions.hour - 12.0) / 24.0)
     rain = 100.0 * min(conditions.rain_mmph / HEAVY_RAIN_MMPH, 1.0) ** 0.5

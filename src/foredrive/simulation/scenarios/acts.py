@@ -105,8 +105,10 @@ def _begun(scene: Scene) -> Scene:
 
 
 def _gap_m(scene: Scene, lead_m: float) -> float:
-    """Return the gap from the ego vehicle's bumper to the rear of a vehicle ahead on the route or beside
-    it, m."""
+    """Return the gap from the ego vehicle's bumper to the rear of the first vehicle of the scenario, m.
+
+    That vehicle is ahead on the route or beside it.
+    """
     on_route_m = scene.scenario.at_m - (scene.way.meet_m - lead_m)
     return scene.ego.front_gap_m(on_route_m) - scene.half_m(scene.play.cast[0])
 

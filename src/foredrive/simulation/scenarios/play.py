@@ -42,8 +42,10 @@ class Director:
     def direct(
         self, play: Play, state: TrafficState, ego: Ego, dt_s: float, at_start: bool = False
     ) -> tuple[Play, TrafficState, Orders]:
-        """Return the updated play, the traffic with newly placed vehicles, and the orders for its next
-        step."""
+        """Return the updated play, the traffic, and the orders for its next step.
+
+        The traffic includes newly placed vehicles.
+        """
         orders = Orders.none(len(state.vehicles.active))
         if play.number < len(self._scenarios):
             scenario = self._scenarios[play.number]
