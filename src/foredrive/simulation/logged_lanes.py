@@ -20,7 +20,6 @@ class LoggedLanes:
         self._areas = shapely.STRtree([shapely.make_valid(shapely.Polygon(outline)) for outline in outlines])
 
     def outside(self, xy: Float64[np.ndarray, "2"]) -> bool:
-        """Return whether a point is further outside of all lanes than CARLA's OutsideRouteLanesTest
-        allows."""
+        """Return whether a point is outside of all lanes, by CARLA's OutsideRouteLanesTest."""
         near = self._areas.query(shapely.Point(*xy), predicate="dwithin", distance=OUTSIDE_BY_M)
         return len(near) == 0
