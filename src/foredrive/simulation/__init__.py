@@ -1,1 +1,1 @@
-"""The closed loop: how the ego vehicle moves and follows a plan, where it has to go, how it is scored."""
+"""Closed-loop simulation: motion of the ego vehicle, plan following, routes, scenarios and scores."""

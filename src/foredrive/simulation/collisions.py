@@ -1,4 +1,4 @@
-"""What the ego vehicle runs into: road users by their boxes, and what stands in a town by its meshes."""
+"""Collisions of the ego vehicle: with road users by their boxes, with static objects by the town's meshes."""
 
 from dataclasses import dataclass
 
@@ -15,26 +15,27 @@ PASSABLE = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN, Surface.HIDDEN)
 SOLID = np.array([surface not in PASSABLE for surface in Surface])
 RAY_HEIGHTS_M = (0.35, 0.8)
 RAY_SPACING_M = 0.12
-"""Posts are not much thinner."""
+"""Lateral distance between rays, m: posts are not much thinner."""
 BUMPER_M, FLANK_M = 0.8, 0.3
-"""What this much of the front meets, but for the corners, stops the vehicle; along the rest it scrapes."""
+"""An object inside the first `BUMPER_M` of the front, except in the outer `FLANK_M` on each side, stops
+the vehicle. Contact elsewhere only scrapes."""
 SAME_S, SAME_M = 5.0, 3.0
-"""A contact is a new collision if the last one with the same road user is so long ago, or the last one with
-something that stands is so far away (CARLA's CollisionTest)."""
+"""A contact counts as a new collision if the last contact with the same road user is more than `SAME_S`
+ago, or if the last static contact is more than `SAME_M` away (CARLA's CollisionTest)."""
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """What has been run into."""
+    """Contacts so far in a drive."""
 
     users: tuple[tuple[int, float], ...] = ()
-    """Track ids, and when they were last in contact, s."""
+    """Track id and time of the last contact, s, of each road user hit recently."""
     standing_xy: tuple[float, float] | None = None
-    """Where something that stands was met last."""
+    """Position of the last counted contact with a static object, m, world frame."""
 
 
 class CollisionSense:
-    """Tells what the ego vehicle runs into in one world."""
+    """Detects the collisions of the ego vehicle in one world."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -52,7 +53,7 @@ class CollisionSense:
         contacts: Contacts,
         t_s: float,
     ) -> tuple[list[Event], Contacts, bool]:
-        """New collisions, what is known of contacts from now on, and whether something stops the vehicle."""
+        """Return the new collisions, the updated contacts, and whether an obstacle stops the vehicle."""
         box = ego_box(T_world_ego, ego)
         events, recent = collide(box, ego, users, contacts.users, t_s)
         stands_in_front, struck = self._standing(T_world_ego)
@@ -70,9 +71,9 @@ class CollisionSense:
     def _standing(
         self, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> tuple[bool, tuple[tuple[float, float], Surface] | None]:
-        """Whether the bumper meets something that stands; where and what is the foremost within the outline.
+        """Return whether the bumper meets a static object, and the foremost hit inside the vehicle's outline.
 
-        Rays go from the bumper to the rear.
+        A hit is its position (m, world frame) and its surface. Rays go from the bumper to the rear.
         """
         R, origin = T_world_ego[:3, :3], T_world_ego[:3, 3]
         start = self._start_ego @ R.T + origin
@@ -91,10 +92,10 @@ class CollisionSense:
 def collide(
     box: Box, ego: BicycleState, users: RoadUsers, met: tuple[tuple[int, float], ...], t_s: float
 ) -> tuple[list[Event], tuple[tuple[int, float], ...]]:
-    """New collisions of the ego vehicle's box with road users, and who has been met when from now on.
+    """Return the new collisions of the ego vehicle's box with road users, and the updated contact times.
 
     Args:
-        met: as `Contacts.users`.
+        met: contact times so far, as `Contacts.users`.
     """
     velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
     known, events = dict(met), []
@@ -111,7 +112,7 @@ def collide(
 
 
 def blocked(box: Box, users: RoadUsers) -> bool:
-    """Whether there is a vehicle right before the bumper."""
+    """Return whether a vehicle stands directly in front of the bumper."""
     forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
     half = np.array([0.5 * BUMPER_M, box.half_lw[1] - FLANK_M])
     bumper = Box(box.foot_m + (box.half_lw[0] - half[0]) * forward, box.yaw_rad, half)
@@ -119,6 +120,6 @@ def blocked(box: Box, users: RoadUsers) -> bool:
 
 
 def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState) -> Box:
-    """The ego vehicle's box."""
+    """Return the box of the ego vehicle."""
     foot = T_world_ego[:3, 3] + EGO.axle_to_centre_m * T_world_ego[:3, 0]
     return Box(foot, ego.yaw_rad, 0.5 * np.array([EGO.length_m, EGO.width_m]))

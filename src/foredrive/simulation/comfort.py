@@ -1,4 +1,4 @@
-"""How a drive feels: accelerations, jerks and turn rates against the bounds of nuPlan's metrics."""
+"""Ride comfort: accelerations, jerks and turn rates of a drive against the bounds of nuPlan's metrics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +13,12 @@ from foredrive.scene import BicycleState
 from foredrive.simulation.dynamics import EGO, STEP_S, Vehicle, yaw_rate_radps
 
 ACCELERATION_S, JERK_S = 0.8, 1.5
-"""Derivatives are those of quadratics over this much time (Savitzky & Golay 1964), as nuPlan takes them."""
+"""Window lengths, s. Derivatives are those of quadratics fitted over a window (Savitzky & Golay 1964), as
+in nuPlan."""
 
 
 class Bounds(NamedTuple):
-    """What is comfortable: nuPlan's ego_is_comfortable (Karnchanachari et al. 2024), from human drives."""
+    """Comfort bounds of nuPlan's ego_is_comfortable (Karnchanachari et al. 2024), taken from human drives."""
 
     min_longitudinal_mps2: float = -4.05
     max_longitudinal_mps2: float = 2.40
@@ -33,33 +34,33 @@ BOUNDS = Bounds()
 
 @dataclass(frozen=True)
 class Comfort:
-    """The extremes of a drive, of the rear axle."""
+    """Extreme values of a drive, measured at the rear axle."""
 
     braking_mps2: float
-    """Hardest, positive."""
+    """Hardest braking, m/s², positive."""
     acceleration_mps2: float
     lateral_mps2: float
     jerk_mps3: float
-    """Of the acceleration as a vector."""
+    """Largest norm of the jerk vector, m/s³."""
     longitudinal_jerk_mps3: float
     yaw_rate_radps: float
     yaw_acceleration_radps2: float
     comfortable_share: float
-    """Share of the time in which all bounds were kept, 0 to 1."""
+    """Share of the time in which all bounds hold, 0 to 1."""
 
     @property
     def comfortable(self) -> bool:
-        """Whether all bounds were kept all the time."""
+        """Return whether all bounds hold all the time."""
         return self.comfortable_share == 1.0
 
 
 def comfort_of(
     states: Sequence[BicycleState], dt_s: float = STEP_S, vehicle: Vehicle = EGO, bounds: Bounds = BOUNDS
 ) -> Comfort:
-    """Comfort of a drive.
+    """Compute the comfort of a drive.
 
     Args:
-        states: one each `dt_s`.
+        states: one state every `dt_s`.
 
     Raises:
         InputError: the drive is shorter than `JERK_S`.

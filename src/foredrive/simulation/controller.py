@@ -1,8 +1,9 @@
-"""Follows plans: steers back to the path, and keeps to its times.
+"""Controller that follows plans: it steers back to the path and keeps the plan's timing.
 
-Both controllers are linear-quadratic regulators of a double integrator, whose gains have a closed form.
-Across the path, over the way driven: offset'' = curvature, with gains 1/λ² and √2/λ for a length λ that grows
-with speed. Along it, over time: gains ω² and √2 ω. What the plan itself asks for is fed forward.
+Lateral and longitudinal control are linear-quadratic regulators of a double integrator, whose gains have a
+closed form. Lateral, over the distance driven: offset'' = curvature, with gains 1/λ² and √2/λ for a length λ
+that grows with speed. Longitudinal, over time: gains ω² and √2 ω. The curvature and the acceleration of the
+plan itself are fed forward.
 """
 
 import dataclasses
@@ -16,36 +17,39 @@ from foredrive.simulation.dynamics import EGO, Vehicle
 from foredrive.simulation.plans import Plan
 
 RETURN_M, RETURN_S = 2.5, 0.5
-"""λ at rest, and what each m/s adds to it."""
+"""λ at rest, m, and its increase per m/s of speed, s."""
 STEERING_DELAY_S = 0.1
-"""The path is read this far ahead: the wheel needs time to turn."""
+"""Look-ahead time on the path, s: the wheel needs time to turn."""
 KEEPING_RADPS = 1.0
-"""ω: errors along the path are gone after a few seconds."""
+"""ω, rad/s: errors along the path decay within a few seconds."""
 LARGEST_LAG_M = 3.0
 PREVIEW_S = 0.3
-"""The acceleration fed forward is the plan's over this time."""
+"""Time over which the plan's acceleration is averaged for the feed-forward, s."""
 STANDING_MPS = 0.1
 HOLDING_MPS2 = 1.0
-"""How hard the brake holds a standing vehicle."""
+"""Deceleration command that holds a standing vehicle, m/s²."""
 NO_PLAN_MPS2 = 3.0
-"""How hard it brakes while there is no plan."""
+"""Deceleration while there is no plan, m/s²."""
 
 
 @dataclass(frozen=True)
 class Following:
-    """What the controller knows: the plan it follows, and those that are still being computed."""
+    """State of the controller: the plan it follows, and the plans that are still being computed."""
 
     plan: Plan | None = None
     coming: tuple[tuple[float, Plan], ...] = ()
-    """When each is there, s, in order of time, and the plan."""
+    """Time at which each plan becomes available, s, and the plan. Sorted by time."""
 
     def expecting(self, plan: Plan, ready_s: float) -> "Following":
-        """Also with a plan that the agent's latency keeps back until `ready_s`."""
+        """Return the state with one more plan.
+
+        The plan becomes available at `ready_s` because of the agent's latency.
+        """
         coming = sorted([*self.coming, (ready_s, plan)], key=lambda item: item[0])
         return dataclasses.replace(self, coming=tuple(coming))
 
     def at(self, t_s: float) -> "Following":
-        """With the newest plan that is there at a time."""
+        """Return the state with the newest plan that is available at `t_s`."""
         ready = [plan for ready_s, plan in self.coming if ready_s <= t_s + 1e-9]
         if not ready:
             return self
@@ -58,7 +62,7 @@ class Following:
 def follow(
     following: Following, state: BicycleState, t_s: float, vehicle: Vehicle = EGO
 ) -> tuple[Control, Following]:
-    """The control for the step that begins now, and what the controller knows from now on."""
+    """Return the control for the step that begins now, and the updated state of the controller."""
     following = following.at(t_s)
     if following.plan is None:
         return Control(-NO_PLAN_MPS2, state.steering_rad), following

@@ -1,4 +1,4 @@
-"""One drive of one route: an agent plans, a controller follows, a simulator answers, until the route ends."""
+"""One drive of one route: the agent plans, the controller follows and the simulator steps until the end."""
 
 import math
 import time
@@ -21,10 +21,10 @@ from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collisio
 
 @dataclass(frozen=True)
 class Pace:
-    """How often an agent plans, and how long it takes for it: in the time of the drive, not of the computer.
+    """Planning period and latency of an agent, in simulation time (not the computer's time).
 
     Raises:
-        InputError: it does not plan at key frames, or the latency is negative.
+        InputError: the period is no multiple of the key frame interval, or the latency is negative.
     """
 
     period_s: float = FRAME_DT_S
@@ -39,26 +39,27 @@ class Pace:
 
     @property
     def steps(self) -> int:
-        """Simulation steps between plans."""
+        """Return the number of simulation steps between plans."""
         return round(self.period_s / STEP_S)
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What came of one drive."""
+    """Result of one drive."""
 
     score: RouteScore
     states: tuple[BicycleState, ...]
-    """At the start and after each step."""
+    """State at the start and after each step."""
     events: tuple[Event, ...]
     nearest_s: tuple[float, ...]
-    """Least time to collision at each key frame, with everybody at constant velocity; infinite: none."""
+    """Minimum time to collision at each key frame, s, if all move at constant velocity. Infinite without a
+    collision."""
     act_s: tuple[float, ...]
-    """What the computer took for each plan."""
+    """Wall-clock time of each plan, s."""
     comfort: Comfort | None
-    """None of a drive too short to tell."""
+    """None if the drive is too short to tell."""
     error: str = ""
-    """What the agent failed of, if it did."""
+    """Error of the agent; empty if there was none."""
 
 
 def drive_route(
@@ -71,16 +72,18 @@ def drive_route(
     pace: Pace | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Drive:
-    """Drive until the route ends; an agent that raises an error or has no plan ends it too: `Ending.CRASHED`.
+    """Drive until the route ends.
+
+    The drive also ends, with `Ending.CRASHED`, if the agent raises an error or returns no plan.
 
     Args:
-        scenario: what the simulator is reset to.
-        agent: sees a batch of one clip.
-        route: its name.
-        on_frame: called at each key frame, the first included, before the agent sees it.
+        scenario: scenario to which the simulator is reset.
+        agent: agent that drives; it observes a batch of one clip.
+        route: name of the route.
+        on_frame: called at each key frame, including the first, before the agent observes it.
 
     Raises:
-        InputError: the simulator cannot start there.
+        InputError: the simulator cannot start the scenario.
     """
     pace = pace or Pace()
     clip = simulator.reset(scenario)
@@ -93,7 +96,7 @@ def drive_route(
             began = time.perf_counter()
             try:
                 plan = _plan(agent, clip, states[-1], index * STEP_S)
-            except Exception as problem:  # whatever an agent does wrong, the route counts
+            except Exception as problem:  # any error of an agent ends the drive, but the route still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
             act_s.append(time.perf_counter() - began)
@@ -127,7 +130,7 @@ def _plan(agent: Agent, clip: Clip, ego: BicycleState, t_s: float) -> Plan:
 
 
 def _nearest_s(clip: Clip) -> float:
-    """The least time to collision at a clip's now."""
+    """Return the minimum time to collision at the clip's current frame, s."""
     boxes = clip.boxes[clip.now]
     valid = boxes.valid.numpy()
     if not valid.any():

@@ -1,4 +1,4 @@
-"""Drives in towns and in rebuilt logs as 123D logs, at the key frames that the agent saw."""
+"""Writes drives in towns and in rebuilt logs as 123D logs, one frame per observed key frame."""
 
 import dataclasses
 from pathlib import Path
@@ -26,7 +26,10 @@ REBUILT_SPLIT = "rebuilt_test"
 
 
 def drive_log(scenario: TownScenario, out: Path, name: str) -> LogWriter:
-    """The writer of a drive's log, at out/logs/SPLIT/NAME; without sensors it has poses, boxes and lights."""
+    """Return the writer of a drive's log at out/logs/SPLIT/NAME.
+
+    Without sensors the log has only poses, boxes and traffic lights.
+    """
     maps = write_town_map(scenario.town, out)
     cameras = [] if scenario.sensors is None else camera_specs(scenario.sensors.rig)
     split = split_of(scenario.town)
@@ -36,18 +39,19 @@ def drive_log(scenario: TownScenario, out: Path, name: str) -> LogWriter:
 def rebuilt_drive_log(
     rig: CameraRig | None, route_xyz: Float64[np.ndarray, "M 3"], out: Path, name: str
 ) -> LogWriter:
-    """The writer of the log of a drive in a rebuilt log, at out/logs/SPLIT/NAME; without a rig nothing is
-    seen.
+    """Return the writer of the log of a drive in a rebuilt log, at out/logs/SPLIT/NAME.
+
+    Without a rig the log has no images.
     """
     cameras = [] if rig is None else camera_specs(rig)
     return LogWriter(out, REBUILT_SPLIT, name, cameras, None, None, route_xyz)
 
 
 def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Frame:
-    """What is logged of a simulator's latest key frame, if that is now.
+    """Return the log frame of a simulator's latest key frame, which must be the current one.
 
     Args:
-        taught: what a teacher would do from here, a batch of one.
+        taught: trajectory that the expert would drive from here, a batch of one.
     """
     names = () if simulator.scenario.sensors is None else simulator.scenario.sensors.rig.names
     lights = simulator.traffic.zone_lights(simulator.state.decided.time_s)
@@ -59,13 +63,13 @@ def key_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Fra
 
 
 def carla_key_frame(simulator: CarlaSimulator, scenario: TownScenario) -> Frame:
-    """The same of a drive on a server of CARLA, whose lights are not logged."""
+    """Return the log frame of a drive on a CARLA server, as `key_frame` does. Its lights are not logged."""
     names = () if scenario.sensors is None else scenario.sensors.rig.names
     return _frame(simulator.state.frames[-1], simulator.state.ego, names)
 
 
 def rebuilt_key_frame(simulator: RebuiltSimulator) -> Frame:
-    """The same of a drive in a rebuilt log."""
+    """Return the log frame of a drive in a rebuilt log, as `key_frame` does."""
     names = simulator.renderer.rig.names if simulator.scenario.sensors else ()
     return _frame(simulator.state.frames[-1], simulator.state.ego, names)
 

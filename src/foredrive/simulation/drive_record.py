@@ -1,4 +1,4 @@
-"""What is kept of a drive, from the simulation to the report."""
+"""Record of a drive, passed from the simulation to the report."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from foredrive.simulation.scores import RouteScore
 from foredrive.simulation.threats import Threat
 
 TRACK_EVERY = 5
-"""Of the states of a drive one in this many is kept: four a second."""
+"""One in this many states of a drive is kept: four per second."""
 Point = tuple[float, float]
-"""World frame, m."""
+"""x and y, m, world frame."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """The way that was driven, S moments."""
+    """Track that was driven, sampled at S times."""
 
     t_s: tuple[float, ...]
     xy: tuple[Point, ...]
@@ -30,48 +30,48 @@ class Track:
 
 @dataclass(frozen=True)
 class ThreatMet:
-    """How a drive through a threat went."""
+    """Result of a drive through a threat."""
 
     kind: Threat
     impact_mps: float | None
-    """Speed at which the vehicle was hit; None: it was not."""
+    """Impact speed, m/s. None without a collision."""
     reference_mps: float
-    """Speed at which a vehicle would be hit that goes on as the log did."""
+    """Impact speed of a vehicle that drives on as in the log, m/s."""
     score: float
 
 
 @dataclass(frozen=True)
 class DriveRecord:
-    """All that is kept of a drive but its log."""
+    """Everything that is kept of a drive except its log."""
 
     town: str | None
-    """Whose lanes are drawn below it; None: there is no map."""
+    """Town whose lanes the report draws below the drive. None without a map."""
     length_m: float
-    """Of the route."""
+    """Length of the route, m."""
     score: RouteScore
     driving_score_1_0: float
     driving_score_2_1: float
     error: str
-    """What the agent failed of; empty if it did not."""
+    """Error of the agent; empty if there was none."""
     events: tuple[Event, ...]
     comfort: Comfort | None
-    """None of a drive too short to tell."""
+    """None if the drive is too short to tell."""
     nearest_s: tuple[float | None, ...]
-    """Least time to collision at each key frame; None: nobody is on the way."""
+    """Minimum time to collision at each key frame, s. None without a collision."""
     act_s: tuple[float, ...]
-    """What the computer took for each plan."""
+    """Wall-clock time of each plan, s."""
     route_xy: tuple[Point, ...]
     track: Track
     wall_s: float
     log: str
-    """Where the drive's log lies in the suite's folder."""
+    """Path of the drive's log inside the suite's folder."""
     threat: ThreatMet | None = None
     lanes_known: bool = True
-    """False: nothing can be said of leaving lanes."""
+    """False if departures from the lanes cannot be detected."""
 
     @property
     def scenario_events(self) -> tuple[Event, ...]:
-        """Where scenarios began, in the order in which they did: they are numbered by it."""
+        """Return the events that start scenarios, in the order of their start. This order numbers them."""
         return tuple(event for event in self.events if event.kind == "scenario")
 
 
@@ -86,7 +86,7 @@ def record_of(
     threat: ThreatMet | None = None,
     lanes_known: bool = True,
 ) -> DriveRecord:
-    """Return what is kept of a drive; arguments as the fields of `DriveRecord`."""
+    """Build the record of a drive. The arguments are fields of `DriveRecord`."""
     states = drive.states[::TRACK_EVERY]
     return DriveRecord(
         town=town,

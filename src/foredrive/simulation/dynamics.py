@@ -1,8 +1,8 @@
-"""How the ego vehicle moves: a kinematic bicycle whose actuators have limits.
+"""Motion of the ego vehicle: a kinematic bicycle with actuator limits.
 
-The reference point is the middle of the rear axle, the ego frame's origin, which never slips sideways:
-yaw rate = v tan(δ) / wheelbase (Rajamani, Vehicle Dynamics and Control, sec. 2.2). Motion is seen from above:
-heights and slopes belong to whoever knows the road.
+The reference point is the middle of the rear axle, which is the origin of the ego frame and never slips
+sideways: yaw rate = v tan(δ) / wheelbase (Rajamani, Vehicle Dynamics and Control, sec. 2.2). Motion is
+computed in the plane. Heights and slopes come from the code that knows the road.
 """
 
 import math
@@ -12,41 +12,42 @@ from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Control
 
 STEP_S = 0.05
-"""The simulation runs at 20 Hz."""
+"""Length of a simulation step, s: the simulation runs at 20 Hz."""
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The ego vehicle's body, and what its actuators can do. The default is what towns are recorded with."""
+    """Body and actuator limits of the ego vehicle. The default is the vehicle used to record the towns."""
 
     wheelbase_m: float = 2.86048
     length_m: float = 4.89238
     width_m: float = 1.83671
     axle_to_centre_m: float = 1.64855
-    """From the rear axle forward to the middle of the body."""
+    """Distance from the rear axle forward to the middle of the body, m."""
     max_steering_rad: float = 0.6
-    """Front-wheel angle at the end stop: the rear axle turns on a circle of 4.2 m."""
+    """Front-wheel angle at the end stop, rad: the rear axle turns on a circle of radius 4.2 m."""
     max_steering_radps: float = 0.7
-    """As fast as a driver turns the wheel in need: 640 °/s at a ratio of 16."""
+    """Rate of the front-wheel angle, rad/s: a driver in an emergency turns the wheel at 640 °/s, with a
+    ratio of 16."""
     max_acceleration_mps2: float = 4.0
     max_braking_mps2: float = 8.0
-    """On a dry road."""
+    """On a dry road, m/s²."""
     max_jerk_mps3: float = 30.0
-    """How fast engine and brakes build up their force: from coasting to full braking in .27 s."""
+    """How fast engine and brakes build up their force, m/s³: from coasting to full braking in 0.27 s."""
 
 
 EGO = Vehicle()
 
 
 def step(state: BicycleState, control: Control, dt_s: float = STEP_S, vehicle: Vehicle = EGO) -> BicycleState:
-    """The state `dt_s` later.
+    """Return the state `dt_s` later.
 
-    The wheel turns towards the wanted angle and the force builds up towards the wanted acceleration, as fast
-    as they can. The way driven is the arc of the step's mean angle, exact while that is held; a vehicle that
-    brakes to a halt within the step stands from there on.
+    The front wheel turns towards the commanded angle and the acceleration changes towards the commanded
+    value, both at limited rates. The vehicle drives the arc of the step's mean steering angle, which is exact
+    for a constant angle. A vehicle that brakes to a halt within the step stays at rest from there on.
 
     Raises:
-        InputError: the control is not finite, or the time not positive.
+        InputError: the control is not finite, or the time is not positive.
     """
     wanted = (control.acceleration_mps2, control.steering_rad)
     if not all(map(math.isfinite, wanted)) or not dt_s > 0:
@@ -73,14 +74,14 @@ def step(state: BicycleState, control: Control, dt_s: float = STEP_S, vehicle: V
 
 
 def yaw_rate_radps(state: BicycleState, vehicle: Vehicle = EGO) -> float:
-    """How fast the heading turns now, positive to the left."""
+    """Return the current yaw rate, rad/s, positive to the left."""
     return state.speed_mps * math.tan(state.steering_rad) / vehicle.wheelbase_m
 
 
 def _along_arc(
     x_m: float, y_m: float, yaw_rad: float, distance_m: float, curvature: float
 ) -> tuple[float, float, float]:
-    """The pose at the end of an arc: its chord points along the mean of both headings."""
+    """Return the pose (x, y, yaw) at the end of an arc. The chord points along the mean of both headings."""
     half_turn = 0.5 * distance_m * curvature
     chord_m = distance_m * (math.sin(half_turn) / half_turn if abs(half_turn) > 1e-6 else 1.0)
     along = yaw_rad + half_turn
@@ -93,5 +94,5 @@ def _clamped(value: float, low: float, high: float) -> float:
 
 
 def _towards(wanted: float, now: float, most: float) -> float:
-    """`wanted`, or as near to it as one comes by a change of `most`."""
+    """Move from `now` towards `wanted` by at most `most`."""
     return _clamped(wanted, now - most, now + most)

@@ -1,4 +1,4 @@
-"""Lights run, stop signs run, lanes left: what CARLA's leaderboard 1.0 watches on the road."""
+"""Lane rules of CARLA's leaderboard 1.0: red lights, stop signs, and driving outside of the lanes."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -15,29 +15,31 @@ from foredrive.towns.traffic.near_lanes import LEVEL_M, NearLanes
 from foredrive.towns.traffic.traffic import Traffic
 
 TAIL = 0.8
-"""A red light is run when the point so far from the middle to the rear bumper crosses the line (CARLA's
-RunningRedLightTest)."""
+"""The vehicle runs a red light when a reference point crosses the line. This point lies behind the
+vehicle's middle by `TAIL` times half the vehicle's length (CARLA's RunningRedLightTest)."""
 STOPPED_MPS = 0.1
-"""Slower than this is a stop (CARLA's RunningStopTest)."""
+"""Speed below which the vehicle counts as stopped, m/s (CARLA's RunningStopTest)."""
 STOP_WITHIN_M = 6.0
-"""A stop counts with the front bumper this far before the line at most, or over it by half a vehicle."""
+"""A stop counts if the front bumper is at most this far before the line, m, or beyond it by at most half a
+vehicle."""
 LINE_MARGIN_M = 0.3
 LINES_WITHIN_M = EGO.length_m + STOP_WITHIN_M
 OUTSIDE_BY_M = 1.3
 WRONG_WAY_RAD = np.deg2rad(120.0)
-"""CARLA's OutsideRouteLanesTest: further than this beside all lanes, or more than this against one."""
+"""CARLA's OutsideRouteLanesTest: the vehicle is more than `OUTSIDE_BY_M` beside all lanes, or its heading
+differs by more than `WRONG_WAY_RAD` from that of its lane."""
 LANES_WITHIN_M = 6.0
 LEAST_LEFT_M = 0.5
-"""Less than this outside is not reported as an event; it counts all the same."""
+"""A shorter distance outside of the lanes, m, gives no event, but still counts in the score."""
 
 
 class Lines(NamedTuple):
-    """The stop lines of K lanes: where the lanes behind them begin."""
+    """Stop lines of K lanes. A line lies where the lane behind it begins."""
 
     zone: Int[np.ndarray, "K"]
     """Index of the stop zone."""
     is_sign: Bool[np.ndarray, "K"]
-    """A stop sign's, not a light's."""
+    """True for a stop sign, False for a light."""
     xyz: Float64[np.ndarray, "K 3"]
     ahead: Float64[np.ndarray, "K 2"]
     half_width_m: Float64[np.ndarray, "K"]
@@ -45,26 +47,26 @@ class Lines(NamedTuple):
 
 @dataclass(frozen=True)
 class RuleState:
-    """What has to be remembered to tell whether rules were kept."""
+    """Memory of the rules between steps."""
 
     stopped_at: frozenset[int] = frozenset()
-    """Stop zones at whose lines the vehicle has stopped, and that it has not passed yet."""
+    """Stop zones at whose lines the vehicle has stopped and which it has not passed yet."""
     driven_m: float = 0.0
     outside_m: float = 0.0
-    """Of it outside of all lanes, or against their direction."""
+    """Part of `driven_m` outside of all lanes or against their direction, m."""
     left_at: tuple[float, float] | None = None
-    """Where it has left the lanes, if it is outside now."""
+    """Position where the vehicle left the lanes, m, world frame. None while it is inside."""
     left_m: float = 0.0
-    """How far it has driven since."""
+    """Distance driven since then, m."""
 
     @property
     def outside_share(self) -> float:
-        """Part of the way that was driven outside of the lanes."""
+        """Return the share of the distance that was driven outside of the lanes."""
         return self.outside_m / max(self.driven_m, 1e-9)
 
 
 def stop_lines(town: TownMap) -> Lines:
-    """The lines before lights and at stop signs."""
+    """Return the stop lines at lights and at stop signs."""
     lanes = {lane.lane_id: lane for lane in town.lanes}
     kinds = (StopZoneKind.TRAFFIC_LIGHT, StopZoneKind.STOP_SIGN)
     rows = [
@@ -85,7 +87,7 @@ def stop_lines(town: TownMap) -> Lines:
 
 
 class LaneRules:
-    """Watches one drive in a town."""
+    """Checks the rules for one drive in a town."""
 
     def __init__(self, town: TownMap, traffic: Traffic) -> None:
         self._lines = stop_lines(town)
@@ -101,7 +103,7 @@ class LaneRules:
         state: RuleState,
         t_s: float,
     ) -> tuple[list[Event], RuleState]:
-        """What was run or left in one step, and what is remembered from now on.
+        """Return the events of one step and the updated rule state.
 
         Args:
             lights: a `Light` for each of the town's stop zones.
@@ -121,7 +123,7 @@ class LaneRules:
             return True
         inside = away_m < 0.5 * self._graph.width_m[lane]
         if not inside.any() or (self._graph.junction[lane[inside]] >= 0).any():
-            return False  # between lanes, or in a junction, where they cross
+            return False  # between lanes, or in a junction, where lanes cross
         turned = np.abs((yaw_rad - self._near.heading[samples[inside]] + np.pi) % (2 * np.pi) - np.pi)
         return bool((turned > WRONG_WAY_RAD).all())
 
@@ -135,12 +137,14 @@ def lines_run(
     stopped_at: frozenset[int],
     t_s: float,
 ) -> tuple[list[Event], frozenset[int]]:
-    """Red lights and stop signs run in one step, and the stop zones at which the vehicle has stopped.
+    """Detect red lights and stop signs that were run in one step.
+
+    Returns the events and the stop zones at which the vehicle has stopped.
 
     Args:
-        lines: those that may be met.
+        lines: stop lines of the road; those near the vehicle are checked.
         lights: a `Light` for each stop zone.
-        stopped_at: what the last step returned.
+        stopped_at: stop zones returned by the last step.
     """
     middle = body_middle(after)
     near = _near_lines(lines, np.append(middle, z_m))
@@ -168,10 +172,12 @@ def lines_run(
 def way_driven(
     state: RuleState, before: BicycleState, after: BicycleState, outside: bool, t_s: float
 ) -> tuple[list[Event], RuleState]:
-    """What is remembered of the lanes after one step, and the event of having come back to them.
+    """Update the distances driven inside and outside of the lanes.
+
+    Returns an event if the vehicle has just come back to the lanes.
 
     Args:
-        outside: whether the vehicle is outside of all lanes now, or goes against them.
+        outside: whether the vehicle is now outside of all lanes or drives against them.
     """
     events, middle = [], body_middle(after)
     moved_m = float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
@@ -193,12 +199,12 @@ def way_driven(
 
 
 def body_middle(state: BicycleState) -> Float64[np.ndarray, "2"]:
-    """The middle of the vehicle, seen from above."""
+    """Return the middle of the vehicle, m, in the plane."""
     return _point(state, EGO.axle_to_centre_m)
 
 
 def _near_lines(lines: Lines, xyz: Float64[np.ndarray, "3"]) -> Lines | None:
-    """The lines that a vehicle with its middle at a point may concern; None if there are none."""
+    """Return the lines near a vehicle whose middle is at `xyz`. None if there are none."""
     offset = np.abs(lines.xyz - xyz)
     near = np.flatnonzero((offset[:, 0] < LINES_WITHIN_M) & (offset[:, 1] < LINES_WITHIN_M))
     near = near[offset[near, 2] < LEVEL_M]
@@ -208,7 +214,7 @@ def _near_lines(lines: Lines, xyz: Float64[np.ndarray, "3"]) -> Lines | None:
 def _beside(
     lines: Lines, xy: Float64[np.ndarray, "2"]
 ) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K"]]:
-    """How far beyond each line a point is, and how far beside the middle of its lane."""
+    """Return how far a point lies beyond each line, m, and how far beside the middle of its lane, m."""
     dx, dy = (xy - lines.xyz[:, :2]).T
     ahead_x, ahead_y = lines.ahead.T
     return ahead_x * dx + ahead_y * dy, np.abs(ahead_x * dy - ahead_y * dx)
@@ -217,18 +223,18 @@ def _beside(
 def _crossed(
     lines: Lines, before: BicycleState, after: BicycleState, ahead_m: float
 ) -> Bool[np.ndarray, "K"]:
-    """Which lines a point of the vehicle has crossed in the direction of travel."""
+    """Return which lines a point of the vehicle has crossed in the direction of travel."""
     first, _ = _beside(lines, _point(before, ahead_m))
     then, aside = _beside(lines, _point(after, ahead_m))
     return (first < 0) & (then >= 0) & (aside < lines.half_width_m)
 
 
 def left_lanes(left_at: tuple[float, float], left_m: float, t_s: float) -> Event:
-    """The event of having driven outside of the lanes until now."""
+    """Build the event of a drive outside of the lanes that ends now."""
     return Event("outside_lane", t_s, left_at, f"for {left_m:.1f} m", "lane", left_m)
 
 
 def _point(state: BicycleState, ahead_m: float) -> Float64[np.ndarray, "2"]:
-    """A point on the vehicle's middle line, ahead of its rear axle."""
+    """Return a point on the vehicle's longitudinal axis, `ahead_m` before its rear axle."""
     forward = np.array([np.cos(state.yaw_rad), np.sin(state.yaw_rad)])
     return np.array([state.x_m, state.y_m]) + ahead_m * forward

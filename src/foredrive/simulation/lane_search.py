@@ -1,4 +1,4 @@
-"""From waypoints to lanes: where each lies on the lane graph, and the shortest way through them all."""
+"""Lane search: maps waypoints to the lane graph and finds the shortest way through all of them."""
 
 import enum
 import heapq
@@ -15,18 +15,19 @@ from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.leaders import abreast
 
 ALSO_NEAR, ALSO_NEAR_M, NO_FURTHER_M = 3.0, 1.0, 20.0
-"""A waypoint may mean any lane up to `ALSO_NEAR` times as far from it as the nearest, and `ALSO_NEAR_M`, but
-no more than `NO_FURTHER_M` further: lanes cross and run into each other, and waypoints beside the road (those
-of Town05 short) do not say which of its lanes they mean."""
+"""A waypoint may mean any lane up to `ALSO_NEAR` times as far away as the nearest one, plus `ALSO_NEAR_M`.
+The lane may be no more than `NO_FURTHER_M` (plus `ALSO_NEAR_M`) further away than the nearest. Lanes cross
+and merge, and waypoints beside the road (those of Town05 short) do not say which of its lanes they mean."""
 ASIDE_WEIGHT = 5.0
-"""A metre from lane to waypoint is as bad as this many metres of way."""
+"""A metre between lane and waypoint costs as much as this many metres of driving."""
 BACK_M = 0.5
-"""A waypoint may lie this far behind the last on the same lane: both are rounded."""
+"""A waypoint may lie this far behind the last one on the same lane, m: both are rounded."""
 CHANGE_M, HURRIED_M2, CLOSED_M = 10.0, 250.0, 50.0
-"""A lane change is as bad as a detour of `CHANGE_M`, of `HURRIED_M2` / room, as hurried ones are worse, and
-of `CLOSED_M` where traffic would not change: over solid lines, and to lanes that are only growing there."""
+"""Cost of a lane change in metres of detour. Each change costs `CHANGE_M` plus `HURRIED_M2` / room,
+because hurried changes are worse. A change that traffic would not make costs `CLOSED_M` more: over solid
+lines, and to lanes that only begin there."""
 LEAST_ROOM_M = 1.0
-"""Where there is less room, nobody changes."""
+"""Lane changes need at least this much room, m."""
 
 
 class Place(NamedTuple):
@@ -34,25 +35,28 @@ class Place(NamedTuple):
 
     lane: int
     s_m: float
-    """Arc length on the lane."""
+    """Arc length on the lane, m."""
     aside_m: float
-    """How far the waypoint is from it."""
+    """Distance between the waypoint and the lane, m."""
 
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of a way: along one lane from one arc length to another, both in m."""
+    """Part of a way: along one lane, from one arc length to another (both m)."""
 
     lane: int
     from_m: float
     to_m: float
     changes: int = 0
-    """How the leg is entered: 0 from the lane before, 1 from the lane to the right by a change to the left,
-    -1 from the lane to the left."""
+    """How the leg begins: 0 continues from the lane before, 1 is a change to the left (from the lane to
+    the right), -1 is a change to the right (from the lane to the left)."""
 
 
 class _Part(enum.IntEnum):
-    """Which part of a way a lane is on: where it ends matters on the last, where it begins on the first."""
+    """Position of a lane within a way.
+
+    The end point matters on the last part, the start point on the first part.
+    """
 
     FIRST = 0
     BETWEEN = 1
@@ -63,7 +67,7 @@ _Node = tuple[int, _Part]
 
 
 def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
-    """Where on the graph a waypoint may lie: on the lane nearest in space, and on others it may mean."""
+    """Return the places on the graph that a waypoint may mean: on the nearest lane and others nearby."""
     distance = np.linalg.norm(graph.xyz - xyz, axis=1)
     nearest = np.minimum.reduceat(distance, graph.first)
     places = []
@@ -82,18 +86,19 @@ def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
 
 
 def _also(nearest_m: float) -> float:
-    """How far lanes may be that a waypoint may mean."""
+    """Return the maximum distance of lanes that a waypoint may mean, m, given that of the nearest."""
     return min(ALSO_NEAR * nearest_m, nearest_m + NO_FURTHER_M) + ALSO_NEAR_M
 
 
 def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[list[Leg], list[Place]]:
-    """The shortest way through all waypoints in turn, and where on it each of them lies.
+    """Find the shortest way through all waypoints in order, and the place of each waypoint on it.
 
-    Of the places each may mean, those are taken that make the whole way shortest (as map matching does,
-    Newson & Krumm 2009): a waypoint within a junction does not say which way through it is meant.
+    Among the places that each waypoint may mean, the search takes those that make the whole way shortest, as
+    map matching does (Newson & Krumm 2009). A waypoint within a junction does not say which way through the
+    junction it means.
 
     Raises:
-        InputError: there are fewer than two waypoints, or one cannot be reached from those before.
+        InputError: there are fewer than two waypoints, or a waypoint cannot be reached from those before it.
     """
     if len(waypoints) < 2:
         raise InputError(f"a route has two waypoints or more, got {len(waypoints)}")
@@ -119,8 +124,11 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
 def _best_onto(
     graph: LaneGraph, starts: Sequence[Place], costs: Sequence[float], end: Place, most: float
 ) -> tuple[float, int, list[Leg]]:
-    """The cheapest way to a place from one of some that cost what they do: what it costs with both places,
-    from which it comes, its legs; infinite if none costs less than `most`. The most promising come first."""
+    """Find the cheapest way to `end` from one of several start places with known costs.
+
+    Returns the cost, which includes both places, the index of the start place, and the legs. The cost is
+    infinite if no way costs less than `most`. The most promising start places are searched first.
+    """
     index, s_m = np.array([place.lane for place in (end, *starts)]), [place.s_m for place in (end, *starts)]
     here, *there = graph.position(index, np.array(s_m))
     aside = ASIDE_WEIGHT * end.aside_m
@@ -135,7 +143,7 @@ def _best_onto(
 
 
 def joined(first: Sequence[Leg], second: Sequence[Leg]) -> list[Leg]:
-    """One way of two, of which the second begins where the first ends."""
+    """Join two ways. The second must begin where the first ends."""
     if not first or not second or first[-1].lane != second[0].lane:
         return [*first, *second]
     middle = Leg(first[-1].lane, first[-1].from_m, second[0].to_m, first[-1].changes)
@@ -143,10 +151,11 @@ def joined(first: Sequence[Leg], second: Sequence[Leg]) -> list[Leg]:
 
 
 def _shortest(graph: LaneGraph, start: Place, end: Place, most_m: float) -> tuple[float, list[Leg]]:
-    """The way from one place to another and its cost; infinite where none costs less than `most_m`
-    (Dijkstra 1959).
+    """Find the cheapest way from one place to another (Dijkstra 1959).
 
-    A node is a lane and the part of the way that one is on there; its cost is that to the lane's beginning.
+    Returns its cost and its legs. The cost is infinite if no way costs less than `most_m`. A node of the
+    search is a lane together with its part of the way. The cost of a node is the cost to the beginning of its
+    lane.
     """
     first, goals = (start.lane, _Part.FIRST), [(end.lane, _Part.LAST)]
     if (straight := _legs(graph, start, end, _beside(graph, start.lane, end.lane))) is not None:
@@ -179,7 +188,7 @@ def _shortest(graph: LaneGraph, start: Place, end: Place, most_m: float) -> tupl
 
 
 def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[tuple[_Node, float]]:
-    """Where one may go from a node, and what it costs."""
+    """Yield the nodes that can be reached from a node, and the cost of each step."""
     lane, part = node
     length_m = float(graph.length_m[lane])
     if part is not _Part.LAST:
@@ -196,7 +205,7 @@ def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[
 
 
 def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:
-    """The lanes from one to another that is the same or on one of its sides; only the first if it is not."""
+    """Return the lanes between `first` and `last`, which lie side by side. Only `first` if they do not."""
     for side in (0, 1):
         lanes = [first]
         while lanes[-1] != last and graph.sides.lane[side, lanes[-1]] >= 0:
@@ -207,9 +216,10 @@ def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:
 
 
 def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[Leg] | None:
-    """The legs along lanes that follow each other or lie side by side; None if they do not lead to the end.
+    """Return the legs along lanes that follow each other or lie side by side.
 
-    Changes are spread evenly over the part of the road that is driven.
+    Returns None if they do not lead to the end. Lane changes are spread evenly over the part of the road that
+    is driven.
     """
     if lanes[-1] != end.lane:
         return None
@@ -229,7 +239,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
             changes = len(stretch) - 1 - k
             if k == 0 and until_m - at_m < (LEAST_ROOM_M if changes else -BACK_M):
                 return None
-            # The first and the last lane of several are driven half as long as those between.
+            # When there are several lanes, the first and the last are driven half as long as those between.
             share = 1.0 if not changes else 0.5 / (changes if k == 0 else changes + 0.5)
             to_m = max(at_m, at_m + share * (until_m - at_m))
             legs.append(Leg(lane, at_m, to_m, side))
@@ -240,7 +250,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
 
 
 def _opposite(graph: LaneGraph, end: Place, lanes: list[int]) -> float:
-    """Arc length on the first of some lanes side by side next to the end, which is on the last."""
+    """Return the arc length on the first of several lanes side by side, next to the end on the last."""
     at_m = end.s_m
     for lane, before in itertools.pairwise(reversed(lanes)):
         at_m = abreast(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)

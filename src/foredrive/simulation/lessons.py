@@ -1,8 +1,9 @@
-"""Drives that show a pupil what a good driver does where good drivers never get: aside, too slow, too fast.
+"""Drives that teach a student to recover from lateral offsets and from too low or too high speed.
 
-Who learns from faultless drives alone has never seen what follows on his own mistakes. Either the teacher is
-disturbed while he drives (Laskey et al. 2017, "DART"; Codevilla et al. 2018 add steering noise), or the pupil
-drives and the teacher says what he would do (Ross et al. 2011, "DAgger").
+A student that learns from faultless drives only has never seen the states that its own mistakes lead to.
+There are two remedies. Either the expert is disturbed while it drives (Laskey et al. 2017, "DART"; Codevilla
+et al. 2018 add steering noise), or the student drives and the expert labels its states (Ross et al. 2011,
+"DAgger").
 """
 
 import dataclasses
@@ -16,24 +17,28 @@ import torch
 from foredrive.scene import Agent, Clip, Trajectory
 
 CALM_S = 5.0
-"""Mean time between disturbances."""
+"""Mean time between disturbances, s."""
 STEERS_RAD, STEERS_S = (0.06, 0.22), (1.0, 2.0)
-"""How far aside a disturbed plan bears, and for how long."""
+"""Range of the heading error of a steered plan, rad, and of its duration, s."""
 PACE, PACE_S = (0.0, 1.4), (1.5, 4.0)
-"""The share of the way that a disturbed plan gets, and for how long; below `HALTS` it gets nowhere."""
+"""Range of the factor on the distance of a disturbed plan, and of its duration, s. A factor up to `HALTS`
+is set to 0."""
 HALTS = 0.25
 STEERED_SHARE = 0.65
-"""Of the disturbances; the others are of pace."""
+"""Share of steering disturbances; the others change the pace."""
 TURN_S = 6.0
-"""Pupil and teacher drive for so long before lots are drawn again."""
+"""Length of a turn, s: student and expert drive for this long before the next draw."""
 
 
 @runtime_checkable
 class Teacher(Protocol):
-    """Who knows what to do, as `TownExpert` does."""
+    """The expert: it knows what to do, as `TownExpert` does."""
 
     def plan(self) -> Trajectory:
-        """What he would do now, in the ego frame; asked twice he says the same."""
+        """Return the plan of the expert from now on, in the ego frame.
+
+        Repeated calls at one time give the same plan.
+        """
         ...
 
 
@@ -45,12 +50,12 @@ class _Disturbance:
 
 
 class Disturbed:
-    """An `Agent` that is the teacher, now and then steered aside, slowed down or hurried.
+    """An `Agent` that drives as the expert but is now and then steered aside, slowed down or sped up.
 
     Args:
-        teacher: whom it happens to.
-        clock: time of the drive, s.
-        seed: of what happens when.
+        teacher: expert whose plans are disturbed.
+        clock: returns the time of the drive, s.
+        seed: seed of the disturbances.
     """
 
     def __init__(self, teacher: Teacher, clock: Callable[[], float], seed: int) -> None:
@@ -60,7 +65,7 @@ class Disturbed:
         self._now: _Disturbance | None = None
 
     def act(self, observation: Clip) -> Trajectory:
-        """The agent's plan, as disturbed as it is now."""
+        """Return the expert's plan with the current disturbance, if there is one."""
         plan, t_s, rng = self.teacher.plan(), self._clock(), self._rng
         if self._now is not None and t_s >= self._now.until_s:
             self._now, self._begins_s = None, t_s + rng.exponential(CALM_S)
@@ -79,13 +84,16 @@ class Disturbed:
 
 
 class Alternating:
-    """An `Agent` that is the pupil most of the time, and the teacher between, who gets him out of dead ends.
+    """An `Agent` that alternates between the student and the expert.
+
+    The student drives most of the time. The expert drives in between and so leads it out of dead ends.
 
     Args:
-        pupil, teacher: who drives.
-        clock: time of the drive, s.
-        seed: of who has which turn.
-        share: the pupil's, of the turns.
+        pupil: student that drives.
+        teacher: expert that drives in between.
+        clock: returns the time of the drive, s.
+        seed: seed of the turns.
+        share: share of the turns that the student gets.
     """
 
     def __init__(
@@ -101,7 +109,7 @@ class Alternating:
         self._until_s, self._is_pupils = -math.inf, True
 
     def act(self, observation: Clip) -> Trajectory:
-        """The plan of whose turn it is."""
+        """Return the plan of the agent that has the current turn."""
         if self._clock() >= self._until_s:
             self._until_s = self._clock() + TURN_S
             self._is_pupils = bool(self._rng.random() < self._share)

@@ -1,4 +1,4 @@
-"""How a log was driven, as a way for others to follow: poses at any time, and the ground along them."""
+"""The ego vehicle's drive in a log, as a route to follow: poses at any time, and the ground along them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,16 +13,16 @@ from foredrive.scene import BicycleState
 from foredrive.simulation.dynamics import EGO
 
 SPEED_OVER_S = 0.2
-"""Speeds are those over twice as long: logged poses tremble."""
+"""Speeds are averaged from this long before to this long after a time, s, because logged poses are noisy."""
 SPACING_M = 0.5
-"""Points of a route are so far apart."""
+"""Distance between points of a route, m."""
 STEERS_FROM_MPS = 1.0
-"""How a slower vehicle's wheels stand cannot be told from where it goes."""
+"""Below this speed, m/s, the steering angle cannot be derived from the motion and is set to 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedDrive:
-    """The ego vehicle of a rebuilt log, or one that keeps its place beside it.
+    """The drive of a rebuilt log's ego vehicle, or of a vehicle at a fixed offset from it.
 
     Raises:
         InputError: there are fewer than two poses.
@@ -30,7 +30,7 @@ class LoggedDrive:
 
     vehicle: Vehicle
     T_ego_shifted: Float[Tensor, "4 4"]
-    """`Edited.T_ego_shifted`."""
+    """The offset, as `Edited.T_ego_shifted`."""
 
     def __post_init__(self) -> None:
         if len(self.vehicle.t_s) < 2:
@@ -38,22 +38,22 @@ class LoggedDrive:
 
     @property
     def first_s(self) -> float:
-        """The first time, since the log's start."""
+        """Return the first time of the log, s, on the log's clock."""
         return float(self.vehicle.t_s[0])
 
     @property
     def end_s(self) -> float:
-        """The last time."""
+        """Return the last time of the log, s."""
         return float(self.vehicle.t_s[-1])
 
     def pose_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
-        """`T_world_ego` at a time; before and after the log it goes on as it moved."""
+        """Return `T_world_ego` at a time. Before and after the log the motion is extrapolated."""
         T_scene_ego = self.vehicle.at(t_s).shifted(self.T_ego_shifted).T_scene_ego.double()
         T_world_ego: np.ndarray = (self.vehicle.T_world_scene @ T_scene_ego).numpy()
         return T_world_ego
 
     def state_at(self, t_s: float) -> BicycleState:
-        """The vehicle at a time, steering as it turned."""
+        """Return the vehicle's state at a time. Its steering angle follows from its turn rate."""
         from_s, to_s = max(t_s - SPEED_OVER_S, self.first_s), min(t_s + SPEED_OVER_S, self.end_s)
         before, now, after = (self.pose_at(at) for at in (from_s, t_s, to_s))
         speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
@@ -64,17 +64,17 @@ class LoggedDrive:
         return BicycleState(float(now[0, 3]), float(now[1, 3]), _yaw(now), speed, float(steering))
 
     def route_from(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
-        """The way from where the vehicle was at a time to where the log ends, world frame.
+        """Return the route from the vehicle's position at a time to the end of the log, m, world frame.
 
         Raises:
-            InputError: it is shorter than the vehicle.
+            InputError: the route is shorter than the vehicle.
         """
         if (left_m := self.way_left_m(t_s)) < EGO.length_m:
             raise InputError(f"from {t_s:.1f} s on the log drives {left_m:.1f} m: nothing to follow")
         return self._way(t_s)
 
     def way_left_m(self, t_s: float) -> float:
-        """How far it is from where the vehicle was at a time to where the log ends, seen from above."""
+        """Return the distance that the log drives from a time on, m, in the plane."""
         return float(np.hypot(*np.diff(self._way(t_s)[:, :2], axis=0).T).sum())
 
     def _way(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
@@ -85,7 +85,10 @@ class LoggedDrive:
         return np.stack(points)
 
     def on_ground(self, ego: BicycleState) -> Float64[np.ndarray, "4 4"]:
-        """`T_world_ego` of a vehicle beside the way driven: on the plane the log stood on nearest to it."""
+        """Return `T_world_ego` of a vehicle beside the logged path.
+
+        The vehicle stands on the ground plane of the nearest logged pose.
+        """
         away_m = np.hypot(*(self._poses[:, :2, 3] - [ego.x_m, ego.y_m]).T)
         near = self._poses[int(np.argmin(away_m))]
         up = near[:3, 2]

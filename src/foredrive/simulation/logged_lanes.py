@@ -1,4 +1,4 @@
-"""Lanes of a log's map, to tell whether a vehicle is on any of them."""
+"""Lanes of a log's map, to check whether a vehicle is on a lane."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from foredrive.simulation.lane_rules import OUTSIDE_BY_M
 
 
 class LoggedLanes:
-    """The area of all lanes; which way they lead is not looked at.
+    """Area of all lanes. Their directions are not considered.
 
     Args:
-        outlines: world frame, m.
+        outlines: outlines of the lanes, m, world frame.
     """
 
     def __init__(self, outlines: Sequence[Float64[np.ndarray, "V 2"]]) -> None:
         self._areas = shapely.STRtree([shapely.make_valid(shapely.Polygon(outline)) for outline in outlines])
 
     def outside(self, xy: Float64[np.ndarray, "2"]) -> bool:
-        """Whether a point is further beside all lanes than CARLA's OutsideRouteLanesTest lets pass."""
+        """Return whether a point is outside of all lanes, by CARLA's OutsideRouteLanesTest."""
         near = self._areas.query(shapely.Point(*xy), predicate="dwithin", distance=OUTSIDE_BY_M)
         return len(near) == 0

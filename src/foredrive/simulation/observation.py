@@ -1,4 +1,4 @@
-"""What an agent gets to see of a town: key frames of the past, put together as a clip."""
+"""Observations of an agent in simulation: past key frames, combined into a clip."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ HORIZON_STEPS = 6
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """What was sensed at one time."""
+    """Sensor data and boxes at one time."""
 
     t_s: float
     T_world_ego: Float64[np.ndarray, "4 4"]
     speed_mps: float
     images: UInt8[Tensor, "C 3 H W"]
-    """No cameras where sensors are off."""
+    """Without cameras (C = 0) if sensors are off."""
     sweep: LidarSweep | None
     boxes: Boxes
 
@@ -35,11 +35,11 @@ def make_clip(
     command: Command,
     target_xy: Float64[np.ndarray, "2"] | None = None,
 ) -> Clip:
-    """The clip of some key frames, the last of which is now; its future is not known.
+    """Build a clip from key frames. The last frame is now; the future is marked invalid.
 
     Args:
-        rig: of the images, without leading dimensions; None where there are none.
-        target_xy: where the route leads, as `Clip` has it; None if that is not known.
+        rig: rig of the images, without leading dimensions. None without images.
+        target_xy: target point on the route, as in `Clip`. None if it is not known.
     """
     count, rig = len(frames), rig or _no_cameras()
     yes = torch.ones(count, dtype=torch.bool)
@@ -72,7 +72,7 @@ def make_clip(
 
 
 def no_images() -> UInt8[Tensor, "0 3 0 0"]:
-    """Of no cameras."""
+    """Return the images of a rig without cameras."""
     return torch.zeros(0, 3, 0, 0, dtype=torch.uint8)
 
 

@@ -1,4 +1,4 @@
-"""What an agent wants, fixed in the world: a path, and how far along it to be at which time."""
+"""Plans of an agent, fixed in the world frame: a path, and the position along it over time."""
 
 import math
 from dataclasses import dataclass
@@ -13,41 +13,44 @@ from foredrive.simulation.dynamics import EGO, Vehicle
 from foredrive.simulation.smooth_path import Path, fit_path
 
 STANDS_M = 0.25
-"""A plan that gets no further than this means to stand."""
+"""A plan that moves no further than this, m, means that the vehicle stands."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Where to be when."""
+    """A path with a time for each position along it."""
 
     made_s: float
-    """When the agent saw what it planned from; the plan's times count from here."""
+    """Time of the observation that the agent planned from, s. The plan's times count from here."""
     path: Path
-    """In the world frame, from where the vehicle was then."""
+    """Path in the world frame, from the vehicle's pose at `made_s`."""
     progress: PchipInterpolator
-    """Way along the path, m, by time since `made_s`, s: monotone, through the waypoints."""
+    """Distance along the path, m, over the time since `made_s`, s. Monotone, through the waypoints."""
     horizon_s: float
 
     def progress_m(self, after_s: float) -> float:
-        """How far along the path to be; at the last waypoint from the horizon on."""
+        """Return the planned distance along the path, m.
+
+        From the horizon on it stays at the last waypoint.
+        """
         return float(self.progress(min(max(after_s, 0.0), self.horizon_s)))
 
     def speed_mps(self, after_s: float) -> float:
-        """How fast to be; 0 beyond the horizon: nobody planned that far."""
+        """Return the planned speed, m/s. It is 0 beyond the horizon, where the plan says nothing."""
         return float(self.progress(max(after_s, 0.0), 1)) if after_s <= self.horizon_s else 0.0
 
 
 def fixed_in_world(
     trajectory: Trajectory, seen_from: BicycleState, made_s: float, vehicle: Vehicle = EGO
 ) -> Plan:
-    """The plan of an agent that saw the world from a pose at a time.
+    """Fix an agent's plan in the world frame, given the pose and the time that the agent observed.
 
     Args:
-        trajectory: one item; of several alternatives the most probable counts, up to its first invalid step.
-            Headings are taken from the points.
+        trajectory: one item. The most probable alternative is used, up to its first invalid step. Headings
+            are derived from the points.
 
     Raises:
-        InputError: it has no valid step, a step that is not finite, or more than one item.
+        InputError: the trajectory has no valid step, a step that is not finite, or more than one item.
     """
     waypoints = _waypoints(trajectory)
     local = fit_path(waypoints, trajectory.dt_s, math.tan(seen_from.steering_rad) / vehicle.wheelbase_m)
@@ -64,7 +67,7 @@ def fixed_in_world(
 
 
 def _waypoints(trajectory: Trajectory) -> Float64[np.ndarray, "T 2"]:
-    """The points of the most probable alternative, up to its first invalid step."""
+    """Return the points of the most probable alternative, up to its first invalid step, m, ego frame."""
     if trajectory.log_prob.shape[:-1].numel() != 1:
         raise InputError(f"one plan at a time, got a batch of {tuple(trajectory.log_prob.shape[:-1])}")
     best, steps = int(trajectory.log_prob.reshape(-1).argmax()), trajectory.xy.shape[-2]

@@ -1,4 +1,4 @@
-"""A rebuilt log as a simulator: the ego vehicle drives at 20 Hz, the others replay, sensors are rendered."""
+"""Simulator over a rebuilt log: the ego vehicle drives at 20 Hz, actors replay, sensors are rendered."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -22,27 +22,28 @@ from foredrive.towns.recorder import BOXES_WITHIN_M
 
 FRAME_STEPS = round(FRAME_DT_S / STEP_S)
 REACH_M = 6.0
-"""Who is further beside the way driven sees little but what nobody has looked at: the drive ends."""
+"""Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
+the drive ends."""
 STRUCK = "struck"
-"""Kind of the event that a replaying actor drives into the ego vehicle from behind: it cannot brake, and that
-is nobody's fault here."""
+"""Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor cannot brake, so
+nobody is to blame."""
 
 
 @dataclass(frozen=True, eq=False)
 class RebuiltScenario:
-    """When a drive begins, with the speed and the steering that the log has then."""
+    """Start of a drive. Initial speed and steering are those of the log at that time."""
 
     start_s: float
-    """Since the log's first moment."""
+    """Start time since the log's first moment, s."""
     sensors: bool = True
-    """False: key frames have boxes alone."""
+    """If False, key frames have only boxes."""
     past_frames: int = 1
-    """Key frames before now in an observation, rendered on the log's way."""
+    """Number of key frames before now in an observation. They are rendered along the logged path."""
 
 
 @dataclass(frozen=True, eq=False)
 class RebuiltState:
-    """A drive at one time: with the scenario, all that its future depends on."""
+    """State of a drive at one time. Together with the scenario it determines the future of the drive."""
 
     step_index: int
     ego: BicycleState
@@ -51,26 +52,26 @@ class RebuiltState:
     progress: Progress = field(default_factory=Progress)
     driven_m: float = 0.0
     outside_m: float = 0.0
-    """Of it outside of all lanes."""
+    """Part of `driven_m` outside of all lanes, m."""
     ended: str | None = None
-    """Why the drive is over, if it is."""
+    """Reason why the drive is over. None while it goes on."""
 
     @property
     def t_s(self) -> float:
-        """Since the drive began."""
+        """Return the time since the drive began, s."""
         return self.step_index * STEP_S
 
 
 class RebuiltSimulator:
     """A `Simulator` over a rebuilt log: equal scenarios and controls give equal drives.
 
-    Others replay their tracks and react to nobody. What stands without a box is no obstacle.
+    Actors replay their tracks and react to nobody. Static objects without a box are no obstacles.
 
     Args:
-        renderer: of the scene.
-        tracks: of its actors, edits included, in the scene's frame.
-        drive: how the log was driven in it.
-        lanes: of the log's map; without them nothing is said of leaving lanes.
+        renderer: renderer of the scene.
+        tracks: tracks of the scene's actors, including edits, in the scene frame.
+        drive: logged drive of the ego vehicle.
+        lanes: lanes of the log's map. Without them, departures from the lanes are not detected.
     """
 
     state: RebuiltState
@@ -86,7 +87,7 @@ class RebuiltSimulator:
         """Start a drive.
 
         Raises:
-            InputError: the log does not reach from the frames before the start to some way after it.
+            InputError: the log does not cover the past frames before the start and some distance after it.
         """
         before_s = scenario.past_frames * FRAME_DT_S
         first_s = self.drive.first_s + before_s
@@ -107,7 +108,7 @@ class RebuiltSimulator:
         return self._clip
 
     def step(self, control: Control) -> Step:
-        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+        """Drive on for `STEP_S`. The clip is that of the latest key frame.
 
         Raises:
             InputError: the drive is over, or the control is not finite.
@@ -126,11 +127,11 @@ class RebuiltSimulator:
         return Step(self._clip, events, state.ended is not None)
 
     def ego(self) -> BicycleState:
-        """The ego vehicle now."""
+        """Return the current state of the ego vehicle."""
         return self.state.ego
 
     def standing(self) -> Standing:
-        """How far the drive has come; without lanes none is outside of them."""
+        """Return the progress of the drive. Without lanes the distance outside of them is 0."""
         state = self.state
         completion = min(1.0, state.progress.done_m / self._route.length_m)
         outside = state.outside_m / state.driven_m if state.driven_m > 0 else 0.0
@@ -138,16 +139,16 @@ class RebuiltSimulator:
 
     @property
     def scenario(self) -> RebuiltScenario:
-        """What is driven."""
+        """Return the current scenario."""
         return self._scenario
 
     @property
     def length_m(self) -> float:
-        """Of the route."""
+        """Return the length of the route, m."""
         return self._route.length_m
 
     def _drive(self, state: RebuiltState, moved: BicycleState) -> tuple[RebuiltState, list[Event]]:
-        """Move the ego vehicle unless something stops it, and see what comes of that."""
+        """Move the ego vehicle unless an obstacle stops it. Return the new state and the events."""
         index = state.step_index + 1
         t_s = index * STEP_S
         users = users_at(self._tracks, self._T_world_scene, self._scenario.start_s + t_s)
@@ -179,14 +180,17 @@ class RebuiltSimulator:
         ), events
 
     def _end_of(self, progress: Progress, t_s: float) -> str | None:
-        """Why the drive is over: also by leaving what the log has seen, in space or in time."""
+        """Return the reason why the drive is over, or None.
+
+        A drive also ends when it leaves the part of space or time that the log covers.
+        """
         ended = self._route.end_of(progress, t_s, self.drive.end_s - self._scenario.start_s - 0.5 * STEP_S)
         return "deviation" if ended is None and progress.beside_m > REACH_M else ended
 
     def _with_frame(
         self, frames: tuple[KeyFrame, ...], ego: BicycleState, T: Float64[np.ndarray, "4 4"], t_s: float
     ) -> tuple[KeyFrame, ...]:
-        """The key frames with one more, as many as an observation has."""
+        """Append a new key frame and return the latest frames, as many as an observation has."""
         at_s = self._scenario.start_s + t_s
         images, sweep = no_images(), None
         T_world_ego = torch.from_numpy(T)

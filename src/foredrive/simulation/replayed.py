@@ -1,4 +1,4 @@
-"""Actors of a rebuilt log, who go where their tracks lead them whatever the ego vehicle does."""
+"""Actors of a rebuilt log. They replay their tracks whatever the ego vehicle does."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from foredrive.simulation.road_users import Box, RoadUsers
 
 
 def users_at(tracks: Tracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:
-    """All actors at a time, a slot for each; those who are not there have no track id."""
+    """Return all actors at a time, one slot each. The track id of an absent actor is -1."""
     states = states_at(tracks, t_s)
     T_world_actor = T_world_scene @ states.T_scene_actor.double()
     half_height = 0.5 * tracks.size_lwh[:, 2:].double()
@@ -26,7 +26,10 @@ def users_at(tracks: Tracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) 
 
 
 def comes_from_behind(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
-    """Whose middle lies behind a vehicle's rear: if they touch it, they drove into it."""
+    """Return which actors have their middle behind the rear of the ego box.
+
+    If such an actor touches the box, it has driven into the ego vehicle.
+    """
     forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad)])
     ahead_m = (users.foot_m - box.foot_m)[:, :2] @ forward
     return np.asarray(ahead_m < -box.half_lw[0])

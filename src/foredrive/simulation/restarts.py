@@ -1,8 +1,9 @@
-"""Getting imitators going again.
+"""Restart of imitation agents that stand still.
 
-Who learns from recordings learns that who stands goes on standing, and drives begin at rest (inertia in
-Codevilla et al. 2019, "Exploring the Limitations of Behavior Cloning"). TransFuser (Chitta et al. 2022) lets
-a vehicle that has stood for long creep forward if its lidar sees nobody ahead; so does this.
+An agent that learns from recordings learns that a standing vehicle goes on standing, and drives begin at rest
+(inertia in Codevilla et al. 2019, "Exploring the Limitations of Behavior Cloning"). TransFuser (Chitta et al.
+2022) therefore lets a vehicle that has stood for long creep forward if its lidar sees no obstacle ahead. This
+module does the same.
 """
 
 from collections.abc import Callable
@@ -14,20 +15,21 @@ from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
 STANDS_MPS, STAYS_M = 0.2, 1.0
-"""Who is slower, and plans to go no further than this, stands because he wants to."""
+"""A vehicle stands on purpose if it is slower than `STANDS_MPS` and plans to go no further than `STAYS_M`."""
 AT_START_S, STUCK_S = 1.0, 20.0
-"""Patience before anything has moved, and later, when a red light may be the reason."""
+"""Waiting times before a restart, s: before the vehicle has ever moved, and afterwards, when a red light
+may be the reason for the stop."""
 CREEPS_S, CREEPS_MPS, CREEPS_MPS2 = 2.0, 4.0, 1.5
 FREE_M, FREE_HALF_WIDTH_M, FREE_HEIGHT_M = 6.0, 1.3, (0.3, 2.2)
-"""Nothing may return a beam from the box ahead of the bumper."""
+"""Box ahead of the bumper that must contain no lidar return."""
 
 
 class Restarting:
-    """An `Agent` that is another, except when that has stood for long and the way ahead is free.
+    """An `Agent` that wraps another agent and creeps forward if that has stood for long and the way is free.
 
     Args:
-        agent: sees a batch of one clip.
-        clock: time of the drive, s.
+        agent: agent that drives; it observes a batch of one clip.
+        clock: returns the time of the drive, s.
     """
 
     def __init__(self, agent: Agent, clock: Callable[[], float]) -> None:
@@ -37,7 +39,7 @@ class Restarting:
         self._creeps_until_s = -1.0
 
     def act(self, observation: Clip) -> Trajectory:
-        """The agent's plan, or one to creep forward."""
+        """Return the agent's plan, or a plan to creep forward."""
         plan, t_s = self._agent.act(observation), self._clock()
         speed_mps = float(observation.ego_speed_mps[0, observation.now])
         if speed_mps > STANDS_MPS or float(plan.xy[0, 0].norm(dim=-1).max()) > STAYS_M:
@@ -55,7 +57,7 @@ class Restarting:
 
 
 def is_free_ahead(observation: Clip) -> bool:
-    """Whether lidar sees nothing in the box ahead of the bumper now; without lidar nobody knows."""
+    """Return whether lidar sees nothing in the box ahead of the bumper now. False without lidar."""
     now = observation.now
     if not bool(observation.sweep_valid[0, now]):
         return False
@@ -68,7 +70,7 @@ def is_free_ahead(observation: Clip) -> bool:
 
 
 def _creeping(speed_mps: float) -> Trajectory:
-    """Straight on, gathering a little speed."""
+    """Return a straight plan with gentle acceleration."""
     t_s = FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
     gains_s = max(CREEPS_MPS - speed_mps, 0.0) / CREEPS_MPS2
     gained_s = t_s.clamp_max(gains_s)

@@ -1,4 +1,4 @@
-"""Everybody on the road as oriented boxes, and which of them touch the ego vehicle."""
+"""Road users as oriented boxes, and the test whether they touch the ego vehicle."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -11,23 +11,23 @@ from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
 
 LEVEL_M = 2.0
-"""What is further apart in height passes over or under."""
+"""Road users further apart than this in height, m, pass over or under each other."""
 
 
 class RoadUsers(NamedTuple):
-    """N slots for all road users but the ego vehicle; world frame."""
+    """N slots for all road users except the ego vehicle, world frame."""
 
     track_id: Int[np.ndarray, "N"]
-    """-1 in slots without anybody."""
+    """-1 in empty slots."""
     category: Int[np.ndarray, "N"]
     foot_m: Float64[np.ndarray, "N 3"]
-    """The middle of the box, on the ground."""
+    """Middle of the box on the ground, m."""
     yaw: Float64[np.ndarray, "N"]
     half_lw: Float64[np.ndarray, "N 2"]
     velocity_mps: Float64[np.ndarray, "N 2"]
 
     def towards(self, later: "RoadUsers", part: float) -> "RoadUsers":
-        """A part of the way on to where they are later; who is not there then stays."""
+        """Interpolate linearly towards a later time. A user that is absent then stays where it is."""
         same = self.track_id == later.track_id
         moved = np.where(same, part, 0.0)
         turned = (later.yaw - self.yaw + np.pi) % (2 * np.pi) - np.pi
@@ -38,7 +38,7 @@ class RoadUsers(NamedTuple):
         )
 
     def without(self, track_ids: Int[np.ndarray, "k"]) -> "RoadUsers":
-        """As if some were not there."""
+        """Return the road users with some of them marked as absent."""
         return self._replace(track_id=np.where(np.isin(self.track_id, track_ids), -1, self.track_id))
 
 
@@ -46,13 +46,13 @@ class Box(NamedTuple):
     """An upright box on the ground."""
 
     foot_m: Float64[np.ndarray, "3"]
-    """Its middle, on the ground."""
+    """Middle of the box on the ground, m."""
     yaw_rad: float
     half_lw: Float64[np.ndarray, "2"]
 
 
 def road_users(traffic: Traffic, state: TrafficState) -> RoadUsers:
-    """All road users but vehicle 0."""
+    """Return all road users except vehicle 0."""
     v, p, strays, poses = state.vehicles, state.people, state.strays, traffic.poses(state)
     forward = poses.forward[1:, :2]
     foot = poses.centre_m[1:] - 0.5 * v.size_lwh[1:, 2:] * [0.0, 0.0, 1.0]
@@ -75,7 +75,10 @@ def _numbers(values: Iterable[int]) -> Int[np.ndarray, "n"]:
 
 
 def touched(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
-    """Who overlaps a box: no axis of either separates the two (Gottschalk et al. 1996, in the plane)."""
+    """Return which road users overlap a box.
+
+    Two boxes overlap if no axis of either separates them (Gottschalk et al. 1996, in the plane).
+    """
     offset = users.foot_m - box.foot_m
     near = (users.track_id >= 0) & (np.abs(offset[:, 2]) < LEVEL_M)
     reach = np.hypot(*box.half_lw) + np.hypot(users.half_lw[:, 0], users.half_lw[:, 1])
@@ -91,6 +94,6 @@ def touched(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
 
 
 def _axes(yaw_rad: float) -> Float64[np.ndarray, "2 2"]:
-    """Forward and left, in rows."""
+    """Return the forward and the left unit vector, in rows."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[cos, sin], [-sin, cos]])

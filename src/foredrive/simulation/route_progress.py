@@ -1,4 +1,4 @@
-"""How far along its route the ego vehicle is, and what ends a drive."""
+"""Progress of the ego vehicle along its route, and the conditions that end a drive."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,30 +13,34 @@ from foredrive.simulation.dynamics import EGO
 
 SPACING_M = 1.0
 AHEAD_M, BACK_M = 20.0, 5.0
-"""Which part of the route is looked at for where the vehicle is: routes may cross themselves."""
+"""Part of the route, ahead and behind, m, that is searched for the vehicle's position: routes may cross
+themselves."""
 ARRIVED_M = 5.0
-"""Who is so near to the end has driven all of the route."""
+"""A vehicle this near to the end, m, has completed the route."""
 DEVIATION_M = 30.0
 BLOCKED_S, BLOCKED_MPS = 180.0, 0.1
-"""Leaderboard 1.0: who is further from the route has left it, who is slower for so long is blocked."""
+"""Bounds of leaderboard 1.0. Further than `DEVIATION_M` from the route is a deviation. Slower than
+`BLOCKED_MPS` for `BLOCKED_S` is blocked."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Along one route."""
+    """Progress along one route."""
 
     done_m: float = 0.0
     beside_m: float = 0.0
-    """Distance from the route."""
+    """Distance from the route, m."""
     moved_s: float = 0.0
-    """When the vehicle moved last."""
+    """Time of the last movement, s."""
 
 
 def first_step(xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "3"]:
-    """From where a route begins to its first point that is a wheelbase away: so a vehicle stands there, m.
+    """Return the vector from a route's start to its first point that is more than a wheelbase away, m.
+
+    A vehicle at the start of the route points in this direction.
 
     Raises:
-        InputError: no point is so far.
+        InputError: no point is that far away.
     """
     away_m = np.hypot(*(xyz[:, :2] - xyz[0, :2]).T)
     ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
@@ -49,7 +53,7 @@ class RouteLine:
     """A route to follow.
 
     Args:
-        xyz: a polyline in the world frame.
+        xyz: polyline, m, world frame.
     """
 
     def __init__(self, xyz: Float64[np.ndarray, "M 3"]) -> None:
@@ -61,7 +65,7 @@ class RouteLine:
     def advance(
         self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
     ) -> Progress:
-        """The progress of a vehicle that is at a point now; never backwards."""
+        """Return the progress of a vehicle that is now at `xy`. Progress never decreases."""
         first, last = np.searchsorted(self._arc_m, [progress.done_m - BACK_M, progress.done_m + AHEAD_M])
         part = slice(int(first), int(last) + 1)
         away_m = np.hypot(*(self._xy[part] - xy).T)
@@ -76,7 +80,7 @@ class RouteLine:
         )
 
     def end_of(self, progress: Progress, t_s: float, limit_s: float) -> str | None:
-        """Why a drive is over: "completed", "deviation", "blocked" or "timeout"; None if it is not."""
+        """Return why a drive is over: "completed", "deviation", "blocked" or "timeout". None if it is not."""
         if progress.done_m >= self.length_m:
             return "completed"
         if progress.beside_m > DEVIATION_M:
@@ -86,11 +90,11 @@ class RouteLine:
         return "timeout" if t_s >= limit_s else None
 
     def command(self, progress: Progress) -> Command:
-        """Where the route leads next, as recorded logs tell it."""
+        """Return the next command of the route, computed as for recorded logs."""
         return command_of(route_offset_m(self._arc_m, self._xy, progress.done_m))
 
     def target_xy(
         self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> Float64[np.ndarray, "2"]:
-        """Where the route leads, seen from the vehicle, as recorded logs tell it."""
+        """Return the target point on the route in the ego frame, m, computed as for recorded logs."""
         return route_target(self._arc_m, self._xy, progress.done_m, T_world_ego)

@@ -1,4 +1,4 @@
-"""Sets of routes: CARLA's route files, and those that come with the package."""
+"""Route sets: CARLA's route files, and the sets that are shipped with the package."""
 
 import json
 import math
@@ -17,19 +17,20 @@ from foredrive.files import atomic_path
 
 SHIPPED = "route_sets.json"
 SHORT_10, OF = "town05-short-10", "town05-short"
-"""The ten routes of the first Town05 short are the first ten of the 32 in use today."""
+"""The ten routes of the first version of Town05 short are the first ten of today's 32."""
 
 
 @dataclass(frozen=True, eq=False)
 class RouteWaypoints:
-    """A route as it is given: W points to pass, in the world frame (right-handed, m).
+    """A route as W waypoints, m, in the right-handed world frame.
 
     Raises:
-        InputError: its id cannot name a file.
+        InputError: the id cannot be part of a file name.
     """
 
     id: str
-    """Names the files of its drives: letters, digits, dots, dashes and underscores."""
+    """Id of the route, used in the file names of its drives: letters, digits, dots, dashes and
+    underscores."""
     town: str
     xyz_m: Float64[np.ndarray, "W 3"]
 
@@ -41,15 +42,15 @@ class RouteWaypoints:
 
 
 def route_set_names() -> tuple[str, ...]:
-    """The sets that come with the package."""
+    """Return the names of the sets that are shipped with the package."""
     return (*shipped_sets(), SHORT_10)
 
 
 def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
-    """The routes of a set that comes with the package, or of a CARLA route file (`….xml`).
+    """Load a set that is shipped with the package, or a CARLA route file (`….xml`).
 
     Raises:
-        InputError: there is neither, or the file has a mistake.
+        InputError: the set or the file does not exist, or the file has an error.
     """
     if name_or_path.endswith(".xml"):
         return read_carla_routes(Path(name_or_path))
@@ -63,7 +64,7 @@ def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
 
 
 def shipped_sets() -> dict[str, list[RouteWaypoints]]:
-    """All sets of the package's data file."""
+    """Load all sets of the package's data file."""
     text = resources.files("foredrive.simulation").joinpath(SHIPPED).read_text()
     return {
         name: [RouteWaypoints(row["id"], row["town"], np.array(row["xyz_m"], dtype=float)) for row in rows]
@@ -72,10 +73,12 @@ def shipped_sets() -> dict[str, list[RouteWaypoints]]:
 
 
 def read_carla_routes(path: Path) -> list[RouteWaypoints]:
-    """Read a route file of CARLA's leaderboard 1.0: y is mirrored, as CARLA's world is left-handed.
+    """Read a route file of CARLA's leaderboard 1.0.
+
+    The y axis is mirrored because CARLA's world is left-handed.
 
     Raises:
-        InputError: naming file and route, if it is missing, no XML, or not of that form.
+        InputError: the file is missing, is no XML or does not have that form. The error names file and route.
     """
     try:
         root = ElementTree.parse(path).getroot()
@@ -90,7 +93,7 @@ def read_carla_routes(path: Path) -> list[RouteWaypoints]:
 
 
 def write_shipped(path: Path, sets: dict[str, Sequence[RouteWaypoints]]) -> None:
-    """Write routes as the package's data file has them: coordinates rounded to centimetres."""
+    """Write routes in the format of the package's data file, with coordinates rounded to centimetres."""
     content = {
         name: [
             {"id": route.id, "town": route.town, "xyz_m": np.round(route.xyz_m, 2).tolist()}

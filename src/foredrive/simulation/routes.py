@@ -1,4 +1,4 @@
-"""Routes to drive: waypoints snapped to lanes, joined into a line to follow, with what to do on the way."""
+"""Routes to drive: waypoints are matched to lanes and joined into a line with an option at each point."""
 
 import enum
 import itertools
@@ -15,18 +15,18 @@ from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneGraph, build_lane_g
 from foredrive.towns.traffic.routes import PLANNED_CHANGE_S, SHORTEST_CHANGE_M
 
 SAMPLE_M, SPACING_M = 0.5, 0.75
-"""Lanes are sampled so finely, and of these points those kept that are so far apart."""
+"""Spacing at which lanes are sampled, and minimum spacing of the points that are kept, m."""
 
 
 class RouteOption(enum.IntEnum):
-    """What a route asks for at a point of it: CARLA's road options."""
+    """Manoeuvre that a route asks for at a point, as CARLA's road options."""
 
     LEFT = 0
     RIGHT = 1
     STRAIGHT = 2
-    """Straight on through a junction."""
+    """Go straight through a junction."""
     FOLLOW = 3
-    """The lane, outside of junctions."""
+    """Follow the lane, outside of junctions."""
     CHANGE_LEFT = 4
     CHANGE_RIGHT = 5
 
@@ -38,33 +38,33 @@ class DriveRoute:
     id: str
     town: str
     xyz: Float64[np.ndarray, "N 3"]
-    """World frame, m, on the road."""
+    """Points on the road, m, world frame."""
     arc_m: Float64[np.ndarray, "N"]
-    """Way from the start to each point, seen from above."""
+    """Distance from the start to each point, m, in the plane."""
     option: Int[np.ndarray, "N"]
-    """A `RouteOption` at each point: from the route alone."""
+    """A `RouteOption` at each point, derived from the route only."""
     legs: tuple[Leg, ...]
-    """The lanes driven, as indices of the town's lane graph."""
+    """Lanes of the route, as indices into the town's lane graph."""
     aside_m: float
-    """How far from its lane the waypoint is that is furthest from it."""
+    """Largest distance between a waypoint and its lane, m."""
 
     @property
     def length_m(self) -> float:
-        """From the first waypoint to the last."""
+        """Return the length from the first waypoint to the last, m."""
         return float(self.arc_m[-1])
 
     @property
     def lanes(self) -> tuple[int, ...]:
-        """Where to be at the end of each stretch of road, as the traffic expects it of vehicle 0."""
+        """Return the lane at the end of each stretch of road, as the traffic expects it of vehicle 0."""
         ends = [leg.lane for leg, onward in itertools.pairwise(self.legs) if not onward.changes]
         return (*ends, self.legs[-1].lane)
 
 
 def snap_route(waypoints: RouteWaypoints) -> DriveRoute:
-    """The route through some waypoints (.1 s, and the town's map).
+    """Compute the route through some waypoints. This takes 0.1 s, plus the loading of the town's map.
 
     Raises:
-        InputError: naming the route, if there is no such town or no way through the waypoints.
+        InputError: there is no such town, or no way through the waypoints. The error names the route.
     """
     try:
         graph = build_lane_graph(load_town_map(waypoints.town))
@@ -78,11 +78,14 @@ def snap_route(waypoints: RouteWaypoints) -> DriveRoute:
 
 
 def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
-    """Points along some legs, led over from lane to lane where they change, and the option at each point."""
+    """Return the points along some legs and the option at each point.
+
+    Where the legs change lanes, the line moves smoothly from one lane to the other.
+    """
     points, leg_of = _sampled(graph, legs)
     steps = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))
     begins = np.append(True, np.diff(leg_of) > 0)
-    steps[begins] = 0.0  # a change of lanes is no way
+    steps[begins] = 0.0  # a lane change adds no length
     arc_m = np.cumsum(steps)
     option = np.full(len(points), int(RouteOption.FOLLOW))
     left = _left_of(points, leg_of)
@@ -108,7 +111,7 @@ def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "
 
 
 def _sampled(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
-    """Points along each leg, both ends among them, and the leg of each."""
+    """Sample points along each leg, including both ends. Return the points and the leg index of each."""
     points, leg_of = [], []
     for number, leg in enumerate(legs):
         count = max(2, int(np.ceil((leg.to_m - leg.from_m) / SAMPLE_M)) + 1)
@@ -119,7 +122,10 @@ def _sampled(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 
 
 
 def _thinned(xy: Float64[np.ndarray, "N 2"]) -> list[int]:
-    """Points that are some way apart, both ends among them: where lanes are changed, they may step back."""
+    """Return the indices of points that are at least `SPACING_M` apart, always with both ends.
+
+    The points may step back at lane changes.
+    """
     kept = [0]
     for k in range(1, len(xy)):
         if np.hypot(*(xy[k] - xy[kept[-1]])) >= SPACING_M:
@@ -130,7 +136,7 @@ def _thinned(xy: Float64[np.ndarray, "N 2"]) -> list[int]:
 
 
 def _left_of(points: Float64[np.ndarray, "N 3"], leg_of: Int[np.ndarray, "N"]) -> Float64[np.ndarray, "N 2"]:
-    """The unit vector to the left of the lane at each point."""
+    """Return the unit vector to the left of the lane at each point."""
     left = np.zeros((len(points), 2))
     for leg in range(leg_of[-1] + 1):
         on = np.flatnonzero(leg_of == leg)
@@ -140,7 +146,7 @@ def _left_of(points: Float64[np.ndarray, "N 3"], leg_of: Int[np.ndarray, "N"]) -
 
 
 def _turn(graph: LaneGraph, legs: list[Leg]) -> RouteOption:
-    """Which way legs turn that lead through a junction."""
+    """Return the turn that legs through a junction make."""
     turn_rad = sum(float(graph.turn_rad[leg.lane]) for leg in legs)
     if abs(turn_rad) < TURN_RAD:
         return RouteOption.STRAIGHT
@@ -154,9 +160,10 @@ def _windows(
     arc_m: Float64[np.ndarray, "N"],
     leg_of: Int[np.ndarray, "N"],
 ) -> list[tuple[int, float, float]]:
-    """For each change on a run of legs outside of junctions: its leg, and from where to where it is made.
+    """Return, for each lane change on a run of legs outside of junctions, its leg and its start and end, m.
 
-    As long as changes are driven gently if the run has the room; one after the other, and all before its end.
+    Each change has the length of a gentle lane change if the run is long enough. Changes follow one another
+    and end before the run does.
     """
     changes = [k for k in run if legs[k].changes]
     on_run = (leg_of >= run[0]) & (leg_of <= run[-1])

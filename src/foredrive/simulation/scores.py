@@ -1,9 +1,9 @@
-"""What a drive is worth, exactly as CARLA's leaderboards 1.0 and 2.1 count it.
+"""Scores of a drive, exactly as CARLA's leaderboards 1.0 and 2.1 compute them.
 
-Driving score = route completion in % × penalty. Leaderboard 1.0 multiplies a factor for each infraction;
-leaderboard 2.1 adds a coefficient for each and divides by 1 + their sum, so that more infractions always cost
-more but a long route is not worth nothing. Both multiply the share of the way that was driven within the
-lanes. Why a route ended early costs nothing by itself: what is missing of it does.
+Driving score = route completion in % × penalty. Leaderboard 1.0 multiplies one factor per infraction.
+Leaderboard 2.1 adds one coefficient per infraction and divides by 1 + their sum, so that more infractions
+always cost more but a long route keeps some score. Both multiply by the share of the distance that was driven
+within the lanes. An early end costs nothing by itself; only the missing completion does.
 """
 
 import enum
@@ -16,7 +16,7 @@ from foredrive.scene import Event
 
 
 class InfractionKind(enum.StrEnum):
-    """What is penalised; the `kind` of the `Event`s that report it."""
+    """Kinds of infractions. They equal the `kind` of the `Event`s that report them."""
 
     COLLISION_PEDESTRIAN = "collision_pedestrian"
     COLLISION_VEHICLE = "collision_vehicle"
@@ -24,24 +24,25 @@ class InfractionKind(enum.StrEnum):
     RED_LIGHT = "red_light"
     STOP_SIGN = "stop_sign"
     SCENARIO_TIMEOUT = "scenario_timeout"
-    """A scenario was not passed in time. Leaderboard 2 only, as are the two that follow."""
+    """A scenario was not passed in time. Only in leaderboard 2, as the next two kinds."""
     YIELD_TO_EMERGENCY = "yield_to_emergency"
     MIN_SPEED = "min_speed"
-    """Slower than the traffic around; weighed by how much slower."""
+    """Slower than the surrounding traffic, weighted by how much slower."""
 
 
 class Ending(enum.StrEnum):
-    """Why a drive ended; the `kind` of the `Event` that reports it."""
+    """Reason why a drive ended. It equals the `kind` of the `Event` that reports it."""
 
     COMPLETED = "completed"
     DEVIATION = "deviation"
-    """30 m from the route (InRouteTest)."""
+    """More than 30 m from the route (InRouteTest)."""
     BLOCKED = "blocked"
-    """Slower than .1 m/s for 180 s (ActorSpeedAboveThresholdTest)."""
+    """Slower than 0.1 m/s for 180 s (ActorSpeedAboveThresholdTest)."""
     TIMEOUT = "timeout"
-    """See `timeout_s`."""
+    """Time limit reached, see `timeout_s`."""
     CRASHED = "crashed"
-    """The agent raised an error or gave no plan: scored by what it drove until then, counted as failed."""
+    """The agent raised an error or returned no plan. The drive is scored up to that point and counts as
+    failed."""
 
 
 FACTOR_1_0 = {
@@ -62,31 +63,32 @@ COEFFICIENT_2_1 = {
     InfractionKind.MIN_SPEED: 0.40,
 }
 SECONDS_PER_M, SECONDS_TO_START = 0.8, 5.0
-"""Leaderboard 1.0's SECONDS_GIVEN_PER_METERS and INITIAL_SECONDS_DELAY."""
+"""SECONDS_GIVEN_PER_METERS and INITIAL_SECONDS_DELAY of leaderboard 1.0."""
 
 
 def timeout_s(route_m: float) -> float:
-    """How long a route may take."""
+    """Return the time limit of a route, s."""
     return float(int(SECONDS_PER_M * route_m + SECONDS_TO_START))
 
 
 @dataclass(frozen=True)
 class Infraction:
-    """Something that is penalised."""
+    """An event that is penalised."""
 
     kind: InfractionKind
     t_s: float
-    """Since the drive began."""
+    """Time since the drive began, s."""
     xy_world: tuple[float, float]
     severity: float = 0.0
-    """Impact speed of a collision, m/s. Of MIN_SPEED the share of the traffic's speed that was reached."""
+    """Impact speed of a collision, m/s. For MIN_SPEED, the share of the traffic's speed that the vehicle
+    reached."""
     what: str = ""
-    """What was hit or run."""
+    """Object that was hit, or line that was crossed."""
     detail: str = ""
 
 
 def infraction_of(event: Event) -> Infraction | None:
-    """The infraction that an event reports; None if it is none."""
+    """Return the infraction that an event reports. None if it reports no infraction."""
     if event.kind not in set(InfractionKind):
         return None
     kind = InfractionKind(event.kind)
@@ -95,14 +97,14 @@ def infraction_of(event: Event) -> Infraction | None:
 
 @dataclass(frozen=True)
 class RouteScore:
-    """One drive of one route."""
+    """Score of one drive of one route."""
 
     route: str
     repetition: int
     completion: float
     """Share of the route that was driven, 0 to 1."""
     outside_lanes: float
-    """Share of the way driven outside of the lanes or against them, 0 to 1."""
+    """Share of the distance that was driven outside of the lanes or against them, 0 to 1."""
     ending: Ending
     infractions: tuple[Infraction, ...]
     driven_m: float
@@ -117,7 +119,7 @@ class RouteScore:
 
     @property
     def penalty_1_0(self) -> float:
-        """Product of the factors; kinds that leaderboard 1.0 does not know cost nothing."""
+        """Return the product of the factors. Kinds that leaderboard 1.0 does not have cost nothing."""
         factor = 1 - self.outside_lanes
         for infraction in self.infractions:
             factor *= FACTOR_1_0.get(infraction.kind, 1.0)
@@ -125,28 +127,28 @@ class RouteScore:
 
     @property
     def penalty_2_1(self) -> float:
-        """(1 - outside) / (1 + Σ coefficients)."""
+        """Return (1 - outside) / (1 + Σ coefficients)."""
         return (1 - self.outside_lanes) / (1 + sum(map(_coefficient_2_1, self.infractions)))
 
     @property
     def driving_score_1_0(self) -> float:
-        """0 to 100."""
+        """Return the driving score of leaderboard 1.0, 0 to 100."""
         return 100 * self.completion * self.penalty_1_0
 
     @property
     def driving_score_2_1(self) -> float:
-        """0 to 100."""
+        """Return the driving score of leaderboard 2.1, 0 to 100."""
         return 100 * self.completion * self.penalty_2_1
 
     @property
     def failed(self) -> bool:
-        """Whether the agent itself crashed."""
+        """Return whether the agent crashed."""
         return self.ending is Ending.CRASHED
 
 
 @dataclass(frozen=True)
 class MeanSpread:
-    """Mean over all drives, and standard deviation of the means of single repetitions, 0 for a single one."""
+    """Mean over all drives, and standard deviation of the repetitions' means (0 for one repetition)."""
 
     mean: float
     spread: float
@@ -154,7 +156,7 @@ class MeanSpread:
 
 @dataclass(frozen=True)
 class SuiteScore:
-    """All drives of a set of routes."""
+    """Score of all drives of a set of routes."""
 
     routes: int
     repetitions: int
@@ -169,10 +171,12 @@ class SuiteScore:
 
 
 def score_suite(drives: Sequence[RouteScore]) -> SuiteScore:
-    """The mean over routes and repetitions: of drives, as CARLA does, not weighed by length.
+    """Average the scores over routes and repetitions.
+
+    Each drive has the same weight, as in CARLA, whatever its length.
 
     Raises:
-        InputError: there is no drive, one is there twice, or a route lacks a repetition that others have.
+        InputError: there is no drive, a drive occurs twice, or a route lacks a repetition that others have.
     """
     keys = [(drive.route, drive.repetition) for drive in drives]
     routes, repetitions = ({key[k] for key in keys} for k in (0, 1))
@@ -206,7 +210,7 @@ def score_suite(drives: Sequence[RouteScore]) -> SuiteScore:
 
 
 def _coefficient_2_1(infraction: Infraction) -> float:
-    """What an infraction adds to leaderboard 2.1's divisor."""
+    """Return the coefficient that an infraction adds to leaderboard 2.1's divisor."""
     coefficient = COEFFICIENT_2_1[infraction.kind]
     if infraction.kind is InfractionKind.MIN_SPEED:
         return coefficient * (1 - min(max(infraction.severity, 0.0), 1.0))

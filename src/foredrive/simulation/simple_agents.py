@@ -1,4 +1,4 @@
-"""Agents that look at nothing: what every other has to beat."""
+"""Agents that ignore their observations: the baselines of every other agent."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
 @dataclass(frozen=True)
 class Straight:
-    """Straight on at one speed, whatever comes. At 0 it stays where it is.
+    """Agent that drives straight on at a constant speed. At speed 0 it stands still.
 
-    Drives begin at rest, so that constant velocity in the sense of open loop would never move.
+    Drives begin at rest, so the constant-velocity baseline of open-loop evaluation would never move.
     """
 
     speed_mps: float
 
     def act(self, observation: Clip) -> Trajectory:
-        """The same plan for everyone."""
+        """Return the same plan for every item of the batch."""
         x = self.speed_mps * FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
         xy = torch.stack([x, torch.zeros_like(x)], dim=-1)
         return _plan(xy.expand(len(observation.t_s), 1, -1, -1))
@@ -31,17 +31,18 @@ class Straight:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Who drives as the log was driven, from wherever that has led; at its end it stands."""
+    """Agent that replays the logged drive from wherever it is. At the end of the log it stands still."""
 
     drive: LoggedDrive
     clock: Callable[[], float]
-    """Time of the log, s."""
+    """Returns the time of the log, s."""
 
     def act(self, observation: Clip) -> Trajectory:
-        """Where the log is at the next key frames, of a batch of one.
+        """Return the log's positions at the next key frames, for a batch of one.
 
-        What the vehicle is off by is made up for evenly until the last of them: who wanted it sooner would
-        plan to speed up at once and then brake, and controllers that feed that forward fall behind for good.
+        The current offset from the log is reduced linearly to 0 at the last of these frames. A faster
+        correction would accelerate at once and then brake, and a controller that feeds this forward would
+        stay behind for good.
         """
         now_s, T_world_ego = self.clock(), observation.T_world_ego[0, -1].numpy()
         poses = [self.drive.pose_at(now_s + FRAME_DT_S * k) for k in range(HORIZON_STEPS + 1)]
@@ -51,7 +52,7 @@ class Replay:
 
 
 def _plan(xy: Float[Tensor, "b 1 T 2"]) -> Trajectory:
-    """Controllers take headings from the points."""
+    """Build a trajectory from points. Its headings are 0, because controllers derive them from the points."""
     flat = xy[..., 0]
     return Trajectory(
         xy=xy,

@@ -1,8 +1,8 @@
-"""Waypoints to a path that can be driven: near them all, with little jerk, from the pose of now on.
+"""Turns waypoints into a drivable path: near all of them, with little jerk, from the current pose.
 
-A path through every waypoint has to turn within the first half second for whatever is amiss with the first
-waypoint; with any latency that swings up. Regularised least squares (as in nuPlan's tracker, which fits
-speeds and curvatures so) takes several waypoints' word for it.
+A path through every waypoint has to correct any error of the first waypoint within the first half second.
+With latency this leads to growing oscillations. Regularised least squares averages over several waypoints
+instead (nuPlan's tracker fits speeds and curvatures in this way).
 """
 
 from typing import NamedTuple
@@ -11,29 +11,32 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 KNOT_M = 2.0
-"""Knots are waypoints at least so far apart: nearer ones say how fast, hardly where to."""
+"""Knots are waypoints at least this far apart, m. Nearer ones tell the speed but hardly the direction."""
 SAMPLE_M = 0.25
 BEYOND_M = 10.0
-"""The path goes straight on beyond its end, for those who overshoot."""
+"""The path continues straight beyond its end, m, for vehicles that overshoot."""
 SMOOTHING_S5 = 3e-4
-"""What jerk weighs: 1 m/s³ for 1 s as much as missing a knot by 1.7 cm."""
+"""Weight of the jerk: 1 m/s³ for 1 s costs as much as missing a knot by 1.7 cm."""
 SLOWEST_MPS = 4.0
-"""Slower paths are smoothed as if driven at this speed."""
+"""Slower paths are smoothed as if driven at this speed, m/s."""
 STEERING_S = 0.3
-"""Curvature may differ from what is steered now as much as steering changes in this time."""
+"""The initial curvature may differ from the current one by as much as steering changes in this time, s."""
 
 
 class Path(NamedTuple):
-    """A path seen from above, sampled every `SAMPLE_M`."""
+    """A path in the plane, sampled every `SAMPLE_M`."""
 
     xy: Float64[np.ndarray, "N 2"]
     heading_rad: Float64[np.ndarray, "N"]
-    """Continuous: beyond ±π in loops."""
+    """Continuous, so it exceeds ±π in loops."""
     curvature: Float64[np.ndarray, "N"]
     """1/m, positive to the left."""
 
     def project(self, xy: Float64[np.ndarray, "2"]) -> tuple[float, float]:
-        """Way along the path, m, and offset to its left, m, of a point, in the next sample's axes."""
+        """Return the distance of a point along the path, m, and its offset to the left of the path, m.
+
+        Both are measured in the axes of the nearest sample.
+        """
         offset = xy - self.xy
         near = int(np.argmin(np.einsum("ni,ni->n", offset, offset)))
         cos, sin = np.cos(self.heading_rad[near]), np.sin(self.heading_rad[near])
@@ -41,22 +44,23 @@ class Path(NamedTuple):
         return near * SAMPLE_M + float(cos * dx + sin * dy), float(cos * dy - sin * dx)
 
     def course(self, way_m: float) -> tuple[float, float]:
-        """Heading, rad, and curvature, 1/m, at a way along the path."""
+        """Return the heading, rad, and the curvature, 1/m, at a distance along the path."""
         way = np.arange(len(self.xy)) * SAMPLE_M
         heading, curvature = (np.interp(way_m, way, column) for column in (self.heading_rad, self.curvature))
         return float(heading), float(curvature)
 
 
 def fit_path(waypoints: Float64[np.ndarray, "T 2"], dt_s: float, curvature_now: float) -> Path:
-    """The path of a plan, from the origin along x.
+    """Fit the path of a plan. It starts at the origin along x.
 
-    Its curvature κ is linear between the knots and least in Σ offset² + `SMOOTHING_S5` ∫ (v³ dκ/ds)² dt, the
-    offsets those to each knot, the jerk the lateral one at the plan's speeds. Linearised about the chords:
-    over each the offset grows by the integral of heading less chord's direction, which is exact for circles.
+    The curvature κ is linear between the knots and minimises Σ offset² + `SMOOTHING_S5` ∫ (v³ dκ/ds)² dt. The
+    offsets are those to each knot, and the jerk is the lateral jerk at the plan's speeds. The problem is
+    linearised about the chords: along each chord the offset grows by the integral of heading minus chord
+    direction, which is exact for circles.
 
     Args:
-        waypoints: in the ego frame when the plan was made, m, `dt_s` apart; the first at `dt_s`.
-        curvature_now: as steered then, 1/m.
+        waypoints: points in the ego frame at the time of the plan, m, `dt_s` apart; the first is at `dt_s`.
+        curvature_now: curvature of the current steering angle, 1/m.
     """
     index = _knots(waypoints)
     if not len(index):
@@ -80,7 +84,10 @@ def fit_path(waypoints: Float64[np.ndarray, "T 2"], dt_s: float, curvature_now: 
 
 
 def _knots(waypoints: Float64[np.ndarray, "T 2"]) -> Int[np.ndarray, "K"]:
-    """The waypoints that make the path, each ahead of the one before; if possible the last."""
+    """Return the indices of the waypoints that become knots.
+
+    Each knot lies ahead of the one before. The last waypoint is a knot if possible.
+    """
     index: list[int] = []
     at, towards = np.zeros(2), np.array([1.0, 0.0])
     for k, point in enumerate(waypoints):
@@ -95,7 +102,10 @@ def _knots(waypoints: Float64[np.ndarray, "T 2"]) -> Int[np.ndarray, "K"]:
 
 
 def _integrated(along_m: Float64[np.ndarray, "K"], knot_curvature: Float64[np.ndarray, "K"]) -> Path:
-    """The path of a curvature that is given at some ways along it, linear between, and 0 beyond the last."""
+    """Integrate a curvature given at some distances along the path.
+
+    It is linear between them and 0 beyond the last.
+    """
     way_m = np.arange(0.0, along_m[-1] + BEYOND_M, SAMPLE_M)
     curvature = np.interp(way_m, along_m, knot_curvature, right=0.0)
     turned = 0.5 * SAMPLE_M * (curvature[1:] + curvature[:-1])

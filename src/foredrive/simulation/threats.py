@@ -1,8 +1,8 @@
-"""Safety-critical moments in rebuilt logs, and what a drive through one is worth.
+"""Safety-critical situations in rebuilt logs, and the score of a drive through one.
 
 After NeuroNCAP (Ljungbergh et al., "NeuroNCAP: Photorealistic Closed-loop Safety Testing for Autonomous
-Driving", 2024): somebody stands in the way, comes head-on or crosses, so that who goes on as the log did runs
-into him a few seconds after the start. Where and how fast they come is ours.
+Driving", 2024): a vehicle stands in the lane, comes head-on or crosses. An ego vehicle that drives on as in
+the log hits it a few seconds after the start. Positions and speeds are our own choice.
 """
 
 import enum
@@ -21,30 +21,30 @@ from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.route_progress import ARRIVED_M
 
 AFTER_S = 4.0
-"""So long after the start who goes on as the log did is hit."""
+"""Time after the start at which an ego vehicle that drives on as in the log is hit, s."""
 THREAT_MPS = 5.0
-"""How fast others come."""
+"""Speed of the other vehicle, m/s."""
 LEAST_MPS = 2.0
-"""A log that is slower when it would be hit has nothing to avoid."""
+"""If the log is slower than this at the time of impact, m/s, there is nothing to avoid."""
 BEST, AFTER_COLLISION = 5.0, 4.0
 
 
 class Threat(enum.StrEnum):
-    """What is in the way."""
+    """The situation, by what the other vehicle does."""
 
     STATIONARY = "stationary"
-    """A vehicle that stands in the lane."""
+    """A vehicle stands in the lane."""
     FRONTAL = "frontal"
-    """One that comes head-on in the lane."""
+    """A vehicle comes head-on in the lane."""
     SIDE = "side"
-    """One that crosses from the right."""
+    """A vehicle crosses from the right."""
 
 
 def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: float) -> Send:
-    """The edit that puts a vehicle of a scene in the way of a drive that begins at a time.
+    """Return the edit that puts a vehicle of the scene in the way of a drive that begins at `start_s`.
 
     Raises:
-        InputError: there is no car to take, or the log is over by then, or hardly moves.
+        InputError: the scene has no car, or at the time of impact the log has ended or hardly moves.
     """
     at_s = start_s + AFTER_S
     if at_s > drive.end_s or drive.way_left_m(at_s) < ARRIVED_M:
@@ -73,12 +73,12 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
 
 
 def threat_id(graph: SceneGraph) -> int:
-    """An id that no actor of a scene has."""
+    """Return an id that no actor of the scene has."""
     return int(graph.tracks.track_id.max()) + 1 if len(graph.tracks) else 1
 
 
 def reference_mps(threat: Threat, drive: LoggedDrive, start_s: float) -> float:
-    """At what speed who goes on as the log did is hit."""
+    """Return the impact speed of an ego vehicle that drives on as in the log, m/s."""
     speed = drive.state_at(start_s + AFTER_S).speed_mps
     return {
         Threat.STATIONARY: speed,
@@ -88,12 +88,12 @@ def reference_mps(threat: Threat, drive: LoggedDrive, start_s: float) -> float:
 
 
 def threat_score(impact_mps: float | None, reference: float) -> float:
-    """NeuroNCAP's score: 5 without a collision (None), else 4 · max(0, 1 - v_impact / v_reference)."""
+    """Return NeuroNCAP's score: 5 without a collision (None), else 4 · max(0, 1 - v_impact / v_reference)."""
     return BEST if impact_mps is None else AFTER_COLLISION * max(0.0, 1.0 - impact_mps / reference)
 
 
 def _most_seen_car(graph: SceneGraph) -> int:
-    """The row of the car with most Gaussians."""
+    """Return the row of the car with the most Gaussians."""
     rows = (graph.tracks.category == Category.CAR).nonzero()[:, 0].tolist()
     if not rows:
         raise InputError("there is no car in the scene that could be put in the way")

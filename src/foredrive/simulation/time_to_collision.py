@@ -1,4 +1,4 @@
-"""How long until boxes touch, if everybody goes on at constant velocity."""
+"""Time until boxes touch, if all of them move at constant velocity."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 LEAST_S = 0.95
-"""nuPlan's bound: nearer is not safe (Karnchanachari et al. 2024, time_to_collision_within_bound)."""
+"""nuPlan's bound, s: a shorter time is not safe (Karnchanachari et al. 2024,
+time_to_collision_within_bound)."""
 
 
 class MovingBoxes(NamedTuple):
-    """M boxes seen from above, in one frame."""
+    """M boxes in the plane, all in one frame."""
 
     centre_m: Float64[np.ndarray, "M 2"]
     size_lw_m: Float64[np.ndarray, "M 2"]
@@ -18,15 +19,16 @@ class MovingBoxes(NamedTuple):
     velocity_mps: Float64[np.ndarray, "M 2"]
 
     def only(self, which: Bool[np.ndarray, "M"]) -> "MovingBoxes":
-        """Some of them."""
+        """Return the selected boxes."""
         return MovingBoxes(*(values[which] for values in self))
 
 
 def time_to_collision_s(ego: MovingBoxes, others: MovingBoxes) -> Float64[np.ndarray, "M"]:
-    """When the ego box first touches each of M others, s; 0 where it does now, infinite where it never will.
+    """Return the time until the ego box first touches each of M other boxes, s.
 
-    Boxes move on without turning. They touch while their shadows do on all four axes along their edges
-    (separating axes); on each axis that is one interval of time, so the answer is exact.
+    The time is 0 for boxes that touch now and infinite for boxes that never do. Boxes move without turning.
+    Two boxes touch while their projections overlap on all four axes along their edges (separating axes). On
+    each axis that is one interval of time, so the result is exact.
 
     Args:
         ego: one box.
@@ -52,6 +54,6 @@ def time_to_collision_s(ego: MovingBoxes, others: MovingBoxes) -> Float64[np.nda
 
 
 def _axes(yaw_rad: Float64[np.ndarray, "M"]) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, "M 2"]]:
-    """Unit vectors along the length and the width of boxes."""
+    """Return unit vectors along the length and the width of boxes."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)

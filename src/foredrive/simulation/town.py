@@ -1,4 +1,4 @@
-"""A town as a simulator: the ego vehicle drives at 20 Hz, everybody reacts to it, sensors see key frames."""
+"""Simulator of a town: the ego vehicle drives at 20 Hz, traffic reacts to it, sensors render key frames."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -30,70 +30,73 @@ from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
 TRAFFIC_STEPS = 2
-"""The others decide at 10 Hz what they do, as in recordings; in between they are on their straight way."""
+"""The traffic decides at 10 Hz, as in recordings. Between decisions its road users move in a straight
+line."""
 DECISION_S = TRAFFIC_STEPS * STEP_S
 FRAME_STEPS = round(FRAME_DT_S / STEP_S)
 GUESTS = 6
-"""So many vehicles of scenarios are on the road at one time at most."""
+"""Maximum number of scenario vehicles on the road at one time."""
 SETTLE_S = 3.0
-"""A drive begins once traffic has left its first, unlikely state; until then the ego vehicle stands."""
+"""Time before a drive, s, in which the traffic leaves its unlikely initial state. The ego vehicle stands
+until then."""
 
 
 @dataclass(frozen=True, eq=False)
 class TownScenario:
-    """Where to drive and under which circumstances. The vehicle starts from rest where the route begins."""
+    """Where to drive, and under which conditions. The vehicle starts from rest at the route's beginning."""
 
     town: str
     route_xyz: Float64[np.ndarray, "M 3"]
-    """World frame, along the lanes."""
+    """Route along the lanes, m, world frame."""
     seed: int = 0
-    """Of the place, the traffic and all noise."""
+    """Seed of the place, the traffic and all noise."""
     lanes: tuple[int, ...] = ()
-    """Where the route has to be at the end of each stretch, as `TrafficState.route`: what the others expect.
-    Without them they expect that it goes straight on."""
+    """Lane of the route at the end of each stretch, as `TrafficState.route`. The traffic expects it.
+    Without lanes the traffic expects the vehicle to go straight on."""
     crowd: Crowd = field(default_factory=Crowd)
     conditions: Conditions | None = None
-    """None draws bright daylight from the seed."""
+    """If None, bright daylight is drawn from the seed."""
     sensors: SensorSuite | None = None
-    """None: key frames have boxes alone."""
+    """If None, key frames have only boxes."""
     past_frames: int = 1
-    """Key frames before now in an observation."""
+    """Number of key frames before now in an observation."""
     limit_s: float = np.inf
-    """The drive ends after this time."""
+    """The drive ends after this time, s."""
     scenarios: tuple[Scenario, ...] = ()
-    """What happens on the way, in the order it is met, as `scenarios_on` finds it for route and seed."""
+    """Scenarios on the route, in the order in which they are met, as `scenarios_on` returns them for route
+    and seed."""
 
 
 @dataclass(frozen=True, eq=False)
 class TownState:
-    """A drive at one time: with the scenario, all that its future depends on."""
+    """State of a drive at one time. Together with the scenario it determines the future of the drive."""
 
     step_index: int
     ego: BicycleState
     z_m: float
-    """Height of the road below the rear axle."""
+    """Height of the road below the rear axle, m."""
     traffic: TrafficState
-    """At the last time that the others decided."""
+    """Traffic at its last decision."""
     decided: TrafficState
-    """One decision later, which they are on their way to."""
+    """Traffic one decision later: the state towards which the road users move."""
     play: Play
-    """Of the scenarios, when that was decided."""
+    """State of the scenarios at that decision."""
     frames: tuple[KeyFrame, ...]
     contacts: Contacts = field(default_factory=Contacts)
     rules: RuleState = field(default_factory=RuleState)
     progress: Progress = field(default_factory=Progress)
     ended: str | None = None
-    """Why the drive is over, if it is."""
+    """Reason why the drive is over. None while it goes on."""
 
     @property
     def t_s(self) -> float:
-        """Since the drive began."""
+        """Return the time since the drive began, s."""
         return self.step_index * STEP_S
 
 
 @dataclass(frozen=True, eq=False)
 class Foresight:
-    """What would be, did the traffic's own rules drive the ego vehicle, which is vehicle 0 here."""
+    """Predicted state in which the traffic's own rules drive the ego vehicle, which is vehicle 0 here."""
 
     t_s: float
     traffic: TrafficState
@@ -103,7 +106,7 @@ class Foresight:
 
 @dataclass(frozen=True, eq=False)
 class SavedDrive:
-    """A drive to go on with, in this process or another."""
+    """A saved drive, to be continued in this process or in another."""
 
     scenario: TownScenario
     state: TownState
@@ -114,10 +117,10 @@ class TownSimulator:
 
     state: TownState
     _users: tuple[RoadUsers, RoadUsers]
-    """Of both states of the traffic."""
+    """Road users in `state.traffic` and in `state.decided`."""
 
     def reset(self, scenario: TownScenario) -> Clip:
-        """Start a drive; takes some seconds where the town is not the last one.
+        """Start a drive. This takes some seconds if the town is not the previous one.
 
         Raises:
             InputError: there is no such town, or the route has no length or begins on no lane.
@@ -148,7 +151,7 @@ class TownSimulator:
         return self._clip
 
     def step(self, control: Control) -> Step:
-        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+        """Drive on for `STEP_S`. The clip is that of the latest key frame.
 
         Raises:
             InputError: the drive is over, or the control is not finite.
@@ -176,26 +179,26 @@ class TownSimulator:
 
     @property
     def scenario(self) -> TownScenario:
-        """What is driven."""
+        """Return the current scenario."""
         return self._scenario
 
     def ego(self) -> BicycleState:
-        """The ego vehicle now."""
+        """Return the current state of the ego vehicle."""
         return self.state.ego
 
     @property
     def traffic(self) -> Traffic:
-        """The rules that the others go by."""
+        """Return the traffic, with the rules that its road users follow."""
         return self._traffic
 
     def foresight(self) -> Foresight:
-        """Now, if the others decide now; else when they decide next."""
+        """Return the prediction for now if the traffic decides now, else for its next decision."""
         state = self.state
         traffic = self._traffic.taken_over(state.decided, self.driven)
         return Foresight(state.t_s, traffic, state.play, state.progress)
 
     def foreseen(self, now: Foresight) -> Foresight:
-        """What comes `DECISION_S` later."""
+        """Return the prediction `DECISION_S` later."""
         v, poses, route = now.traffic.vehicles, self._traffic.poses(now.traffic), self._route
         xyz, speed, t_s = poses.axle_xyz[0], float(v.speed_mps[0]), now.t_s
         progress = route.advance(now.progress, xyz[:2], speed, t_s)
@@ -207,21 +210,21 @@ class TownSimulator:
 
     @property
     def driven(self) -> Driven:
-        """The ego vehicle now, as the others see it."""
+        """Return the current ego vehicle as the traffic sees it."""
         return self._driven(self.state.ego, self.state.z_m)
 
     def standing(self) -> Standing:
-        """How far the drive has come."""
+        """Return the progress of the drive."""
         rules = self.state.rules
         completion = min(1.0, self.state.progress.done_m / self._route.length_m)
         return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def save(self) -> SavedDrive:
-        """The drive as it is now: an immutable value that can be pickled."""
+        """Return the drive in its current state, as an immutable value that can be pickled."""
         return SavedDrive(self._scenario, self.state)
 
     def restore(self, saved: SavedDrive) -> Clip:
-        """Go on from there, as if nothing had been in between."""
+        """Continue a saved drive as if there had been no interruption."""
         self._prepare(saved.scenario)
         self._adopt(saved.state)
         return self._clip
@@ -243,20 +246,20 @@ class TownSimulator:
         self._users = road_users(self._traffic, state.traffic), road_users(self._traffic, state.decided)
 
     def _decide(self, state: TownState) -> tuple[Play, TrafficState]:
-        """What the others do next."""
+        """Compute the next decision of the scenarios and the traffic."""
         seen = self._seen(state.ego, state.progress, state.z_m, state.t_s)
         play, traffic, orders = self._director.direct(state.play, state.decided, seen, DECISION_S)
         driven = self._driven(state.ego, state.z_m)
         return play, self._traffic.step(traffic, DECISION_S, driven, orders)
 
     def _seen(self, ego: BicycleState, progress: Progress, z_m: float, t_s: float) -> Ego:
-        """The ego vehicle as scenarios see it."""
+        """Return the ego vehicle as scenarios see it."""
         driven = self._driven(ego, z_m)
         middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
         return Ego(t_s, progress.done_m, ego.speed_mps, ego.acceleration_mps2, middle, ego.yaw_rad)
 
     def _drive(self, state: TownState, moved: BicycleState) -> tuple[TownState, list[Event]]:
-        """Move the ego vehicle unless something stops it, and see what comes of that."""
+        """Move the ego vehicle unless an obstacle stops it. Return the new state and the events."""
         index = state.step_index + 1
         t_s, part = index * STEP_S, (state.step_index % TRAFFIC_STEPS + 1) / TRAFFIC_STEPS
         users: RoadUsers = self._users[0].towards(self._users[1], part)
@@ -292,7 +295,7 @@ class TownSimulator:
         return Driven(axle, ego.yaw_rad, ego.speed_mps, yaw_rate_radps(ego))
 
     def _pose(self, ego: BicycleState, about_z_m: float) -> Float64[np.ndarray, "4 4"]:
-        """`T_world_ego` on the road: both axles at its height, no roll."""
+        """Return `T_world_ego` on the road: both axles are at road height, and roll is 0."""
         flat = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
         axles = np.array([ego.x_m, ego.y_m]) + np.array([[0.0], [EGO.wheelbase_m]]) * flat
         rear_m, front_m = self._traffic.near_lanes.height_m(axles, about_z_m)
@@ -305,7 +308,7 @@ class TownSimulator:
         return T
 
     def _with_frame(self, state: TownState) -> tuple[KeyFrame, ...]:
-        """The key frames with the one of now, as many as an observation has."""
+        """Append the current key frame and return the latest frames, as many as an observation has."""
         T, sensors = self._pose(state.ego, state.z_m), self._scenario.sensors
         actors = self._traffic.actors(state.decided)
         everyone = [*actors, *self._world.parked]
@@ -331,9 +334,9 @@ class TownSimulator:
         return make_clip(state.frames, rig, route.command(progress), target_xy)
 
 
-@lru_cache(maxsize=1)  # drives in a row are often in one town
+@lru_cache(maxsize=1)  # consecutive drives are often in one town
 def grow(town: str, seed: int) -> World:
-    """The place of drives in a town with a seed, in bright daylight."""
+    """Build the world of a town and a seed, in bright daylight."""
     return World(load_town_map(town), seed)
 
 
@@ -343,6 +346,6 @@ def _rules_of(town: str, seed: int, crowd: Crowd) -> Traffic:
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:
-    """At rest where a route begins, along it."""
+    """Return the state of a vehicle at rest at the beginning of a route, pointing along it."""
     x, y, _ = first_step(route_xyz)
     return BicycleState(float(route_xyz[0, 0]), float(route_xyz[0, 1]), float(np.arctan2(y, x)), 0.0)

@@ -1,9 +1,9 @@
-"""The privileged driver of a town: it knows everybody's state and rules, and so what comes of its driving.
+"""Privileged expert for towns: it knows the states and the rules of all road users.
 
-Twice a second it lets the town go on in imagination with itself as one of the drivers, by the very rules that
-drive in recordings (`towns.traffic`): right of way, lights, gaps, lane changes for its route; what scenarios
-hold ready for it happens there as well. Where that brings it is its plan. It is the ceiling of all that learn
-from recordings.
+Twice a second it simulates the town ahead with itself as one of the road users. The simulation uses the same
+rules that drive in recordings (`towns.traffic`): right of way, lights, gaps, and lane changes for its route.
+Scenarios happen in the simulation as well. The simulated motion of the ego vehicle is the plan. The expert is
+the upper bound for all agents that learn from recordings.
 """
 
 import dataclasses
@@ -25,32 +25,36 @@ from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import Vehicles, path_starts
 
 EVERY, STEPS = 2, 15
-"""Waypoints lie so many decisions apart: 3 s in all."""
+"""A waypoint lies every `EVERY` decisions, `STEPS` in all: 3 s."""
 SETS_OFF_S, SETS_OFF_MPS, AT_LIGHT_M = 2.5, 1.0, 3.0
-"""Who is slower than this so near before a line needs so long to get over it: he waits for the next green."""
+"""A vehicle slower than `SETS_OFF_MPS` and nearer to a stop line than `AT_LIGHT_M` needs `SETS_OFF_S` to
+cross it. If the light changes earlier, it waits for the next green."""
 BRAKES_MPS2 = (3.0, 6.0)
-"""How hard it brakes on its path if that leads into somebody: gently if that will do."""
+"""Decelerations with which the expert brakes if its path leads into a road user, m/s². It prefers the
+gentler one."""
 NEAR_M = 0.2
-"""Nobody comes nearer to its outline on the path that it takes."""
+"""Minimum distance of road users from the vehicle's outline on its path, m."""
 REJOINS_M = 5.0
-"""Who is beside where it imagines itself is back there to 1/e after this way."""
+"""A lateral offset from the simulated path decays to 1/e over this distance, m."""
 HALT_MPS = 0.3
-"""Who is slower than this stands."""
+"""A slower vehicle counts as standing, m/s."""
 EDGES_MPS, EDGES_MPS2 = 2.5, 1.0
-"""Where there is no room for a lane change that the route needs, it edges over along the route's line."""
+"""Speed and acceleration with which the expert moves slowly along the route, if there is no room for a
+lane change that the route needs."""
 CLEAR_M = 0.5
-"""It stops before anybody nearer to its outline then."""
+"""Minimum distance of road users from the vehicle's outline in this case, m."""
 LOOK_M = 2.0
-"""It points to where the line is so far ahead."""
+"""Look-ahead distance on the route from which the heading is taken in this case, m."""
 LOST_AHEAD_M, LOST_BESIDE_M = 3.0, 1.5
-"""Who is further from where it meant to be starts anew from the lane that it is on."""
+"""If the vehicle is further than this from its planned position, m (longitudinal, lateral), the plan
+restarts from its current lane."""
 
 
 class TownExpert:
-    """An `Agent` for one simulator; what it plans to do with a lane change goes on from plan to plan.
+    """An `Agent` for one simulator. A planned lane change is continued from plan to plan.
 
     Args:
-        simulator: in which it drives; it looks at nothing but this.
+        simulator: simulator in which the expert drives; its state is all that the expert uses.
     """
 
     def __init__(self, simulator: TownSimulator) -> None:
@@ -59,11 +63,14 @@ class TownExpert:
         self._planned: tuple[TownState, Trajectory] | None = None
 
     def act(self, observation: Clip) -> Trajectory:
-        """The plan from the simulator's now on, whatever was observed."""
+        """Return the plan from the simulator's current state. The observation is not used."""
         return self.plan()
 
     def plan(self) -> Trajectory:
-        """The plan from the simulator's now on; who asks twice is told the same."""
+        """Return the plan from the simulator's current state.
+
+        Repeated calls in one state give the same plan.
+        """
         if self._planned is None or self._planned[0] is not self._simulator.state:
             self._planned = self._simulator.state, self._plan()
         return self._planned[1]
@@ -87,10 +94,10 @@ class TownExpert:
     def _not_into_anybody(
         self, traffic: Traffic, path: Float64[np.ndarray, "K 2"], here: Driven
     ) -> Float64[np.ndarray, "K 2"]:
-        """The path as imagined or, if that leads into somebody, braked on."""
+        """Return the simulated path, or a path with braking if it would lead into a road user."""
         v, graph = self._imagined[0].traffic.vehicles, traffic.lanes
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
-        behind = v.track_id[leader == 0]  # who follows takes care himself
+        behind = v.track_id[leader == 0]  # vehicles behind take care themselves
         users = [road_users(traffic, then.traffic).without(behind) for then in self._imagined]
         arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
         t_s = DECISION_S * np.arange(len(path))
@@ -103,7 +110,10 @@ class TownExpert:
         return np.stack([np.interp(best_m, arc_m, axis) for axis in path.T], axis=1)
 
     def _edged_over(self, traffic: Traffic, here: Driven) -> Float64[np.ndarray, "T 2"]:
-        """Slowly along the line of the route, as long as nobody comes near; for each imagined step."""
+        """Return points that move slowly along the route, one per simulated step.
+
+        The motion stops as soon as a road user comes near.
+        """
         now, xyz = self._imagined[0], self._simulator.scenario.route_xyz
         arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
         most_m = traffic.to_light_m(now.traffic)
@@ -120,7 +130,7 @@ class TownExpert:
             others = road_users(traffic, then.traffic)
             met = touched(Box(middle, yaw, half), others)
             if (np.hypot(*others.velocity_mps[met].T) > HALT_MPS).any():
-                points = points[:1]  # he goes first
+                points = points[:1]  # the moving road user goes first
             if met.any():
                 break
             points.append(np.array([x, y]))
@@ -128,7 +138,7 @@ class TownExpert:
         return np.stack(points[1:])
 
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: Driven) -> TrafficState:
-        """With the path and the lane change that were meant, if the vehicle is where they lead."""
+        """Keep the planned path and lane change, if the vehicle is where they lead."""
         known = (then.traffic for then in self._imagined)
         meant = next((then for then in known if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
         if meant is None:
@@ -163,7 +173,7 @@ def _is_free(
     users: Sequence[RoadUsers],
     here: Driven,
 ) -> bool:
-    """Whether it touches nobody on a path, so far along it at each step."""
+    """Return whether the vehicle touches no road user on a path, given its distance along it at each step."""
     half, yaw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + NEAR_M, here.yaw_rad
     for at_m, others in zip(way_m.tolist(), users, strict=True):
         axle, before = (
@@ -179,13 +189,13 @@ def _is_free(
 
 
 def _is_too_late(traffic: Traffic, state: TrafficState) -> bool:
-    """Whether it stands, or nearly, at a light that is not green long enough to get over the line."""
+    """Return whether the vehicle is at rest, or nearly, at a light that is not green long enough to cross."""
     to_light_m = min(traffic.to_light_m(state, in_s) for in_s in (0.0, SETS_OFF_S))
     return bool(state.vehicles.speed_mps[0] < SETS_OFF_MPS and to_light_m < AT_LIGHT_M)
 
 
 def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "K 2"]:
-    """A path that begins where the vehicle is, and comes to the imagined one little by little."""
+    """Return a path that begins at the vehicle and gradually approaches the simulated one."""
     way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
     return path + np.exp(-way_m / REJOINS_M)[:, None] * (here - path[0])
 

@@ -1,6 +1,6 @@
-"""Our own routes of the towns that are trained in: drawn from a seed, and kept in the package's data file.
+"""Foredrive's own routes in the training towns, drawn from a seed and kept in the package's data file.
 
-`python -m foredrive.simulation.training_routes` draws them all again and writes them there.
+`python -m foredrive.simulation.training_routes` draws all of them again and writes them there.
 """
 
 import math
@@ -22,16 +22,16 @@ from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import Route, draw_route
 
 CANDIDATES = 6
-"""Of so many routes that one is taken which has most of what the others lack."""
+"""Number of candidates per route. The one with the most manoeuvres that the others lack is taken."""
 WAYPOINT_AT = 0.75
-"""How far along each lane its waypoint lies: behind a lane change, if there is one."""
+"""Position of the waypoint on each lane, as a share of its length: behind a lane change, if there is one."""
 CLEAR_OF_END_M = 3.0
 APART_M = 300.0
-"""To begin so far from all others is worth as much as a manoeuvre that none of them has."""
+"""A start this far from all others, m, is worth as much as a manoeuvre that no other route has."""
 
 
 class Kind(NamedTuple):
-    """What the routes of a set are like."""
+    """Number and lengths of the routes of a set."""
 
     per_town: int
     shortest_m: float
@@ -42,7 +42,10 @@ KINDS = {"training-short": Kind(8, 80.0, 150.0), "training-long": Kind(3, 500.0,
 
 
 def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
-    """Routes of a town, spread over it, with turns, ways straight on and lane changes as evenly as can be."""
+    """Draw routes that are spread over a town.
+
+    Turns, straight crossings and lane changes are mixed as evenly as possible.
+    """
     graph = build_lane_graph(load_town_map(town))
     starts, rng = find_starts(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
@@ -65,7 +68,10 @@ def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
 def _checked(
     name: str, town: str, graph: LaneGraph, drawn: Route, length_m: float, kind: Kind
 ) -> tuple[RouteWaypoints, DriveRoute] | None:
-    """A route as waypoints, and as it is read from them; None if that is another way, or too short."""
+    """Return a route as waypoints and as `snap_route` reads them.
+
+    Returns None if there is no such route, if it takes another way, or if its length is out of range.
+    """
     ends_m = np.append(0.0, np.cumsum(graph.length_m[drawn.lanes])) - drawn.start_m
     last = int(np.flatnonzero((ends_m[:-1] < length_m) & (graph.junction[drawn.lanes] < 0))[-1])
     lanes = drawn.lanes[: last + 1]
@@ -85,7 +91,7 @@ def _checked(
 
 
 def _worth(route: DriveRoute, others: Sequence[DriveRoute], met: Counter[int]) -> float:
-    """How much a route adds to others: manoeuvres that they lack, and a place where they are not."""
+    """Return the value that a route adds to others: manoeuvres that they lack, and a distant start."""
     away_m = min((float(np.hypot(*(route.xyz[0] - o.xyz[0])[:2])) for o in others), default=0.0)
     return sum(1 / (1 + met[option]) for option in _manoeuvres(route)) + min(away_m / APART_M, 1.0)
 
@@ -95,7 +101,7 @@ def _manoeuvres(route: DriveRoute) -> set[int]:
 
 
 def main() -> None:
-    """Write the data file with these sets drawn anew and all others as they are."""
+    """Draw these sets anew and write the data file. All other sets stay as they are."""
     sets: dict[str, Sequence[RouteWaypoints]] = dict(shipped_sets())
     for name, kind in KINDS.items():
         towns = [town for town in TOWNS if town not in TEST_TOWNS]

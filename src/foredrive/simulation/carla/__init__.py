@@ -1,5 +1,6 @@
-"""The real CARLA, both ways: its server as a `Simulator`, and Foredrive's agents in its leaderboards.
+"""Interface to CARLA: its server as a `Simulator`, and Foredrive's agents in its leaderboards.
 
-The package `carla` (0.9.16, the optional extra of that name) is imported late and in `client` alone;
-everything else takes its objects as they are. `docs/carla.md` says what of this has met a server.
+The package `carla` (0.9.16, the optional extra of that name) is imported only when it is needed, and only in
+`client`. All other modules take its objects as arguments. `docs/carla.md` says which parts have been tested
+on a server.
 """

@@ -1,4 +1,4 @@
-"""Who else is there: CARLA's actors as ours, and what the ego vehicle has run into."""
+"""CARLA's actors as Foredrive's actors, and the collisions of the ego vehicle with them."""
 
 import dataclasses
 import math
@@ -23,12 +23,12 @@ CATEGORY_OF_BASE_TYPE = {
 """By the blueprints' attribute `base_type`."""
 SAME_S, SAME_M = 5.0, 5.0
 LEAST_MPS = 0.1
-"""CARLA's CollisionTest: contacts with one actor within this time, or at places so near to each other, are
-one collision; who stands has caused none."""
+"""CARLA's CollisionTest: contacts with one actor within `SAME_S`, or at places within `SAME_M`, are one
+collision. A vehicle slower than `LEAST_MPS` has caused none."""
 
 
 def category_of(type_id: str, attributes: dict[str, str]) -> Category | None:
-    """What an actor is; None if it is no road user."""
+    """Return the category of an actor. None if it is no road user."""
     if type_id.startswith("walker.pedestrian"):
         return Category.PEDESTRIAN
     if not type_id.startswith("vehicle."):
@@ -37,7 +37,7 @@ def category_of(type_id: str, attributes: dict[str, str]) -> Category | None:
 
 
 def actor_state(actor: Any) -> ActorState | None:
-    """A `carla.Actor` as one of ours; None if it is no road user."""
+    """Convert a `carla.Actor`. Return None if it is no road user."""
     category = category_of(actor.type_id, actor.attributes)
     if category is None:
         return None
@@ -57,10 +57,10 @@ def actor_state(actor: Any) -> ActorState | None:
 
 @dataclass(frozen=True)
 class Contact:
-    """What has been run into last."""
+    """The last collision of the ego vehicle."""
 
     actor_id: int | None = None
-    """None: something that belongs to the town."""
+    """None for an object that belongs to the town."""
     t_s: float = -math.inf
     xy: tuple[float, float] | None = None
 
@@ -72,10 +72,13 @@ def collision(
     t_s: float,
     last: Contact,
 ) -> tuple[Event | None, Contact]:
-    """The collision that a `carla.CollisionEvent` reports, unless it is the last one still.
+    """Return the collision that a `carla.CollisionEvent` reports, and the updated contact.
+
+    The collision is None if the event belongs to the last collision, if the ego vehicle stands, or if it
+    touches a sidewalk.
 
     Args:
-        ego_velocity: before the step in which it came about, world frame.
+        ego_velocity: velocity before the step of the collision, m/s, world frame.
     """
     other, speed_mps = event.other_actor, float(np.hypot(*ego_velocity))
     known = other.id if other.id != 0 else None

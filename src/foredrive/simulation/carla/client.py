@@ -1,4 +1,4 @@
-"""The way to CARLA's server: the one place that imports the package `carla`."""
+"""Connection to CARLA's server. Only this module imports the package `carla`."""
 
 import contextlib
 import importlib
@@ -9,7 +9,7 @@ from foredrive.errors import InputError
 
 
 def import_carla() -> Any:
-    """The package `carla`.
+    """Import the package `carla`.
 
     Raises:
         InputError: it is not installed.
@@ -21,10 +21,10 @@ def import_carla() -> Any:
 
 
 def connect(host: str = "localhost", port: int = 2000, timeout_s: float = 10.0) -> Any:
-    """A `carla.Client` whose server answers and is of its version.
+    """Return a `carla.Client` that is connected to a server of the same version.
 
     Raises:
-        InputError: there is no client, no server answers in time, or their versions differ.
+        InputError: the client is not installed, no server answers in time, or the versions differ.
     """
     carla = import_carla()
     where = f"{host}:{port}"
@@ -42,10 +42,10 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = 10.0) 
 
 
 def require_same_version(client: str, server: str, where: str) -> None:
-    """Refuse a server that speaks another version's protocol: it would fail later, and darkly.
+    """Refuse a server of another version, whose protocol may cause unclear errors later.
 
     Raises:
-        InputError: naming both.
+        InputError: the versions differ. The error names both.
     """
     if server != client:
         raise InputError(
@@ -55,7 +55,7 @@ def require_same_version(client: str, server: str, where: str) -> None:
 
 @contextlib.contextmanager
 def answering(what: str) -> Iterator[None]:
-    """Turn the client's errors (the server is gone, or too slow) into one line that says what was tried.
+    """Turn the client's errors (no server, or a slow one) into one line that says what was tried.
 
     Raises:
         InputError: the client raised RuntimeError.

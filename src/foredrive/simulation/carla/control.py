@@ -1,9 +1,9 @@
-"""From what our controller asks for to CARLA's pedals and steering wheel.
+"""Converts the controller's commands into CARLA's pedals and steering.
 
-CARLA's vehicles have an engine, gears and tyres; how much acceleration a pedal gives depends on all of them.
-So the pedals are what a simple model of the vehicle says, corrected by how far the speed has fallen behind
-what was asked for. The model's constants are estimates, nobody has calibrated them on a server: the
-correction makes up for ±3 m/s² of error.
+CARLA's vehicles have an engine, gears and tyres, and the acceleration of a pedal depends on all of them. The
+pedals therefore follow a simple model of the vehicle, plus a correction for the speed that the vehicle lags
+behind its commands. The model's constants are estimates and have not been calibrated on a server. The
+correction makes up for errors of ±3 m/s².
 """
 
 import math
@@ -14,18 +14,20 @@ from foredrive.scene import Control
 from foredrive.simulation.dynamics import EGO, STEP_S
 
 FULL_THROTTLE_MPS2 = 4.0
-"""Estimate for the ego vehicle in its lower gears."""
+"""Estimate for the ego vehicle in its lower gears, m/s²."""
 FULL_BRAKE_MPS2 = 8.0
-"""On a dry road."""
+"""On a dry road, m/s²."""
 COASTING_MPS2, COASTING_PER_M = 0.3, 8e-4
-"""Without pedals it slows down by this, and by this times the square of the speed: tyres and air."""
+"""Deceleration without pedals, by tyres and air: the first, m/s², plus the second, 1/m, times the speed
+squared."""
 CATCH_UP_PER_S = 2.0
-"""Acceleration for each m/s that the speed is behind."""
+"""Additional acceleration per m/s that the speed lags behind, 1/s."""
 MOST_BEHIND_MPS = 1.5
 CURVATURE_AT_LOCK_PER_M = 0.278
-"""How sharply the vehicle turns at full steering, in proportion below: the slope of the bicycle that Chen et
-al. ("Learning to drive from a world on rails", ICCV 2021) fitted to CARLA's Lincoln, 0.368 rad / 1.327 m.
-The wheels can turn further than that (70°), but do so less the faster it goes, and tyres slip."""
+"""Curvature at full steering, 1/m; smaller steering gives proportionally less. It is the slope of the
+bicycle model that Chen et al. ("Learning to drive from a world on rails", ICCV 2021) fitted to CARLA's
+Lincoln, 0.368 rad / 1.327 m. The wheels can turn further (70°), but they turn less at higher speed, and
+tyres slip."""
 STANDING_MPS = 0.1
 
 
@@ -40,19 +42,19 @@ class Pedals(NamedTuple):
 
 @dataclass(frozen=True)
 class Asked:
-    """What has been asked for so far."""
+    """Effect of all commands so far."""
 
     speed_mps: float | None = None
-    """The speed that the vehicle would have by now if it had done as it was asked to; None at first."""
+    """Speed that the vehicle would have now if it had followed its commands, m/s. None at the beginning."""
 
 
 def actuate(control: Control, speed_mps: float, asked: Asked) -> tuple[Pedals, Asked]:
-    """Pedals and steering for the step that begins now, and what to remember for the next one."""
+    """Return pedals and steering for the step that begins now, and the state for the next step."""
     wanted = min(max(control.acceleration_mps2, -EGO.max_braking_mps2), EGO.max_acceleration_mps2)
     behind = 0.0 if asked.speed_mps is None else asked.speed_mps - speed_mps
     behind = min(max(behind, -MOST_BEHIND_MPS), MOST_BEHIND_MPS)
     stands = speed_mps < STANDING_MPS
-    if stands and wanted <= 0:  # as it is to
+    if stands and wanted <= 0:  # standing as commanded
         behind, due = 0.0, speed_mps
     else:
         due = speed_mps + behind + wanted * STEP_S
@@ -63,7 +65,7 @@ def actuate(control: Control, speed_mps: float, asked: Asked) -> tuple[Pedals, A
 
 
 def steer_of(steering_rad: float) -> float:
-    """CARLA's steering for a front-wheel angle of our bicycle: the same curvature, mirrored."""
+    """Return CARLA's steering for a front-wheel angle of our bicycle model: the same curvature, mirrored."""
     curvature = (
         math.tan(min(max(steering_rad, -EGO.max_steering_rad), EGO.max_steering_rad)) / EGO.wheelbase_m
     )
@@ -71,5 +73,5 @@ def steer_of(steering_rad: float) -> float:
 
 
 def steering_rad_of(steer: float) -> float:
-    """The front-wheel angle of our bicycle that CARLA's steering amounts to."""
+    """Return the front-wheel angle of our bicycle model that corresponds to CARLA's steering, rad."""
     return math.atan(-steer * CURVATURE_AT_LOCK_PER_M * EGO.wheelbase_m)

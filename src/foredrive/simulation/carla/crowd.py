@@ -1,4 +1,4 @@
-"""Traffic and people in CARLA: its traffic manager drives, its navigation mesh walks."""
+"""Traffic and pedestrians in CARLA, driven by its traffic manager and its navigation mesh."""
 
 from typing import Any
 
@@ -10,20 +10,20 @@ from foredrive.simulation.carla.session import Session
 from foredrive.towns.recorder import Crowd
 
 NEAR_ROUTE_M = 140.0
-"""Vehicles start on roads that are no further from the route."""
+"""Maximum distance from the route at which vehicles start, m."""
 FREE_M = 12.0
-"""Nobody starts so near to where the ego vehicle does."""
+"""Minimum distance from the ego vehicle's start at which vehicles start, m."""
 ABOVE_M = 0.5
-"""Let down onto the road from this high."""
+"""Height above the road from which actors are dropped, m."""
 WALKING_MPS = (0.8, 1.8)
 TRIES = 5
-"""For each pedestrian, where the place is taken."""
+"""Maximum number of attempts per pedestrian, as a place may be taken."""
 
 
 def add_crowd(
     session: Session, crowd: Crowd, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
 ) -> None:
-    """As many vehicles and people as there is room for, at most what `crowd` asks for."""
+    """Add vehicles and pedestrians, at most as many as `crowd` asks for. Places without room are skipped."""
     _add_vehicles(session, crowd.vehicles, route_xyz, rng)
     if crowd.people:
         _add_people(session, crowd.people, rng)
@@ -65,7 +65,7 @@ def _add_people(session: Session, count: int, rng: np.random.Generator) -> None:
         controller = session.spawn("controller.ai.walker", CarlaPose(0.0, 0.0, 0.0), {}, attach_to=walker)
         if controller is not None:
             controllers.append(controller)
-    session.tick()  # walkers exist for the navigation from here on
+    session.tick()  # the navigation knows walkers from here on
     for controller in controllers:
         _let_walk(session, controller, rng)
 

@@ -1,10 +1,11 @@
-"""CARLA's frames and ours: pure functions.
+"""Conversions between CARLA's frames and Foredrive's: pure functions.
 
-CARLA is left-handed (x forward, y to the right, z up) with angles in degrees, yaw positive to the right,
-pitch positive nose up, roll positive right side down. Ours are right-handed (docs/conventions.md). Mirroring
-y turns one world into the other; a rotation R becomes M R M with M = diag(1, -1, 1).
+CARLA is left-handed (x forward, y to the right, z up) with angles in degrees: yaw positive to the right,
+pitch positive nose up, roll positive right side down. Foredrive is right-handed (docs/conventions.md).
+Mirroring y converts one world into the other. A rotation R becomes M R M with M = diag(1, -1, 1).
 
-A vehicle's origin is the middle of its box on the ground in CARLA, the middle of its rear axle in ours.
+The origin of a vehicle is the middle of its box on the ground in CARLA, and the middle of its rear axle in
+Foredrive.
 """
 
 import math
@@ -19,11 +20,12 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _BODY_FROM_OPTICAL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-"""A camera's optical axes (x right, y down, z forward) in its body's (x forward, y left, z up)."""
+"""Rotation from a camera's optical axes (x right, y down, z forward) to its body axes (x forward, y left,
+z up)."""
 
 
 class CarlaPose(NamedTuple):
-    """What a `carla.Transform` holds: m and degrees, left-handed."""
+    """The content of a `carla.Transform`: m and degrees, left-handed."""
 
     x: float
     y: float
@@ -34,22 +36,25 @@ class CarlaPose(NamedTuple):
 
 
 def mirrored(xyz: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-    """Points or vectors from one world to the other, either way."""
+    """Convert points or vectors between the two worlds, in either direction."""
     return xyz * [1.0, -1.0, 1.0]
 
 
 def xyz_of(vector: Any) -> Float64[np.ndarray, "3"]:
-    """A `carla.Location` or `carla.Vector3D` in our axes."""
+    """Convert a `carla.Location` or `carla.Vector3D` to our axes."""
     return np.array([vector.x, -vector.y, vector.z])
 
 
 def matrix_of(transform: Any) -> Float64[np.ndarray, "4 4"]:
-    """A `carla.Transform`, from an actor's or sensor's axes to the world's, between our right-handed axes."""
+    """Convert a `carla.Transform` to a matrix.
+
+    It maps an actor's or sensor's axes to the world's, all right-handed.
+    """
     return MIRROR @ np.array(transform.get_matrix()) @ MIRROR
 
 
 def pose_of(T: Float64[np.ndarray, "4 4"]) -> CarlaPose:
-    """The other way round: a rigid motion between right-handed axes as CARLA writes it."""
+    """Convert a rigid motion between right-handed axes to CARLA's form. The inverse of `matrix_of`."""
     x, y, z = T[:3, 3]
     forward, left_z, up_z = T[:3, 0], T[2, 1], T[2, 2]
     return CarlaPose(
@@ -63,10 +68,10 @@ def pose_of(T: Float64[np.ndarray, "4 4"]) -> CarlaPose:
 
 
 def ego_in_actor(box_centre_x_m: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-    """`T_actor_ego`: our ego frame in the right-handed axes of CARLA's actor.
+    """Return `T_actor_ego`: our ego frame in the right-handed axes of CARLA's actor.
 
     Args:
-        box_centre_x_m: how far before the actor's origin its box has its middle (`bounding_box.location.x`).
+        box_centre_x_m: x of the box's middle in the actor's axes, m (`bounding_box.location.x`).
     """
     T = np.eye(4)
     T[0, 3] = box_centre_x_m - EGO.axle_to_centre_m
@@ -74,10 +79,13 @@ def ego_in_actor(box_centre_x_m: float = 0.0) -> Float64[np.ndarray, "4 4"]:
 
 
 def camera_pose(T_ego_cam: Float64[np.ndarray, "4 4"], T_actor_ego: Float64[np.ndarray, "4 4"]) -> CarlaPose:
-    """Where a camera is mounted on CARLA's actor."""
+    """Return the mounting pose of a camera on CARLA's actor."""
     return pose_of(T_actor_ego @ T_ego_cam @ _BODY_FROM_OPTICAL.T)
 
 
 def yaw_of_compass(compass_rad: float) -> float:
-    """Our heading of an IMU's compass: 0 is north, CARLA's -y, from there clockwise seen from above."""
+    """Convert an IMU's compass to our heading, rad.
+
+    The compass is 0 to the north, which is CARLA's -y, and turns clockwise seen from above.
+    """
     return math.remainder(0.5 * math.pi - compass_rad, 2 * math.pi)

@@ -1,4 +1,4 @@
-"""The route as the leaderboard gives it: few points, each with what to do from there on."""
+"""The leaderboard's route: a few points, each with the road option that holds from there on."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,19 +18,18 @@ COMMAND_OF_OPTION = {
     "CHANGELANELEFT": Command.LEFT,
     "CHANGELANERIGHT": Command.RIGHT,
 }
-"""By the names of CARLA's `RoadOption`; all others (STRAIGHT, LANEFOLLOW, VOID) go straight on."""
+"""By the names of CARLA's `RoadOption`. All others (STRAIGHT, LANEFOLLOW, VOID) mean straight on."""
 
 
 class GlobalPlan:
     """A route of N points.
 
     Args:
-        plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` leaves them. An
-        option
-            holds from its point to the next.
+        plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` keeps them. An
+            option holds from its point to the next.
 
     Raises:
-        InputError: it has less than two points, or no length.
+        InputError: there are fewer than two points, or the route has no length.
     """
 
     def __init__(self, plan: Sequence[tuple[Any, Any]]) -> None:
@@ -46,14 +45,14 @@ class GlobalPlan:
     def advance(
         self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
     ) -> Progress:
-        """The progress of a vehicle that is at a point now."""
+        """Return the progress of a vehicle that is now at `xy`."""
         return self._line.advance(progress, xy, speed_mps, t_s)
 
     def command(self, progress: Progress) -> Command:
-        """The first turn or change of lanes that is under way or begins within `LOOKAHEAD_M`.
+        """Return the first turn or lane change that is under way or begins within `LOOKAHEAD_M`.
 
-        That is about when commands turn in training (`data.commands`), but for bends outside of junctions, of
-        which the few points do not tell.
+        In training (`data.commands`) commands change at about the same place. The difference is bends outside
+        of junctions, which the few points do not show.
         """
         first = int(np.searchsorted(self._arc_m, progress.done_m, side="right")) - 1
         last = int(np.searchsorted(self._arc_m, progress.done_m + LOOKAHEAD_M))
@@ -63,5 +62,8 @@ class GlobalPlan:
     def target_xy(
         self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> Float64[np.ndarray, "2"]:
-        """Where the route leads, seen from the vehicle; between its few points it is taken to be straight."""
+        """Return the target point on the route in the ego frame, m.
+
+        The route is straight between its points.
+        """
         return self._line.target_xy(progress, T_world_ego)

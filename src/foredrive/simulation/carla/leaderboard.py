@@ -1,8 +1,8 @@
-"""A Foredrive agent by the interface of CARLA's leaderboards 1.0, 2.0 and 2.1, and of Bench2Drive's fork.
+"""A Foredrive agent with the interface of CARLA's leaderboards 1.0, 2.0 and 2.1 and of Bench2Drive's fork.
 
-What they hand over in `run_step` becomes a `Clip`, twice a second; the agent's plan is followed by our
-controller at 20 Hz. Nothing is used that the track SENSORS does not have: cameras, lidar, satellites, IMU,
-speedometer, the route.
+The data of `run_step` becomes a `Clip` twice a second. Foredrive's controller follows the agent's plan at 20
+Hz. Only inputs of the track SENSORS are used: cameras, lidar, satellite navigation, IMU, speedometer and the
+route.
 """
 
 import dataclasses
@@ -38,22 +38,23 @@ from foredrive.towns.recorder import boxes_of
 
 GPS, IMU, SPEED, LIDAR = "GPS", "IMU", "SPEED", "LIDAR"
 COMPASS_AT = 6
-"""In what the IMU sends, after three accelerations and three turn rates."""
+"""Index of the compass in the IMU's data, after three accelerations and three turn rates."""
 
 
 LIDAR_STEPS = 2
-"""The leaderboards' lidar turns at 10 Hz: so many steps make a revolution."""
+"""Number of steps per revolution: the leaderboards' lidar turns at 10 Hz."""
 
 
 class LeaderboardDriver:
     """Drives one route.
 
     Args:
-        agent: sees batches of one clip.
-        rig: its cameras, without leading dimensions; None for an agent that needs none. Leaderboard 1.0
-            allows four, 2.x and Bench2Drive eight.
-        lidar: where one is mounted; what it is like, the leaderboards decide. None: there is none.
-        past_frames: key frames before now that it looks at; until it has them the vehicle stands.
+        agent: agent that drives; it observes batches of one clip.
+        rig: cameras of the agent, without leading dimensions. None for an agent without cameras. Leaderboard
+            1.0 allows four, 2.x and Bench2Drive eight.
+        lidar: lidar whose mounting is used; the leaderboards define its other properties. None without lidar.
+        past_frames: number of key frames before now that the agent observes. The vehicle stands until they
+            exist.
 
     Raises:
         InputError: CARLA has no such cameras.
@@ -81,16 +82,16 @@ class LeaderboardDriver:
         self._next_frame_s = 0.0
 
     def sensors(self) -> list[dict[str, Any]]:
-        """What the leaderboard is to mount."""
+        """Return the sensors that the leaderboard is to mount."""
         return [dict(sensor) for sensor in self._sensors]
 
     def set_route(
         self, plan_gps: Sequence[tuple[dict[str, float], Any]], plan_world: Sequence[tuple[Any, Any]]
     ) -> None:
-        """The route, as the base class keeps it in `_global_plan` and `_global_plan_world_coord`.
+        """Set the route, as the base class keeps it in `_global_plan` and `_global_plan_world_coord`.
 
         Raises:
-            InputError: it has no length, or the two do not go together.
+            InputError: the route has no length, or the two plans do not match.
         """
         if len(plan_gps) != len(plan_world):
             raise InputError(f"a route of {len(plan_world)} points, but {len(plan_gps)} by satellite")
@@ -98,10 +99,10 @@ class LeaderboardDriver:
         self._geo: GeoFrame = fit_geo_frame(lat_lon_of(plan_gps), self._plan.xy)
 
     def step(self, input_data: Mapping[str, tuple[int, Any]], t_s: float) -> Pedals:
-        """What to do in the step that begins now.
+        """Return the pedals for the step that begins now.
 
         Args:
-            input_data: for each sensor the number of the frame, and what it sent.
+            input_data: frame number and data of each sensor.
 
         Raises:
             InputError: there is no route, or a sensor has sent nothing.

@@ -1,10 +1,9 @@
-"""Where a vehicle is by what the leaderboard lets it carry: satellites, a compass, a speedometer.
+"""Localization with the sensors that the leaderboard allows: satellite navigation, compass and speedometer.
 
-No map is needed to read the satellites: the route comes both as coordinates of the world and as latitudes
-and longitudes, by a projection (Mercator) that is known up to a scale and an origin. CARLA 0.9.16 projects
-in other ways than the leaderboard writes its routes: 0.04 % larger, and with north where the route has
-south. So a reading may mean either of two places, and the one that is nearer to where the vehicle has to be
-is taken.
+No map is needed to read the satellite positions. The route is given both in world coordinates and in latitude
+and longitude, related by a Mercator projection of unknown scale and origin. CARLA 0.9.16 projects differently
+from the leaderboard's routes: 0.04 % larger, and with north and south exchanged. A reading may therefore mean
+two places, and the one nearer to the expected position is taken.
 """
 
 import dataclasses
@@ -18,16 +17,19 @@ from jaxtyping import Float64
 from foredrive.errors import InputError
 
 GAIN = 0.02
-"""How much of the difference between satellites and dead reckoning is believed in one step of 0.05 s. In
-balance with satellites 0.56 m off (the leaderboard's 5e-6 degrees) and dead reckoning that strays by 1 cm a
-step."""
+"""Share of the difference between satellites and dead reckoning that is corrected in one step of 0.05 s.
+It balances satellites with an error of 0.56 m (the leaderboard's 5e-6 degrees) and dead reckoning with an
+error of 1 cm per step."""
 SPREAD_M = 1.0
-"""A route that is shorter than this tells no scale."""
+"""A shorter route, m, does not determine the scale."""
 
 
 @dataclass(frozen=True)
 class GeoFrame:
-    """Latitude and longitude (degrees) to our world: x = a·λ + b, y = a·ln tan(45° + φ/2) + c in radians."""
+    """Map from latitude φ and longitude λ to our world: x = a·λ + b, y = a·ln tan(45° + φ/2) + c.
+
+    Latitude and longitude are given in degrees; the formula takes radians.
+    """
 
     scale_m: float
     x_m: float
@@ -36,7 +38,7 @@ class GeoFrame:
     def xy(
         self, lat_deg: float, lon_deg: float, near_xy: Float64[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "2"]:
-        """The place in our world or its mirror image in y, whichever is nearer to `near_xy`."""
+        """Return the place in our world or its mirror image in y, m, whichever is nearer to `near_xy`."""
         east, north = _mercator(lat_deg, lon_deg)
         there = np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
         mirrored = there * [1.0, -1.0]
@@ -45,7 +47,7 @@ class GeoFrame:
 
 
 def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarray, "N 2"]) -> GeoFrame:
-    """The frame in which points lie at both places, by least squares.
+    """Fit the frame to points that are known in both coordinate systems, by least squares.
 
     Raises:
         InputError: the points are at one place.
@@ -61,18 +63,18 @@ def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarra
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """An estimate of the rear axle's pose in our world."""
+    """Estimated pose of the rear axle in our world."""
 
     x_m: float
     y_m: float
     yaw_rad: float
     t_s: float
     steps: int = 1
-    """How many measurements it rests on."""
+    """Number of measurements in the estimate."""
 
     @property
     def T_world_ego(self) -> Float64[np.ndarray, "4 4"]:
-        """On a flat ground: heights by satellite are no better than half a metre."""
+        """Return the pose on flat ground: satellite heights are no better than half a metre."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         T = np.eye(4)
         T[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -87,10 +89,11 @@ def locate(
     speed_mps: float,
     t_s: float,
 ) -> Whereabouts:
-    """The estimate one step later: dead reckoning, drawn towards the satellites.
+    """Return the estimate one step later: dead reckoning, corrected towards the satellites.
 
     Args:
-        yaw_rad: by the compass; what is not finite, as CARLA's is at times, leaves the last heading.
+        yaw_rad: heading by the compass. If it is not finite, as CARLA's is at times, the last heading is
+            kept.
     """
     if before is None:
         x, y = satellites_xy.tolist()
@@ -105,7 +108,7 @@ def locate(
 
 
 def lat_lon_of(plan: Sequence[tuple[dict[str, float], object]]) -> Float64[np.ndarray, "N 2"]:
-    """Latitudes and longitudes of the leaderboard's route."""
+    """Return latitudes and longitudes of the leaderboard's route, degrees."""
     return np.array([(point["lat"], point["lon"]) for point, _ in plan], dtype=float).reshape(-1, 2)
 
 

@@ -1,4 +1,4 @@
-"""Lights, stop signs and lanes as the client knows them, judged by the rules of `lane_rules`."""
+"""Lights, stop signs and lanes of a CARLA world, checked with the rules of `lane_rules`."""
 
 import dataclasses
 import math
@@ -25,10 +25,10 @@ from foredrive.towns.traffic.lights import Light
 
 
 class CarlaRoad:
-    """Watches one drive in a world of CARLA.
+    """Checks the rules for one drive in a CARLA world.
 
-    What the client alone lets one see: a light's lines are its `get_stop_waypoints()`, a stop sign's line
-    lies across the lane at its trigger volume, and the lane is the one nearest to the vehicle's middle.
+    Only the client's data is used. A light's lines are its `get_stop_waypoints()`. A stop sign's line lies
+    across the lane at its trigger volume. The lane is the one nearest to the vehicle's middle.
 
     Args:
         world: a `carla.World`.
@@ -51,21 +51,21 @@ class CarlaRoad:
         self._signs = len(signs)
 
     def lights(self) -> Int[np.ndarray, "Z"]:
-        """What each light shows now, a `Light`; NONE for the stop signs, which come after them."""
+        """Return the current `Light` of each light. The stop signs come after the lights, with NONE."""
         shown = [self._shows.get(light.get_state(), Light.NONE) for light in self._lights]
         return np.array([*shown, *[Light.NONE] * self._signs], dtype=np.int64)
 
     def check(
         self, before: BicycleState, after: BicycleState, z_m: float, state: RuleState, t_s: float
     ) -> tuple[list[Event], RuleState]:
-        """What was run or left in one step, and what is remembered from now on."""
+        """Return the events of one step and the updated rule state."""
         events, stopped_at = lines_run(self._lines, before, after, z_m, self.lights(), state.stopped_at, t_s)
         outside = self.is_outside(np.append(body_middle(after), z_m), after.yaw_rad)
         more, state = way_driven(state, before, after, outside, t_s)
         return events + more, dataclasses.replace(state, stopped_at=stopped_at)
 
     def is_outside(self, xyz: Float64[np.ndarray, "3"], yaw_rad: float) -> bool:
-        """Whether a vehicle is outside of all lanes, or against the direction of the one it is on."""
+        """Return whether a vehicle is outside of all lanes, or drives against the direction of its lane."""
         x, y, z = xyz.tolist()
         kinds = self._lane_type.Driving | self._lane_type.Parking
         lane = self._map.get_waypoint(self._location(x, -y, z), lane_type=kinds)
@@ -81,11 +81,11 @@ class CarlaRoad:
 
 
 def lines_at(waypoints: Sequence[tuple[int, Any]], lights: int) -> Lines:
-    """Lines across lanes.
+    """Return the stop lines across lanes.
 
     Args:
         waypoints: index of a light or sign, and a `carla.Waypoint` on its line.
-        lights: how many of the indices are lights'; signs come after them.
+        lights: number of lights; indices from there on are signs.
     """
     T = np.array([matrix_of(waypoint.transform) for _, waypoint in waypoints]).reshape(-1, 4, 4)
     index = np.array([i for i, _ in waypoints], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Our sensors as CARLA mounts them, and what they send as our tensors."""
+"""Conversions of Foredrive's sensors to CARLA's, and of CARLA's sensor data to tensors."""
 
 import math
 from typing import Any
@@ -19,14 +19,14 @@ PIXEL_TOLERANCE = 0.01
 
 
 def camera_specs(rig: CameraRig, T_actor_ego: Float64[np.ndarray, "4 4"]) -> list[dict[str, Any]]:
-    """The cameras of a rig in the form of the leaderboard's `sensors()`: m and degrees on CARLA's actor.
+    """Return a rig's camera specs as in the leaderboard's `sensors()`: m and degrees on CARLA's actor.
 
     Args:
-        rig: without leading dimensions.
+        rig: rig without leading dimensions.
 
     Raises:
-        InputError: CARLA has no such camera: it knows pinholes with square pixels, the principal point in the
-            middle of the image and a global shutter.
+        InputError: CARLA has no such camera. Its cameras are pinholes with square pixels, a centred principal
+            point and a global shutter.
     """
     height, width = rig.size_hw
     specs = []
@@ -47,9 +47,9 @@ def camera_specs(rig: CameraRig, T_actor_ego: Float64[np.ndarray, "4 4"]) -> lis
 
 
 def camera_attributes(spec: dict[str, Any]) -> dict[str, str]:
-    """The attributes of a camera's blueprint: its pictures are what falls in, without effects of a lens.
+    """Return the attributes of a camera's blueprint, without lens effects.
 
-    Rendered at every step; only those of key frames are looked at. `sensor_tick` would spare the others, but
+    Cameras render at every step, but only key frames use the images. `sensor_tick` would avoid this, but it
     counts in floating point and may miss the frame that is waited for.
     """
     return {
@@ -64,9 +64,10 @@ def camera_attributes(spec: dict[str, Any]) -> dict[str, str]:
 
 
 def lidar_attributes(lidar: SpinningLidar) -> dict[str, str]:
-    """The attributes of a lidar's blueprint: one revolution a simulation step, without random dropout.
+    """Return the attributes of a lidar's blueprint: one revolution per simulation step, no random dropout.
 
-    CARLA's channels lie evenly between the highest and the lowest, all beams of a step leave at once.
+    CARLA's channels are spaced evenly between the highest and the lowest. All beams of a step are sent at one
+    time.
     """
     channels = len(lidar.elevation_rad)
     return {
@@ -85,39 +86,39 @@ def lidar_attributes(lidar: SpinningLidar) -> dict[str, str]:
 
 
 def lidar_pose(lidar: SpinningLidar, T_actor_ego: Float64[np.ndarray, "4 4"]) -> CarlaPose:
-    """Where a lidar is mounted on CARLA's actor."""
+    """Return the mounting pose of a lidar on CARLA's actor."""
     return pose_of(T_actor_ego @ lidar.T_ego_lidar.double().numpy())
 
 
 def lidar_spec(lidar: SpinningLidar, name: str, T_actor_ego: Float64[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """A lidar in the form of the leaderboard's `sensors()`, which has one kind alone."""
+    """Return a lidar in the form of the leaderboard's `sensors()`, which has only one kind of lidar."""
     return {"type": LIDAR, "id": name} | mounting(lidar_pose(lidar, T_actor_ego))
 
 
 def mounting(pose: CarlaPose) -> dict[str, float]:
-    """A pose under the leaderboard's names."""
+    """Return a pose with the leaderboard's field names."""
     x, y, z, roll, pitch, yaw = pose
     return {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
 
 
 def image_of(bgra: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "3 H W"]:
-    """A picture as CARLA's cameras send it: B, G, R, and an alpha that means nothing."""
+    """Convert an image of CARLA's cameras to RGB. Its channels are B, G, R and an unused alpha."""
     return torch.from_numpy(np.ascontiguousarray(bgra[..., 2::-1].transpose(2, 0, 1)))
 
 
 def bgra_of(image: Any) -> UInt8[np.ndarray, "H W 4"]:
-    """The pixels of a `carla.Image`."""
+    """Return the pixels of a `carla.Image`."""
     return np.frombuffer(image.raw_data, dtype=np.uint8).reshape(image.height, image.width, 4)
 
 
 def sweep_of(
     points: Float32[np.ndarray, "N 4"], counts: Int[np.ndarray, "C"], lidar: SpinningLidar
 ) -> LidarSweep:
-    """What a lidar has sent in one step: returns alone, CARLA tells nothing of beams that meet nothing.
+    """Convert the lidar data of one step. It has returns only: CARLA does not report beams that hit nothing.
 
     Args:
         points: x, y, z, intensity in the lidar's left-handed axes, channel by channel, highest first.
-        counts: returns of each channel.
+        counts: number of returns of each channel.
     """
     T = lidar.T_ego_lidar.double().numpy()
     along = mirrored(points[:, :3].astype(np.float64))

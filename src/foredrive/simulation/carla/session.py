@@ -1,4 +1,4 @@
-"""A world on CARLA's server for as long as it is needed: in step with us, and left as it was found."""
+"""A session on CARLA's server: the world runs in step with the client, and is restored at the end."""
 
 import atexit
 import contextlib
@@ -16,15 +16,15 @@ _log = logging.getLogger(__name__)
 
 
 class Session:
-    """One town, in synchronous mode at 20 Hz, and all that was put into it.
+    """One town in synchronous mode at 20 Hz, with all actors that were added to it.
 
-    `close` destroys the actors and lets the server run by itself again, whatever has happened; it is a
-    context manager that does so. Each of these steps is tried even if others fail.
+    `close` destroys the actors and returns the server to asynchronous mode, even after errors. Each of these
+    steps is tried even if others fail. The session is a context manager that calls `close`.
 
     Args:
         client: a `carla.Client`.
-        town: by its name. It is loaded anew, so that lights and props are as they were.
-        seed: of the traffic.
+        town: name of the town. The town is loaded anew, so that lights and props are in their initial state.
+        seed: seed of the traffic.
 
     Raises:
         InputError: the server has no such town, or does not answer.
@@ -71,10 +71,10 @@ class Session:
     def spawn(
         self, blueprint: str, pose: CarlaPose, attributes: dict[str, str], attach_to: Any = None
     ) -> Any | None:
-        """Put an actor into the world; None if there is no room for it.
+        """Add an actor to the world. Return None if there is no room for it.
 
         Raises:
-            InputError: the server has no such blueprint, or this no such attribute.
+            InputError: the server has no such blueprint, or the blueprint has no such attribute.
         """
         try:
             thing = self.world.get_blueprint_library().find(blueprint)
@@ -90,18 +90,18 @@ class Session:
         return actor
 
     def transform(self, pose: CarlaPose) -> Any:
-        """A `carla.Transform`."""
+        """Convert a pose to a `carla.Transform`."""
         x, y, z, roll, pitch, yaw = pose
         location, rotation = self._carla.Location(x, y, z), self._carla.Rotation(pitch, yaw, roll)
         return self._carla.Transform(location, rotation)
 
     def tick(self) -> int:
-        """One simulation step; the number of the frame that it leads to."""
+        """Run one simulation step. Return the number of the new frame."""
         with answering("a simulation step"):
             return int(self.world.tick())
 
     def close(self) -> None:
-        """Destroy what was put into the world and let it run by itself; warns if the server is gone."""
+        """Destroy the added actors and return the server to asynchronous mode. Warn if the server is gone."""
         atexit.unregister(self.close)
         try:
             self._end.close()
@@ -116,11 +116,11 @@ class Session:
 
 
 class Receiver:
-    """What one sensor sends, from the client's thread to ours.
+    """Queue that passes the data of one sensor from the client's thread to ours.
 
     Args:
-        sensor: a `carla.Sensor`; it listens from now on.
-        name: of it, for errors.
+        sensor: a `carla.Sensor`, which listens from now on.
+        name: name of the sensor, for errors.
     """
 
     def __init__(self, sensor: Any, name: str) -> None:
@@ -128,10 +128,10 @@ class Receiver:
         sensor.listen(self._sent.put)
 
     def at(self, frame: int, timeout_s: float) -> Any:
-        """What it measured at a frame; what came before is dropped.
+        """Return the data of a frame. Data of earlier frames is dropped.
 
         Raises:
-            InputError: it does not come in time.
+            InputError: the data does not arrive in time.
         """
         with contextlib.suppress(queue.Empty):
             while True:
@@ -143,7 +143,7 @@ class Receiver:
         raise InputError(f"CARLA's sensor {self._name} has sent nothing for frame {frame} in {timeout_s:g} s")
 
     def all(self) -> list[Any]:
-        """What has come since the last time."""
+        """Return all data that has arrived since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):
             while True:

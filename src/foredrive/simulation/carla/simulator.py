@@ -1,4 +1,4 @@
-"""CARLA as a simulator (`scene.Simulator`): scenarios, steps and events as those of a town."""
+"""CARLA as a simulator (`scene.Simulator`), with the scenarios, steps and events of a town."""
 
 import dataclasses
 import math
@@ -32,13 +32,13 @@ from foredrive.towns.conditions import draw_daylight
 from foredrive.towns.recorder import BOXES_WITHIN_M, boxes_of
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2020"
-"""The vehicle whose sizes `dynamics.EGO` has."""
+"""Vehicle with the dimensions of `dynamics.EGO`."""
 HOLD = Pedals(throttle=0.0, brake=1.0, steer=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class CarlaState:
-    """A drive at one time, as far as it is known here: the world itself is on the server."""
+    """State of a drive at one time, as far as the client knows it. The world itself is on the server."""
 
     step_index: int
     ego: BicycleState
@@ -49,16 +49,16 @@ class CarlaState:
     rules: RuleState = field(default_factory=RuleState)
     progress: Progress = field(default_factory=Progress)
     ended: str | None = None
-    """Why the drive is over, if it is."""
+    """Reason why the drive is over. None while it goes on."""
 
     @property
     def t_s(self) -> float:
-        """Since the drive began."""
+        """Return the time since the drive began, s."""
         return self.step_index * STEP_S
 
 
 class _Ego(NamedTuple):
-    """The vehicle and what it carries."""
+    """The ego vehicle and its sensors."""
 
     vehicle: Any
     T_actor_ego: Float64[np.ndarray, "4 4"]
@@ -68,15 +68,15 @@ class _Ego(NamedTuple):
 
 
 class CarlaSimulator:
-    """A `Simulator` over a server of CARLA; drives are not repeatable bit by bit, and cannot be saved.
+    """A `Simulator` over a CARLA server. Drives are not repeatable bit by bit, and cannot be saved.
 
-    A context manager: at the end, whatever has happened, the server has its actors destroyed and runs by
-    itself again. An interrupt between two steps is covered by that, or by the end of the process.
+    It is a context manager. At the end, even after errors, the server's actors are destroyed and it returns
+    to asynchronous mode. An interrupt between two steps is covered by this, or by the end of the process.
 
     Args:
         client: a `carla.Client`, see `client.connect`.
-        timeout_s: how long to wait for what a sensor sends.
-        traffic_port: of the traffic manager; one for each simulator on a machine.
+        timeout_s: maximum time to wait for sensor data, s.
+        traffic_port: port of the traffic manager; each simulator on a machine needs its own.
     """
 
     state: CarlaState
@@ -86,21 +86,22 @@ class CarlaSimulator:
         self._session: Session | None = None
 
     def ego(self) -> BicycleState:
-        """The ego vehicle now."""
+        """Return the current state of the ego vehicle."""
         return self.state.ego
 
     def standing(self) -> Standing:
-        """How far the drive has come."""
+        """Return the progress of the drive."""
         rules = self.state.rules
         completion = min(1.0, self.state.progress.done_m / self._route.length_m)
         return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def reset(self, scenario: TownScenario) -> Clip:
-        """Load the town and start a drive; the vehicle stands until traffic has set in.
+        """Load the town and start a drive. The vehicle stands until traffic has started to move.
 
         Raises:
             InputError: the server lacks the town, a blueprint or an answer; there is no room for the vehicle;
-                the rig has cameras that CARLA has not; there are scenarios to play, which towns alone do.
+                CARLA has no such cameras as the rig's; or there are scenarios to play, which only town
+                simulators do.
         """
         self.close()
         if scenario.scenarios:
@@ -116,7 +117,7 @@ class CarlaSimulator:
             raise
 
     def step(self, control: Control) -> Step:
-        """Drive on for `STEP_S`; the clip is that of the latest key frame.
+        """Drive on for `STEP_S`. The clip is that of the latest key frame.
 
         Raises:
             InputError: the drive is over, the control is not finite, or the server does not answer.
@@ -133,7 +134,7 @@ class CarlaSimulator:
             raise
 
     def close(self) -> None:
-        """Leave the server as it was found."""
+        """Restore the server to its original state."""
         if self._session is not None:
             session, self._session = self._session, None
             session.close()
@@ -151,7 +152,7 @@ class CarlaSimulator:
         session.world.reset_all_traffic_lights()
         self._ego = self._spawn_ego(session, start)
         add_crowd(session, scenario.crowd, scenario.route_xyz, rng)
-        session.tick()  # what a new world holds is listed from the next frame on
+        session.tick()  # actors of a new world are listed from the next frame on
         self._road = CarlaRoad(session.world)
         before = max(round(SETTLE_S / STEP_S), scenario.past_frames * FRAME_STEPS)
         self.state = CarlaState(-before, BicycleState(0.0, 0.0, 0.0, 0.0), np.eye(4))
@@ -162,7 +163,7 @@ class CarlaSimulator:
                 self.state = dataclasses.replace(
                     self.state, frames=self._with_frame(session, self.state, frame)
                 )
-        self._ego.collisions.all()  # where it was let down
+        self._ego.collisions.all()  # drop contacts from the vehicle's drop onto the road
         self._clip = self._make_clip(self.state)
         return self._clip
 
@@ -193,7 +194,7 @@ class CarlaSimulator:
     def _advance(
         self, session: Session, pedals: Pedals
     ) -> tuple[int, Float64[np.ndarray, "4 4"], BicycleState]:
-        """One step with some pedals: the frame's number and where the vehicle is then."""
+        """Run one step with some pedals. Return the frame number and the vehicle's new pose and state."""
         vehicle = self._ego.vehicle
         vehicle.apply_control(self._make_control(**pedals._asdict()))
         frame = session.tick()
@@ -240,7 +241,7 @@ class CarlaSimulator:
         return events, contact
 
     def _with_frame(self, session: Session, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
-        """The key frames with the one of now, as many as an observation has."""
+        """Append the current key frame and return the latest frames, as many as an observation has."""
         suite, images, sweep = self._scenario.sensors, no_images(), None
         if suite is not None and self._ego.lidar is not None:
             images = self._images(frame)
@@ -281,7 +282,7 @@ def _sweep(measurement: Any, lidar: SpinningLidar) -> LidarSweep:
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> CarlaPose:
-    """Where CARLA's actor is put so that the rear axle stands where the route begins, along it."""
+    """Return the pose of CARLA's actor that puts the rear axle on the route's start, along the route."""
     forward = first_step(route_xyz)
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(*forward[:2])

@@ -1,4 +1,4 @@
-"""Our conditions as CARLA's weather."""
+"""Conversion of Foredrive's conditions to CARLA's weather."""
 
 import math
 from typing import Any
@@ -7,14 +7,17 @@ from foredrive.simulation.carla.client import import_carla
 from foredrive.towns.conditions import Conditions
 
 HIGHEST_SUN_DEG, LOWEST_SUN_DEG = 75.0, -60.0
-"""At noon and at midnight; 0 at 6 and at 18 o'clock."""
+"""Altitude of the sun at noon and at midnight, degrees. It is 0 at 6 and at 18 o'clock."""
 HEAVY_RAIN_MMPH = 50.0
 FOG_VISIBILITY_M = 1000.0
-"""Fog begins below; at a tenth of it and less CARLA's is at its densest."""
+"""Visibility below which fog begins, m. At a tenth of it or less CARLA's fog has its maximum density."""
 
 
 def weather_of(conditions: Conditions) -> Any:
-    """`carla.WeatherParameters` that come near: CARLA gives its percentages no unit to convert to."""
+    """Return similar `carla.WeatherParameters`.
+
+    CARLA's percentages have no unit, so the conversion is approximate.
+    """
     carla = import_carla()
     phase = math.cos(2 * math.pi * (conditions.hour - 12.0) / 24.0)
     rain = 100.0 * min(conditions.rain_mmph / HEAVY_RAIN_MMPH, 1.0) ** 0.5

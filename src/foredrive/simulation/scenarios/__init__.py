@@ -1,1 +1,1 @@
-"""What others do to the ego vehicle on its way, after the scenarios of CARLA's leaderboard 1.0."""
+"""Scenarios that the ego vehicle meets on its route, after those of CARLA's leaderboard 1.0."""

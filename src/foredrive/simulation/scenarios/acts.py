@@ -1,4 +1,4 @@
-"""What the vehicles of a scenario are told to do."""
+"""Orders for the vehicles of a scenario."""
 
 import dataclasses
 
@@ -12,37 +12,43 @@ from foredrive.towns.traffic.guests import granted_through
 from foredrive.towns.traffic.lane_changes import change_length_m
 
 MOVES_MPS = 1.0
-"""Who comes to meet the ego vehicle looks at it only while it is slower, and in the way."""
+"""Oncoming and crossing vehicles react to the ego vehicle only if it is slower than this, m/s, and in the
+way."""
 PASSED_M = 6.0
 SETS_OFF_M = 48.0
 SLOW = {ScenarioKind.LEAD_BRAKES: 0.55, ScenarioKind.CUT_IN: 0.35}
-"""Who drives ahead stands until the ego vehicle is so near, and then drives at this part of the limit."""
+"""A lead vehicle stands until the gap to the ego vehicle is below `SETS_OFF_M`. Then it drives at this
+share of the speed limit."""
 BRAKES_MPS2, BRAKES_S = 6.0, 4.5
 FOLLOWED_M, FOLLOWED_S = 40.0, 4.0
-"""A lead vehicle brakes when it is followed so near for so long, or before the ego vehicle comes too near."""
+"""A lead vehicle brakes when the ego vehicle has followed within `FOLLOWED_M` for `FOLLOWED_S`, or before
+the gap gets too short."""
 STANDS_WITHIN_M, STANDS_S, BLOCKS_S = 25.0, 3.0, 40.0
-"""A vehicle that blocks the lane drives on when it has been waited behind for so long, or after all."""
+"""A vehicle that blocks the lane drives on when the ego vehicle has stood within `STANDS_WITHIN_M` for
+`STANDS_S`, or at the latest after `BLOCKS_S`."""
 CUTS_IN_S, LEAST_CUT_M = 5.0, 4.0
 BESIDE_M, ASIDE_M = 9.0, 2.0
 RUNS_MPS2 = 2.5
-"""Who would have to brake harder than this for a line can be seen not to stop."""
+"""A vehicle that needs a harder deceleration than this to stop at a line, m/s², visibly does not stop."""
 ROOM_M = 3.4
-"""Half the road that crossing vehicles need."""
+"""Half the road width that crossing vehicles need, m."""
 GATHERS_MPS2, FASTEST = 3.0, 1.15
 EASY, SETS_OUT_S = 0.6, 0.5
-"""Who waits to run a light counts on this part of the limit, and on so long until he really accelerates."""
+"""A waiting red light runner plans its start with the share `EASY` of the speed limit, and with a delay of
+`SETS_OUT_S` before it really accelerates."""
 CREEP_MPS, NEAR_M = 4.0, 35.0
 LONGEST_WAIT_S = 60.0
 RESERVES_M = 50.0
-"""Others stand back for a vehicle that runs a light once it is so near."""
+"""Other vehicles give way to a red light runner once it is this near to the line, m."""
 
 
 STANDING = (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN, ScenarioKind.OBSTACLE_BEHIND_CORNER)
-"""Their vehicles stand in a lane until the ego vehicle comes, but not for long in the way of others."""
+"""Kinds whose vehicles stand in a lane until the ego vehicle comes. They do not hold up other vehicles for
+long."""
 
 
 def act(scene: Scene, dt_s: float) -> Scene:
-    """The scene with the orders for its vehicles; a scenario that is over gives way to the next."""
+    """Return the scene with the orders for its vehicles. When a scenario is over, the next one follows."""
     play, ego = scene.play, scene.ego
     if scene.scenario.kind is ScenarioKind.CUT_IN and play.since_s is not None:
         return _come_over(scene, play.since_s)
@@ -57,7 +63,7 @@ def act(scene: Scene, dt_s: float) -> Scene:
     if lead_m is None:
         return _over(scene)
     if play.since_s is None and scene.scenario.kind in ENDS_BEFORE and lead_m > scene.way.meet_m:
-        return _over(scene)  # nobody brakes or changes lanes in a junction for it
+        return _over(scene)  # no vehicle brakes or changes lanes in a junction for the scenario
     if play.since_s is None and scene.scenario.kind in STANDING:
         held_s = play.holds_up_s + dt_s if scene.holds_up() else 0.0
         scene = scene._replace(play=dataclasses.replace(play, holds_up_s=held_s))
@@ -74,7 +80,10 @@ def act(scene: Scene, dt_s: float) -> Scene:
 
 
 def _without_passed(scene: Scene) -> Play:
-    """Those alone who can still be met: they have neither passed the place nor turned off."""
+    """Return the play with only those vehicles that can still be met.
+
+    Such a vehicle has neither passed the meeting point nor turned off.
+    """
     places = ((slot, scene.along_m(slot)) for slot in scene.play.cast)
     until_m = scene.way.meet_m + ROOM_M
     left = [slot for slot, m in places if m is not None and m < until_m + scene.half_m(slot)]
@@ -82,7 +91,7 @@ def _without_passed(scene: Scene) -> Play:
 
 
 def _waiting(scene: Scene, dt_s: float, goes_on: bool) -> Scene:
-    """With the time that has been waited counted on, or from now."""
+    """Count the waiting time on if `goes_on`, else reset it."""
     waited_s = scene.play.waited_s + dt_s if goes_on else 0.0
     return scene._replace(play=dataclasses.replace(scene.play, waited_s=waited_s))
 
@@ -96,13 +105,16 @@ def _begun(scene: Scene) -> Scene:
 
 
 def _gap_m(scene: Scene, lead_m: float) -> float:
-    """From the ego vehicle's bumper to the rear of a vehicle ahead on the route or beside it."""
+    """Return the gap from the ego vehicle's bumper to the rear of the first vehicle of the scenario, m.
+
+    That vehicle is ahead on the route or beside it.
+    """
     on_route_m = scene.scenario.at_m - (scene.way.meet_m - lead_m)
     return scene.ego.front_gap_m(on_route_m) - scene.half_m(scene.play.cast[0])
 
 
 def _cruise_ahead(scene: Scene, gap_m: float) -> None:
-    """Slowly, once the ego vehicle is near."""
+    """Order the lead vehicle to drive slowly once the ego vehicle is near."""
     slot = scene.play.cast[0]
     goes = scene.ego.has_set_out and (gap_m < SETS_OFF_M or scene.speed_mps(slot) > MOVES_MPS)
     goes |= scene.play.holds_up_s > STANDS_S
@@ -145,7 +157,10 @@ def _block(scene: Scene) -> Scene:
 
 
 def _stands_behind(scene: Scene) -> bool:
-    """Whether the ego vehicle does, or somebody else, who may leave it no room to come that far."""
+    """Return whether the ego vehicle stands behind the obstacle, or another vehicle does.
+
+    Another vehicle may leave the ego vehicle no room to come that far.
+    """
     if scene.play.holds_up_s > 0.0:
         return True
     ego = scene.ego
@@ -161,7 +176,7 @@ def _cut_in(scene: Scene, lead_m: float) -> Scene:
     if lead_mps < MOVES_MPS or not has_room:
         return scene
     closing_mps = ego.speed_mps - lead_mps
-    # It goes on as it does: what counts is by how much the ego vehicle is faster.
+    # The lead keeps its speed, so the ego vehicle's excess speed counts.
     least_m = max(stopping_m(closing_mps, ego.acceleration_mps2), LEAST_CUT_M)
     spare_m = gap_m - least_m
     if closing_mps > MOVES_MPS and 0.0 < spare_m < SPARE_M + closing_mps and _is_free(scene, slot):
@@ -178,7 +193,7 @@ def _come_over(scene: Scene, since_s: float) -> Scene:
 
 
 def _is_free(scene: Scene, slot: int) -> bool:
-    """Whether nobody is where a vehicle would go over to."""
+    """Return whether the space that a vehicle would change into is free."""
     poses, v = scene.traffic.poses(scene.state), scene.state.vehicles
     ahead = poses.forward[slot, :2]
     left = np.array([-ahead[1], ahead[0]]) * (1.0 if scene.scenario.side == 0 else -1.0)
@@ -190,8 +205,11 @@ def _is_free(scene: Scene, slot: int) -> bool:
 
 
 def _meet(scene: Scene, lead_m: float) -> Scene:
-    """Be there when the ego vehicle is. Who runs a light cares for it only until he can be seen to run it;
-    oncoming traffic is never faster than allowed, and drives on as it likes where it is waited for."""
+    """Order a vehicle to reach the meeting point together with the ego vehicle.
+
+    A red light runner reacts to the ego vehicle only until it visibly runs the light. Oncoming traffic never
+    exceeds the speed limit, and drives freely if the ego vehicle waits for it.
+    """
     scenario, play, ego, slot = scene.scenario, scene.play, scene.ego, scene.play.cast[0]
     runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
     line_m, room_m = scene.way.line_m - lead_m - scene.half_m(slot), ego.front_gap_m(scenario.at_m - ROOM_M)
@@ -217,14 +235,14 @@ def _meet(scene: Scene, lead_m: float) -> Scene:
 
 
 def _has_time(scene: Scene, lead_m: float) -> bool:
-    """Whether it is early to set out for a vehicle that stands."""
+    """Return whether it is too early for a standing vehicle to start."""
     speed, way_m = scene.speed_mps(scene.play.cast[0]), scene.way.meet_m - lead_m
     needs_s = SETS_OUT_S + arrival_s(way_m, speed, GATHERS_MPS2, EASY * scene.scenario.limit_mps)
     return speed < MOVES_MPS and scene.ego.arrival_s(scene.scenario) > needs_s
 
 
 def _synchronised(scene: Scene, lead_m: float, fastest: float) -> Scene:
-    """With orders to meet the ego vehicle, no faster than a part of the limit."""
+    """Order the vehicle to meet the ego vehicle, at no more than the share `fastest` of the speed limit."""
     slot, scenario = scene.play.cast[0], scene.scenario
     if lead_m > scene.way.meet_m:
         return scene
@@ -236,7 +254,10 @@ def _synchronised(scene: Scene, lead_m: float, fastest: float) -> Scene:
 
 
 def _wait(scene: Scene, slot: int, to_go_m: float) -> None:
-    """Before the line of a light that will be run; of all others the lights take care."""
+    """Order a vehicle to wait.
+
+    A red light runner waits before its line. For all other vehicles the lights do this.
+    """
     if scene.scenario.kind is ScenarioKind.RED_LIGHT_RUNNER:
         scene.towards_mps(slot, min(max((to_go_m - RUN_UP_M) / 3.0, 0.0), CREEP_MPS))
     elif not scene.ego.has_set_out:
@@ -254,7 +275,7 @@ def _run(scene: Scene, slot: int, line_m: float) -> Scene:
 
 
 def _begins_m(scene: Scene, lane: int) -> float:
-    """Where on the way a lane begins, from the line on."""
+    """Return where a lane begins along the way, relative to the junction's line, m."""
     lanes = scene.way.lanes
     length_m = scene.traffic.lanes.length_m[list(lanes[: lanes.index(lane)])].sum()
     return float(length_m) - scene.way.line_m + 1e-6

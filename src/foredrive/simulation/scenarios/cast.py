@@ -1,4 +1,4 @@
-"""Who is called in for a scenario, and where: out of sight, or from the start of the drive on."""
+"""Places the vehicles of a scenario on the road: out of sight, or at the start of the drive."""
 
 import dataclasses
 
@@ -13,24 +13,26 @@ from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.turnover import BORN_BEYOND_M
 
 EARLY_M = 170.0
-"""Nobody is called in for what is so much further along the route."""
+"""No vehicle is placed for a scenario further than this along the route, m."""
 AT_START_M = (35.0, 85.0)
-"""Oncoming traffic stands so far from the place where it is met when a drive begins."""
+"""Range of the distance between oncoming traffic and the meeting point at the start of a drive, m."""
 RUN_UP_M, CAR_M = 22.0, 2.5
-"""Who will run a light waits for the ego vehicle with its bumper so far before its line."""
+"""A red light runner waits with its bumper `RUN_UP_M` before its line. `CAR_M` is half a car's length."""
 AHEAD_AT_START_M, AHEAD_M = 28.0, 102.0
-"""Who is to be followed or passed begins so far ahead of the ego vehicle."""
+"""Initial distance of a lead or cut-in vehicle ahead of the ego vehicle, m: at the start of the drive, and
+later."""
 SHARED_AT_START_M, SHARED_M = 25.0, 36.0
-"""And has so much to drive, at least, until it has to have happened."""
+"""Minimum distance that such a vehicle must have until the scenario has to be over, m: at the start of the
+drive, and later."""
 STREAM, STREAM_APART_M = 3, 17.0
-"""How many come towards the ego vehicle, and how far from each other."""
+"""Number of oncoming vehicles, and the distance between them, m."""
 BEGIN_M = 6.0
 SAMPLES_M = 4.0
 APPROACHING_MPS = 3.0
 
 
 def can_stand(ground: Ground, at_m: float) -> bool:
-    """Whether somebody can be called in to stand at a place of a route, unseen."""
+    """Return whether a standing vehicle can be placed at a point of a route unseen."""
     if at_m < EARLY_M:
         return True
     away_m = np.arange(BORN_BEYOND_M, EARLY_M, SAMPLES_M)
@@ -38,7 +40,7 @@ def can_stand(ground: Ground, at_m: float) -> bool:
 
 
 def can_drive_ahead(ground: Ground, from_m: float, to_m: float) -> bool:
-    """Whether somebody can be called in to drive ahead on a stretch of a route, unseen."""
+    """Return whether a lead vehicle can be placed on a stretch of a route unseen."""
     if from_m <= AHEAD_AT_START_M <= to_m - SHARED_AT_START_M:
         return True
     ahead_m = np.arange(max(from_m, AHEAD_M), to_m - SHARED_M, SAMPLES_M)
@@ -46,17 +48,20 @@ def can_drive_ahead(ground: Ground, from_m: float, to_m: float) -> bool:
 
 
 def _is_far(ground: Ground, ahead_m: Float64[np.ndarray, "n"], behind_m: Float64[np.ndarray, "n"]) -> bool:
-    """Whether of some pairs of places of a route one is too far apart to see from the one to the other."""
+    """Return whether at least one of some pairs of points on a route is too far apart for sight.
+
+    Two points cannot be seen from each other if they are further apart than `BORN_BEYOND_M`.
+    """
     xy, arc_m = ground.route.xyz.T[:2], ground.route.arc_m
     there, here = (np.stack([np.interp(m, arc_m, axis) for axis in xy]) for m in (ahead_m, behind_m))
     return bool((np.hypot(*(there - here)) > BORN_BEYOND_M).any())
 
 
 def call(scene: Scene, at_start: bool) -> Scene:
-    """The scene with its vehicles on the road, if they can come now.
+    """Return the scene with its vehicles on the road, if they can be placed now.
 
     Args:
-        at_start: the drive is about to begin: nobody has seen yet what is there and what is not.
+        at_start: whether the drive is about to begin, so that vehicles may also appear in sight.
     """
     gap_m = scene.ego.middle_gap_m(scene.scenario.at_m)
     if not 0.0 < gap_m < EARLY_M:
@@ -72,7 +77,7 @@ def call(scene: Scene, at_start: bool) -> Scene:
 
 
 def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float | None, float]:
-    """Where along a way the first vehicle begins (None: not now), and how fast."""
+    """Return where along a way the first vehicle begins, m (None: not now), and its speed, m/s."""
     scenario, ego = scene.scenario, scene.ego
     if scenario.kind is ScenarioKind.OBSTACLE_BEHIND_CORNER:
         return way.meet_m, 0.0
@@ -92,7 +97,7 @@ def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float 
 
 
 def is_let_go(scene: Scene, after_s: float) -> bool:
-    """Whether the ego vehicle will not have a red light at the junction of the scenario."""
+    """Return whether the ego vehicle will have no red light at the scenario's junction."""
     shows = scene.traffic.signals.shows(scene.state.time_s + after_s)
     return bool(shows[scene.scenario.ego_lane] != Light.RED)
 

@@ -1,4 +1,4 @@
-"""The places of a route: which lane it is on where, which way it points there."""
+"""Places along a route: its lanes, its points and its headings."""
 
 from typing import NamedTuple
 
@@ -12,21 +12,21 @@ from foredrive.towns.traffic.near_lanes import NearLanes
 from foredrive.towns.world import World
 
 AROUND_M = 25.0
-"""Routes may cross themselves: a place is looked for so near to where it should be."""
+"""Search radius around the expected position on the route, m: routes may cross themselves."""
 ONWARD_LANES = 4
 
 
 class Stretch(NamedTuple):
-    """A part of a route on one lane."""
+    """Part of a route on one lane."""
 
     leg: Leg
     from_m: float
-    """On the route."""
+    """Start on the route, m."""
     to_m: float
 
 
 class Ground(NamedTuple):
-    """What there is to know of a place."""
+    """The route and the town in which scenarios are searched."""
 
     route: DriveRoute
     graph: LaneGraph
@@ -35,7 +35,7 @@ class Ground(NamedTuple):
 
 
 def stretches_of(ground: Ground) -> list[Stretch]:
-    """The route's legs and where on it they begin and end."""
+    """Return the route's legs with their start and end on the route."""
     route, graph, at_m, found = ground.route, ground.graph, 0.0, []
     for leg in route.legs:
         ends = graph.position(np.array([leg.lane, leg.lane]), np.array([leg.from_m, leg.to_m]))
@@ -46,14 +46,14 @@ def stretches_of(ground: Ground) -> list[Stretch]:
 
 
 def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> float:
-    """Where a route passes a point, around a place of it."""
+    """Return the position on the route, m, that is nearest to a point, searched around `about_m`."""
     away_m = np.hypot(*(route.xyz[:, :2] - xyz[:2]).T)
     away_m[np.abs(route.arc_m - about_m) > AROUND_M] = np.inf
     return float(route.arc_m[np.argmin(away_m)]) if np.isfinite(away_m).any() else about_m
 
 
 def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]]:
-    """A point of a route, and its heading there."""
+    """Return a point of the route, m, and the unit vector of its heading there."""
     at, before, after = (
         np.array([np.interp(at_m + ds, route.arc_m, axis) for axis in route.xyz.T]) for ds in (0.0, -1.5, 1.5)
     )
@@ -62,7 +62,7 @@ def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Floa
 
 
 def onward(graph: LaneGraph, lane: int) -> list[int]:
-    """Where a lane leads straight on."""
+    """Return the lanes that lead straight on from a lane."""
     lanes = [lane]
     for _ in range(ONWARD_LANES):
         options = graph.successors[lanes[-1], : graph.successor_count[lanes[-1]]]

@@ -1,4 +1,4 @@
-"""Whom a route meets in junctions: oncoming traffic, and who runs a light."""
+"""Scenarios in junctions: oncoming traffic and red light runners."""
 
 from collections.abc import Iterator
 
@@ -10,16 +10,17 @@ from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind, Way
 from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
 
 UPSTREAM_M, LEAST_UPSTREAM_M = 120.0, 62.0
-"""How much straight road vehicles have to come along: what is looked for, and what will do."""
+"""Length of straight approach for the other vehicles, m: wanted, and minimum."""
 AHEAD_COS, ACROSS_COS = -0.7, 0.7
 LEAST_APPROACH_M, LEAST_THROUGH_MPS = 50.0, 4.5
-"""Of who has less way to it, or is slower in its turn, nobody knows early enough when he will be there."""
+"""If the ego vehicle's approach is shorter, m, or its turn is slower, m/s, its arrival cannot be predicted
+in time."""
 MEET_M = 2.0
-"""Lanes whose centrelines come so near to each other cross."""
+"""Two lanes cross if their centrelines come this near to each other, m."""
 
 
 def at_junctions(ground: Ground, stretches: list[Stretch]) -> Iterator[Scenario]:
-    """Oncoming traffic at left turns, and who comes from the side at lights."""
+    """Yield oncoming traffic at left turns, and red light runners from the side at lights."""
     graph = ground.graph
     heading = _start_headings(graph)
     for leg, from_m, to_m in stretches:
@@ -63,7 +64,10 @@ def _start_headings(graph: LaneGraph) -> Float64[np.ndarray, "L"]:
 
 
 def _met(ground: Ground, lane: int, other: int, about_m: float) -> tuple[float, Way] | None:
-    """Where the route meets another lane, and a way along that; None if it does not or there is no room."""
+    """Return where the route meets another lane, m, and a way along that lane.
+
+    Returns None if they do not meet or the approach is too short.
+    """
     graph = ground.graph
     mine, theirs = graph.samples(lane), graph.samples(other)
     apart_m = np.hypot(*(mine[:, None, :2] - theirs[None, :, :2]).transpose(2, 0, 1))
@@ -78,7 +82,7 @@ def _met(ground: Ground, lane: int, other: int, about_m: float) -> tuple[float, 
 
 
 def _upstream(graph: LaneGraph, lane: int) -> list[int]:
-    """The lanes that lead straight to one, the furthest first."""
+    """Return the lanes that lead straight to a lane, the furthest first."""
     before: list[int] = []
     length_m = 0.0
     while length_m < UPSTREAM_M:

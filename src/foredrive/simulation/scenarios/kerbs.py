@@ -1,4 +1,4 @@
-"""Who may come into the road from its edge, and from between parked cars."""
+"""Scenarios at the road's edge: crossing pedestrians and cyclists, also from between parked cars."""
 
 from collections.abc import Iterator
 
@@ -14,29 +14,35 @@ from foredrive.towns.traffic.strays import FIRST_TRACK_ID, Stray
 from foredrive.towns.world import World
 
 STEP_M, OFF_LANES_M = 0.5, 1.0
-"""The road ends where there have been no lanes for so long."""
+"""The road ends where there is no lane for `OFF_LANES_M`; `STEP_M` is the search step."""
 FURTHEST_RIGHT_M, FURTHEST_LEFT_M = 12.0, 26.0
 RUN_UP_M = 3.0
-"""Cyclists start further from the road."""
+"""Additional distance from which cyclists start, m."""
 HEIGHTS_M = (0.4, 0.9)
-"""Nothing may stand in the way at these heights."""
+"""Heights at which nothing may block the crossing, m."""
 EYE_M = 1.4
 CLEAR_OF_END_M = 5.0
 PARKED_ASIDE_M, PARKED_SKEW_RAD = (1.7, 4.2), 0.3
-"""How far beside the route cars stand, and how much askew, that somebody steps out from."""
+"""Lateral distance of a parked car from the route, m, and maximum angle to it, rad, for a pedestrian to
+step out."""
 STRAIGHT_M, STRAIGHT_COS = 20.0, 0.97
-"""And how straight the route has to be so far before."""
+"""Distance before the car over which the route must be straight, m, and minimum cosine of its heading
+change there."""
 STEPS_OUT_M = 0.6
-"""So far before the car."""
+"""The pedestrian steps out this far before the car, m."""
 INTO_LANE_M = 0.7
-"""And stops so far right of the route."""
+"""The pedestrian stops this far right of the route, m."""
 PEDESTRIAN_LWH, CYCLIST_LWH = (0.5, 0.55, 1.72), (1.75, 0.6, 1.7)
 
 
 def crossing(
     ground: Ground, at_m: float, limit_mps: float, category: Category, seen_m: float
 ) -> Iterator[Scenario]:
-    """Somebody crosses from the right, if the way is clear, and can be seen from so far before it."""
+    """Yield a crossing from the right, if its way is clear and the ego vehicle sees its start in time.
+
+    Args:
+        seen_m: distance before the crossing from which its start must be visible, m.
+    """
     point, ahead = pose(ground.route, at_m)
     left = np.array([-ahead[1], ahead[0], 0.0])
     right_m = _to_edge_m(ground, point, -left, FURTHEST_RIGHT_M)
@@ -58,7 +64,7 @@ def crossing(
 def _to_edge_m(
     ground: Ground, point: Float64[np.ndarray, "3"], aside: Float64[np.ndarray, "3"], furthest_m: float
 ) -> float | None:
-    """How far it is, straight to one side, to where there are no lanes any more."""
+    """Return the distance straight to one side at which the lanes end, m. None if they do not."""
     graph, near, free_m = ground.graph, ground.near, 0.0
     for away_m in np.arange(0.0, furthest_m, STEP_M).tolist():
         here = point + away_m * aside
@@ -71,7 +77,7 @@ def _to_edge_m(
 
 
 def beside_parked(ground: Ground) -> Iterator[Scenario]:
-    """Who may step out before parked cars."""
+    """Yield the pedestrians that may step out before parked cars."""
     route, graph = ground.route, ground.graph
     for car in ground.world.parked:
         away_m = np.hypot(*(route.xyz[:, :2] - car.centre_m[:2]).T)
@@ -109,7 +115,7 @@ def _lane_at(ground: Ground, at_m: float) -> int:
 
 
 def _is_clear(world: World, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:
-    """Whether nothing stands between two points on the ground."""
+    """Return whether nothing stands between two points on the ground."""
     up = np.array([[0.0, 0.0, height] for height in HEIGHTS_M])
     origins = np.concatenate([start + up, end + up])
     way = np.concatenate([np.tile(end - start, (len(up), 1)), np.tile(start - end, (len(up), 1))])
@@ -117,7 +123,7 @@ def _is_clear(world: World, start: Float64[np.ndarray, "3"], end: Float64[np.nda
 
 
 def _is_seen(world: World, eye: Float64[np.ndarray, "3"], foot: Float64[np.ndarray, "3"]) -> bool:
-    """Whether a driver sees who stands at a point."""
+    """Return whether a driver at `eye` sees a point on the ground."""
     up = np.array([0.0, 0.0, EYE_M])
     return not _is_struck(world, (eye + up)[None], (foot - eye)[None])
 

@@ -1,7 +1,7 @@
-"""What somebody on the road does to the ego vehicle, after the scenarios of CARLA's leaderboard 1.0.
+"""Scenarios that the ego vehicle can meet, after those of CARLA's leaderboard 1.0.
 
-All of them are fair: when somebody begins, there is still room to stop for who drives no faster than allowed,
-and attentively (`kinematics.stopping_m`).
+All of them are fair: when a scenario begins, an attentive driver within the speed limit still has room to
+stop (`kinematics.stopping_m`).
 """
 
 import enum
@@ -12,60 +12,61 @@ from foredrive.towns.traffic.strays import Stray
 
 
 class ScenarioKind(enum.StrEnum):
-    """Who does what."""
+    """Kinds of scenarios."""
 
     LEAD_BRAKES = "lead_brakes"
     """The vehicle ahead brakes to a halt, and drives on a little later."""
     OBSTACLE_BEHIND_CORNER = "obstacle_behind_corner"
-    """A vehicle stands in the lane after a turn, until somebody has waited behind it."""
+    """A vehicle stands in the lane after a turn, until another vehicle has waited behind it."""
     CROSSING_PEDESTRIAN = "crossing_pedestrian"
     CROSSING_CYCLIST = "crossing_cyclist"
     ONCOMING_TRAFFIC = "oncoming_traffic"
-    """At a left turn that no light protects; nobody makes room."""
+    """Oncoming traffic at a left turn without a protected light. It does not make room."""
     RED_LIGHT_RUNNER = "red_light_runner"
-    """From the side, at a green light."""
+    """A vehicle from the side runs its red light while the ego vehicle has a green one."""
     CUT_IN = "cut_in"
     """A slower vehicle comes over from the next lane."""
     DOOR_ZONE = "door_zone"
-    """Somebody steps out before a parked car, stays for a while, and goes back."""
+    """A pedestrian steps out before a parked car, stays for a while, and goes back."""
 
 
 MEETINGS = (ScenarioKind.ONCOMING_TRAFFIC, ScenarioKind.RED_LIGHT_RUNNER)
-"""Whose vehicles come from elsewhere."""
+"""Kinds whose vehicles come from another road or direction."""
 ENDS_BEFORE = (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN)
-"""Where these are met is where they have to be over."""
+"""Kinds that must be over at the point where they are met."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """Lanes that a vehicle takes, and where on them it meets the route."""
+    """Lanes that a vehicle takes, and the point at which it meets the route."""
 
     lanes: tuple[int, ...]
-    """Of the town's lane graph, one after the other."""
+    """Consecutive lanes of the town's lane graph."""
     meet_m: float
-    """Way from the begin of the first lane."""
+    """Distance of the meeting point from the beginning of the first lane, m."""
     line_m: float = math.inf
-    """Where on the way the junction's line is, if they meet in one."""
+    """Distance of the junction's line along the way, m, if they meet in a junction."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One thing that happens at a place of a route; nothing happens where the route is not driven."""
+    """A scenario at a place of a route. Nothing happens if the ego vehicle does not drive there."""
 
     kind: ScenarioKind
     at_m: float
-    """Where on the route it is met. Of a lead vehicle, or one that cuts in, where it has to have happened."""
+    """Position on the route where the scenario is met, m. For a lead or cut-in vehicle, the position where
+    it must be over."""
     limit_mps: float
-    """How fast the ego vehicle may be there."""
+    """Speed limit of the ego vehicle there, m/s."""
     through_mps: float = math.inf
-    """How fast it can be, as in a turn."""
+    """Maximum speed that the ego vehicle can drive there, m/s, for instance in a turn."""
     ways: tuple[Way, ...] = ()
-    """Of vehicles: any of them will do."""
+    """Alternative ways of the vehicles."""
     side: int = 0
-    """To which side a vehicle cuts in (0 left, 1 right)."""
+    """Side to which a vehicle cuts in (0 left, 1 right)."""
     ego_lane: int = -1
-    """The lane whose light the ego vehicle has, at junctions."""
+    """Lane of the ego vehicle in the junction, whose light it has. -1 outside of junctions."""
     stray: Stray | None = None
-    """Who crosses, as it waits before it does."""
+    """The crossing road user in its waiting state, if there is one."""
     meet_m: float = 0.0
-    """How far along its way it meets the route."""
+    """Distance along the crossing road user's way at which it meets the route, m."""

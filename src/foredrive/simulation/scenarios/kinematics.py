@@ -1,17 +1,20 @@
-"""How far somebody drives until he stands, when he is somewhere, how fast he has to be for that."""
+"""Stopping distance, arrival time and required speed of a vehicle or a person."""
 
 import math
 
 REACTION_S, BITES_S, BRAKING_MPS2 = 1.0, 0.2, 4.0
-"""An attentive driver reacts within so long; his brakes take effect a little later, and this hard."""
+"""Reaction time of an attentive driver, s, delay of the brakes, s, and deceleration, m/s²."""
 SPARE_M = 2.0
-"""What scenarios leave him beyond the way that he needs to stop."""
+"""Distance that scenarios leave beyond the stopping distance, m."""
 SLOWS_MPS2 = 2.0
-"""How hard one brakes for a turn."""
+"""Deceleration before a turn, m/s²."""
 
 
 def stopping_m(speed_mps: float, acceleration_mps2: float = 0.0) -> float:
-    """The way to a halt of an attentive driver, who until he reacts drives on as he does."""
+    """Return the stopping distance of an attentive driver, m.
+
+    Until the brakes take effect the vehicle keeps its acceleration, if that is positive.
+    """
     gaining = max(acceleration_mps2, 0.0)
     until_s = REACTION_S + BITES_S
     then_mps = speed_mps + gaining * until_s
@@ -21,20 +24,23 @@ def stopping_m(speed_mps: float, acceleration_mps2: float = 0.0) -> float:
 def arrival_s(
     way_m: float, speed_mps: float, acceleration_mps2: float, limit_mps: float, through_mps: float = math.inf
 ) -> float:
-    """When somebody has driven a way who accelerates as now up to the limit; infinite if he stands.
+    """Return the time to drive a distance, s, with the current acceleration up to the limit.
+
+    The time is infinite for a vehicle that stands and does not accelerate.
 
     Args:
-        through_mps: how fast he can be there, as in a turn: he slows down for it with `SLOWS_MPS2`.
+        through_mps: maximum speed at the end, m/s, for instance in a turn. The vehicle slows down for it with
+            `SLOWS_MPS2`.
     """
     gains = max(acceleration_mps2, 1e-3) if speed_mps < limit_mps else 1e-3
     if speed_mps < 1e-3 and acceleration_mps2 < 1e-3:
         return math.inf
     limit_mps, through_mps = max(limit_mps, speed_mps), min(through_mps, max(limit_mps, speed_mps))
-    # What is gained up to the peak and lost from there on makes the way.
+    # The distance gained up to the peak speed and lost after it make up the way.
     peak2 = (way_m + speed_mps**2 / (2 * gains) + through_mps**2 / (2 * SLOWS_MPS2)) / (
         0.5 / gains + 0.5 / SLOWS_MPS2
     )
-    if peak2 < max(speed_mps, through_mps) ** 2:  # there is no way left to gain on, or none to slow down
+    if peak2 < max(speed_mps, through_mps) ** 2:  # no way left to accelerate, or too little to slow down
         return _gaining_s(way_m, speed_mps, gains if speed_mps < through_mps else -SLOWS_MPS2)
     peak = min(math.sqrt(peak2), limit_mps)
     gained_m = (peak**2 - speed_mps**2) / (2 * gains)
@@ -44,16 +50,16 @@ def arrival_s(
 
 
 def _gaining_s(way_m: float, speed_mps: float, gains_mps2: float) -> float:
-    """Time for a way with a constant acceleration."""
+    """Return the time for a distance at constant acceleration, s."""
     then_mps = math.sqrt(max(speed_mps**2 + 2 * gains_mps2 * way_m, 0.0))
     return 2 * way_m / max(speed_mps + then_mps, 1e-3)
 
 
 def cruise_mps(way_m: float, time_s: float, speed_mps: float, acceleration_mps2: float) -> float:
-    """The speed that, taken up with an acceleration and then kept, makes a way in a time.
+    """Return the speed, m/s, that covers a distance in a time if first reached at constant acceleration.
 
-    From d = c t - (c - v)² / 2a; as near as can be where the time is too short. Who has more time than he
-    needs slows down at once.
+    Solves d = c t - (c - v)² / 2a for c. If the time is too short, the result is as near as possible. If
+    there is more time than needed, the vehicle slows down at once.
     """
     missing_m = way_m - speed_mps * time_s
     if missing_m <= 0:

@@ -1,4 +1,4 @@
-"""Which scenarios a route makes possible where, and those drawn of them from a seed."""
+"""Finds the scenarios that a route allows, and draws some of them from a seed."""
 
 import dataclasses
 import itertools
@@ -22,25 +22,28 @@ from foredrive.towns.traffic.strays import FIRST_TRACK_ID
 from foredrive.towns.world import World
 
 FIRST_M, CLEAR_OF_END_M = 28.0, 8.0
-"""The route's begin and end are left alone."""
+"""Lengths at the route's beginning and end without scenarios, m."""
 APART_M, STAGED_APART_M = 80.0, 120.0
-"""Between scenarios: vehicles have to come up out of sight."""
+"""Minimum distance between scenarios, m. Scenarios with vehicles need more, as these must approach out of
+sight."""
 CHOICE_M = 70.0
-"""Of the scenarios possible on so much of the route one is drawn, of a kind that there were fewest of."""
+"""One scenario is drawn among those within this distance on the route, m, of the kind that is rarest so
+far."""
 STRAY_EVERY_M = 9.0
 AFTER_TURN_M, SEEN_AFTER_TURN_M = 9.0, 8.0
-"""Who crosses behind a corner is so far behind it, and seen so far before."""
+"""Distance of a crossing behind a turn, m, and the distance before it from which it must be visible, m."""
 BEHIND_CORNER_M = 16.0
-"""Who stands there is further: in a turn one drives slowly, but is hardly through it."""
+"""Distance of a standing vehicle behind a turn, m. It is longer because in a turn one drives slowly but is
+hardly through it."""
 BEFORE_LINE_M = 14.0
 LEAST_STRETCH_M = 45.0
 
 
 def scenarios_on(route: DriveRoute, world: World, seed: int) -> tuple[Scenario, ...]:
-    """Scenarios along a route, in the order they are met, 80 m or more from each other.
+    """Return scenarios along a route, in the order in which they are met, at least 80 m apart.
 
     Args:
-        world: the town as the drive has it: grown from the drive's seed.
+        world: world of the drive, grown from the drive's seed.
         seed: equal seeds give equal scenarios.
     """
     rng = np.random.default_rng((seed, *route.id.encode()))
@@ -49,7 +52,10 @@ def scenarios_on(route: DriveRoute, world: World, seed: int) -> tuple[Scenario, 
 
 
 def possible_scenarios(route: DriveRoute, world: World, rng: np.random.Generator) -> list[Scenario]:
-    """All that could happen on a route, in the order it would be met; of who may cross where, a draw."""
+    """Return all scenarios that a route allows, in the order in which they are met.
+
+    Places and kinds of crossings are drawn at random.
+    """
     graph = build_lane_graph(world.town)
     ground = Ground(route, graph, near_lanes_of(graph), world)
     stretches = stretches_of(ground)
@@ -79,7 +85,7 @@ def _drawn(possible: Sequence[Scenario], rng: np.random.Generator) -> list[Scena
 
 
 def _numbered(scenario: Scenario, number: int, rng: np.random.Generator) -> Scenario:
-    """With an identity of its own for who crosses."""
+    """Give the crossing road user of a scenario its own track id and style."""
     if scenario.stray is None:
         return scenario
     style = int(rng.integers(2**31))
@@ -88,7 +94,7 @@ def _numbered(scenario: Scenario, number: int, rng: np.random.Generator) -> Scen
 
 
 def _on_stretches(ground: Ground, stretches: list[Stretch], rng: np.random.Generator) -> Iterator[Scenario]:
-    """What may happen outside of junctions, on runs of lanes without a change."""
+    """Yield the scenarios outside of junctions, on runs of lanes between them."""
     graph = ground.graph
     for is_inside, group in itertools.groupby(stretches, key=lambda s: bool(graph.junction[s.leg.lane] >= 0)):
         run = list(group)
@@ -118,7 +124,7 @@ def _after_turn(ground: Ground, run: list[Stretch]) -> Iterator[Scenario]:
 def _along(
     ground: Ground, from_m: float, to_m: float, run: list[Stretch], rng: np.random.Generator
 ) -> Iterator[Scenario]:
-    """Who may cross on a stretch."""
+    """Yield the crossings on a stretch."""
     for at_m in np.arange(from_m + rng.uniform(0.0, 3.0), to_m, STRAY_EVERY_M).tolist():
         lane = next((s.leg.lane for s in run if at_m <= s.to_m), run[-1].leg.lane)
         limit = float(ground.graph.limit_mps[lane])

@@ -22,7 +22,7 @@ PASSED_M = 8.0
 
 
 class Director:
-    """Tells the traffic what to do for the scenarios of one route; all that changes is in `Play`."""
+    """Gives the traffic its orders for the scenarios of one route. All changing state is in `Play`."""
 
     def __init__(self, traffic: Traffic, scenarios: Sequence[Scenario]) -> None:
         self._traffic, self._scenarios = traffic, scenarios
@@ -30,7 +30,10 @@ class Director:
         self._strays = tuple(scenario.stray for scenario in scenarios if scenario.stray is not None)
 
     def set_up(self, state: TrafficState, ego: Ego, dt_s: float) -> tuple[Play, TrafficState]:
-        """The traffic that a drive begins with: whoever will cross stands there, who is near has come."""
+        """Return the play and the traffic at the start of a drive.
+
+        All crossing road users wait at their places, and the vehicles of a near scenario are on the road.
+        """
         play = Play(pace_mps=(0.0,) * len(self._strays))
         state = dataclasses.replace(state, strays=self._strays)
         play, state, _ = self.direct(play, state, ego, dt_s, at_start=True)
@@ -39,7 +42,10 @@ class Director:
     def direct(
         self, play: Play, state: TrafficState, ego: Ego, dt_s: float, at_start: bool = False
     ) -> tuple[Play, TrafficState, Orders]:
-        """What to remember, the traffic with those who are called in, and the orders for its next step."""
+        """Return the updated play, the traffic, and the orders for its next step.
+
+        The traffic includes newly placed vehicles.
+        """
         orders = Orders.none(len(state.vehicles.active))
         if play.number < len(self._scenarios):
             scenario = self._scenarios[play.number]
@@ -63,7 +69,7 @@ class Director:
         return dataclasses.replace(play.beginning(ego.t_s), pace_mps=paces)
 
     def _paces(self, play: Play, state: TrafficState, ego: Ego) -> tuple[float, ...]:
-        """How fast each stray goes now."""
+        """Return the current speed of each stray, m/s."""
         begun, paces, boxes = dict(play.begun), list(play.pace_mps), None
         for index, (number, stray) in enumerate(zip(self._numbers, state.strays, strict=True)):
             if paces[index] == 0.0 or stray.s_m >= stray.length_m:

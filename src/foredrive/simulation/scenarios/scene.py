@@ -1,4 +1,4 @@
-"""What those who play a scenario know: how far it is, where everybody is, what they have been told."""
+"""State of a scenario: its progress, the ego vehicle, the traffic and the orders given."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -20,40 +20,43 @@ SET_OUT_M = 1.0
 STANDS_MPS = 0.3
 ROUNDED_M = 0.5
 FRONT_M = EGO.axle_to_centre_m + 0.5 * EGO.length_m
-"""From the rear axle to the front bumper."""
+"""Distance from the rear axle to the front bumper, m."""
 SOON_S, TO_SPEED_MPS2 = 0.5, 3.0
-"""How soon a vehicle is to drive at the speed it is told, and how hard it may brake or speed up for that."""
+"""Time in which a vehicle is to reach its ordered speed, s, and maximum deceleration and acceleration for
+it, m/s²."""
 
 
 @dataclass(frozen=True)
 class Play:
-    """How far the scenarios of a route have come: one after the other, never two at a time."""
+    """Progress of the scenarios of a route. They are played one after the other, never two at a time."""
 
     number: int = 0
-    """Of the one whose turn it is; those before are over, or have been missed."""
+    """Number of the current scenario. Those before are over, or have been missed."""
     cast: tuple[int, ...] = ()
-    """Slots of the vehicles that have been called in for it."""
+    """Slots of the vehicles that have been placed for it."""
     way: int = 0
-    """Which of its ways they take."""
+    """Index of the way that they take, among the scenario's ways."""
     since_s: float | None = None
-    """Since when it goes on; None: it has not begun."""
+    """Time at which the scenario began, s. None if it has not begun."""
     cruise_mps: float = 0.0
-    """How fast a vehicle goes that is on its way to meet the ego vehicle, from then on."""
+    """Speed of a vehicle that is on its way to meet the ego vehicle, m/s, kept once the scenario has
+    begun."""
     waited_s: float = 0.0
-    """How long it has been waited for."""
+    """Time for which the scenario's waiting condition has held, s: the ego vehicle follows, stands behind,
+    or is waited for."""
     holds_up_s: float = 0.0
-    """For how long others have stood behind its vehicles."""
+    """Time for which others have stood behind its vehicles, s."""
     begun: tuple[tuple[int, float], ...] = ()
-    """The numbers of all that have begun, and when in the drive, s."""
+    """Numbers of all scenarios that have begun, and their start times in the drive, s."""
     pace_mps: tuple[float, ...] = ()
-    """Of each stray, once it has begun."""
+    """Speed of each stray, m/s, once it has begun."""
 
     def after(self) -> "Play":
-        """With the next one's turn."""
+        """Return the play with the next scenario as the current one."""
         return Play(self.number + 1, begun=self.begun, pace_mps=self.pace_mps)
 
     def beginning(self, t_s: float) -> "Play":
-        """With the one whose turn it is going on from now."""
+        """Return the play in which the current scenario begins now."""
         return dataclasses.replace(self, since_s=t_s, begun=(*self.begun, (self.number, t_s)))
 
 
@@ -61,34 +64,37 @@ class Ego(NamedTuple):
     """The ego vehicle as scenarios see it."""
 
     t_s: float
-    """Since the drive began."""
+    """Time since the drive began, s."""
     done_m: float
-    """How far along the route its rear axle is."""
+    """Position of the rear axle along the route, m."""
     speed_mps: float
     acceleration_mps2: float
     centre_m: Float64[np.ndarray, "3"]
-    """On the ground."""
+    """Middle of the vehicle on the ground, m."""
     yaw_rad: float
 
     @property
     def has_set_out(self) -> bool:
-        """Whether it has left the place where the drive began."""
+        """Return whether the vehicle has left the place where the drive began."""
         return self.done_m > SET_OUT_M
 
     def stopping_m(self) -> float:
-        """Its way to a halt if it is driven attentively."""
+        """Return the stopping distance of an attentive driver, m."""
         return stopping_m(self.speed_mps, self.acceleration_mps2)
 
     def front_gap_m(self, at_m: float) -> float:
-        """From its bumper to a place of the route, rather too little: it is known to the metre."""
+        """Return the distance from the bumper to a place of the route, m.
+
+        `ROUNDED_M` is subtracted, because the position on the route is known to the metre only.
+        """
         return at_m - self.done_m - FRONT_M - ROUNDED_M
 
     def middle_gap_m(self, at_m: float) -> float:
-        """From its middle to a place of the route."""
+        """Return the distance from the vehicle's middle to a place of the route, m."""
         return at_m - self.done_m - EGO.axle_to_centre_m
 
     def arrival_s(self, scenario: Scenario) -> float:
-        """When its middle is where the scenario is met."""
+        """Return the time until the vehicle's middle reaches the place of the scenario, s."""
         gap_m = max(self.middle_gap_m(scenario.at_m), 0.0)
         motion = (self.speed_mps, self.acceleration_mps2, scenario.limit_mps, scenario.through_mps)
         return arrival_s(gap_m, *motion)
@@ -103,15 +109,15 @@ class Scene(NamedTuple):
     state: TrafficState
     ego: Ego
     orders: Orders
-    """Filled in by who plays it."""
+    """Filled in while the scenario is played."""
 
     @property
     def way(self) -> Way:
-        """That the vehicles take."""
+        """Return the way that the vehicles take."""
         return self.scenario.ways[self.play.way]
 
     def along_m(self, slot: int) -> float | None:
-        """How far along the way the middle of a vehicle is; None: it is not there any more."""
+        """Return the position of a vehicle's middle along the way, m. None if it has left the way."""
         v, graph, lanes = self.state.vehicles, self.traffic.lanes, self.way.lanes
         lane = int(v.path[slot, BEHIND])
         if not v.active[slot] or lane not in lanes:
@@ -120,20 +126,20 @@ class Scene(NamedTuple):
         return float(before_m + v.s_m[slot])
 
     def speed_mps(self, slot: int) -> float:
-        """Of a vehicle."""
+        """Return the speed of a vehicle, m/s."""
         return float(self.state.vehicles.speed_mps[slot])
 
     def holds_up(self) -> bool:
-        """Whether somebody else stands because of the first vehicle."""
+        """Return whether another vehicle stands because of the scenario's first vehicle."""
         v, graph = self.state.vehicles, self.traffic.lanes
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
         return bool((v.active & (leader == self.play.cast[0]) & (v.speed_mps < STANDS_MPS))[1:].any())
 
     def half_m(self, slot: int) -> float:
-        """Half a vehicle's length."""
+        """Return half the length of a vehicle, m."""
         return 0.5 * float(self.state.vehicles.size_lwh[slot, 0])
 
     def towards_mps(self, slot: int, wanted_mps: float) -> None:
-        """Order a vehicle to drive no faster than a speed, soon."""
+        """Order a vehicle to drive no faster than a speed, reached within `SOON_S`."""
         wanted = (wanted_mps - self.speed_mps(slot)) / SOON_S
         self.orders.most_mps2[slot] = min(max(wanted, -TO_SPEED_MPS2), TO_SPEED_MPS2)

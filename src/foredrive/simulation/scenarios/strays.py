@@ -1,4 +1,4 @@
-"""When those who cross set out, and how they go on without walking into others."""
+"""Strays (crossing pedestrians and cyclists): when they start, and how they avoid vehicles."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,24 +18,27 @@ PREFERRED_MPS = {Category.PEDESTRIAN: 1.4, Category.BICYCLE: 3.5}
 SLOWEST_MPS, FASTEST_MPS = 0.8, {Category.PEDESTRIAN: 3.0, Category.BICYCLE: 6.0}
 STEP_OUT_MPS = 1.5
 STAYS_S = 9.0
-"""Who steps out before a parked car goes back after this time."""
+"""A pedestrian that steps out before a parked car goes back after this time, s."""
 HALF_WIDTH_M = 0.5
 NEARLY_M = 0.3
 STANDS_MPS = 0.5
 LATE_M = 3.0
 SAFE_S = 4.0
 BACK_MPS = -0.8
-"""Who cannot go on because somebody stands in his way makes room."""
+"""Speed of a stray that steps back because a vehicle blocks its way, m/s."""
 BESIDE_M = 0.4
 
 
 def pace_to_begin(scenario: Scenario, stray: Stray, ego: Ego) -> float | None:
-    """How fast somebody sets out now to meet the ego vehicle; None: it is too early, or no longer fair."""
+    """Return the speed at which a stray starts now to meet the ego vehicle, m/s.
+
+    Returns None if it is too early, or no longer fair.
+    """
     gap_m, speed = ego.front_gap_m(scenario.at_m) - HALF_WIDTH_M, ego.speed_mps
     spare_m = gap_m - ego.stopping_m()
     if speed < SLOWEST_EGO_MPS:
         return None
-    if scenario.kind is ScenarioKind.DOOR_ZONE:  # in the lane for all to see while one can still stop
+    if scenario.kind is ScenarioKind.DOOR_ZONE:  # visible in the lane while the ego vehicle can still stop
         spare_m -= speed * scenario.meet_m / STEP_OUT_MPS
         return STEP_OUT_MPS if SPARE_M - LATE_M < spare_m < SPARE_M else None
     arrives_s = ego.arrival_s(scenario)
@@ -47,13 +50,13 @@ def pace_to_begin(scenario: Scenario, stray: Stray, ego: Ego) -> float | None:
 
 
 def is_on_the_spot(scenario: Scenario, stray: Stray, since_s: float) -> bool:
-    """Whether somebody stays where he is for now: who has stepped out before a parked car."""
+    """Return whether a stray waits where it is: a pedestrian that has stepped out before a parked car."""
     waits = scenario.kind is ScenarioKind.DOOR_ZONE and since_s < STAYS_S
     return waits and stray.s_m >= scenario.meet_m - NEARLY_M
 
 
 def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
-    """Whether somebody who goes on meets a vehicle that he would not meet if he stood."""
+    """Return whether a stray that goes on hits a vehicle that it would not hit if it stood still."""
     to_go_m = stray.length_m - stray.s_m if pace_mps > 0 else stray.s_m
     left_s = to_go_m / abs(pace_mps)
     goes = time_to_collision_s(_box(stray, pace_mps), others).min(initial=np.inf)
@@ -62,8 +65,10 @@ def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
 
 
 def pace_among(stray: Stray, pace_mps: float, others: MovingBoxes) -> float:
-    """How fast somebody goes on among vehicles: he waits for those that come, and makes room before
-    those that stand in his way."""
+    """Return the speed of a stray among vehicles, m/s.
+
+    It waits for vehicles that approach, and steps back from vehicles that block its way.
+    """
     if not walks_into(stray, pace_mps, others):
         return pace_mps
     stand = np.hypot(*others.velocity_mps.T) < STANDS_MPS
@@ -73,7 +78,7 @@ def pace_among(stray: Stray, pace_mps: float, others: MovingBoxes) -> float:
 
 
 def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxes:
-    """What nobody walks into: all vehicles but vehicle 0, and that as well while it stands."""
+    """Return the vehicles that strays avoid: all except vehicle 0, and vehicle 0 too while it stands."""
     v, poses = state.vehicles, traffic.poses(state)
     rows = np.flatnonzero(v.active)
     rows = rows[rows > 0]
