@@ -41,7 +41,7 @@ def distortion_jacobian(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]
 
 
 def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
-    """Invert `distort` by fixed-point iteration. The result is accurate where the distortion is invertible."""
+    """Invert `distort` by fixed-point iteration. It is accurate where the distortion is invertible."""
     if _is_ideal(dist):
         return xy
     out = xy

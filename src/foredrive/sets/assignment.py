@@ -61,7 +61,7 @@ def best_assignment(cost: Float[ndarray, "R C"], free: Float[ndarray, "R"]) -> A
 
 
 def k_best_assignments(cost: Float[ndarray, "R C"], free: Float[ndarray, "R"], k: int) -> RankedAssignments:
-    """Return the k (≥ 1) assignments of minimum cost, or all assignments of finite cost if there are fewer."""
+    """Return the k (≥ 1) assignments of minimum cost, or all of finite cost if there are fewer."""
     column, total = _rank(_as_costs(cost), _as_costs(free), k)
     return RankedAssignments(np.where(column == cost.shape[1], -1, column), total)
 
@@ -199,8 +199,7 @@ def _rank(cost, free, k):
 @_kernel
 @no_type_check
 def _insert(waiting, parent_of, row_cut, wanted, cost, parent, row):
-    """Insert a subproblem into the sorted list of the `wanted` cheapest ones. The most expensive one drops
-    out."""
+    """Insert a subproblem into the sorted list of the `wanted` cheapest ones. The last one drops out."""
     place = wanted - 1
     while place > 0 and waiting[place - 1] > cost:
         waiting[place], parent_of[place] = waiting[place - 1], parent_of[place - 1]
@@ -289,9 +288,8 @@ def _apply(column_of, u, v, start, length, reached_unused, unused, search):
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows
-    rise = (
-        length - reached_unused if reached_unused < np.inf else 0.0
-    )  # the price of unused nodes must stay 0
+    # After the path's first unused node, prices change by less: the price of unused nodes must stay 0.
+    rise = length - reached_unused if reached_unused < np.inf else 0.0
     for x in range(len(v)):
         r = row_of[x]
         if r < start:  # the node is unused, or its row is fixed

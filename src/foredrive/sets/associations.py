@@ -172,7 +172,7 @@ def _sum_large(
     k: int,
     max_states: int,
 ) -> _Found:
-    """Sum a subset of the pairs of a component that is too large, and bound the contribution of the others."""
+    """Sum a subset of the pairs of a component that is too large, and bound the contribution of the rest."""
     found = _sum_thinner(log_pair, log_row, log_column, k, max_states, _THINNER_NATS)
     left_out = log_pair > -np.inf
     left_out[found.row, found.column] = False

@@ -45,7 +45,7 @@ class MultiBernoulli(Record):
 
     @classmethod
     def from_softmax(cls, logits: Float[Tensor, "*b M K_1"], boxes: BoxDensity) -> "MultiBernoulli":
-        """Convert the logits of a detector with one softmax over the classes and, last, "no object" (DETR)."""
+        """Convert the logits of a detector with one softmax over the classes and "no object" (DETR)."""
         log_prob = logits.double().log_softmax(-1)
         log_existence = log_prob[..., :-1].logsumexp(-1)
         return cls(log_existence, log_prob[..., -1], log_prob[..., :-1] - log_existence[..., None], boxes)
