@@ -53,7 +53,7 @@ def _level(block, start):
 @kernel_part
 @no_type_check
 def _collect(inputs, block, first, last, head):
-    """Fill `block` with the points of the pairs first … last - 1. Points are sorted by level, then by pair."""
+    """Fill `block` with the points of pairs first … last - 1, sorted by level, then by pair."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
     for pair in range(first, last):

@@ -24,7 +24,7 @@ def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def numba_can(*tensors: Tensor) -> bool:
-    """Return whether the CPU kernels apply: all tensors are on the CPU, none is float64, nothing is traced."""
+    """Return whether the CPU kernels apply: all tensors on the CPU, none float64, nothing traced."""
     return _plain(tensors, "cpu")
 
 

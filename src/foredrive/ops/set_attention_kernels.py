@@ -27,7 +27,10 @@ NOTHING = np.float32(-1e30)
 @kernel
 @no_type_check
 def attend_sets(first, last, query_key, value, order, ends, largest, out):
-    """Sets `first` to `last` of `attend_within`, into out[K C]; in `order` they lie between ends[S + 1]."""
+    """Compute sets `first` to `last` - 1 of `attend_within` into out[K C].
+
+    The tokens of set s are order[ends[s] : ends[s + 1]].
+    """
     width = value.shape[1]
     room = (largest + ROW - 1) // ROW * ROW
     keys = np.empty(ROW * room, np.float32)  # channel-major: 16 keys are adjacent

@@ -19,7 +19,7 @@ SLOTS = LANES * LANES
 PARTS = 4
 """Number of parts of a turn. A tile of beams never extends over two parts."""
 SIDE_PX = 16
-"""Side length of a camera tile in pixels. Its blocks are squares of 4×4."""
+"""Side length of a camera tile in pixels. Its blocks have 4 by 4 pixels."""
 
 
 @dataclass(frozen=True)

@@ -201,7 +201,7 @@ def _look(
 
 @torch.no_grad()
 def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
-    """Return, for each tile, the splats whose opacity reaches 1/255 somewhere in the box around its points."""
+    """Return, for each tile, the splats whose opacity reaches 1/255 in the box around its points."""
     points = points.to(splats.mean.device, splats.mean.dtype)
     low, high = points.tile_bounds[:, 0::2], points.tile_bounds[:, 1::2]  # [T 3]: x y time
     tiles, count = len(low), len(splats.opacity)

@@ -47,8 +47,11 @@ SUMS = 12
 @inlined_part
 @no_type_check
 def _start_back(places, tile, out, grad_out, state, columns):
-    """Fill a block's rows: transmittance, what is left of the result times its gradient, gradients of range,
-    alpha and alpha before the hit, then of the features."""
+    """Fill the rows of each block.
+
+    The rows are: transmittance, dot product of the remaining result and its gradient, gradients of range,
+    alpha and alpha before the hit, then the gradients of the features.
+    """
     depth = columns - 5
     for s in range(POINTS):
         p = places.point[tile, s]
@@ -180,7 +183,7 @@ class Gradients(NamedTuple):
 @kernel
 @no_type_check
 def gather_gradients(start, stop, pairs, first_slot, raw, grads):
-    """Sum the pair gradients of the splats start … stop - 1, which are contiguous, and apply the chain rule."""
+    """Sum the pair gradients of splats start … stop - 1, which are contiguous; apply the chain rule."""
     sums = np.empty(SUMS + grads.feature.shape[1], np.float32)
     for i in range(start, stop):
         sums[:] = 0

@@ -156,7 +156,10 @@ def gather_hits(places, tile, hits):
 @inlined_part
 @no_type_check
 def _start(state, columns):
-    """Nothing seen yet: transmittance 1, then the columns of a result with the features last."""
+    """Initialise the rows of each block: transmittance 1, median range infinite, all else 0.
+
+    The order is transmittance, expected range, median range, alpha, alpha before the hit, features.
+    """
     state[:] = 0
     for block in range(ROW):
         base = block * columns * ROW
@@ -176,10 +179,9 @@ def _add(splat, feature, base, state, dx, dy, t, hit):
     range_m = range_at(splat, dx, dy, t)
     store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
     store(state, base + ROW, load_row(state, base + ROW) + weight * range_m)
-    crossed = where_more(
-        weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO
-    )  # 0.5 where it may be crossed here
     # The median range is that of the splat at which the transmittance falls from above 0.5 to 0.5 or less.
+    # `crossed` is 0.5 at the rays where that happens, else 0.
+    crossed = where_more(weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO)
     crossed = where_more(passed, HALF, ZERO, crossed)
     median = load_row(state, base + 2 * ROW)
     store(state, base + 2 * ROW, where_more(crossed, ZERO, range_m, median))
@@ -210,7 +212,7 @@ def look_for(scene, places, tile, begin, end, touched):
 @kernel
 @no_type_check
 def composite_tiles(start, stop, scene, places, out):
-    """Write the results of the points of tiles start … stop - 1 to `out`, Float32[P D + 4], features first."""
+    """Write the results of tiles start … stop - 1 to `out`, Float32[P D + 4], features first."""
     columns = scene.feature.shape[1] + EXTRA + 1
     state, hits, touched = aligned(ROW * columns), aligned(ROW), np.empty(BATCH, np.uint32)
     for tile in range(start, stop):

@@ -14,7 +14,7 @@ from torch import Tensor
 TILE = 1024
 """Numbers in a tile: eight per thread."""
 PLACES, POINTS_AT_ONCE = 256, 16
-"""Maximum number of places (rows × points) and of points in a tile. A place needs more registers than a
+"""Maximum number of places (rows times points) and of points in a tile. A place needs more registers than a
 number that is read there."""
 
 
@@ -27,7 +27,7 @@ class Tile(NamedTuple):
 
 
 def tile_of(points: int, channels: int) -> Tile:
-    """Return the tile for rows with a number of points and of channels: all channels, some points and rows."""
+    """Return the tile for rows of given size: it has all channels, some points and some rows."""
     wide = int(triton.next_power_of_2(channels))
     many = min(int(triton.next_power_of_2(points)), POINTS_AT_ONCE, max(TILE // wide, 1))
     return Tile(rows=max(min(TILE // wide, PLACES) // many, 1), points=many, channels=wide)

@@ -144,7 +144,7 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
 @kernel_part
 @no_type_check
 def _slopes(block, count, shape):
-    """Convert `dots` into gradients with respect to x, y, z and weight. They overwrite four rows of `part`."""
+    """Convert `dots` into gradients with respect to x, y, z and weight, in the first rows of `part`."""
     place, slope = block.place, block.part
     depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
     for i in range(count):
