@@ -163,8 +163,10 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
 
 
 def _track_ids(tokens: np.ndarray) -> Int64[np.ndarray, "N"]:
-    """Return integer track ids. Numeric tokens keep their value; other tokens are numbered in alphabetical
-    order."""
+    """Return integer track ids.
+
+    Numeric tokens keep their value. Other tokens are numbered in alphabetical order.
+    """
     if all(token.isdecimal() and len(token) < 19 for token in tokens):
         return np.array([int(token) for token in tokens], dtype=np.int64)
     return np.unique(tokens.astype(str), return_inverse=True)[1].astype(np.int64)

@@ -82,8 +82,10 @@ def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetad
 
 
 def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
-    """Assign a 123D id to each camera by its viewing direction: front, back, then left and right from front
-    to back."""
+    """Assign a 123D id to each camera by its viewing direction.
+
+    The ids are front, back, and left and right, numbered from front to back.
+    """
     azimuth = {c.name: float(np.arctan2(c.T_ego_cam[1, 2], c.T_ego_cam[0, 2])) for c in cameras}
     spare = [*_CAMERA_IDS_SPARE, *_CAMERA_IDS_LEFT[::-1], *_CAMERA_IDS_RIGHT[::-1]]
     if len(azimuth) < len(cameras):
@@ -112,8 +114,10 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
 
 
 def depth_metadata(camera: PinholeCameraMetadata) -> DepthCameraMetadata:
-    """Return metadata of depth along the optical axis, in steps of `DEPTH_STEP_M` up to 655 m. The sky is
-    NaN."""
+    """Return metadata of depth images.
+
+    Depth is along the optical axis, in steps of `DEPTH_STEP_M` up to 655 m. The sky is NaN.
+    """
     return DepthCameraMetadata(camera, max_depth=DEPTH_STEP_M * _DEPTH_CODES, has_invalid=True)
 
 

@@ -57,8 +57,9 @@ def route_target(
     progress_m: float,
     T_world_ego: Float64[np.ndarray, "4 4"],
 ) -> Float64[np.ndarray, "2"]:
-    """Return the route point LOOKAHEAD_M ahead, or the route's end, in the vehicle frame: x forward, y left,
-    m.
+    """Return the route point LOOKAHEAD_M ahead, or the route's end.
+
+    It is in the vehicle frame: x forward, y left, m.
 
     Args:
         arc_m: arc length of each route point.

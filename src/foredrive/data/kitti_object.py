@@ -138,6 +138,7 @@ class _Calibration:
 
     @classmethod
     def read(cls, file: Path) -> "_Calibration":
+        """Read a calibration file."""
         values = {}
         for line in file.read_text().splitlines():
             name, _, numbers = line.partition(":")
@@ -157,8 +158,10 @@ class _Calibration:
 
 
 def _rigid(rows: Float64[np.ndarray, "3 _"]) -> Float64[np.ndarray, "4 4"]:
-    """Return a rotation (and offset) as a 4×4 matrix. It is orthonormalised, because the files have seven
-    digits."""
+    """Return a rotation (and offset) as a 4×4 matrix.
+
+    The rotation is orthonormalised, because the files have only seven digits.
+    """
     T = np.eye(4)
     U, _, V = np.linalg.svd(rows[:, :3])
     T[:3, :3] = U @ V

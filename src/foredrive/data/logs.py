@@ -87,8 +87,7 @@ class Log:
 
     @functools.cached_property
     def fingerprint(self) -> tuple[tuple[str, int, int], ...]:
-        """Return name, size and modification time of every file except images. It changes when the log
-        changes."""
+        """Return name, size and modification time of all files except images, to detect changes."""
         files = sorted(f for f in self.path.folder.glob("*.arrow") if not f.name.startswith("camera"))
         return tuple((str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files)
 
@@ -118,8 +117,7 @@ class Log:
     def path_of_point(
         self, point_ego: Float[np.ndarray, "3"], t_us: Float64[np.ndarray, "N"]
     ) -> Float64[np.ndarray, "N 3"]:
-        """Return world positions of a vehicle-fixed point at any times, with constant velocity beyond the
-        log."""
+        """Return world positions of a vehicle-fixed point, with constant velocity beyond the log."""
         at = self._drive_t_us.astype(np.float64)
         xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
         if len(at) > 1:
@@ -130,10 +128,10 @@ class Log:
     def poses_at(
         self, t_us: Float64[np.ndarray, "N"]
     ) -> tuple[Float64[np.ndarray, "N 4 4"], Bool[np.ndarray, "N"]]:
-        """Return interpolated `T_world_ego` at any times, and whether the log has close poses before and
-        after.
+        """Return interpolated `T_world_ego` at any times, and whether they are valid.
 
-        The vehicle stands still before and after the log.
+        A pose is valid if the log has close poses before and after it. The vehicle stands still before and
+        after the log.
         """
         at, T = self._drive_t_us, self._drive_T
         if len(at) < 2 or len(t_us) == 0:
@@ -198,8 +196,10 @@ def _speed(
     t_us: Int64[np.ndarray, "F"],
     T_world_ego: Float64[np.ndarray, "F 4 4"],
 ) -> Float64[np.ndarray, "F"]:
-    """Return the logged speed, else the distance from the previous frame over time. Later frames must not
-    leak in."""
+    """Return the logged speed, else the mean speed since the previous frame, m/s.
+
+    Later frames are not used, so that no future information leaks in.
+    """
     step_m = np.linalg.norm(np.diff(T_world_ego[:, :3, 3], axis=0), axis=-1)
     past_mps = np.concatenate([[np.nan], step_m / (np.diff(t_us) * 1e-6)])
     return np.where(np.isfinite(logged_mps), logged_mps, past_mps)

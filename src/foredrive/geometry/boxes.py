@@ -15,8 +15,10 @@ EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4),
 def box_corners(
     centre: Float[Tensor, "*b 3"], size_lwh: Float[Tensor, "*b 3"], yaw: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 8 3"]:
-    """Return the eight corners, m: bottom face front-left, front-right, rear-right, rear-left, then the top
-    face."""
+    """Return the eight corners, m.
+
+    The order is front-left, front-right, rear-right, rear-left of the bottom face, then of the top face.
+    """
     local = 0.5 * _SIGNS.to(centre) * size_lwh[..., None, :]
     cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
     x = cos * local[..., 0] - sin * local[..., 1]

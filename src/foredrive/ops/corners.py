@@ -44,7 +44,7 @@ def new_block(axes):
 @inlined_part
 @no_type_check
 def read_point(values, base, block, p, corners, total, zero):
-    """Return total + interpolated value at point p, in the channels from `base` on.
+    """Return total + weighted interpolated value at point p, in the channels from `base` on.
 
     `zero` sets the number of channels: a float32 for one, a vector for eight.
     """

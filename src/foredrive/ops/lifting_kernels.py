@@ -112,8 +112,7 @@ def _read(inputs, block, first, last, channel, zero, out):
 @kernel
 @no_type_check
 def lift_pairs(inputs, first_pair, last_pair, out):
-    """Add the samples of the pairs first_pair … last_pair - 1 to `out`, Float[b·Q D]. L·P ≤ BLOCK is
-    required."""
+    """Add the samples of pairs first_pair … last_pair - 1 to `out`, Float[b·Q D]. Requires L·P ≤ BLOCK."""
     heads, width = inputs.weights.shape[1], inputs.values.shape[2] // inputs.weights.shape[1]
     # Channels are read in vectors of WIDTH, then the rest one by one.
     whole = width - width % WIDTH
@@ -147,8 +146,7 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
 @kernel_part
 @no_type_check
 def _slopes(block, count, size):
-    """Convert `dots` into gradients with respect to x, y and weight. They overwrite the first three rows of
-    `part`."""
+    """Convert `dots` into gradients with respect to x, y and weight, in the first rows of `part`."""
     height, width, _ = size
     dots, slope = block.dots, block.part
     for i in range(count):

@@ -25,8 +25,7 @@ def attend_within(
     counts: Int[Tensor, "S"],
     heads: int,
 ) -> Float[Tensor, "K C"]:
-    """Return attention of each token to its own set, softmax(q kᵀ / √d) v per head (Vaswani et al. 2017, eq.
-    1).
+    """Return softmax(q kᵀ / √d) v of each token within its set, by head (Vaswani et al. 2017, eq. 1).
 
     The kernel requires float32 on the CPU, heads of 16 channels and no gradients.
 

@@ -56,8 +56,7 @@ class Tiles(NamedTuple):
 @kernel
 @no_type_check
 def pack_splats(start, stop, raw, period, packed):
-    """Fill rows start … stop - 1 of `packed`, Float32[N 16], with the data of each splat for the other
-    kernels."""
+    """Fill rows start … stop - 1 of `packed`, Float32[N 16], the input of the other kernels."""
     for i in range(start, stop):
         row = packed[i]
         x = raw.mean[i, 0]
@@ -76,7 +75,8 @@ def pack_splats(start, stop, raw, period, packed):
         row[RANGE], row[RATE] = raw.range_m[i], raw.range_rate_mps[i]
         row[SLOPE_X], row[SLOPE_Y] = raw.range_slope[i, 0], raw.range_slope[i, 1]
         row[TILT_Y], row[TILT_X] = -xy / yy, -xy / xx
-        # The largest offset along x of the ellipse d'Ad ≤ c is √(c · yy / det A); along y, √(c · xx / det A).
+        # The largest offset along x of the ellipse dᵀ A d ≤ c is √(c · yy / det A); along y, √(c · xx / det
+        # A).
         area = np.float64(xx) * np.float64(yy) - np.float64(xy) * np.float64(xy)
         square = max(2 * (log_opacity - LEAST) / LOG2_E, 0) / max(area, 1e-30)
         row[REACH_X], row[REACH_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
@@ -114,8 +114,7 @@ def turned(x, bounds, period):
 @inlined_part
 @no_type_check
 def _last_at_most(values, start, stop, x):
-    """Return the index of the last element ≤ x in the ascending values[start:stop], or start if there is
-    none.
+    """Return the index of the last element ≤ x in ascending values[start:stop]; start if there is none.
 
     Tiles have similar widths, so linear interpolation gives a good first guess.
     """

@@ -59,8 +59,7 @@ def composite_gsplat(
 
 @torch.no_grad()
 def _reach_px(inverse_covariance: Float[Tensor, "N 3"], opacity: Float[Tensor, "N"]) -> Tensor:
-    """Return the distance along u and v at which the opacity falls to 1/255, in whole px; 0 if it is never
-    reached."""
+    """Return the distance along u and v at which the opacity falls to 1/255, whole px; 0 if it is lower."""
     xx, xy, yy = inverse_covariance.unbind(-1)
     square = 2 * (opacity.clamp(min=1e-30).log() + math.log(255)).clamp(min=0) / (xx * yy - xy * xy)
     return (square[:, None] * torch.stack([yy, xx], -1)).sqrt().ceil().int()

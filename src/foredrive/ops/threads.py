@@ -19,8 +19,10 @@ RANGES_PER_THREAD = 4
 
 
 def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> None:
-    """Call job(start, stop) on ranges that cover range(count). All but the last have at least `grain`
-    elements."""
+    """Call job(start, stop) on ranges that cover range(count), with at least `grain` elements each.
+
+    The last range may be shorter.
+    """
     threads = torch.get_num_threads()
     step = max(grain, -(-count // (RANGES_PER_THREAD * threads)))
     starts = range(0, count, step)

@@ -89,8 +89,7 @@ def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.V
 @intrinsic
 @no_type_check
 def load(typing_context, array, index, like):
-    """Read a value of the type of `like` at flat `index` of a C-contiguous float32 array, without bounds
-    check."""
+    """Read a value of `like`'s type at `index` of a C-contiguous float32 array, without bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, signature, args, args[2].type), align=4)
@@ -101,7 +100,7 @@ def load(typing_context, array, index, like):
 @intrinsic
 @no_type_check
 def load_row(typing_context, array, index):
-    """Read sixteen numbers at flat `index` of a C-contiguous float32 array, without bounds check."""
+    """Read sixteen numbers at flat `index` of a C-contiguous float32 array, without a bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, signature, args, _FORM), align=4)

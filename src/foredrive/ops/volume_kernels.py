@@ -108,8 +108,10 @@ def _read(inputs, block, item, first, last, channel, zero, out):
 @kernel
 @no_type_check
 def read_queries(inputs, item, first_query, last_query, out):
-    """Write the samples of the queries first_query … last_query - 1 to `out`, Float[b Q D]. P ≤ BLOCK is
-    required."""
+    """Write the samples of queries first_query … last_query - 1 to `out`, Float[b Q D].
+
+    Requires P ≤ BLOCK.
+    """
     heads = inputs.weights.shape[2]
     width = inputs.values.shape[4] // heads
     # Channels are read in vectors of WIDTH, then the rest one by one.

@@ -21,7 +21,7 @@ NOW_TOLERANCE_S = 1e-4
 
 
 class Command(enum.IntEnum):
-    """Direction of the route at the next junction."""
+    """Direction in which the route continues."""
 
     LEFT = 0
     RIGHT = 1

@@ -17,7 +17,7 @@ from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelSpec
 
 Task = Literal["occupancy", "forecast", "plan"]
-"""Purpose of the features: occupancy now, occupancy later, or a path."""
+"""Purpose of the features: the scene now, the scene later, or a path."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Event:
     xy_world: tuple[float, float]
     detail: str = ""
     what: str = ""
-    """Name of the object that was hit, or of the light or sign that was run."""
+    """Object of the event: the object hit, the light or sign that was run, the lane that was left."""
     severity: float = 0.0
     """For a collision the impact speed, m/s. For leaving the lanes the distance driven outside, m."""
 

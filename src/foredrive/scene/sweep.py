@@ -35,6 +35,5 @@ class LidarSweep(Record):
 
     @property
     def points_ego(self) -> Float[Tensor, "*b N 3"]:
-        """Return the end points of the beams in the ego frame, m. They are meaningful where `returned &
-        valid`."""
+        """Return the end points of the beams in the ego frame, m, meaningful where `returned & valid`."""
         return self.origin_ego + self.dir_ego * self.range_m[..., None]

@@ -155,8 +155,7 @@ def _facts(log: Log, frame: int) -> dict[str, object]:
 
 
 def _counts(log: Log, frame: int, views: Mapping[str, View]) -> dict[str, dict[str, int | None]]:
-    """Return the number of annotated objects by class, for the whole scene and each view. None if not
-    annotated."""
+    """Count annotated objects by class, for the whole scene and each view. None if not annotated."""
     boxes = read_boxes(log, frame)
     if boxes is None:
         return {name: dict.fromkeys(COUNTS.values()) for name in (WHOLE, *views)}

@@ -149,8 +149,10 @@ class FrameIndex:
                     self._partition(name, max(1, rows // PARTITION_ROWS))
 
     def _partition(self, column: str, partitions: int) -> None:
-        """Partition the rows by an embedding, unless a recent partition exists. Its name contains the number
-        of partitions."""
+        """Partition the rows by an embedding, unless a recent partition exists.
+
+        The number of partitions is stored in the name.
+        """
         from lancedb.index import IvfSq
 
         there = [index.name for index in self._frames.list_indices() if column in index.columns]

@@ -43,8 +43,7 @@ class Sector(NamedTuple):
         return project(points_cam, self.camera.K, self.camera.dist, self.size_hw)[2]
 
     def sweep(self, sweep: LidarSweep) -> LidarSweep:
-        """Return the returns of an unbatched sweep that are in the sector, with x along its middle (see
-        `Towers`)."""
+        """Return an unbatched sweep's returns in the sector, with x along its middle (see `Towers`)."""
         inside = sweep[sweep.valid & sweep.returned & self.contains(sweep.points_ego)]
         T_sector_ego = matrix_from_yaw(torch.tensor(-self.azimuth_rad), torch.zeros(3))
         return dataclasses.replace(

@@ -93,8 +93,7 @@ def solve(cost, free):
         row, reached = start, 0.0
         none_distance, none_row = np.inf, -1
         while True:
-            # A path may end with any reached row giving up its column for "no column". Keep the shortest such
-            # path.
+            # A path may end at any reached row that takes "no column". Keep the shortest such path.
             to_none = reached + free[row] - u[row]
             if to_none < none_distance:
                 none_distance, none_row = to_none, row
@@ -154,7 +153,7 @@ def _rank(cost, free, k):
     first_open = np.zeros(k, np.int64)  # rows before it keep their columns
     banned = np.zeros((k, columns + 1), np.bool_)  # columns that the first open row must not take
     no_ban = np.zeros(columns + 1, np.bool_)
-    waiting = np.full(k, np.inf)  # costs of the waiting subproblems in increasing order
+    waiting = np.full(k, np.inf)  # costs of the cheapest unsolved subproblems, in increasing order
     parent_of, row_cut = np.empty(k, np.int64), np.empty(k, np.int64)
     nodes = columns + rows
     search = _Search(
@@ -288,7 +287,7 @@ def _apply(column_of, u, v, start, length, reached_unused, unused, search):
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows
-    # After the path's first unused node, prices change by less: the price of unused nodes must stay 0.
+    # The usual update would lower the price of unused nodes. `rise` shifts all prices so that it stays 0.
     rise = length - reached_unused if reached_unused < np.inf else 0.0
     for x in range(len(v)):
         r = row_of[x]

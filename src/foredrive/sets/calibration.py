@@ -85,8 +85,7 @@ class SetCalibration:
 def fit_set_calibration(
     detected: Sequence[MultiBernoulli], objects: Sequence[LabelledBoxes], background: PoissonProcess
 ) -> SetCalibration:
-    """Fit isotonic existence and one factor on standard deviations, from frames that were not used in
-    training.
+    """Fit isotonic existence and one factor on standard deviations, on frames outside the training set.
 
     Detections are matched by the associations of each frame. Objects without a detection belong to
     `background`.
@@ -113,11 +112,11 @@ def fit_set_calibration(
 
 
 def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float) -> float:
-    """Return q such that the box mean ± q·σ contains all coordinates of a new object with probability ≥
-    `coverage`.
+    """Return q such that mean ± q·σ contains a new object with probability ≥ `coverage`.
 
-    This is split conformal prediction with the largest |error| / σ as score. It is valid for any distribution
-    if the new pairs are exchangeable with these. Return +inf if there are too few pairs.
+    All coordinates must be inside. This is split conformal prediction with the largest |error| / σ as score.
+    It is valid for any distribution if the new pairs are exchangeable with these. Return +inf if there are
+    too few pairs.
     """
     score = np.sort(conformal_scores(boxes, objects))
     rank = math.ceil((len(score) + 1) * coverage)

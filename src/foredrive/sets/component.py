@@ -14,8 +14,10 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Scaled(NamedTuple):
-    """Weights of a component, rescaled by rows and columns. The best association weighs 1, and no factor
-    exceeds 1."""
+    """Weights of a component, rescaled by rows and columns.
+
+    The best association weighs 1, and no factor exceeds 1.
+    """
 
     cost: Float[ndarray, "R C"]
     free: Float[ndarray, "R"]
@@ -36,8 +38,10 @@ class Scaled(NamedTuple):
 
 
 class Components(NamedTuple):
-    """Members of the connected components, sorted by component. Component n is the slice start[n] : start[n +
-    1]."""
+    """Members of the connected components, sorted by component.
+
+    Component n is the slice start[n] : start[n + 1].
+    """
 
     row: Int[ndarray, "_"]
     row_start: Int[ndarray, "components_1"]

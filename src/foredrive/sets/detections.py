@@ -20,11 +20,11 @@ def pmb_from_detections(
     lower: Float[Tensor, "6"] | None = None,
     upper: Float[Tensor, "6"] | None = None,
 ) -> PoissonMultiBernoulli:
-    """Convert the detections of one frame. Their background is uniform over states between `lower` and
-    `upper`.
+    """Convert the detections of one frame into a PMB density.
 
-    A state is the centre (ego frame, m) and log lwh (m). The covariance between state and heading is dropped.
-    The heading has a von Mises distribution with κ = 1/σ², where σ² is the first-order variance of the angle.
+    The background is uniform over states between `lower` and `upper`. A state is the centre (ego frame, m)
+    and log lwh (m). The covariance between state and heading is dropped. The heading has a von Mises
+    distribution with κ = 1/σ², where σ² is the first-order variance of the angle.
 
     Raises:
         InputError: a probability is outside [0, 1], a covariance is not positive definite, or a background

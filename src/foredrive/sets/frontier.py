@@ -101,7 +101,7 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
     rows, columns = len(start) - 1, len(row_start) - 1
     order, size, states = np.empty(rows, np.int64), np.zeros(rows, np.int64), 0
     first, last, slot = np.full(columns, -1), np.full(columns, -1), np.full(columns, -1)
-    added, user = np.zeros(rows, np.bool_), np.full(_WIDEST, -1)  # the column that has a slot
+    added, user = np.zeros(rows, np.bool_), np.full(_WIDEST, -1)  # the column that uses each bit; -1: none
     waiting = row_start[1:] - row_start[:-1]  # rows that may take the column and are not added yet
     unseen = 0  # all rows before it are added
     for place in range(rows):
@@ -137,8 +137,7 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
             for r in row[row_start[user[bit]] : row_start[user[bit] + 1]]:
                 if added[r]:
                     continue
-                # Change of the frontier's width: a new column costs 1, and a column whose last row this is
-                # gains 1. A column with both gets 2 - 1 = 1, because its bit is still needed at this row.
+                # Score of row r: +2 for each column that it adds to the frontier, -1 for each that it closes.
                 wider = 0
                 for c in column[start[r] : start[r + 1]]:
                     wider += 2 * (first[c] < 0) - (waiting[c] == 1)

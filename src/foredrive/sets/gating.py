@@ -1,5 +1,4 @@
-"""Selection of the pairs that matter in a sum over associations, and bounds on the contribution of the
-others."""
+"""Selection of the pairs that matter in a sum over associations, with bounds on the others."""
 
 from typing import no_type_check
 
@@ -138,6 +137,8 @@ def _estimate_charges(pair, row_alone, column_alone):
     weight, to_column, to_row = np.empty(len(row)), np.empty(len(row)), np.zeros(len(row))
     for e in range(len(row)):
         weight[e] = pair[row[e], column[e]]
+
+    # Messages along each pair: its weight over the sum of all other choices of the sending node.
     for _ in range(_ROUNDS):
         total = row_alone.copy()
         for e in range(len(row)):

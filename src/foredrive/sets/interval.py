@@ -98,5 +98,6 @@ def choice_bound(
             for c in mine:
                 chosen[c] += pair[r, c] / cost[c] / total
         least = min(least, log_bound)
+        # Sinkhorn step: raise the cost of a column that is chosen more than once on average.
         cost = np.maximum(np.maximum(column_alone, cost * chosen), _CHEAPEST)
     return least

@@ -203,11 +203,10 @@ class PoissonMultiBernoulli:
     def from_detections(
         cls, detections: MultiBernoulli, confidence: float = 0.1, other: PoissonProcess | None = None
     ) -> "PoissonMultiBernoulli":
-        """Convert the detections of one frame. Those with r ≤ `confidence` become the Poisson process (Paper
-        A).
+        """Convert the detections of one frame into a PMB density (Paper A).
 
-        The process `other`, such as a uniform one, is added to it. Without it, objects far from every
-        detection have almost zero density.
+        Detections with r ≤ `confidence` become the Poisson process. The process `other`, such as a uniform
+        one, is added to it. Without it, objects far from every detection have almost zero density.
         """
         low = detections.log_existence <= math.log(confidence)
         few = detections[low]
