@@ -72,7 +72,7 @@ class ClipDataset(Dataset[Example]):
 
     Raises:
         InputError: a log cannot be read, is too short for one clip or lacks the requested occupancy, or no
-        log has a requested camera.
+            log has a requested camera.
     """
 
     command_source: dict[str, int]

@@ -162,7 +162,7 @@ class LogWriter:
 
     Raises:
         InputError: the split is invalid, there are too many cameras, the map is missing, a frame does not
-        fit, a pose is NaN, time runs backwards, or there are no frames.
+            fit, a pose is NaN, time runs backwards, or there are no frames.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ class Composite(NamedTuple):
     Attributes:
         weights: w_i = α_i Π_{j<i} (1 - α_j), the probability that the ray ends at sample i.
         expected_depth: Σ w_i d_i, m. A ray that does not end adds nothing. Divide by Σ w_i for the depth of
-        rays that end.
+            rays that end.
         transmittance: Π (1 - α_i), the probability that the ray passes all samples.
     """
 

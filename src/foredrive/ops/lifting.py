@@ -37,8 +37,8 @@ def lift(
     Args:
         values: feature maps with channels last, in any order of levels.
         uv: position of each query in each image, relative to its width and height. (0, 0) is the top left
-        corner of the top left pixel, (1, 1) the bottom right corner of the bottom right pixel. It comes from
-        calibration and gets no gradient. It is ignored where `visible` is False.
+            corner of the top left pixel, (1, 1) the bottom right corner of the bottom right pixel. It comes
+            from calibration and gets no gradient. It is ignored where `visible` is False.
         visible: whether each camera sees each query.
         offsets: x y in pixels of the feature map of the level.
         weights: attention weights, already normalised over L·P.

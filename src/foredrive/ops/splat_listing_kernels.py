@@ -75,8 +75,7 @@ def pack_splats(start, stop, raw, period, packed):
         row[RANGE], row[RATE] = raw.range_m[i], raw.range_rate_mps[i]
         row[SLOPE_X], row[SLOPE_Y] = raw.range_slope[i, 0], raw.range_slope[i, 1]
         row[TILT_Y], row[TILT_X] = -xy / yy, -xy / xx
-        # The largest offset along x of the ellipse dᵀ A d ≤ c is √(c · yy / det A); along y, √(c · xx / det
-        # A).
+        # The ellipse dᵀ A d ≤ c reaches √(c · yy / det A) along x and √(c · xx / det A) along y.
         area = np.float64(xx) * np.float64(yy) - np.float64(xy) * np.float64(xy)
         square = max(2 * (log_opacity - LEAST) / LOG2_E, 0) / max(area, 1e-30)
         row[REACH_X], row[REACH_Y] = np.sqrt(square * yy), np.sqrt(square * xx)

@@ -92,7 +92,7 @@ def pixel_points(size_hw: tuple[int, int], readout_s: float = 0.0) -> TiledPoint
     Args:
         size_hw: image size, px.
         readout_s: time from the first to the last row of a rolling shutter. Times are relative to the middle
-        row, as in `sensors.camera_rays`.
+            row, as in `sensors.camera_rays`.
     """
     height, width = size_hw
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)

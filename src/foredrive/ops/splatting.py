@@ -88,7 +88,7 @@ def composite_splats(
     Args:
         points: result of `pixel_points` or `beam_points`, on the device of the splats.
         hit_range_m: range of the lidar return minus a margin; infinite if there is no return. It is needed
-        for `alpha_before_hit`.
+            for `alpha_before_hit`.
         median: whether to compute `median_range_m`; without it the field is NaN.
 
     Raises:

@@ -166,7 +166,7 @@ def load_towers(folder: Path) -> Towers:
 
     Raises:
         InputError: there are no towers, they are damaged, or the base model has other weights than in
-        training.
+            training.
     """
     try:
         card = TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())

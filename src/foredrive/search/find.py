@@ -56,7 +56,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     Args:
         target: vectors to compare rows with. None if the query does not compare.
         exact_up_to: maximum number of rows for exact comparison. With more rows, approximate search selects
-        the candidates.
+            the candidates.
 
     Raises:
         InputError: the condition cannot be parsed, or the query needs data that towers or logs do not have.

@@ -31,7 +31,7 @@ class PretrainedTowers:
 
     Args:
         model: a name on the Hugging Face hub, or a local folder. A folder with a configuration but without
-        weights gives random weights with a fixed seed, and a warning.
+            weights gives random weights with a fixed seed, and a warning.
 
     Raises:
         InputError: the model is not available, or it is of another kind.

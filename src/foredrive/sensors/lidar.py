@@ -25,7 +25,7 @@ class SpinningLidar:
 
     Raises:
         ValueError: a table has a different number of channels, the lasers of a column need more time than a
-        column takes, or `rays_per_beam` is below 1.
+            column takes, or `rays_per_beam` is below 1.
     """
 
     elevation_rad: tuple[float, ...]
@@ -75,7 +75,7 @@ class SpinningLidar:
 
         Args:
             twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame in its own axes, assumed constant
-            over the revolution.
+                over the revolution.
 
         Returns:
             Rays [N] in the ego frame at the end of the revolution. dt_s runs from -1/rate to 0.

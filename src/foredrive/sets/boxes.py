@@ -40,7 +40,7 @@ class BoxDensity(Record):
 
     Raises:
         InputError: a covariance is not positive definite, or a value is not finite. The message names the
-        first.
+            first.
     """
 
     mean: Float[Tensor, "*b M D"]

@@ -28,7 +28,7 @@ def pmb_from_detections(
 
     Raises:
         InputError: a probability is outside [0, 1], a covariance is not positive definite, or a background
-        has no region.
+            has no region.
     """
     found = dataclasses.replace(detections, background_rate=None)[detections.valid]
     existence = found.existence.double()
