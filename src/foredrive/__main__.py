@@ -1,4 +1,4 @@
-"""`python -m foredrive`."""
+"""Entry point of `python -m foredrive`."""
 
 import sys
 

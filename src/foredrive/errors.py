@@ -1,9 +1,9 @@
-"""The one error that users cause and can mend."""
+"""The error class for input that users can correct."""
 
 
 class InputError(ValueError):
-    """Bad input (a path, a log, a recipe name, a shape) that the caller can put right.
+    """Invalid input (a path, a log, a recipe name, a shape) that the caller can correct.
 
-    The message is one line that names what is wrong and where. The command line prints it without a
+    The message is one line. It names the problem and its place. The command line prints it without a
     traceback and exits with code 2.
     """

@@ -1,4 +1,4 @@
-"""Writing to disk so that a file under its final name is always whole."""
+"""Atomic writing: a file under its final name is always complete."""
 
 import contextlib
 import os
@@ -10,12 +10,15 @@ from pathlib import Path
 from foredrive.errors import InputError
 
 WHILE_WRITING = "while writing "
-"""Starts the note that `naming` adds to an error; the path follows."""
+"""Prefix of the note that `naming` adds to an error. The path follows."""
 
 
 @contextlib.contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Note on errors of the block (a full disk) what it writes: they may name a scratch file, or nothing."""
+    """Add the path being written to errors of the block (e.g. a full disk).
+
+    Such an error may otherwise name a scratch file, or no file.
+    """
     try:
         yield
     except Exception as error:
@@ -24,11 +27,11 @@ def naming(path: Path | str) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, unless it is there.
+    """Create a folder and its parents, unless it exists.
 
     Raises:
-        InputError: there can be none, as below /proc.
-        OSError: the disk refuses it.
+        InputError: no folder can exist there, as below /proc.
+        OSError: the operating system refuses it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -38,14 +41,14 @@ def make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `final` and rename it there when the block ends well.
+    """Yield a temporary path beside `final`, and rename it to `final` if the block succeeds.
 
-    The block may make the temporary path a file or a folder; an existing file under the final name is
-    replaced, an existing folder too. If the block raises (a full disk, Ctrl-C), whatever was written is
-    removed and the final name is left as it was.
+    The block may create a file or a folder at the temporary path. An existing file or folder at `final` is
+    replaced. If the block raises (a full disk, Ctrl-C), everything written is removed and `final` is
+    unchanged.
 
     Raises:
-        InputError: its folder cannot be made.
+        InputError: the parent folder cannot be created.
     """
     final = Path(final)
     with naming(final):

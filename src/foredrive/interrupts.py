@@ -1,4 +1,4 @@
-"""Ctrl-C that nothing swallows."""
+"""Ctrl-C handling that is not lost in code that drops exceptions."""
 
 import _thread
 import signal
@@ -11,20 +11,20 @@ if TYPE_CHECKING:
     from types import FrameType
 
 PATIENCE_S = 0.2
-"""How long an interruption may seem lost until it is raised again."""
+"""Time after which an interruption without effect is raised again."""
 
 
 class LastingInterrupt:
-    """A handler of SIGINT that raises KeyboardInterrupt, and again where it was lost on its way.
+    """A handler of SIGINT that raises KeyboardInterrupt, and raises it again if it was lost.
 
-    Code may drop an exception that comes from outside: Python does in destructors and in callbacks from C,
-    NumPy does where it looks for attributes of operands, which runs Python code for members of enumerations.
-    Whoever handles an exception (clears away what is half-written) is left alone.
+    Some code drops exceptions from signal handlers. Python does so in destructors and in callbacks from C.
+    NumPy does so when it looks up attributes of operands, which runs Python code for enumeration members.
+    While an exception is being handled (e.g. cleaning up half-written files), it is not raised again.
 
-    As a context it is the handler of SIGINT inside of it, if that is Python's own outside.
+    As a context manager it is the SIGINT handler inside the block, if Python's own handler is active outside.
 
     Args:
-        wanted: whether there is something to be interrupted.
+        wanted: returns whether there is something to interrupt.
     """
 
     def __init__(self, wanted: Callable[[], bool] = lambda: True) -> None:
@@ -35,7 +35,7 @@ class LastingInterrupt:
         self._installed = False
 
     def __call__(self, number: int, frame: "FrameType | None") -> None:
-        """SIGINT has come."""
+        """Handle SIGINT."""
         again, self._asks_again = self._asks_again, False
         if again and sys.exc_info()[1] is not None:
             return
@@ -51,7 +51,7 @@ class LastingInterrupt:
             self._asks_again = True
             if is_blocked:
                 _thread.interrupt_main()
-            else:  # wakes the main thread where it sleeps, too
+            else:  # also wakes a sleeping main thread
                 signal.pthread_kill(self._main, signal.SIGINT)
 
     def __enter__(self) -> "LastingInterrupt":
@@ -70,13 +70,13 @@ class LastingInterrupt:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _ignored(self, unraisable: "sys.UnraisableHookArgs") -> None:
-        """What Python ignores it tells of, but not of an interruption, which comes again."""
+        """Report exceptions that Python ignores, except KeyboardInterrupt, which will be raised again."""
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._hook(unraisable)
 
 
 def raises_interrupts() -> bool:
-    """Whether Ctrl-C raises KeyboardInterrupt here: in the main thread, with nobody else's handler."""
+    """Return whether Ctrl-C raises KeyboardInterrupt here: in the main thread, without a foreign handler."""
     handler = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
     return in_main_thread and (handler is signal.default_int_handler or isinstance(handler, LastingInterrupt))

@@ -1,4 +1,4 @@
-"""Packages that import what they offer when it is asked for: no verb waits for what only others use."""
+"""Packages that import their modules on first use, so that a command imports only what it needs."""
 
 import importlib
 import importlib.util
@@ -8,11 +8,11 @@ from typing import Any
 
 
 def on_demand(package: str, homes: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package (PEP 562) that takes names from its modules.
+    """Return the `__getattr__` of a package (PEP 562) that imports names from its modules.
 
     Args:
-        package: its full name.
-        homes: by module of the package, the names that it provides.
+        package: full name of the package.
+        homes: names provided by each module of the package.
     """
     home_of = {name: f"{package}.{module}" for module, names in homes.items() for name in names}
 
@@ -25,14 +25,14 @@ def on_demand(package: str, homes: Mapping[str, tuple[str, ...]]) -> Callable[[s
 
 
 def defer_imports(package: str, homes: Mapping[str, tuple[str, ...]]) -> None:
-    """Let a library's package take its names from its modules when they are asked for.
+    """Make a library's package import its names from its modules on first use.
 
-    The package's own `__init__`, which would import all of its modules, is not run. Nothing changes where
-    the package has been imported already.
+    The package's own `__init__`, which would import all modules, is not run. If the package is already
+    imported, nothing changes.
 
     Args:
-        package: its full name.
-        homes: as for `on_demand`; all that its `__init__` offers.
+        package: full name of the package.
+        homes: as for `on_demand`. It must contain all names that `__init__` offers.
     """
     if package in sys.modules:
         return

@@ -1,4 +1,4 @@
-"""123D logs to clips and back: reading, labels, datasets, writing."""
+"""123D logs: reading, voxel labels, datasets of clips, writing."""
 
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,8 @@ __getattr__ = on_demand(
     },
 )
 
-# py123d.api imports its executors for their types alone, and Ray with them: most of its time and memory.
+# py123d.api imports its executors, and Ray with them, only for type annotations. This takes most of its
+# import time and memory, so it is deferred.
 defer_imports(
     "py123d.common.execution",
     {

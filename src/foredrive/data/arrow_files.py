@@ -1,4 +1,4 @@
-"""Reading Arrow files of a 123D log as arrays, with errors that name the file."""
+"""Reading the Arrow files of a 123D log as arrays, with errors that name the file."""
 
 import contextlib
 import errno
@@ -18,9 +18,9 @@ _REFUSES_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 @contextlib.contextmanager
 def reading(file: Path, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while reading `what` out of a log's file into one line that names it.
+    """Convert errors while reading `what` from a file of a log into one-line `InputError`s.
 
-    A disk that refuses what is written meanwhile is not the file's fault: that error goes on as it is.
+    An error of a full or read-only disk while writing is not caused by the file. It is raised unchanged.
     """
     try:
         yield
@@ -42,10 +42,10 @@ def _said(file: Path, what: str, error: Exception) -> str:
 
 
 def check_whole(folder: Path) -> None:
-    """Each of a log's files must be a whole Arrow file; py123d passes over those it cannot open.
+    """Check that each file of a log is a complete Arrow file. py123d skips files that it cannot open.
 
     Raises:
-        InputError: naming the first one that is not.
+        InputError: a file is damaged. The message names the first one.
     """
     for file in [folder / "sync.arrow", *sorted(folder.glob("*.arrow"))]:
         with reading(file, "it as an Arrow file"), pa.memory_map(str(file)) as source:
@@ -53,7 +53,7 @@ def check_whole(folder: Path) -> None:
 
 
 def column_array(table: pa.Table, name: str) -> pa.Array:
-    """A column as one array."""
+    """Return a column as one array."""
     array = table[name].combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         return array.chunk(0) if array.num_chunks else pa.array([], type=array.type)
@@ -61,7 +61,7 @@ def column_array(table: pa.Table, name: str) -> pa.Array:
 
 
 def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
-    """An array of fixed-size lists as rows; NaN where the list is null."""
+    """Return an array of fixed-size lists as rows. Null lists become NaN."""
     out = np.full((len(array), width), np.nan)
     present = array.is_valid().to_numpy(zero_copy_only=False)
     out[present] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
@@ -69,7 +69,10 @@ def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
 
 
 def pose_matrices(pose: Float64[np.ndarray, "N 7"]) -> Float64[np.ndarray, "N 4 4"]:
-    """Rigid motions of x y z qw qx qy qz; NaN where they are not finite or the quaternion is none."""
+    """Convert x y z qw qx qy qz into 4×4 matrices.
+
+    A pose that is not finite, or whose quaternion is not valid, becomes NaN.
+    """
     whole = np.isfinite(pose).all(-1) & (np.linalg.norm(pose[:, 3:], axis=-1) > 0.5)
     T = np.full((len(pose), 4, 4), np.nan)
     T[whole] = np.eye(4)

@@ -1,4 +1,4 @@
-"""What was read of a log's frames, put together as a clip."""
+"""Assembly of a clip from the data of a log's frames."""
 
 from collections.abc import Sequence
 
@@ -26,21 +26,21 @@ def assemble_clip(
     target_xy: Float64[np.ndarray, "2"] | None = None,
     map_patch: MapPatch | None = None,
 ) -> Clip:
-    """A clip of T frames, with their boxes, poses and speeds; what is None is masked.
+    """Assemble a clip of T frames with their boxes, poses and speeds. Arguments that are None are masked.
 
     Args:
-        log: that was read.
-        frames: T of its frames.
-        now: that of them which is now.
-        seen: see `read_rig`.
-        sweeps: T sweeps, each with whether beams that did not return are in it.
-        future: what the vehicle does from now on.
-        command: asked of the driver now.
-        target_xy: where the route leads to, in the ego frame at now, m.
-        map_patch: around now.
+        log: the source log.
+        frames: T frames of the log.
+        now: the frame at t = 0.
+        seen: images, their validity and the rig, see `read_rig`.
+        sweeps: T sweeps, each with whether it includes the beams that did not return.
+        future: path of the vehicle from now on.
+        command: driving command at now.
+        target_xy: target point of the route in the ego frame at now, m.
+        map_patch: map around the vehicle at now.
 
     Raises:
-        InputError: on boxes that cannot be read.
+        InputError: the boxes cannot be read.
     """
     chosen = list(frames)
     boxes = [read_boxes(log, frame) for frame in chosen]

@@ -1,7 +1,7 @@
-"""A 123D parser for Argoverse 2 sensor logs of which the cameras, the calibration or most sweeps are missing.
+"""A 123D parser for Argoverse 2 sensor logs without cameras, calibration or most sweeps.
 
-py123d's own parser goes from sweep to sweep and needs the folders of all cameras. This one goes from one
-annotated time to the next and takes the sweeps there are.
+py123d's own parser steps from sweep to sweep and needs the folders of all cameras. This parser steps from one
+annotated time to the next and uses the available sweeps.
 """
 
 from collections.abc import Iterator
@@ -41,10 +41,10 @@ _LIDARS = {LidarID.LIDAR_TOP: "up_lidar", LidarID.LIDAR_DOWN: "down_lidar"}
 
 
 class Av2PartialParser(BaseLogParser):
-    """An AV2 sensor log without images.
+    """Parser of an AV2 sensor log without images.
 
     Args:
-        folder: the log's; needs annotations*.feather, city_SE3_egovehicle.feather and map/.
+        folder: folder of the log. It must have annotations*.feather, city_SE3_egovehicle.feather and map/.
         split: 123D split, e.g. av2-sensor_val.
     """
 
@@ -53,13 +53,13 @@ class Av2PartialParser(BaseLogParser):
         self._split = split
 
     def get_log_metadata(self) -> LogMetadata:
-        """Named and mapped as py123d's parser does it."""
+        """Return the log's metadata. Name and map are the same as in py123d's parser."""
         map_metadata = get_av2_map_metadata(self._split, self._folder, dataset="av2-sensor")
         location = map_metadata.location
         return LogMetadata("av2-sensor", self._split, self._folder.name, location, map_metadata)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Ego pose and boxes at every annotated time, with the sweep of that time where there is one."""
+        """Yield ego pose and boxes at every annotated time, and the sweep of that time if there is one."""
         annotations = feather.read_table(next(self._folder.glob("annotations*.feather")))
         poses = feather.read_table(self._folder / "city_SE3_egovehicle.feather")
         row_at = {t_ns: row for row, t_ns in enumerate(poses["timestamp_ns"].to_pylist())}
@@ -97,7 +97,7 @@ class Av2PartialParser(BaseLogParser):
 
 
 def _boxes(rows: pa.Table, ego: PoseSE3, timestamp: Timestamp) -> BoxDetectionsSE3:
-    """Boxes of one time, without the ego vehicle's and without velocities, which AV2 does not have."""
+    """Return the boxes of one time, without the ego vehicle. AV2 has no velocities."""
     box = _columns(rows, _POSE + _SIZE)
     box[:, :7] = rel_to_abs_se3_array(ego, box[:, :7])
     detections = [

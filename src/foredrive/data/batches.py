@@ -1,4 +1,4 @@
-"""Putting records together: frames to a clip, examples to a batch."""
+"""Collation of records: frames to a clip, examples to a batch."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from foredrive.scene.record import Record
 R = TypeVar("R", bound=Record)
 
 _PADDING = {"kind": -1, "beam": -1}
-"""What padded entries of a field hold; zeros (and False) in all others."""
+"""Padding values of fields. All other fields are padded with 0 (False)."""
 
 
 def collate(examples: Sequence[Example]) -> Example:
-    """A batch of examples; boxes, beams and polylines are padded to the most in the batch.
+    """Collate examples to a batch. Boxes, beams and polylines are padded to the maximum in the batch.
 
     Raises:
-        InputError: if the examples do not go together (other cameras, another grid).
+        InputError: the examples differ in cameras or grid.
     """
     keys = tuple(key for example in examples for key in example.key)
     batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
@@ -30,10 +30,10 @@ def collate(examples: Sequence[Example]) -> Example:
 
 
 def stack_records(records: Sequence[R]) -> R:
-    """Stack the tensors of records along a new first dimension, padding those of different sizes.
+    """Stack the tensors of records along a new first dimension. Tensors of different sizes are padded.
 
     Raises:
-        InputError: if what the records share (names, sizes, grids) differs.
+        InputError: constants of the records (names, sizes, grids) differ.
     """
     changed = {}
     for field in dataclasses.fields(records[0]):

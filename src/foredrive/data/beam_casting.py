@@ -1,6 +1,6 @@
-"""What a sweep says about a voxel grid: walking every beam through it (numba).
+"""Ray casting of lidar beams through a voxel grid (numba).
 
-`no_type_check` keeps the shape checks of the tests out of what numba compiles.
+`no_type_check` keeps the tests' shape checks out of the code that numba compiles.
 """
 
 from typing import no_type_check
@@ -20,17 +20,17 @@ def cast_beams(
     free_until: Float64[np.ndarray, "N"],
     state_zyx: UInt8[np.ndarray, "Z Y X"],
 ) -> None:
-    """Mark the UNKNOWN voxels that a beam passes through FREE.
+    """Change the UNKNOWN voxels that a beam passes through to FREE.
 
-    Exact traversal (Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987): every voxel
-    whose inside the beam crosses is visited once. Scalars and a flat index, because small arrays in the inner
-    loop make it seven times slower.
+    The traversal is exact (Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987). It
+    visits every voxel whose interior the beam crosses once. It uses scalars and a flat index, because small
+    arrays in the inner loop make it seven times slower.
 
     Args:
-        origin: where the beams start, in voxels from the grid's lower corner, x y z.
-        end: where they end, likewise.
-        free_until: fraction of the way from origin to end up to which a beam is known to be free.
-        state_zyx: contiguous; changed in place.
+        origin: start of each beam, in voxels from the grid's lower corner, x y z.
+        end: end of each beam, in the same coordinates.
+        free_until: fraction of the way from origin to end up to which the beam is known to be free.
+        state_zyx: contiguous state of the voxels, changed in place.
     """
     nz, ny, nx = state_zyx.shape
     state = state_zyx.reshape(-1)
@@ -47,6 +47,7 @@ def cast_beams(
         z, step_z, next_z, delta_z = _start(oz, dz, nz, enter)
         at = np.uint64((z * ny + y) * nx + x)
         while True:
+            # Step across the nearest voxel border.
             if state[at] == UNKNOWN:
                 state[at] = FREE
             if next_x <= next_y and next_x <= next_z:
@@ -72,7 +73,7 @@ def cast_beams(
 @numba.njit(inline="always", error_model="numpy")
 @no_type_check
 def _clip(o: float, d: float, size: int, enter: float, leave: float) -> tuple[float, float]:
-    """Narrow the interval of a beam o + t d to what lies between 0 and size on one axis."""
+    """Narrow the interval of a beam o + t d to the part between 0 and `size` on one axis."""
     if d == 0.0:
         return enter, (leave if 0.0 <= o < size else -1.0)
     near, far = -o / d, (size - o) / d
@@ -82,7 +83,7 @@ def _clip(o: float, d: float, size: int, enter: float, leave: float) -> tuple[fl
 @numba.njit(inline="always", error_model="numpy")
 @no_type_check
 def _start(o: float, d: float, size: int, enter: float) -> tuple[int, int, float, float]:
-    """Cell at t = enter, step, t at the next border, and t from border to border, on one axis."""
+    """Return, for one axis: cell at t = enter, step, t at the next border, and t between borders."""
     cell = min(max(int(np.floor(o + enter * d)), 0), size - 1)
     if d > 0.0:
         return cell, 1, (cell + 1 - o) / d, 1.0 / d
@@ -99,7 +100,9 @@ def box_of_points(
     half_lwh: Float64[np.ndarray, "M 3"],
     yaw: Float64[np.ndarray, "M"],
 ) -> np.ndarray:
-    """Index of the box each point lies in, -1 for none; where boxes overlap, the one whose centre is nearest.
+    """Return the index of the box that contains each point, -1 for none.
+
+    Where boxes overlap, it is the box with the nearest centre.
 
     Returns:
         Int64 [N].

@@ -1,4 +1,4 @@
-"""Boxes of a 123D log in the ego frame, with Foredrive's categories and with velocities from the tracks."""
+"""Boxes of a 123D log in the ego frame, with Foredrive's categories and velocities from the tracks."""
 
 import functools
 from dataclasses import dataclass
@@ -21,10 +21,11 @@ from foredrive.scene import Boxes, Category
 
 _KEY = ModalityType.BOX_DETECTIONS_SE3.serialize()
 _LONGEST_DIFFERENCE_S = 1.5
-"""Sightings of a track further apart give no velocity, as in the nuScenes devkit's `box_velocity`."""
+"""Maximum time between two observations of a track for a velocity, as in the nuScenes devkit's
+`box_velocity`."""
 
 _BACKWARDS = {"pandaset"}
-"""Data sets whose boxes py123d 0.7 turns by half a turn: every moving car of theirs drives in reverse."""
+"""Datasets whose boxes py123d 0.7 rotates by half a turn: all their moving cars seem to drive backwards."""
 
 _DEFAULT_CATEGORY = {
     DefaultBoxDetectionLabel.VEHICLE: Category.CAR,
@@ -34,7 +35,7 @@ _DEFAULT_CATEGORY = {
     DefaultBoxDetectionLabel.TRAFFIC_CONE: Category.TRAFFIC_CONE,
     DefaultBoxDetectionLabel.BARRIER: Category.BARRIER,
 }
-"""py123d's common labels; what is not here is OTHER."""
+"""Categories of py123d's common labels. All other labels become OTHER."""
 
 _FINER_CATEGORY = {
     Category.TRUCK: (
@@ -51,44 +52,45 @@ _FINER_CATEGORY = {
     Category.MOTORCYCLE: "MOTORCYCLE MOTORIZED_SCOOTER VEHICLE_MOTORCYCLE",
     Category.OTHER: "OTHER_VEHICLE_UNCOMMON OTHER_VEHICLE",
 }
-"""Native labels whose common label says less than a category. A name means the same in every data set."""
+"""Names of native labels that are more specific than their common label. A name has the same meaning in every
+dataset."""
 
 _CATEGORY_OF_NAME = {name: category for category, names in _FINER_CATEGORY.items() for name in names.split()}
 
 
 def category_of(label: BoxDetectionLabel) -> Category:
-    """Category of a data set's own label."""
+    """Return the category of a dataset's own label."""
     named = _CATEGORY_OF_NAME.get(label.name)
     return named if named is not None else _DEFAULT_CATEGORY.get(label.to_default(), Category.OTHER)
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """All boxes of a log, one row a box, in the order of time; world frame."""
+    """All boxes of a log in the world frame, one row per box, in order of time."""
 
     first_row: Int64[np.ndarray, "R_1"]
-    """Row r of 123D's box table holds the boxes first_row[r] to first_row[r + 1]."""
+    """Row r of 123D's box table has the boxes first_row[r] to first_row[r + 1] - 1."""
     centre: Float64[np.ndarray, "N 3"]
     R_world_box: Float64[np.ndarray, "N 3 3"]
     size_lwh: Float64[np.ndarray, "N 3"]
     velocity: Float64[np.ndarray, "N 3"]
-    """NaN where neither the log nor its tracks say."""
+    """Velocity, m/s. NaN where neither the log nor the track gives one."""
     track_id: Int64[np.ndarray, "N"]
     category: Int64[np.ndarray, "N"]
     is_ego: Bool[np.ndarray, "N"]
 
 
 def read_boxes(log: Log, frame: int) -> Boxes | None:
-    """Boxes at a frame, unbatched, in its ego frame, without the ego vehicle's own.
+    """Read the boxes at a frame, unbatched, in its ego frame, without the ego vehicle.
 
-    Velocities are over ground along the ego axes: as logged, else the centred difference of the track between
-    its neighbouring sightings, else NaN.
+    Velocities are over ground, along the ego axes. They are the logged values if there are any. Otherwise
+    they are the centred difference between the neighbouring observations of the track, or NaN.
 
     Returns:
-        None if the frame is not annotated.
+        The boxes, or None if the frame is not annotated.
 
     Raises:
-        InputError: on boxes that cannot be read or are not finite.
+        InputError: the boxes cannot be read or are not finite.
     """
     file = log.file(_KEY)
     if not file.is_file():
@@ -119,7 +121,7 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
 
 @functools.lru_cache(maxsize=4)
 def _tracks(log: Log, _mtime_ns: int) -> Tracks:
-    """The whole box table; a few logs' are kept, because neighbouring frames come from the same log."""
+    """Read the whole box table. A few tables are cached: neighbouring frames come from the same log."""
     table = get_modality_table(log.path.folder, _KEY)
     metadata = log.scene.get_modality_metadata(ModalityType.BOX_DETECTIONS_SE3)
     if table is None or not isinstance(metadata, BoxDetectionsSE3Metadata):
@@ -142,9 +144,9 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     t_s = np.repeat(column["timestamp_us"].to_numpy() * 1e-6, np.diff(first_row))
     logged = fixed_lists(column["velocity_3d"].flatten(), 3)
     if log.metadata.dataset != DATASET:
-        logged[(logged == 0).all(-1)] = np.nan  # what py123d's parsers write when they do not know
+        logged[(logged == 0).all(-1)] = np.nan  # py123d's parsers write zeros for an unknown velocity
     difference = _track_velocity(track_id, t_s, box[:, :3])
-    quaternion = box[:, 3:7].copy()  # scipy refuses an empty array that is read-only
+    quaternion = box[:, 3:7].copy()  # scipy rejects an empty read-only array
     R_world_box = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
     if log.metadata.dataset in _BACKWARDS:
         R_world_box = R_world_box @ np.diag([-1.0, -1.0, 1.0])
@@ -161,7 +163,10 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
 
 
 def _track_ids(tokens: np.ndarray) -> Int64[np.ndarray, "N"]:
-    """Tokens that are numbers stand for themselves; others are numbered in the order of their names."""
+    """Return integer track ids.
+
+    Numeric tokens keep their value. Other tokens are numbered in alphabetical order.
+    """
     if all(token.isdecimal() and len(token) < 19 for token in tokens):
         return np.array([int(token) for token in tokens], dtype=np.int64)
     return np.unique(tokens.astype(str), return_inverse=True)[1].astype(np.int64)
@@ -170,7 +175,7 @@ def _track_ids(tokens: np.ndarray) -> Int64[np.ndarray, "N"]:
 def _track_velocity(
     track_id: Int64[np.ndarray, "N"], t_s: Float64[np.ndarray, "N"], centre: Float64[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Difference between the sightings of a track before and after each box; one-sided at the ends."""
+    """Return the difference between the observations before and after each box; one-sided at the ends."""
     order = np.lexsort((t_s, track_id))
     track, at, xyz = track_id[order], t_s[order], centre[order]
     joined = (np.diff(track) == 0) & (np.diff(at) <= _LONGEST_DIFFERENCE_S)
@@ -186,7 +191,7 @@ def _track_velocity(
 
 
 def no_boxes() -> Boxes:
-    """Boxes of a frame without any."""
+    """Return the boxes of a frame without any box."""
     return Boxes(
         centre=torch.zeros(0, 3),
         size_lwh=torch.zeros(0, 3),

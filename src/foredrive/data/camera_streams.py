@@ -1,4 +1,4 @@
-"""Cameras as 123D describes them: their ids, geometry, and the label images that share it."""
+"""Cameras in 123D's terms: ids, geometry, and the label images with the same geometry."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,7 @@ from foredrive.errors import InputError
 
 DEPTH_STEP_M = 0.01
 _DEPTH_CODES = 2**16 - 2
-"""0 means that there is no depth."""
+"""Number of depth values. Code 0 means "no depth"."""
 
 _CAMERA_IDS_LEFT = (CameraID.PCAM_L0, CameraID.PCAM_L1, CameraID.PCAM_L2)
 _CAMERA_IDS_RIGHT = (CameraID.PCAM_R0, CameraID.PCAM_R1, CameraID.PCAM_R2)
@@ -35,18 +35,18 @@ class CameraSpec:
 
     name: str
     K: Float[np.ndarray, "3 3"]
-    """px, pixel centres at +0.5."""
+    """Intrinsics, px, pixel centres at +0.5."""
     T_ego_cam: Float[np.ndarray, "4 4"]
     size_hw: tuple[int, int]
     readout_s: float = 0.0
-    """From the first row's exposure to the last's, the middle one's being at the frame's time; 0: global
-    shutter."""
+    """Time from the exposure of the first row to that of the last, s. The middle row is exposed at the
+    frame's time. 0 is a global shutter."""
     dist: Float[np.ndarray, "5"] | None = None
-    """OpenCV's k1 k2 p1 p2 k3; None: an ideal pinhole."""
+    """OpenCV's k1 k2 p1 p2 k3. None is an ideal pinhole."""
 
 
 class RollingCameraMetadata(PinholeCameraMetadata):
-    """123D's description of a pinhole camera and, which 123D passes over, how long its readout takes."""
+    """123D's metadata of a pinhole camera, extended by the readout time, which 123D does not store."""
 
     __slots__ = ("readout_s",)
 
@@ -56,18 +56,18 @@ class RollingCameraMetadata(PinholeCameraMetadata):
 
     @classmethod
     def from_dict(cls, data_dict: dict[str, Any]) -> "RollingCameraMetadata":
-        """From a log's metadata; without a readout time the shutter is global."""
+        """Read a log's metadata. Without a readout time the shutter is global."""
         known = PinholeCameraMetadata.from_dict(data_dict)
         described = {slot[1:]: getattr(known, slot) for slot in PinholeCameraMetadata.__slots__}
         return cls(data_dict.get("readout_s", 0.0), **described)
 
     def to_dict(self) -> dict[str, Any]:
-        """123D's dictionary with the readout time."""
+        """Return 123D's dictionary with the readout time."""
         return {**super().to_dict(), "readout_s": self.readout_s}
 
 
 def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetadata:
-    """123D's description of a camera."""
+    """Return 123D's metadata of a camera."""
     return RollingCameraMetadata(
         spec.readout_s,
         camera_name=spec.name,
@@ -82,7 +82,10 @@ def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetad
 
 
 def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
-    """Give each camera a 123D id by where it looks: ahead, behind, left and right from front to back."""
+    """Assign a 123D id to each camera by its viewing direction.
+
+    The ids are front, back, and left and right, numbered from front to back.
+    """
     azimuth = {c.name: float(np.arctan2(c.T_ego_cam[1, 2], c.T_ego_cam[0, 2])) for c in cameras}
     spare = [*_CAMERA_IDS_SPARE, *_CAMERA_IDS_LEFT[::-1], *_CAMERA_IDS_RIGHT[::-1]]
     if len(azimuth) < len(cameras):
@@ -111,15 +114,18 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
 
 
 def depth_metadata(camera: PinholeCameraMetadata) -> DepthCameraMetadata:
-    """Depth along the optical axis in steps of `DEPTH_STEP_M`, up to 655 m; the sky has none (NaN)."""
+    """Return metadata of depth images.
+
+    Depth is along the optical axis, in steps of `DEPTH_STEP_M` up to 655 m. The sky is NaN.
+    """
     return DepthCameraMetadata(camera, max_depth=DEPTH_STEP_M * _DEPTH_CODES, has_invalid=True)
 
 
 def semantic_metadata(camera: PinholeCameraMetadata) -> SegmentationCameraMetadata:
-    """Pixels labelled by 123D's own classes."""
+    """Return metadata of semantic images with 123D's own classes."""
     return SegmentationCameraMetadata(camera, DefaultCameraSegmentationLabel, CameraChannelType.SEMANTIC)
 
 
 def instance_metadata(camera: PinholeCameraMetadata) -> SegmentationCameraMetadata:
-    """Pixels labelled by the track ids of the boxes, 0 for what is in none."""
+    """Return metadata of instance images with the track ids of the boxes. 0 is outside all boxes."""
     return SegmentationCameraMetadata(camera, DefaultCameraSegmentationLabel, CameraChannelType.INSTANCE)

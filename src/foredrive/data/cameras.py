@@ -1,4 +1,4 @@
-"""Cameras of a 123D log: images of one size, intrinsics to match, motion-compensated extrinsics."""
+"""Cameras of a 123D log: resized images, matching intrinsics, motion-compensated extrinsics."""
 
 import functools
 import io
@@ -25,10 +25,10 @@ from foredrive.errors import InputError
 _log = logging.getLogger(__name__)
 
 _ROWS_EXPOSED_S = {"pandaset": (-0.03, 0.01)}
-"""When the first and the last image row are exposed, relative to the time that the data set gives the image.
-PandaSet: neurad-studio's PandaSetDataParserConfig.rolling_shutter_offsets; in a moving log, lidar intensity
-against image brightness bears them out row by row. Data sets not listed: all rows at the given time, or about
-it where the log itself has a readout time."""
+"""Exposure times of the first and the last image row, relative to the dataset's image time. The values of
+PandaSet are neurad-studio's PandaSetDataParserConfig.rolling_shutter_offsets. Lidar intensity compared with
+image brightness, row by row in a moving log, confirms them. For other datasets, all rows are exposed at the
+image time, or centred on it if the log has a readout time."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +36,18 @@ class CameraFrame:
     """One camera at one frame."""
 
     image: UInt8[Tensor, "3 H W"] | None
-    """RGB; None if the log has none at this frame or it was not asked for."""
+    """RGB. None if the log has no image at this frame or it was not requested."""
     K: Float[Tensor, "3 3"]
     T_ego_cam: Float[Tensor, "4 4"]
-    """From the camera at the time of its middle row."""
+    """Pose of the camera at the exposure of its middle row."""
     dist: Float[Tensor, "5"]
     readout_s: float
     exposed_dt_s: float
-    """When the middle row is exposed, relative to the frame's time; 0 where there is no image."""
+    """Exposure time of the middle row relative to the frame's time, s. 0 if there is no image."""
 
 
 def pinhole_cameras(log: Log) -> dict[str, PinholeCameraMetadata]:
-    """A log's pinhole cameras by their own names, front first; cameras of other models are passed over."""
+    """Return the pinhole cameras of a log by their own names, front first. Other cameras are skipped."""
     cameras = {}
     for key, metadata in log.scene.get_all_modality_metadatas().items():
         if metadata.modality_type != ModalityType.CAMERA:
@@ -60,13 +60,13 @@ def pinhole_cameras(log: Log) -> dict[str, PinholeCameraMetadata]:
 
 
 def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> PinholeCameraMetadata | None:
-    """A camera by its own name ("CAM_FRONT") or by 123D's ("pcam_f0"), which all data sets share."""
+    """Find a camera by its own name ("CAM_FRONT") or by 123D's name ("pcam_f0"), common to all datasets."""
     by_id = {metadata.camera_id.serialize(): metadata for metadata in cameras.values()}
     return cameras.get(name) or by_id.get(name)
 
 
 def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:
-    """Cameras as errors list them: by both names that `find_camera` knows."""
+    """Return a list of cameras for error messages, with both names that `find_camera` accepts."""
     names = dict.fromkeys((metadata.camera_name, metadata.camera_id.serialize()) for metadata in cameras)
     told = [own if own == shared else f"{own} ({shared})" for own, shared in names]
     return ", ".join(told) or "none"
@@ -78,7 +78,7 @@ def read_camera(
     """Read one camera at one frame, resized to `image_hw`.
 
     Raises:
-        InputError: on an image that cannot be decoded or a pose that is not finite.
+        InputError: the image cannot be decoded, or the pose is not finite.
     """
     file = log.file(metadata.modality_key)
     with reading(file, "the camera's poses"):
@@ -120,7 +120,10 @@ def _rows_exposed_s(log: Log, modality_key: str) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=64)
 def _exposed_us(log: Log, modality_key: str) -> Float64[np.ndarray, "F"]:
-    """When the middle row is exposed at every frame, in the log's time; the frame's time without an image."""
+    """Return the exposure time of the middle row at every frame, in the log's time.
+
+    Without an image it is the time of the frame.
+    """
     exposed_us = log.t_us.astype(np.float64)
     frames, rows = log.rows(modality_key)
     table = get_modality_table(log.path.folder, modality_key)
@@ -132,8 +135,11 @@ def _exposed_us(log: Log, modality_key: str) -> Float64[np.ndarray, "F"]:
 
 @functools.lru_cache(maxsize=64)
 def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
-    """`T_ego_cam` at every frame, from the camera at the exposure of its middle row to the ego frame at the
-    frame's time: by the camera's logged pose, else by the vehicle's; the static one where there is no image.
+    """Return `T_ego_cam` at every frame.
+
+    It maps from the camera at the exposure of its middle row to the ego frame at the frame's time. It uses
+    the logged camera pose if there is one, else the vehicle's pose. Without an image it is the static
+    extrinsic matrix.
     """
     metadata = log.scene.get_all_modality_metadatas()[modality_key]
     assert isinstance(metadata, PinholeCameraMetadata)
@@ -164,7 +170,7 @@ def _scaled_intrinsics(metadata: PinholeCameraMetadata, image_hw: tuple[int, int
 def _open_image(
     log: Log, frame: int, metadata: PinholeCameraMetadata, data: bytes | str | int
 ) -> Image.Image:
-    """An image as 123D stores it: encoded bytes, a path under the data set's root, or a video's frame."""
+    """Open an image as 123D stores it: encoded bytes, a path under the dataset's root, or a video frame."""
     if isinstance(data, bytes):
         try:
             return Image.open(io.BytesIO(data))
@@ -183,9 +189,11 @@ def _open_image(
 
 
 def _resize(image: Image.Image, image_hw: tuple[int, int]) -> UInt8[Tensor, "3 H W"]:
-    """Antialiased resize; JPEGs are decoded at the smallest scale (1, 1/2, 1/4, 1/8) that is large enough.
+    """Resize an image with antialiasing.
 
-    A JPEG whose size is no multiple of the scale comes with a part of a pixel too much, which is left out.
+    JPEGs are decoded at the smallest scale (1, 1/2, 1/4, 1/8) that is large enough. If the size of a JPEG is
+    not a multiple of the scale, the decoded image extends beyond the original by part of a pixel. This part
+    is cropped.
     """
     size_wh = image_hw[::-1]
     drafted = image.draft("RGB", size_wh)

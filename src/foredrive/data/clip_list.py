@@ -1,4 +1,4 @@
-"""A list of clips in a file: parts of logs that somebody chose, by a search or by hand."""
+"""Clip list files: parts of logs selected by a search or by hand."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,23 +13,23 @@ FORMAT = "foredrive clips 1"
 
 @dataclass(frozen=True)
 class ListedClip:
-    """A part of a log."""
+    """A selected part of a log."""
 
     folder: Path
     maps_dir: Path
     start_s: float
-    """Since the log's start."""
+    """Start, s since the start of the log."""
     end_s: float
-    """Left out."""
+    """End (exclusive), s since the start of the log."""
 
 
 def clip_list(
     clips: Sequence[ListedClip], notes: Sequence[Mapping[str, object]] | None = None
 ) -> dict[str, object]:
-    """A list as its file has it.
+    """Return a list in the format of its file.
 
     Args:
-        notes: what else to say of each clip; nobody reads it.
+        notes: additional entries for each clip. They are not read back.
     """
     told = notes if notes is not None else [{} for _ in clips]
     entries = [
@@ -43,16 +43,16 @@ def clip_list(
 
 
 def write_clip_list(path: Path, listed: Mapping[str, object]) -> None:
-    """Write a `clip_list`."""
+    """Write the result of `clip_list` to a file."""
     with atomic_path(path) as scratch:
         scratch.write_text(json.dumps(listed, indent=1) + "\n")
 
 
 def read_clip_list(path: Path) -> list[ListedClip]:
-    """Read a list; folders that are not absolute are looked for beside it.
+    """Read a clip list. Relative folders are relative to the folder of the list.
 
     Raises:
-        InputError: it is not one, or has no clips.
+        InputError: the file is not a clip list, or it has no clips.
     """
     try:
         written = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""Clips of 123D logs with their voxel labels, as a torch data set."""
+"""A torch dataset of clips from 123D logs, with voxel labels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,55 +28,55 @@ from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """Which frames of a log make a clip, and what is read of them."""
+    """The frames of a clip and the data to read for them."""
 
     past_frames: int
-    """Key frames before now."""
+    """Number of key frames before now."""
     future_frames: int
-    """Key frames after now: what training and scoring compare with."""
+    """Number of key frames after now, the targets of training and evaluation."""
     image_hw: tuple[int, int]
-    """Height and width all images are resized to, px."""
+    """Height and width of the resized images, px."""
     voxels: VoxelSpec
     frame_dt_s: float = 0.5
-    """Time between key frames."""
+    """Time between key frames, s."""
     horizon_steps: int = 6
     horizon_dt_s: float = 0.5
     cameras: tuple[str, ...] | None = None
-    """Cameras by their own or by 123D's names ("pcam_f0"), in this order; None takes all there are."""
+    """Camera names, the log's own or 123D's ("pcam_f0"), in this order. None selects all cameras."""
     now_stride_s: float = 0.5
-    """Time between the clips' nows."""
+    """Time between the nows of successive clips, s."""
     future_images: bool = True
     lidar: bool = False
-    """Put the sweeps into the clip."""
+    """Whether to read lidar sweeps into the clip."""
     map: bool = False
     occupancy_source: Literal["lidar", "recorded"] = "lidar"
-    """Where voxel labels come from: what the beams met and passed through, or the exact occupancy with flow
-    that recordings of towns carry, seen or not."""
+    """Source of the voxel labels: "lidar" for beams of the sweep, or "recorded" for the exact occupancy and
+    flow in recordings of towns, which includes voxels that no sensor has observed."""
     future_source: Literal["driven", "taught"] = "driven"
-    """Where the future to learn from comes from: what was driven, or what the teacher of a lesson would do
-    instead (`foredrive drive --taught`); clips of logs without a teacher have what was driven."""
+    """Source of the future trajectory: "driven" for the recorded path, or "taught" for the expert's plan in
+    DAgger demonstrations (`foredrive drive --taught`). Clips without such a plan use the driven path."""
     part_s: tuple[float, float] | None = None
-    """Of a log only clips whose now and frames after it lie in this part: seconds since the log's start, the
-    end left out. None takes all of it."""
+    """Part of each log, (start, end) in s since its start, end exclusive. Only clips with now and all later
+    frames inside it are used. None is the whole log."""
 
 
 class ClipDataset(Dataset[Example]):
-    """Every clip of some logs, unbatched, in the order of logs and time.
+    """All clips of some logs, unbatched, ordered by log and time.
 
-    Files are opened when they are first read, in whichever process reads them; the data set can be pickled.
-    Workers need the forkserver start method: `DataLoader(..., multiprocessing_context="forkserver")`.
+    Files are opened at the first access in each process, and the dataset can be pickled. DataLoader workers
+    need the forkserver start method: `DataLoader(..., multiprocessing_context="forkserver")`.
 
     Args:
-        logs: at least one.
-        cache_dir: folder for voxel labels and shrunk images; None keeps nothing.
+        logs: at least one log.
+        cache_dir: folder for voxel labels and resized images. None disables the cache.
 
     Raises:
-        InputError: on a log that cannot be read, is too short for one clip or lacks the occupancy that is
-            asked for, or a camera that no log has.
+        InputError: a log cannot be read, is too short for one clip or lacks the requested occupancy, or no
+            log has a requested camera.
     """
 
     command_source: dict[str, int]
-    """How many clips have their command from a provided "route", from the "driven_future", or "none"."""
+    """Number of clips by source of their command: "route" (provided), "driven_future" or "none"."""
     camera_names: tuple[str, ...]
 
     def __init__(self, logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path | None) -> None:
@@ -103,15 +103,15 @@ class ClipDataset(Dataset[Example]):
         return len(self._clips)
 
     def now_us(self, index: int) -> int:
-        """A clip's now, in the time of its log."""
+        """Return the now of a clip in the time of its log, µs."""
         number, frames = self._clips[index]
         return int(self._logs[number].t_us[frames[self.config.past_frames]])
 
     def __getitem__(self, index: int) -> Example:
-        """Read one clip.
+        """Read one clip with its labels.
 
         Raises:
-            InputError: on data that cannot be read.
+            InputError: data cannot be read.
         """
         number, frames = self._clips[index]
         log = self._logs[number]
@@ -134,7 +134,7 @@ class ClipDataset(Dataset[Example]):
 
     def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
         if self.config.occupancy_source == "recorded":
-            return recorded_labels(log, frame, self.config.voxels)  # read as fast as a kept entry is
+            return recorded_labels(log, frame, self.config.voxels)  # as fast as reading a cache entry
         return self._labels.labels(log, frame)
 
     def _choose_cameras(self) -> tuple[str, ...]:
@@ -161,7 +161,7 @@ class ClipDataset(Dataset[Example]):
         """Read one clip without its labels.
 
         Raises:
-            InputError: on data that cannot be read.
+            InputError: data cannot be read.
         """
         number, frames = self._clips[index]
         log, config = self._logs[number], self.config
@@ -188,7 +188,7 @@ class ClipDataset(Dataset[Example]):
 
 
 def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
-    """Frames of each clip: those nearest to the key times, none off by more than half the log's period."""
+    """Return the frames of each clip: those nearest to the key times, at most half the log's period away."""
     offset_us = np.arange(-config.past_frames, config.future_frames + 1) * config.frame_dt_s * 1e6
     slack_us = 0.5e6 * log.period_s
     first_us = log.t_us[0] - offset_us[0]
@@ -204,7 +204,7 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
     if log.path.parts_s:
         now_s = (log.t_us[frames[:, config.past_frames]] - log.t_us[0]) * 1e-6
         whole &= np.any([(now_s >= start) & (now_s < end) for start, end in log.path.parts_s], axis=0)
-    if not whole.any() and not log.path.parts_s:  # of a list of clips some may lie at the end of their log
+    if not whole.any() and not log.path.parts_s:  # a listed clip may lie at the end of its log
         raise InputError(
             f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
@@ -215,7 +215,7 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
 
 
 def _at_times(plan: Trajectory, times_s: Float64[np.ndarray, "T"]) -> Trajectory:
-    """A plan of one alternative at other, even times; beyond its end nothing is valid."""
+    """Resample a plan of one alternative at evenly spaced times. Times beyond its end are not valid."""
     known_s = plan.dt_s * np.arange(len(plan.xy[0]) + 1)
     yaw = np.unwrap(np.append(0.0, plan.yaw[0].double().numpy()))
     x, y = (np.append(0.0, axis) for axis in plan.xy[0].double().numpy().T)

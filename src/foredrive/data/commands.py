@@ -1,4 +1,4 @@
-"""The driving command at a frame: from the log's route, or else from the driven future."""
+"""The driving command at a frame, from the log's route or from the driven future."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -9,21 +9,21 @@ from foredrive.data.logs import Log
 from foredrive.scene import Command, Trajectory
 
 LATERAL_M = 2.0
-"""nuScenes convention (ST-P3, UniAD, VAD): further to the side than this is a turn."""
+"""Minimum lateral offset of a turn, by the nuScenes convention (ST-P3, UniAD, VAD)."""
 LOOKAHEAD_M = 20.0
-"""How far ahead the route is asked: about three seconds of city driving."""
+"""Lookahead distance along the route: about three seconds of city driving."""
 HEADING_OVER_M = 2.0
-"""The route's heading is that of a chord this long: routes are polylines."""
+"""Length of the chord that defines the route's heading. A chord is needed because routes are polylines."""
 
 
 def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None, str]:
-    """The command and its source: "route", "driven_future" or "none".
+    """Return the command and its source: "route", "driven_future" or "none".
 
-    The driven future leaks what an agent is judged on, hence the source. A route counts only if it was given
-    to the vehicle: py123d derives one from the driven path where there is none.
+    The driven future reveals information on which an agent is evaluated, so the source is reported. A route
+    counts only if it was provided to the vehicle. Without one, py123d derives a route from the driven path.
 
     Raises:
-        InputError: on a route that cannot be read.
+        InputError: the route cannot be read.
     """
     lateral_m = _route_offset_m(log, frame)
     if lateral_m is not None:
@@ -35,17 +35,17 @@ def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None
 
 
 def command_of(lateral_m: float) -> Command:
-    """The command for a route, or a path, that bears so far to the left."""
+    """Return the command for a route or path with this lateral offset (m, positive to the left)."""
     if lateral_m >= LATERAL_M:
         return Command.LEFT
     return Command.RIGHT if lateral_m <= -LATERAL_M else Command.STRAIGHT
 
 
 def target_at(log: Log, frame: int) -> Float64[np.ndarray, "2"] | None:
-    """Where the route leads, as `route_target`; None without a provided route.
+    """Return the target point of the route (see `route_target`), or None without a provided route.
 
     Raises:
-        InputError: on a route that cannot be read.
+        InputError: the route cannot be read.
     """
     route = _route_at(log, frame)
     return None if route is None else route_target(*route, log.T_world_ego[frame])
@@ -57,11 +57,13 @@ def route_target(
     progress_m: float,
     T_world_ego: Float64[np.ndarray, "4 4"],
 ) -> Float64[np.ndarray, "2"]:
-    """The route's point LOOKAHEAD_M ahead, or its end, seen from the vehicle: x forward, y left, m.
+    """Return the route point LOOKAHEAD_M ahead, or the route's end.
+
+    It is in the vehicle frame: x forward, y left, m.
 
     Args:
-        arc_m: arc length of each point of the route.
-        progress_m: arc length of the ego's projection on it.
+        arc_m: arc length of each route point.
+        progress_m: arc length of the ego's projection on the route.
     """
     ahead = np.array([np.interp(progress_m + LOOKAHEAD_M, arc_m, axis) for axis in xy.T])
     forward = T_world_ego[:2, 0] / np.hypot(*T_world_ego[:2, 0])
@@ -70,7 +72,7 @@ def route_target(
 
 
 def _route_offset_m(log: Log, frame: int) -> float | None:
-    """How far left the route bears from where the ego is beside it; None without a provided route."""
+    """Return `route_offset_m` at a frame, or None without a provided route."""
     route = _route_at(log, frame)
     return None if route is None else route_offset_m(*route)
 
@@ -78,7 +80,7 @@ def _route_offset_m(log: Log, frame: int) -> float | None:
 def _route_at(
     log: Log, frame: int
 ) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K 2"], float] | None:
-    """Arc length and points of the route, and how far along it the ego is."""
+    """Return arc length and points of the route, and the ego's progress along it (m)."""
     metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
     if not isinstance(metadata, RouteMetadata) or metadata.source != "provided":
         return None
@@ -92,13 +94,14 @@ def _route_at(
 def route_offset_m(
     arc_m: Float64[np.ndarray, "K"], xy: Float64[np.ndarray, "K 2"], progress_m: float
 ) -> float:
-    """How far left of the route's heading at `progress_m` the route is LOOKAHEAD_M later, m.
+    """Return the lateral offset of the route LOOKAHEAD_M ahead, relative to its heading at `progress_m`.
 
-    Measured along the route alone: where the vehicle is beside it, overtaking or swaying, is no turn.
+    The offset is in m, positive to the left. It depends only on the route: a lateral offset of the vehicle,
+    as in overtaking, is not a turn.
 
     Args:
-        arc_m: arc length of each point of the route.
-        progress_m: arc length of the ego's projection on it.
+        arc_m: arc length of each route point.
+        progress_m: arc length of the ego's projection on the route.
     """
     half_m = 0.5 * HEADING_OVER_M
     at_m = np.clip(progress_m, arc_m[0] + half_m, arc_m[-1] - half_m)

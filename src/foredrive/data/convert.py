@@ -1,4 +1,4 @@
-"""Raw data sets to self-contained 123D logs."""
+"""Conversion of raw datasets to self-contained 123D logs."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -24,21 +24,21 @@ LogParsers = Iterator[tuple[Path, BaseLogParser, BaseMapParser | None]]
 
 
 def convert(source: Path, dataset: str, out: Path) -> list[LogPath]:
-    """Convert a raw data set into 123D logs that hold their images and sweeps themselves.
+    """Convert a raw dataset into 123D logs that contain their images and sweeps.
 
-    Velocities that the data set does not have are left out, not inferred, and routes are not made up. An
-    existing log of the same name is replaced.
+    Missing velocities are left out, not inferred, and no routes are derived. An existing log of the same name
+    is replaced.
 
     Args:
-        source: folder of one raw log, or a folder (of folders) of them.
+        source: folder of one raw log, or a folder (of folders) of raw logs.
         dataset: one of `DATASETS`.
         out: 123D data root.
 
     Returns:
-        the logs written.
+        The written logs.
 
     Raises:
-        InputError: on an unknown data set, a source without raw logs of it, or one that cannot be read.
+        InputError: the dataset is unknown, or the source has no raw logs of it or cannot be read.
     """
     if dataset not in DATASETS:
         raise InputError(f"unknown data set {dataset!r}; there are: {', '.join(DATASETS)}")
@@ -80,7 +80,7 @@ def _convert_one(folder: Path, log: BaseLogParser, map_: BaseMapParser | None, o
 
 
 def _folders_with(source: Path, file: str) -> list[Path]:
-    """`source`, or else the folders one or two levels below it, that hold `file`."""
+    """Return `source`, or else the folders one or two levels below it that contain `file`."""
     for depth in range(3):
         found = sorted(source.glob("*/" * depth + file))
         if found:
@@ -120,5 +120,5 @@ DATASETS: dict[str, Callable[[Path], LogParsers]] = {
     "nuscenes-keyframe": _nuscenes_keyframe,
     "kitti-object": _kitti_object,
 }
-"""How the raw logs of each data set are found and parsed. The whole of nuScenes, and data sets that are not
-here, are for py123d's own `py123d-conversion`."""
+"""Functions that find and parse the raw logs of each dataset. For full nuScenes and all other datasets, use
+py123d's own `py123d-conversion`."""

@@ -1,4 +1,4 @@
-"""A whole log as one clip: every frame it has, at its own rate."""
+"""A whole log as one clip, with all frames at the log's own rate."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,11 +22,11 @@ from foredrive.sensors import SpinningLidar, pandar64
 from foredrive.sensors.missed_beams import with_missed_beams
 
 _LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {"pandaset": pandar64}
-"""What data sets drive with that keep no beam without a return: lidar -> ego to its pattern."""
+"""Lidars of datasets that store no missed beams: function from the pose lidar -> ego to the lidar."""
 
 
 def lidar_of(dataset: str, T_ego_lidar: Float[Tensor, "4 4"]) -> SpinningLidar | None:
-    """The lidar that a data set drives with; None where that is not known here."""
+    """Return the lidar of a dataset, or None if it is not known."""
     make_lidar = _LIDARS.get(dataset)
     return None if make_lidar is None else make_lidar(T_ego_lidar)
 
@@ -37,19 +37,19 @@ def read_drive(
     cameras: tuple[str, ...] | None = None,
     cache_dir: Path | None = None,
 ) -> Clip:
-    """Read all frames of a log, its sweeps and boxes with them; now is the first, so all times are >= 0.
+    """Read all frames of a log with sweeps and boxes. Now is the first frame, so all times are >= 0.
 
-    Beams that did not return are put back where the lidar's pattern is known (`sensors.missed_beams`).
-    Nothing is asked of anyone here: there is no command, no target and no future.
+    Beams that did not return are reconstructed where the lidar's pattern is known (`sensors.missed_beams`).
+    The clip has no command, no target and no future.
 
     Args:
         path: the log.
-        image_hw: height and width that images are resized to, px.
-        cameras: by their own or 123D's names, in this order; None takes all.
-        cache_dir: folder for shrunk images; None keeps none.
+        image_hw: height and width of the resized images, px.
+        cameras: camera names, the log's own or 123D's, in this order. None selects all.
+        cache_dir: folder for resized images. None disables the cache.
 
     Raises:
-        InputError: on a log that cannot be read, or that has no camera of a name.
+        InputError: the log cannot be read, or it lacks a requested camera.
     """
     log = Log(path)
     there = pinhole_cameras(log)
@@ -65,7 +65,7 @@ def read_drive(
 
 
 def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
-    """`read_sweep` with the beams that did not return, if they are recorded or can be told."""
+    """Read a sweep with the beams that did not return, if they are recorded or can be reconstructed."""
     read = read_sweep(log, frame)
     if read is None or read[1] or not len(read[0].dt_s):
         return read

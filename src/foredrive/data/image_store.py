@@ -1,4 +1,4 @@
-"""Camera images decoded and resized once, and kept in a folder."""
+"""A cache of decoded and resized camera images."""
 
 import dataclasses
 import hashlib
@@ -14,16 +14,16 @@ from foredrive.data.logs import Log
 from foredrive.files import atomic_path
 
 IMAGE_VERSION = 1
-"""Part of every cache key: raise it when images come out differently."""
+"""Version in every cache key. Increase it when the images change."""
 
 _log = logging.getLogger(__name__)
 
 
 class ImageStore:
-    """Reads cameras; images that had to be shrunk are kept, a uint8 [3 H W] .npy each.
+    """A reader of cameras with a cache. Images that were downsized are stored as uint8 [3 H W] .npy files.
 
-    An entry's name is a hash of the camera's file (name, size, time of change), the frame, the size and
-    `IMAGE_VERSION`. Entries are written atomically; damaged ones are made anew.
+    The name of an entry is a hash of the camera's file (name, size, modification time), the frame, the image
+    size and `IMAGE_VERSION`. Entries are written atomically. Damaged entries are replaced.
     """
 
     def __init__(self, cache_dir: Path | None, image_hw: tuple[int, int]) -> None:
@@ -31,7 +31,7 @@ class ImageStore:
         self.image_hw = image_hw
 
     def camera(self, log: Log, frame: int, metadata: PinholeCameraMetadata, with_image: bool) -> CameraFrame:
-        """One camera at one frame, as `read_camera` does it."""
+        """Read one camera at one frame, as `read_camera`, with the cache."""
         shrinks = metadata.width * metadata.height > self.image_hw[0] * self.image_hw[1]
         if self._folder is None or not with_image or not shrinks:
             return read_camera(log, frame, metadata, self.image_hw, with_image)

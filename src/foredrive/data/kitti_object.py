@@ -1,7 +1,7 @@
-"""A 123D parser for frames of KITTI's object benchmark (Geiger et al. 2012), which are not part of any drive.
+"""A 123D parser for frames of KITTI's object benchmark (Geiger et al. 2012), which belong to no drive.
 
-Each frame of training/ or testing/ (image_2, image_3 where there is one, velodyne, calib, label_2) is a log
-of one frame. Nothing is known of when and where it was taken: its time is 0 and the world begins at the IMU.
+Each frame of training/ or testing/ (image_2, image_3 if present, velodyne, calib, label_2) becomes a log of
+one frame. Its time and place are unknown, so the time is 0 and the origin of the world is the IMU.
 """
 
 from collections.abc import Iterator
@@ -52,11 +52,11 @@ _NOT_LABELLED = "DontCare"
 
 
 class KittiObjectParser(BaseLogParser):
-    """One frame as a log of one frame, with KITTI-360's vehicle: the two are the same.
+    """Parser of one frame as a log. The vehicle is that of KITTI-360, which is the same.
 
     Args:
         folder: training/ or testing/.
-        frame: such as 000008.
+        frame: number, such as 000008.
         split: 123D split, e.g. kitti_train.
     """
 
@@ -64,11 +64,11 @@ class KittiObjectParser(BaseLogParser):
         self._folder, self._frame, self._split = Path(folder), frame, split
 
     def get_log_metadata(self) -> LogMetadata:
-        """The frame's number is its name."""
+        """Return the log's metadata. Its name is the frame's number."""
         return LogMetadata("kitti", self._split, self._frame, location=None)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """The frame: lidar, cameras and, for training, boxes."""
+        """Yield the frame: lidar, cameras and, for training frames, boxes."""
         calibration = _Calibration.read(self._file("calib", "txt"))
         ego = EgoStateSE3.from_imu(PoseSE3.identity(), KITTI360_EGO_STATE_SE3_METADATA, _NOW)
         found: list[BaseModality] = [ego, self._lidar(calibration)]
@@ -118,7 +118,7 @@ class KittiObjectParser(BaseLogParser):
             T_rect_box[:3, 0] = [np.cos(turn), 0.0, -np.sin(turn)]
             T_rect_box[:3, 1] = [np.sin(turn), 0.0, np.cos(turn)]
             T_rect_box[:3, 2] = [0.0, -1.0, 0.0]
-            T_rect_box[:3, 3] = [x, y - 0.5 * height, z]  # labels have the middle of the bottom
+            T_rect_box[:3, 3] = [x, y - 0.5 * height, z]  # labels give the centre of the bottom face
             pose = _pose(calibration.T_imu_rect @ T_rect_box)
             attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[_CATEGORY[kind]], str(number), None)
             detections.append(BoxDetectionSE3(attributes, BoundingBoxSE3(pose, length, width, height), None))
@@ -130,7 +130,7 @@ class KittiObjectParser(BaseLogParser):
 
 @dataclass(frozen=True)
 class _Calibration:
-    """Of one frame; "rect" is the rectified frame of camera 0, in which boxes are given."""
+    """The calibration of one frame. "rect" is the rectified frame of camera 0, in which boxes are given."""
 
     T_imu_velo: Float64[np.ndarray, "4 4"]
     T_imu_rect: Float64[np.ndarray, "4 4"]
@@ -138,6 +138,7 @@ class _Calibration:
 
     @classmethod
     def read(cls, file: Path) -> "_Calibration":
+        """Read a calibration file."""
         values = {}
         for line in file.read_text().splitlines():
             name, _, numbers = line.partition(":")
@@ -149,7 +150,7 @@ class _Calibration:
         return cls(T_imu_velo, T_imu_velo @ np.linalg.inv(T_rect_velo), projections)
 
     def camera(self, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "4 4"]]:
-        """K and T_imu_cam of a camera, which lies aside of camera 0 by what its projection adds."""
+        """Return K and T_imu_cam of a camera. Its projection matrix contains its offset from camera 0."""
         P = self.projections[name]
         T_cam_rect = np.eye(4)
         T_cam_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
@@ -157,7 +158,10 @@ class _Calibration:
 
 
 def _rigid(rows: Float64[np.ndarray, "3 _"]) -> Float64[np.ndarray, "4 4"]:
-    """A rotation, or a rotation and an offset, as a matrix; the files' seven digits are made a rotation."""
+    """Return a rotation (and offset) as a 4×4 matrix.
+
+    The rotation is orthonormalised, because the files have only seven digits.
+    """
     T = np.eye(4)
     U, _, V = np.linalg.svd(rows[:, :3])
     T[:3, :3] = U @ V

@@ -1,4 +1,4 @@
-"""Voxel labels made from raw data: pseudo-occupancy from lidar beams, flow from tracks; cached on disk."""
+"""Voxel labels from lidar beams (pseudo-occupancy) and from tracks (flow), with a disk cache."""
 
 import hashlib
 import logging
@@ -21,29 +21,29 @@ from foredrive.files import atomic_path
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
 LABEL_VERSION = 2
-"""Part of every cache key: raise it when labels come out differently."""
+"""Version in every cache key. Increase it when the labels change."""
 FREE_MARGIN_VOXELS = 0.5
-"""A beam frees nothing this close before its return: ranges are noisy, and a surface at a voxel's border must
-not free the voxel in front that it also fills."""
+"""Distance before a return within which a beam frees no voxel. Ranges are noisy, and a surface at the border
+of a voxel must not free the voxel in front of it, which it also occupies."""
 EGO_MARGIN_M = 0.2
-"""Returns from the ego vehicle's box enlarged by this (mirrors) are dropped."""
+"""Margin around the ego vehicle's box. Returns inside (e.g. mirrors) are dropped."""
 BOX_MARGIN_M = 0.1
-"""Annotated boxes are enlarged by this when points are assigned to them."""
+"""Margin around annotated boxes when points are assigned to them."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class VoxelLabels:
-    """Labels of one frame in its own ego frame."""
+    """Voxel labels of one frame in its own ego frame."""
 
     occupied: Bool[Tensor, "Z Y X"]
     known: Bool[Tensor, "Z Y X"]
-    """Occupied, or passed through by a beam."""
+    """Whether the voxel is occupied, or a beam passed through it."""
     flow_mps: Float[Tensor, "3 Z Y X"]
-    """Velocity over ground in the ego axes; 0 where not known."""
+    """Velocity over ground in the ego axes. 0 where not known."""
     flow_known: Bool[Tensor, "Z Y X"]
-    """Occupied voxels of annotated frames, but for those in boxes of unknown velocity."""
+    """Occupied voxels of annotated frames, without those in boxes of unknown velocity."""
 
 
 def voxel_labels(
@@ -52,15 +52,15 @@ def voxel_labels(
     boxes: Boxes | None,
     ego_box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None,
 ) -> VoxelLabels:
-    """Labels of one sweep.
+    """Compute the labels of one sweep.
 
-    A voxel is occupied if a return lies in it; else it is free if a beam passes through it on its way to its
-    return (but for the last `FREE_MARGIN_VOXELS`) or, for a miss, up to the range that is known to be free;
-    else it is unknown.
+    A voxel is occupied if it contains a return. Otherwise it is free if a beam passes through it before the
+    return (without the last `FREE_MARGIN_VOXELS`) or, for a miss, within the range known to be free. All
+    other voxels are unknown.
 
     Args:
-        sweep: unbatched, ego frame.
-        boxes: unbatched, ego frame; None if the frame is not annotated, which leaves the flow unknown.
+        sweep: unbatched, in the ego frame.
+        boxes: unbatched, in the ego frame. None if the frame is not annotated; then the flow is unknown.
         ego_box: centre and size (length, width, height) of the ego vehicle in its frame, m.
     """
     beams = sweep if bool(sweep.valid.all()) else sweep[sweep.valid]
@@ -99,7 +99,7 @@ def _on_ego(
     centre: Float[np.ndarray, "3"],
     size_lwh: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "N"]:
-    """Whether points lie on the ego vehicle: in its box, or above it but not above its sensors."""
+    """Return whether points are on the ego vehicle: in its box, or above it up to its highest sensor."""
     offset, reach = points - centre, 0.5 * size_lwh + EGO_MARGIN_M
     top = max(reach[2], float(origin[:, 2].max(initial=-np.inf)) - centre[2] + EGO_MARGIN_M)
     footprint = (np.abs(offset[:, :2]) <= reach[:2]).all(-1)
@@ -107,7 +107,7 @@ def _on_ego(
 
 
 def _voxels(points: Float[np.ndarray, "N 3"], spec: VoxelSpec) -> Int64[np.ndarray, "N"]:
-    """Flat ZYX index of the voxel each point lies in, -1 outside the grid."""
+    """Return the flat ZYX index of the voxel of each point, -1 outside the grid."""
     x, y, z = np.floor((points - np.asarray(spec.lower_m)) / spec.voxel_m).astype(np.int64).T
     nz, ny, nx = spec.shape_zyx
     inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
@@ -120,7 +120,10 @@ def _flow(
     occupied: Bool[np.ndarray, "Z Y X"],
     boxes: Boxes | None,
 ) -> tuple[Float[np.ndarray, "3 Z Y X"], Bool[np.ndarray, "Z Y X"]]:
-    """A voxel moves as the box that one of its points lies in; it stands if none of them lies in a box."""
+    """Compute the flow of occupied voxels.
+
+    A voxel has the velocity of the box that contains one of its points. It is static if no box contains any.
+    """
     flow = np.zeros((3, *occupied.shape), dtype=np.float32)
     if boxes is None:
         return flow, np.zeros_like(occupied)
@@ -140,10 +143,11 @@ def _flow(
 
 
 class LabelStore:
-    """Labels of a log's frames, made once and kept in a folder.
+    """A disk cache of the labels of a log's frames.
 
-    An entry's name is a hash of all that the labels depend on: the log's files (name, size, time of change),
-    the frame's time, the grid and `LABEL_VERSION`. Entries are written atomically, damaged ones made anew.
+    The name of an entry is a hash of everything that the labels depend on: the log's files (name, size,
+    modification time), the frame's time, the grid and `LABEL_VERSION`. Entries are written atomically.
+    Damaged entries are replaced.
     """
 
     def __init__(self, cache_dir: Path | None, spec: VoxelSpec) -> None:
@@ -151,7 +155,7 @@ class LabelStore:
         self._spec = spec
 
     def labels(self, log: Log, frame: int) -> VoxelLabels:
-        """Labels of one frame; all unknown where the log has no sweep."""
+        """Return the labels of one frame. All voxels are unknown if the log has no sweep there."""
         file = self._file(log, frame)
         if file is not None:
             kept = _read_entry(file, self._spec)
@@ -163,7 +167,7 @@ class LabelStore:
         entry = _encode(labels)
         with atomic_path(file) as temporary:
             temporary.write_bytes(entry)
-        return _decode(entry, self._spec)  # velocities are rounded, the first time as every other
+        return _decode(entry, self._spec)  # velocities are rounded here as in later reads
 
     def _file(self, log: Log, frame: int) -> Path | None:
         if self._folder is None:
@@ -174,10 +178,10 @@ class LabelStore:
 
 
 def make_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
-    """Read a frame's sweep and boxes and label it.
+    """Read a frame's sweep and boxes and compute its labels.
 
     Raises:
-        InputError: on data that cannot be read.
+        InputError: data cannot be read.
     """
     read = read_sweep(log, frame)
     if read is None:
@@ -187,7 +191,7 @@ def make_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
 
 
 def _encode(labels: VoxelLabels) -> bytes:
-    """Bits of the grids, velocities of what moves; a checksum first."""
+    """Encode bit masks of the grids and velocities of moving voxels, with a checksum in front."""
     occupied = labels.occupied.numpy()
     moving = np.flatnonzero(labels.flow_mps.numpy().any(0))
     arrays: dict[str, np.ndarray] = {
@@ -227,6 +231,6 @@ def _read_entry(file: Path, spec: VoxelSpec) -> VoxelLabels | None:
         return None
     try:
         return _decode(data, spec)
-    except Exception as error:  # whatever is wrong with it, it can be made anew
+    except Exception as error:  # any damaged entry can be computed again
         _log.warning("%s is damaged (%s) and is made anew", file, error)
         return None

@@ -1,4 +1,4 @@
-"""Lidar sweeps of a 123D log, in the ego frame, with the origin of every beam."""
+"""Lidar sweeps of a 123D log in the ego frame, with the origin of every beam."""
 
 import numpy as np
 import torch
@@ -18,16 +18,17 @@ _NEAREST_RETURN_M = 1e-3
 
 
 def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
-    """The sweep at a frame, unbatched, and whether it holds the beams that did not return.
+    """Read the sweep at a frame, unbatched, and whether it includes the beams that did not return.
 
-    Returns of all lidars are taken together. Where points carry times, the origin of each beam is where the
-    sensor was at its own time, in the ego frame at the frame's time, to which the points are compensated.
+    The returns of all lidars are combined. If points have times, the origin of each beam is the position of
+    the sensor at the beam's own time. It is given in the ego frame at the frame's time, like the
+    motion-compensated points.
 
     Returns:
-        None if the log has no lidar at this frame.
+        The sweep and the flag, or None if the log has no lidar at this frame.
 
     Raises:
-        InputError: on a sweep that cannot be read.
+        InputError: the sweep cannot be read.
     """
     origins, misses = _recorded_beams(log, frame)
     parts = []
@@ -48,20 +49,20 @@ def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
 
 
 def _recorded_beams(log: Log, frame: int) -> tuple[Float[np.ndarray, "R 3"] | None, LidarSweep | None]:
-    """Beam origins of the returns and the misses, in logs that have them."""
+    """Return the beam origins of the returns, and the misses, from logs that store them."""
     with reading(log.file(f"custom.{LIDAR_BEAMS}"), f"the beams at frame {frame}"):
         beams = log.scene.get_custom_modality_at_iteration(log.iteration(frame), LIDAR_BEAMS)
         return unpack_beams(beams.data) if isinstance(beams, CustomModality) else (None, None)
 
 
 def concatenate(sweeps: list[LidarSweep]) -> LidarSweep:
-    """Several unbatched sweeps as one."""
+    """Concatenate unbatched sweeps."""
     names = ("origin_ego", "dir_ego", "range_m", "returned", "intensity", "dt_s", "beam", "valid")
     return LidarSweep(*(torch.cat([getattr(sweep, name) for sweep in sweeps]) for name in names))
 
 
 def empty_sweep() -> LidarSweep:
-    """A sweep of no beams."""
+    """Return a sweep without beams."""
     nothing = np.zeros((0, 3), dtype=np.float32)
     return _sweep(nothing, nothing, np.zeros(0), np.zeros(0), np.zeros(0))
 
@@ -73,7 +74,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
     dt_us = np.zeros(count)
     if lidar.timestamps is not None:
         since = lidar.timestamps - log.t_us[frame]
-        if (np.abs(since) <= _LONGEST_SWEEP_US).all():  # some data sets stamp points by another clock
+        if (np.abs(since) <= _LONGEST_SWEEP_US).all():  # some datasets use another clock for point times
             dt_us = since.astype(np.float64)
     if origins is None:
         origins = _origins(log, frame, lidar, dt_us)
@@ -87,7 +88,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
 
 
 def _origins(log: Log, frame: int, lidar: Lidar, dt_us: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
-    """Where each beam left its sensor, in the ego frame at the frame's time."""
+    """Return the sensor position of each beam at its time, in the ego frame at the frame's time."""
     sensors = lidar.lidar_metadatas
     ids = lidar.ids if lidar.ids is not None else np.full(len(dt_us), int(next(iter(sensors))))
     T_ego_imu = np.linalg.inv(log.T_imu_ego)
@@ -107,7 +108,7 @@ def _origins(log: Log, frame: int, lidar: Lidar, dt_us: Float[np.ndarray, "N"]) 
 def _sweep(
     ends: np.ndarray, origins: np.ndarray, intensity: np.ndarray, dt_s: np.ndarray, beam: np.ndarray
 ) -> LidarSweep:
-    """Beams from `origins` that returned at `ends`."""
+    """Return a sweep of beams from `origins` that returned at `ends`."""
     along = ends - origins
     range_m = np.linalg.norm(along, axis=-1)
     direction = along / np.maximum(range_m, _NEAREST_RETURN_M)[:, None]

@@ -1,4 +1,4 @@
-"""Where 123D logs lie. Nothing heavy is imported here, so that a wrong path is told at once."""
+"""Locations of 123D logs. This module has no heavy imports, so that a wrong path is reported at once."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,25 +12,27 @@ _SEARCH_DEPTH = 3
 
 @dataclass(frozen=True)
 class LogPath:
-    """Where a log lies, and the folder of the maps that go with it (it may not exist)."""
+    """Location of a log, and the folder of its maps (which may not exist)."""
 
     folder: Path
     maps_dir: Path
     parts_s: tuple[tuple[float, float], ...] = ()
-    """Which parts of it are meant, s since its start, ends left out; none: all of it."""
+    """Selected parts as (start, end) in s since the log's start, end exclusive. Empty means the whole log."""
 
     @property
     def name(self) -> str:
-        """split/name: unique within a data root."""
+        """Return split/name, which is unique within a data root."""
         return f"{self.folder.parent.name}/{self.folder.name}"
 
 
 def find_logs(path: Path) -> list[LogPath]:
-    """All 123D logs at `path`: a data root (with logs/SPLIT/NAME), a split's folder, one log's folder, or a
-    list of clips (`clip_list`), whose logs come with the parts that it names.
+    """Find all 123D logs at `path`.
+
+    The path is a data root (with logs/SPLIT/NAME), the folder of a split or of one log, or a clip list
+    (`clip_list`). A clip list gives its logs with the listed parts.
 
     Raises:
-        InputError: if there is none.
+        InputError: there is no log.
     """
     path = Path(path).absolute()
     if path.is_file():
@@ -44,12 +46,12 @@ def find_logs(path: Path) -> list[LogPath]:
 
 
 def find_all_logs(paths: Sequence[Path]) -> tuple[LogPath, ...]:
-    """The logs at several places, each once."""
+    """Return the logs at several paths, without duplicates."""
     return tuple({log.folder: log for path in paths for log in find_logs(path)}.values())
 
 
 def find_one_log(path: Path) -> LogPath:
-    """The log at `path`, where there is exactly one.
+    """Return the only log at `path`.
 
     Raises:
         InputError: there is none, or there are several.
@@ -71,7 +73,7 @@ def _listed_logs(path: Path) -> list[LogPath]:
 
 
 def _united(spans: list[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Spans in the order of time, those that touch as one."""
+    """Sort spans by time and merge those that touch."""
     out: list[tuple[float, float]] = []
     for start, end in sorted(spans):
         if out and start <= out[-1][1]:

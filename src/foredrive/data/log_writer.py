@@ -1,4 +1,4 @@
-"""Writing what was driven and sensed as a 123D log that py123d's own API and viewer open."""
+"""Writing of drives and their sensor data as 123D logs, which py123d's own API and viewer can open."""
 
 import contextlib
 import dataclasses
@@ -79,7 +79,7 @@ from foredrive.geometry.se3 import log_so3, matrix_from_yaw
 from foredrive.scene import Boxes, Category, LidarSweep, Trajectory, VoxelSpec
 
 DATASET = "foredrive"
-"""123D's data set name of all that is written here; maps lie at maps/foredrive/foredrive_LOCATION.arrow."""
+"""123D dataset name of all logs written here. Maps are at maps/foredrive/foredrive_LOCATION.arrow."""
 
 EGO_VEHICLE = EgoStateSE3Metadata(
     vehicle_name="carla_lincoln_mkz_2020",
@@ -90,7 +90,7 @@ EGO_VEHICLE = EgoStateSE3Metadata(
     center_to_imu_se3=PoseSE3(x=1.64855, y=0.0, z=1.49028 / 2, qw=1.0, qx=0.0, qy=0.0, qz=0.0),
     rear_axle_to_imu_se3=PoseSE3.identity(),
 )
-"""The recording vehicle: CARLA's Lincoln MKZ, its frame on the ground below the rear axle."""
+"""The recording vehicle: CARLA's Lincoln MKZ. Its frame is on the ground below the rear axle."""
 
 LABEL_OF_CATEGORY = {
     Category.CAR: Label.VEHICLE_CAR,
@@ -106,63 +106,63 @@ LABEL_OF_CATEGORY = {
     Category.BARRIER: Label.MOVABLE_OBJECT_BARRIER,
     Category.OTHER: Label.MOVABLE_OBJECT_DEBRIS,
 }
-"""nuScenes' labels, which keep every category apart and which py123d reads without Foredrive."""
+"""nuScenes labels. They distinguish all categories, and py123d can read them without Foredrive."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """All that was sensed at one time, with the exact labels."""
+    """Sensor data of one time, with the exact labels."""
 
     t_us: int
     T_world_ego: Float64[np.ndarray, "4 4"]
     velocity_ego_mps: Float[np.ndarray, "3"]
     acceleration_ego_mps2: Float[np.ndarray, "3"]
     images: dict[str, UInt8[np.ndarray, "_ _ 3"]]
-    """RGB by camera name; a camera may be missing."""
+    """RGB by camera name. A camera may be missing."""
     sweep: LidarSweep | None
-    """Unbatched, in the ego frame at `t_us`, misses included."""
+    """Unbatched, in the ego frame at `t_us`, with the misses."""
     boxes: Boxes
     """Unbatched, in the ego frame at `t_us`."""
     _: KW_ONLY
     occupancy: FullOccupancy | None = None
     lidar_points: Int[np.ndarray, "M"] | None = None
-    """Returns from each of `boxes`: 0 where it is hidden; None if they were not counted."""
+    """Number of returns from each of `boxes` (0 for a hidden one). None if not counted."""
     visibility: Float[np.ndarray, "M"] | None = None
-    """Share of each of `boxes` that the cameras see of what they would if nothing hid it, 0 to 1."""
+    """For each of `boxes`, the visible area relative to the area without occlusion, 0 to 1."""
     setting: Setting | None = None
     caption: str | None = None
     taught: Trajectory | None = None
-    """What a teacher would do from here, unbatched, in the ego frame at `t_us`."""
+    """Plan of the expert from here, unbatched, in the ego frame at `t_us`."""
     traffic_lights: dict[int, TrafficLightStatus] | None = None
-    """What the lights show, by the ids that the lanes behind their stop lines have in the log's map."""
+    """States of the traffic lights, by the map ids of the lanes behind their stop lines."""
     depth_m: dict[str, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
-    """Along the optical axis, by camera name; infinite for the sky."""
+    """Depth along the optical axis by camera name; infinite for the sky."""
     semantic: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
     """`DefaultCameraSegmentationLabel`s by camera name."""
     instance: dict[str, UInt16[np.ndarray, "_ _"]] = field(default_factory=dict)
-    """Track ids by camera name, 0 for what is in no box."""
+    """Track ids by camera name; 0 outside all boxes."""
     beam_semantic: UInt8[np.ndarray, "N"] | None = None
     """`DefaultLidarSegmentationLabel`s of the beams of `sweep`."""
     beam_instance: UInt16[np.ndarray, "N"] | None = None
-    """Track ids, likewise."""
+    """Track ids of the beams of `sweep`."""
 
 
 class LogWriter:
-    """Context manager that writes one log; it appears under its final name only on clean exit.
+    """A context manager that writes one log. The log gets its final name only on a clean exit.
 
-    The log lies at root/logs/SPLIT/NAME and replaces one of that name. The same input gives the same bytes.
+    The log is at root/logs/SPLIT/NAME and replaces a log of that name. The same input gives the same bytes.
 
     Args:
         root: 123D data root.
-        split: ends in _train, _val or _test, which py123d goes by.
-        cameras: specs of every camera that may appear in a frame, at most 11.
-        map_dir: root/maps with the map of `location` in it (`maps.write_map`); None: the log has no map.
-        location: town name, None if there is none.
-        route_xyz: the route to follow, world frame, m; None if there is none.
+        split: name that ends in _train, _val or _test, as py123d requires.
+        cameras: all cameras that may appear in a frame, at most 11.
+        map_dir: root/maps with the map of `location` (`maps.write_map`). None if the log has no map.
+        location: town name, or None.
+        route_xyz: route to follow, world frame, m, or None.
 
     Raises:
-        InputError: on a bad split, too many cameras, a missing map, a frame that does not fit, a NaN pose,
-            time that runs backwards, no frames at all.
+        InputError: the split is invalid, there are too many cameras, the map is missing, a frame does not
+            fit, a pose is NaN, time runs backwards, or there are no frames.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class LogWriter:
             os.replace(written, self._final)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame; times increase."""
+        """Append a frame. Times must increase."""
         if not np.isfinite(frame.T_world_ego).all():
             raise InputError(f"{self.folder}: the ego pose at {frame.t_us} µs is not finite")
         if self._previous is not None and frame.t_us <= self._previous.t_us:
@@ -272,7 +272,11 @@ class LogWriter:
             yield self._camera(frame, instance_metadata(self._declared(name, track_id)), track_id)
 
     def _declared(self, name: str, image: np.ndarray) -> PinholeCameraMetadata:
-        """The camera that an image is of."""
+        """Return the metadata of an image's camera.
+
+        Raises:
+            InputError: the camera was not declared, or the image has another size.
+        """
         if name not in self._cameras:
             raise InputError(f"{self.folder}: image of camera {name!r}, which was not declared")
         spec, metadata = self._cameras[name]
@@ -368,7 +372,7 @@ def _map_metadata(map_dir: Path | None, location: str | None) -> MapMetadata | N
 
 
 def _date_route_by(folder: Path, t_us: int) -> None:
-    """Date the route file by the log's own last time: py123d stamps it with the wall clock."""
+    """Set the date of the route file to the log's last time, because py123d writes the wall-clock time."""
     file = folder / f"{ROUTE_POSITION_KEY}.arrow"
     if not file.is_file():
         return

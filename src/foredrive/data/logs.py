@@ -1,4 +1,4 @@
-"""An opened 123D log: its key times, ego poses and what it holds."""
+"""An opened 123D log: times, ego poses and available modalities."""
 
 import functools
 from pathlib import Path
@@ -18,17 +18,17 @@ from foredrive.scene import Trajectory
 
 _EGO = ModalityType.EGO_STATE_SE3.serialize()
 _LONGEST_GAP_S = 1.0
-"""Ego poses further apart than this are not interpolated between."""
+"""Maximum time between ego poses for interpolation."""
 
 
 class Log:
-    """One opened log. Frames are the rows of its sync table that have an ego pose; picklable.
+    """One opened log, picklable. Frames are the rows of its sync table that have an ego pose.
 
-    The ego frame is Foredrive's: below the rear axle on the ground. 123D's vehicle box stands on the ground,
-    which therefore lies half its height below its centre.
+    The ego frame is that of Foredrive: on the ground below the rear axle. The bottom face of 123D's vehicle
+    box is on the ground, so the ground is half the box height below the box centre.
 
     Raises:
-        InputError: on a file that is not whole, a pose that is not finite, time that runs backwards.
+        InputError: a file is incomplete, a pose is not finite, or time runs backwards.
     """
 
     path: LogPath
@@ -36,9 +36,9 @@ class Log:
     """Time of each frame: that of its ego pose."""
     T_world_ego: Float64[np.ndarray, "F 4 4"]
     speed_mps: Float64[np.ndarray, "F"]
-    """Ego speed: as logged, else from the previous pose; NaN at a first frame without either."""
+    """Ego speed: as logged, else from the previous pose. NaN at a first frame without a logged speed."""
     period_s: float
-    """Median time between frames; 0 for a single frame."""
+    """Median time between frames, s. 0 for a single frame."""
 
     def __init__(self, path: LogPath) -> None:
         self.path = path
@@ -63,11 +63,11 @@ class Log:
         return len(self.t_us)
 
     def iteration(self, frame: int) -> int:
-        """py123d's iteration of a frame."""
+        """Return py123d's iteration of a frame."""
         return int(self._iterations[frame])
 
     def rows(self, modality_key: str) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
-        """The frames at which the log has a modality, and the rows of its table that hold it."""
+        """Return the frames at which the log has a modality, and the corresponding rows of its table."""
         table = get_sync_table(self.path.folder)
         if modality_key not in table.column_names:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -76,23 +76,23 @@ class Log:
         return frames, row[frames].astype(np.int64)
 
     def file(self, modality_key: str) -> Path:
-        """The file of a modality."""
+        """Return the file of a modality."""
         return self.path.folder / f"{modality_key}.arrow"
 
     @property
     def ego_box(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """Centre and length, width, height of the ego vehicle in the ego frame, m."""
+        """Return centre and size (length, width, height) of the ego vehicle in the ego frame, m."""
         T_ego_box = np.linalg.inv(self.T_imu_ego) @ self.vehicle.center_to_imu_se3.transformation_matrix
         return T_ego_box[:3, 3], np.array([self.vehicle.length, self.vehicle.width, self.vehicle.height])
 
     @functools.cached_property
     def fingerprint(self) -> tuple[tuple[str, int, int], ...]:
-        """Name, size and time of change of every file but the images: changes when the log does."""
+        """Return name, size and modification time of all files except images, to detect changes."""
         files = sorted(f for f in self.path.folder.glob("*.arrow") if not f.name.startswith("camera"))
         return tuple((str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files)
 
     def nearest_frames(self, t_us: Float64[np.ndarray, "*n"]) -> tuple[np.ndarray, np.ndarray]:
-        """The frame nearest to each time, and whether it is off by at most half the log's period."""
+        """Return the frame nearest to each time, and whether it is at most half the log's period away."""
         after = np.searchsorted(self.t_us, t_us).clip(1, max(len(self) - 1, 1))
         before = after - 1
         after = after.clip(0, len(self) - 1)
@@ -101,7 +101,7 @@ class Log:
         return frame, np.abs(self.t_us[frame] - t_us) <= tolerance_us
 
     def driven_future(self, frame: int, steps: int, dt_s: float) -> Trajectory:
-        """Where the ego vehicle went after `frame`, M = 1; steps beyond the log or in a gap are not valid."""
+        """Return the ego path after `frame`, M = 1. Steps beyond the log or in a gap are not valid."""
         t_us = self.t_us[frame] + np.arange(1, steps + 1) * dt_s * 1e6
         T_world, valid = self.poses_at(t_us)
         T = np.linalg.inv(self.T_world_ego[frame]) @ T_world
@@ -117,7 +117,7 @@ class Log:
     def path_of_point(
         self, point_ego: Float[np.ndarray, "3"], t_us: Float64[np.ndarray, "N"]
     ) -> Float64[np.ndarray, "N 3"]:
-        """World positions of a point fixed to the vehicle at any time; constant velocity beyond the log."""
+        """Return world positions of a vehicle-fixed point, with constant velocity beyond the log."""
         at = self._drive_t_us.astype(np.float64)
         xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
         if len(at) > 1:
@@ -128,9 +128,10 @@ class Log:
     def poses_at(
         self, t_us: Float64[np.ndarray, "N"]
     ) -> tuple[Float64[np.ndarray, "N 4 4"], Bool[np.ndarray, "N"]]:
-        """`T_world_ego` at any times, interpolated, and whether the log has poses close before and after.
+        """Return interpolated `T_world_ego` at any times, and whether they are valid.
 
-        Before and after the log the vehicle stands still.
+        A pose is valid if the log has close poses before and after it. The vehicle stands still before and
+        after the log.
         """
         at, T = self._drive_t_us, self._drive_T
         if len(at) < 2 or len(t_us) == 0:
@@ -149,7 +150,7 @@ class Log:
         return out, valid
 
     def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN: none) of all ego states."""
+        """Return times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN if missing) of all ego states."""
         file = self.file(_EGO)
         with reading(file, "the ego states"):
             table = get_modality_table(self.path.folder, _EGO)
@@ -167,7 +168,7 @@ class Log:
         return t_us, T_world_imu @ self.T_imu_ego, np.linalg.norm(velocity, axis=-1)
 
     def _read_sync(self, ego_t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sync rows that have an ego pose, and the rows of those poses."""
+        """Return the sync rows that have an ego pose, and the rows of those poses."""
         file = self.path.folder / "sync.arrow"
         with reading(file, "the frames"):
             table = get_sync_table(self.path.folder)
@@ -195,7 +196,10 @@ def _speed(
     t_us: Int64[np.ndarray, "F"],
     T_world_ego: Float64[np.ndarray, "F 4 4"],
 ) -> Float64[np.ndarray, "F"]:
-    """The logged speed, else the distance from the previous frame: what comes after must not leak in."""
+    """Return the logged speed, else the mean speed since the previous frame, m/s.
+
+    Later frames are not used, so that no future information leaks in.
+    """
     step_m = np.linalg.norm(np.diff(T_world_ego[:, :3, 3], axis=0), axis=-1)
     past_mps = np.concatenate([[np.nan], step_m / (np.diff(t_us) * 1e-6)])
     return np.where(np.isfinite(logged_mps), logged_mps, past_mps)

@@ -1,4 +1,4 @@
-"""123D maps: the piece around the ego vehicle as polylines, and writing a map once for many logs."""
+"""123D maps: the patch around the ego vehicle as polylines, and writing of maps shared by logs."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ from foredrive.scene import MapKind, MapPatch
 
 RADIUS_M = 60.0
 VERTICES = 32
-"""Longer polylines are cut into pieces that share an end."""
+"""Maximum number of vertices. Longer polylines are cut into pieces that share an end."""
 
 _OUTLINE_KIND = {
     MapLayer.CROSSWALK: MapKind.CROSSWALK,
@@ -36,10 +36,10 @@ _OUTLINE_KIND = {
 
 
 def read_map_patch(log: Log, frame: int) -> MapPatch:
-    """The map within RADIUS_M of the ego vehicle at a frame, unbatched; no polylines where there is no map.
+    """Read the map within RADIUS_M of the ego vehicle at a frame, unbatched. Without a map it is empty.
 
     Raises:
-        InputError: on a map that cannot be read.
+        InputError: the map cannot be read.
     """
     T_world_ego = log.T_world_ego[frame]
     pieces: list[tuple[MapKind, np.ndarray]] = []
@@ -67,10 +67,12 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
 
 
 def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "V 2"]] | None:
-    """Outlines of the lanes within RADIUS_M of where the ego vehicle drove, world frame; None without a map.
+    """Read the outlines of the lanes around the driven path, world frame. Return None without a map.
+
+    The lanes are those within a circle around the whole path, enlarged by RADIUS_M.
 
     Raises:
-        InputError: on a map that cannot be read.
+        InputError: the map cannot be read.
     """
     driven = log.T_world_ego[:, :2, 3]
     middle = 0.5 * (driven.min(axis=0) + driven.max(axis=0))
@@ -86,10 +88,10 @@ def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "V 2"]] | None:
 
 
 def write_map(objects: Iterable[BaseMapObject], location: str, root: Path) -> Path:
-    """Write a map that all logs of `location` in the data root share, once; it has heights.
+    """Write a map with heights, unless it exists. All logs of `location` in the data root share it.
 
     Returns:
-        the folder to hand to `LogWriter` as `map_dir`.
+        The folder for the argument `map_dir` of `LogWriter`.
     """
     maps_dir = Path(root) / "maps"
     final = maps_dir / DATASET / f"{DATASET}_{location}.arrow"
@@ -122,6 +124,6 @@ def _points(line: Polyline2D | Polyline3D) -> Float64[np.ndarray, "V D"]:
 
 
 def _pieces(line: Float64[np.ndarray, "V 3"]) -> list[Float64[np.ndarray, "v 3"]]:
-    """Cut to VERTICES, and keep what comes within RADIUS_M."""
+    """Cut a line into pieces of at most VERTICES, and keep those that come within RADIUS_M."""
     cuts = [line[start : start + VERTICES] for start in range(0, max(len(line) - 1, 1), VERTICES - 1)]
     return [piece for piece in cuts if (np.linalg.norm(piece[:, :2], axis=-1) <= RADIUS_M).any()]

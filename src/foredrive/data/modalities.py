@@ -1,8 +1,8 @@
-"""What Foredrive adds to 123D's modalities: beams that did not return, exact occupancy, visibility,
-settings, captions, what a teacher would do.
+"""Foredrive's additions to 123D's modalities.
 
-All travel as 123D custom modalities, one row a frame; arrays are zstd-compressed one by one, so that a row
-can be read without touching its neighbours.
+They are beams that did not return, exact occupancy, visibility, settings, captions and the plans of an
+expert. All are stored as 123D custom modalities with one row per frame. Each array is compressed separately
+with zstd, so that a row can be read without its neighbours.
 """
 
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ LIDAR_BEAMS = "lidar_beams"
 FULL_OCCUPANCY = "full_occupancy"
 BOX_VISIBILITY = "box_visibility"
 SETTING = "setting"
-"""The facts of `data.setting.Setting`, words and numbers by their names."""
+"""The facts of `data.setting.Setting`: words and numbers by field name."""
 CAPTION = "caption"
-"""One text a frame."""
+"""One text per frame."""
 TAUGHT_PLAN = "taught_plan"
-"""What a teacher would do from here."""
+"""The plan of the expert from the frame on."""
 
 _ORIGIN_STEP_M = 1e-4
 _DIRECTION_STEP = 1 / 32767
@@ -33,20 +33,20 @@ _DIRECTION_STEP = 1 / 32767
 
 @dataclass(frozen=True)
 class FullOccupancy:
-    """Every occupied voxel of a frame, seen or not, with what it holds and how that moves."""
+    """All occupied voxels of a frame, observed or not, with category and velocity."""
 
     spec: VoxelSpec
     index_zyx: Int[np.ndarray, "K 3"]
     category: Int[np.ndarray, "K"]
-    """A `Category`; below 0 for the static world (a town says what it is: -1 minus its `Surface`)."""
+    """A `Category`, or a negative number for the static world (in towns: -1 minus the `Surface`)."""
     velocity_mps: Float[np.ndarray, "K 3"]
     """Velocity over ground in the ego axes of the frame."""
 
 
 def pack_beams(sweep: LidarSweep) -> dict[str, Any]:
-    """What 123D's lidar modality has no room for: the origin of each return, and the misses.
+    """Pack the beam data that 123D's lidar modality lacks: the origin of each return, and the misses.
 
-    Directions are kept to 3e-5 rad, origins to 0.1 mm, times to 1 µs.
+    The resolution is 3e-5 rad for directions, 0.1 mm for origins and 1 µs for times.
     """
     returned = (sweep.valid & sweep.returned).numpy()
     missed = (sweep.valid & ~sweep.returned).numpy()
@@ -72,7 +72,7 @@ def pack_beams(sweep: LidarSweep) -> dict[str, Any]:
 
 
 def unpack_beams(data: dict[str, Any]) -> tuple[Float[np.ndarray, "R 3"], LidarSweep]:
-    """Origins of the returns in the order of the lidar modality's points (m, ego frame), and the misses."""
+    """Return the origins of the returns (m, ego frame, in the order of the lidar's points) and the misses."""
     origins = expand_array(data["origin_steps"]).reshape(-1, 3).astype(np.float32) * np.float32(
         _ORIGIN_STEP_M
     )
@@ -93,13 +93,13 @@ def unpack_beams(data: dict[str, Any]) -> tuple[Float[np.ndarray, "R 3"], LidarS
 
 
 def occupancy_metadata(spec: VoxelSpec) -> CustomModalityMetadata:
-    """Metadata of a log's full occupancy: the grid, the same for all of its frames."""
+    """Return metadata of the full occupancy: the grid, constant within a log."""
     grid = {"lower_m": list(spec.lower_m), "voxel_m": spec.voxel_m, "shape_zyx": list(spec.shape_zyx)}
     return CustomModalityMetadata(FULL_OCCUPANCY, grid)
 
 
 def pack_occupancy(occupancy: FullOccupancy) -> dict[str, Any]:
-    """Sparse voxels, sorted; velocities are kept to half precision (5 mm/s at 10 m/s)."""
+    """Pack occupancy as sorted sparse voxels. Velocities have half precision (5 mm/s at 10 m/s)."""
     flat = np.ravel_multi_index(tuple(occupancy.index_zyx.T), occupancy.spec.shape_zyx)
     order = np.argsort(flat, kind="stable")
     return {
@@ -110,7 +110,7 @@ def pack_occupancy(occupancy: FullOccupancy) -> dict[str, Any]:
 
 
 def unpack_occupancy(data: dict[str, Any], metadata: CustomModalityMetadata) -> FullOccupancy:
-    """Inverse of `pack_occupancy`; voxels come in the order of their flat index."""
+    """Invert `pack_occupancy`. Voxels are in the order of their flat index."""
     grid = metadata.metadata
     spec = VoxelSpec(tuple(grid["lower_m"]), grid["voxel_m"], tuple(grid["shape_zyx"]))
     flat = np.cumsum(expand_array(data["voxel_step"]), dtype=np.int64)
@@ -123,23 +123,23 @@ def unpack_occupancy(data: dict[str, Any], metadata: CustomModalityMetadata) -> 
 
 
 def pack_visibility(visibility: Float[np.ndarray, "M"]) -> dict[str, Any]:
-    """Visibilities in the order of the frame's boxes, kept to .0005."""
+    """Pack visibilities in the order of the frame's boxes, with a precision of 0.0005."""
     return {"visibility": squeeze_array(visibility.astype(np.float16))}
 
 
 def unpack_visibility(data: dict[str, Any]) -> Float[np.ndarray, "M"]:
-    """Inverse of `pack_visibility`."""
+    """Invert `pack_visibility`."""
     return expand_array(data["visibility"]).astype(np.float32)
 
 
 def pack_plan(plan: Trajectory) -> dict[str, Any]:
-    """A plan of one alternative, waypoints kept to the millimetre."""
+    """Pack a plan of one alternative, with waypoints in whole millimetres."""
     xy_mm = np.round(plan.xy[0].double().numpy() * 1e3).astype(np.int32)
     return {"xy_mm": squeeze_array(xy_mm), "yaw": squeeze_array(plan.yaw[0].numpy()), "dt_s": plan.dt_s}
 
 
 def unpack_plan(data: dict[str, Any]) -> Trajectory:
-    """Inverse of `pack_plan`, unbatched."""
+    """Invert `pack_plan`. The result is unbatched."""
     xy = torch.from_numpy(expand_array(data["xy_mm"]).astype(np.float32) * np.float32(1e-3))[None]
     return Trajectory(
         xy=xy,
@@ -151,14 +151,14 @@ def unpack_plan(data: dict[str, Any]) -> Trajectory:
 
 
 def squeeze_array(array: np.ndarray) -> dict[str, Any]:
-    """An array as plain values that msgpack can hold, zstd-compressed."""
+    """Pack an array as zstd-compressed plain values that msgpack can store."""
     data = np.ascontiguousarray(array).tobytes()
     packed = pa.compress(data, codec="zstd", asbytes=True) if data else b""
     return {"zstd": packed, "dtype": array.dtype.str, "shape": list(array.shape)}
 
 
 def expand_array(packed: dict[str, Any]) -> np.ndarray:
-    """Inverse of `squeeze_array`; the result is read-only."""
+    """Invert `squeeze_array`. The result is read-only."""
     dtype, shape = np.dtype(packed["dtype"]), packed["shape"]
     size = dtype.itemsize * int(np.prod(shape))
     data = pa.decompress(packed["zstd"], decompressed_size=size, codec="zstd", asbytes=True) if size else b""

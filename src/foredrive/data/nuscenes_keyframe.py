@@ -1,8 +1,8 @@
-"""A 123D parser for single nuScenes key frames without the data set around them.
+"""A 123D parser for single nuScenes key frames without the rest of the dataset.
 
-py123d's own parser needs all of nuScenes' tables and the devkit. This one reads a folder with the sensor
-files of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in a file of infos as
-mmdetection3d writes it (*.pkl).
+py123d's own parser needs all nuScenes tables and the devkit. This parser reads a folder with the sensor files
+of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in an info file of
+mmdetection3d (*.pkl).
 """
 
 import json
@@ -41,10 +41,10 @@ from foredrive.scene import Category
 
 
 class NuScenesKeyframeParser(BaseLogParser):
-    """One key frame as a log of one frame.
+    """Parser of one key frame as a log of one frame.
 
     Args:
-        folder: holds v1.0-*/ with the tables, the info file and the sensor files by their bare names.
+        folder: contains v1.0-*/ with the tables, the info file, and the sensor files by their bare names.
         split: 123D split, e.g. nuscenes_val.
     """
 
@@ -55,11 +55,11 @@ class NuScenesKeyframeParser(BaseLogParser):
         self._rows = {file.stem: json.loads(file.read_text()) for file in tables.glob("*.json")}
 
     def get_log_metadata(self) -> LogMetadata:
-        """The scene's name; the location is in a table that the folder does not have."""
+        """Return the log's metadata with the scene's name. The folder has no table with the location."""
         return LogMetadata("nuscenes", self._split, self._rows["scene"][0]["name"], location=None)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """The frame: ego pose at the lidar's time, boxes, lidar and six cameras."""
+        """Yield the frame: ego pose at the lidar's time, boxes, lidar and six cameras."""
         by_channel = {self._channel(row): row for row in self._rows["sample_data"]}
         lidar = by_channel["LIDAR_TOP"]
         timestamp = Timestamp.from_us(lidar["timestamp"])
@@ -86,7 +86,7 @@ class NuScenesKeyframeParser(BaseLogParser):
         names = {number: name for name, number in info["metainfo"]["categories"].items()}
         detections = []
         for track, instance in enumerate(info["data_list"][0]["instances"]):
-            *values, yaw = (float(value) for value in instance["bbox_3d"])  # lidar frame, z is the centre's
+            *values, yaw = (float(value) for value in instance["bbox_3d"])  # lidar frame, z of the centre
             T = T_world_lidar @ _yaw_matrix(yaw, values[:3])
             velocity = T_world_lidar[:3, :3] @ [*(float(v) for v in instance["velocity"]), 0.0]
             name = names.get(instance["bbox_label_3d"], "other")

@@ -1,8 +1,8 @@
-"""PandaSet as py123d reads it, but without running what its pickles say.
+"""py123d's PandaSet parser, with a safe reader of its pickle files.
 
-Raw PandaSet keeps sweeps, cuboids and semantic labels as gzipped pickles of tables. py123d opens all of them
-with one function, which unpickles freely: to convert a log, or to open one that refers to raw sweeps, would
-run whatever the files ask for. That function is replaced here, for all of py123d.
+Raw PandaSet stores sweeps, cuboids and semantic labels as gzipped pickles of tables. py123d opens all of them
+with one unrestricted unpickling function. Converting a log, or opening one that refers to raw sweeps, could
+thus run any code in the files. This module replaces that function for all of py123d.
 """
 
 from py123d.parser.pandaset import pandaset_parser, pandaset_sensor_io

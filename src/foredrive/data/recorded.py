@@ -1,4 +1,4 @@
-"""Exact labels of recordings: what they carry beyond 123D's own modalities, and what traffic lights show."""
+"""Exact labels of recordings beyond 123D's own modalities, and states of traffic lights."""
 
 from jaxtyping import Float
 from py123d.datatypes import ModalityType, TrafficLightStatus
@@ -23,10 +23,10 @@ from foredrive.scene import Trajectory
 
 
 def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
-    """How much of each box of `read_boxes` the cameras see, 0 to 1; None if it was not recorded.
+    """Read the visible share of each box of `read_boxes`, 0 to 1. Return None if it was not recorded.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     with reading(log.file(f"custom.{BOX_VISIBILITY}"), f"the visibility at frame {frame}"):
         row = _row(log, frame, BOX_VISIBILITY)
@@ -34,10 +34,10 @@ def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
 
 
 def read_setting(log: Log, frame: int) -> Setting | None:
-    """Return the facts of a frame; None if they were not recorded.
+    """Read the setting of a frame. Return None if it was not recorded.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     with reading(log.file(f"custom.{SETTING}"), f"the setting at frame {frame}"):
         row = _row(log, frame, SETTING)
@@ -45,10 +45,10 @@ def read_setting(log: Log, frame: int) -> Setting | None:
 
 
 def read_caption(log: Log, frame: int) -> str | None:
-    """What the cameras see in plain English; None if it was not recorded.
+    """Read the English caption of the camera images. Return None if it was not recorded.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     with reading(log.file(f"custom.{CAPTION}"), f"the caption at frame {frame}"):
         row = _row(log, frame, CAPTION)
@@ -56,10 +56,10 @@ def read_caption(log: Log, frame: int) -> str | None:
 
 
 def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
-    """Every occupied voxel, seen or not, in the frame's ego frame; None if it was not recorded.
+    """Read all occupied voxels, observed or not, in the frame's ego frame. Return None if not recorded.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     with reading(log.file(f"custom.{FULL_OCCUPANCY}"), f"the occupancy at frame {frame}"):
         row = _row(log, frame, FULL_OCCUPANCY)
@@ -67,10 +67,10 @@ def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
 
 
 def read_taught_plan(log: Log, frame: int) -> Trajectory | None:
-    """What the teacher would do from a frame on, unbatched, in its ego frame; None if nobody was asked.
+    """Read the expert's plan from a frame on, unbatched, in its ego frame. Return None if there is none.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     with reading(log.file(f"custom.{TAUGHT_PLAN}"), f"the taught plan at frame {frame}"):
         row = _row(log, frame, TAUGHT_PLAN)
@@ -78,10 +78,10 @@ def read_taught_plan(log: Log, frame: int) -> Trajectory | None:
 
 
 def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] | None:
-    """What lights show, by the map's id of each lane that begins behind one; None if the log does not tell.
+    """Read the states of traffic lights by the map id of the lanes behind them. Return None if not logged.
 
     Raises:
-        InputError: on a row that cannot be read.
+        InputError: the row cannot be read.
     """
     file = log.file(ModalityType.TRAFFIC_LIGHT_DETECTIONS.serialize())
     with reading(file, f"the traffic lights at frame {frame}"):

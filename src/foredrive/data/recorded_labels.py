@@ -1,4 +1,4 @@
-"""Voxel labels from the exact occupancy that a recording carries, on any grid."""
+"""Voxel labels from recorded exact occupancy, resampled to any grid."""
 
 import numpy as np
 import torch
@@ -13,24 +13,24 @@ from foredrive.scene import VoxelSpec
 
 NOTHING = -1
 SLACK = 1e-4
-"""Of a voxel: borders this close to each other coincide."""
+"""Tolerance in voxels within which two borders coincide."""
 
 
 def check_recorded_occupancy(log: Log) -> None:
-    """The log must carry its exact occupancy.
+    """Check that the log has recorded occupancy.
 
     Raises:
-        InputError: it does not.
+        InputError: it has none.
     """
     if not log.file(f"custom.{FULL_OCCUPANCY}").is_file():
         raise InputError(f"{log.path.folder}: no recorded occupancy; take its labels from lidar")
 
 
 def recorded_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
-    """Labels of one frame, of all of space and not of what lidar has seen of it.
+    """Return the labels of one frame for the whole space, not only for the part that lidar has observed.
 
     Raises:
-        InputError: the frame has no recorded occupancy, or one that cannot be read.
+        InputError: the frame has no recorded occupancy, or it cannot be read.
     """
     recorded = read_occupancy(log, frame)
     if recorded is None:
@@ -39,17 +39,17 @@ def recorded_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
 
 
 def resampled_labels(recorded: FullOccupancy, spec: VoxelSpec) -> VoxelLabels:
-    """Recorded occupancy on another grid of the same ego frame.
+    """Resample recorded occupancy to another grid of the same ego frame.
 
-    A voxel is occupied if the middle of an occupied recorded voxel lies in it, or its own middle lies in one.
-    Where the grids coincide, or one's voxels are made of whole ones of the other, that is exactly what holds
-    matter; elsewhere surfaces are off by up to half a recorded voxel. A voxel moves as the fastest of what it
-    holds. All voxels are known that lie within the recorded grid; what lies under the ground, which is a
-    surface, is free.
+    A voxel is occupied if it contains the centre of an occupied recorded voxel, or if its own centre is in
+    one. The result is exact if the grids coincide, or if the voxels of one consist of whole voxels of the
+    other. Otherwise surfaces are displaced by up to half a recorded voxel. A voxel has the largest velocity
+    of its content. All voxels inside the recorded grid are known. Voxels under the ground are free, because
+    the ground is a surface.
     """
     fastest_last = np.argsort((recorded.velocity_mps**2).sum(axis=-1), kind="stable")
     index, velocity = recorded.index_zyx[fastest_last], recorded.velocity_mps[fastest_last]
-    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)  # a layer more, for what lies beyond
+    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)  # one more layer, for indices outside
     which[tuple(index.T)] = np.arange(len(index))
     held = which[np.ix_(*_voxels_at_middles(spec, recorded.spec))]
     middles = _voxels_at_middles(recorded.spec, spec)
@@ -70,7 +70,7 @@ def resampled_labels(recorded: FullOccupancy, spec: VoxelSpec) -> VoxelLabels:
 
 
 def _voxels_at_middles(spec: VoxelSpec, grid: VoxelSpec) -> list[Int[np.ndarray, "_"]]:
-    """Along z, y and x: which of the grid's layers the middle of each of the spec's lies in, -1 beyond it."""
+    """Return, along z, y and x, the layer of `grid` at the centre of each layer of `spec`; -1 if outside."""
     found = []
     for axis, count in enumerate(spec.shape_zyx):
         middle_m = spec.lower_m[2 - axis] + (np.arange(count) + 0.5) * spec.voxel_m
@@ -80,7 +80,7 @@ def _voxels_at_middles(spec: VoxelSpec, grid: VoxelSpec) -> list[Int[np.ndarray,
 
 
 def _within(spec: VoxelSpec, grid: VoxelSpec) -> Bool[np.ndarray, "Z Y X"]:
-    """Voxels of the spec that lie wholly within the grid."""
+    """Return the voxels of `spec` that are completely inside `grid`."""
     slack_m = SLACK * grid.voxel_m
     along = []
     for axis, count in enumerate(spec.shape_zyx):

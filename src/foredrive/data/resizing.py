@@ -1,4 +1,4 @@
-"""Images of a clip at another size, as data sets read them from logs."""
+"""Resizing of the images of a clip, in the same way as datasets read them from logs."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from foredrive.scene import Clip
 
 
 def shrink_images(clip: Clip, image_hw: tuple[int, int]) -> Clip:
-    """The clip with its images resized, intrinsics with them; antialiased as in `read_camera`."""
+    """Return the clip with resized images and matching intrinsics, antialiased as in `read_camera`."""
     height, width = clip.rig.size_hw
     if (height, width) == image_hw:
         return clip

@@ -1,4 +1,4 @@
-"""All cameras of a log at some of its frames: images and the rig that took them."""
+"""All cameras of a log at some of its frames: images and camera rig."""
 
 from collections.abc import Collection, Sequence
 
@@ -20,18 +20,18 @@ def read_rig(
     store: ImageStore,
     with_images: Collection[int],
 ) -> tuple[UInt8[Tensor, "T C 3 H W"], Bool[Tensor, "T C"], CameraRig]:
-    """Images, which of them are there, and the rig; a camera that the log lacks has identity matrices.
+    """Read images, their validity, and the rig. A camera that the log lacks has identity matrices.
 
     Args:
-        log: that is read.
-        frames: T of its frames.
-        cameras: C of its cameras; None for one that it lacks.
-        names: C names for them.
-        store: reads the images and says their size.
-        with_images: those of `frames` whose images are wanted.
+        log: the log to read.
+        frames: T frames of the log.
+        cameras: C cameras of the log; None for a missing one.
+        names: C camera names.
+        store: reader of the images; it sets their size.
+        with_images: the frames whose images are read.
 
     Raises:
-        InputError: on an image or a pose that cannot be read.
+        InputError: an image or a pose cannot be read.
     """
     shape = (len(frames), len(names))
     images = torch.zeros(*shape, 3, *store.image_hw, dtype=torch.uint8)

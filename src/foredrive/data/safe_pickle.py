@@ -1,4 +1,4 @@
-"""Reading pickles from outside without running what they say."""
+"""Reading of untrusted pickles without running their code."""
 
 import gzip
 import importlib
@@ -20,11 +20,11 @@ _PLAIN = {
     ("numpy._core.numeric", "_frombuffer"),
     ("_codecs", "encode"),
 }
-"""What arrays and numbers are made of; plain containers need nothing."""
+"""Names that pickles of arrays and numbers need. Plain containers need none."""
 
 _TABLE = _PLAIN | {
     ("builtins", "slice"),
-    ("pandas", "DataFrame"),  # pandas 3; until then by the module that defines it
+    ("pandas", "DataFrame"),  # pandas 3; earlier versions name the defining module
     ("pandas", "Index"),
     ("pandas", "RangeIndex"),
     ("pandas.core.frame", "DataFrame"),
@@ -34,7 +34,7 @@ _TABLE = _PLAIN | {
     ("pandas.core.indexes.base", "_new_Index"),
     ("pandas.core.indexes.range", "RangeIndex"),
 }
-"""What a pandas table of numbers and strings is made of besides."""
+"""Names that a pickled pandas table of numbers and strings needs in addition."""
 
 
 class _Unpickler(pickle.Unpickler):
@@ -50,19 +50,19 @@ class _Unpickler(pickle.Unpickler):
 
 
 def load_pickle(file: Path) -> Any:
-    """Load a pickle that holds nothing but containers, numbers, strings and numpy arrays.
+    """Load a pickle of containers, numbers, strings and numpy arrays only.
 
     Raises:
-        InputError: if it holds anything else or is damaged.
+        InputError: the file contains anything else, or it is damaged.
     """
     return _load(file, open, _PLAIN)
 
 
 def load_table(file: Path) -> pd.DataFrame:
-    """Load a gzipped pickle that holds one pandas table of numbers and strings.
+    """Load a gzipped pickle of one pandas table of numbers and strings.
 
     Raises:
-        InputError: if it holds anything else or is damaged.
+        InputError: the file contains anything else, or it is damaged.
     """
     table = _load(file, gzip.open, _TABLE)
     if not isinstance(table, pd.DataFrame):
@@ -75,7 +75,7 @@ def _load(file: Path, opened: Callable[..., Any], allowed: set[tuple[str, str]])
         with opened(file, "rb") as source, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="dtype.*align")  # written by an older numpy
             return _Unpickler(source, allowed).load()
-    except Exception as error:  # a damaged pickle can raise anything
+    except Exception as error:  # a damaged pickle can raise any error
         raise InputError(f"{file}: cannot read it as a pickle of plain data: {_first_line(error)}") from error
 
 

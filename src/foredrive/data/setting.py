@@ -1,4 +1,4 @@
-"""The setting of a recorded frame: when, in what weather, where, and what the vehicle does."""
+"""The setting of a recorded frame: time, weather, place, and behaviour of the vehicle."""
 
 import dataclasses
 import enum
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class TimeOfDay(enum.StrEnum):
-    """By the sun."""
+    """Time of day by the position of the sun."""
 
     NIGHT = "night"
     DAWN = "dawn"
@@ -18,7 +18,7 @@ class TimeOfDay(enum.StrEnum):
 
 
 class Weather(enum.StrEnum):
-    """Rain comes before fog, fog before the state of the sky."""
+    """Weather. Rain has priority over fog, and fog over the state of the sky."""
 
     CLEAR = "clear"
     CLOUDY = "cloudy"
@@ -28,7 +28,7 @@ class Weather(enum.StrEnum):
 
 
 class Place(enum.StrEnum):
-    """Where the vehicle is."""
+    """Type of place of the vehicle."""
 
     STREET = "street"
     JUNCTION = "junction"
@@ -57,7 +57,7 @@ class ObjectKind(enum.StrEnum):
 
 
 class Doing(enum.StrEnum):
-    """What the vehicle does."""
+    """Behaviour of the vehicle."""
 
     DRIVES = "drives"
     TURNS_LEFT = "turns left"
@@ -71,7 +71,7 @@ class Doing(enum.StrEnum):
 
 
 class LightColour(enum.StrEnum):
-    """What a traffic light shows."""
+    """Colour of a traffic light."""
 
     RED = "red"
     YELLOW = "yellow"
@@ -80,7 +80,7 @@ class LightColour(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Setting:
-    """Facts of one frame that are not in its boxes."""
+    """Facts of one frame, in addition to its boxes."""
 
     time_of_day: TimeOfDay
     weather: Weather
@@ -88,22 +88,22 @@ class Setting:
     doing: Doing
     speed_mps: float
     leader: ObjectKind | None
-    """The vehicle right ahead on the same way, if one is seen."""
+    """Type of the visible vehicle directly ahead on the same route. None if there is none."""
     light: LightColour | None
-    """Of the vehicle's own traffic light, if it is in view."""
+    """Colour of the vehicle's own traffic light. None if it is not in view."""
     hour: float
     """Solar time, 0 to 24."""
     clouds: float
-    """Share of the sky."""
+    """Cloud cover, share of the sky."""
     rain_mmph: float
     wetness: float
-    """Of the ground, 0 dry to 1 under water."""
+    """Wetness of the ground: 0 is dry, 1 is under water."""
     visibility_m: float
-    """Meteorological range; fog is below 1000 m."""
+    """Meteorological visibility. Fog is below 1000 m."""
 
 
 def pack_setting(setting: Setting) -> dict[str, Any]:
-    """Return plain words and numbers by the names of the fields."""
+    """Return plain words and numbers by field name."""
     facts = dataclasses.asdict(setting)
     return {name: fact.value if isinstance(fact, enum.Enum) else fact for name, fact in facts.items()}
 
@@ -113,7 +113,7 @@ def unpack_setting(data: dict[str, Any]) -> Setting:
 
     Raises:
         KeyError: a field is missing.
-        ValueError: a word is none of those that its field may hold, or a number is none.
+        ValueError: a word is not valid for its field, or a value is not a number.
     """
     leader, light = data["leader"], data["light"]
     return Setting(

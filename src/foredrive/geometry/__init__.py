@@ -1,1 +1,1 @@
-"""Pure tensor maths: rigid motions, projection, boxes, voxel indices. Frames as in docs/conventions.md."""
+"""Tensor maths: rigid motions, projection and boxes. The frames are defined in docs/conventions.md."""

@@ -1,4 +1,4 @@
-"""Upright 3-D boxes: centre, length-width-height, yaw."""
+"""Upright 3-D boxes, given by centre, size (length, width, height) and yaw."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,13 +9,16 @@ _SIGNS = torch.tensor(
     dtype=torch.float32,
 )
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-"""Pairs of `box_corners` that a wire frame joins."""
+"""Pairs of corner indices of `box_corners`: the 12 edges of a wireframe box."""
 
 
 def box_corners(
     centre: Float[Tensor, "*b 3"], size_lwh: Float[Tensor, "*b 3"], yaw: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 8 3"]:
-    """Corners: bottom face front-left, front-right, rear-right, rear-left, then the top face."""
+    """Return the eight corners, m.
+
+    The order is front-left, front-right, rear-right, rear-left of the bottom face, then of the top face.
+    """
     local = 0.5 * _SIGNS.to(centre) * size_lwh[..., None, :]
     cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
     x = cos * local[..., 0] - sin * local[..., 1]
@@ -29,7 +32,7 @@ def points_in_boxes(
     size_lwh: Float[Tensor, "M 3"],
     yaw: Float[Tensor, "M"],
 ) -> Bool[Tensor, "N M"]:
-    """Whether each point lies inside (or on) each box."""
+    """Return whether each point lies inside or on the surface of each box."""
     offset = points[:, None] - centre  # [N, M, 3]
     cos, sin = yaw.cos(), yaw.sin()
     along = cos * offset[..., 0] + sin * offset[..., 1]

@@ -9,7 +9,7 @@ UNDISTORT_ITERATIONS = 10
 
 
 def distort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
-    """Apply k1 k2 p1 p2 k3 to normalised image coordinates (x/z, y/z)."""
+    """Apply the distortion k1 k2 p1 p2 k3 to normalised image coordinates (x/z, y/z)."""
     k1, k2, p1, p2, k3 = (d[..., None] for d in dist.unbind(-1))
     x, y = xy.unbind(-1)
     r2 = x * x + y * y
@@ -24,12 +24,12 @@ def distort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[T
 
 
 def distortion_jacobian(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 3"]:
-    """The Jacobian of `distort` at normalised image coordinates: its entries xx, xy = yx and yy."""
+    """Return the Jacobian of `distort` at normalised image coordinates: its entries xx, xy = yx and yy."""
     k1, k2, p1, p2, k3 = (d[..., None] for d in dist.unbind(-1))
     x, y = xy.unbind(-1)
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # of radial over r2, twice
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # 2 · d(radial)/d(r2)
     return torch.stack(
         [
             radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
@@ -41,7 +41,7 @@ def distortion_jacobian(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]
 
 
 def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
-    """Inverse of `distort`, by fixed-point iteration; accurate where the distortion is invertible."""
+    """Invert `distort` by fixed-point iteration. It is accurate where the distortion is invertible."""
     if _is_ideal(dist):
         return xy
     out = xy
@@ -51,7 +51,10 @@ def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float
 
 
 def _is_ideal(dist: Float[Tensor, "*b 5"]) -> bool:
-    """Whether there is no distortion to compute; what is traced has to hold for any, so there always is."""
+    """Return whether the distortion is zero, so that it can be skipped.
+
+    Return False during tracing, because a traced graph must also work for cameras with distortion.
+    """
     return not torch.compiler.is_compiling() and not bool(dist.any())
 
 
@@ -64,9 +67,10 @@ def project(
     """Project points in the camera frame.
 
     Returns:
-        pixel coordinates u, v (px); depth z (m); whether the point is in front of the camera and inside the
-        image. Points far outside the field of view are rejected before distortion, whose polynomial would
-        fold them back into the image.
+        Pixel coordinates u, v (px).
+        Depth z (m).
+        Whether the point is in front of the camera and inside the image. Points far outside the field of view
+        are rejected before distortion, because the distortion polynomial would fold them back into the image.
     """
     depth = points_cam[..., 2]
     xy = points_cam[..., :2] / depth.clamp_min(MIN_DEPTH_M)[..., None]
@@ -84,7 +88,7 @@ def project(
 def pixels_to_rays(
     uv: Float[Tensor, "*b N 2"], K: Float[Tensor, "*b 3 3"], dist: Float[Tensor, "*b 5"]
 ) -> Float[Tensor, "*b N 3"]:
-    """Unit viewing directions of pixel coordinates, in the camera frame."""
+    """Return unit viewing directions of pixel coordinates, in the camera frame."""
     focal = torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :]
     xy = undistort((uv - K[..., None, :2, 2]) / focal, dist)
     rays = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
@@ -92,6 +96,6 @@ def pixels_to_rays(
 
 
 def pixel_centres(size_hw: tuple[int, int]) -> Float[Tensor, "H W 2"]:
-    """u, v of every pixel's centre, px."""
+    """Return the coordinates u, v of every pixel centre, px."""
     v, u = torch.meshgrid(torch.arange(size_hw[0]) + 0.5, torch.arange(size_hw[1]) + 0.5, indexing="ij")
     return torch.stack([u, v], dim=-1)

@@ -1,4 +1,4 @@
-"""Unit quaternions w x y z."""
+"""Unit quaternions in the order w x y z."""
 
 import torch
 from jaxtyping import Float
@@ -6,10 +6,11 @@ from torch import Tensor
 
 
 def quaternion_of(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
-    """Quaternion of a rotation, differentiable for every rotation; its largest entry is positive.
+    """Return the quaternion of a rotation matrix. Its largest entry is positive.
 
-    The columns of 4 q qᵀ can be read off R; the one with the largest diagonal entry is the best conditioned
-    (Shepperd, "Quaternion from rotation matrix", 1978).
+    The function is differentiable for every rotation. The columns of 4 q qᵀ are sums of entries of R. The
+    column with the largest diagonal entry is the best conditioned (Shepperd, "Quaternion from rotation
+    matrix", 1978).
     """
     xx, yy, zz = R.diagonal(dim1=-2, dim2=-1).unbind(-1)
     wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
@@ -29,7 +30,7 @@ def quaternion_of(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
 
 
 def multiply(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
-    """Hamilton product: the rotation b, then a."""
+    """Return the Hamilton product: the rotation b followed by the rotation a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

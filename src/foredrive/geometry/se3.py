@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def inverse_se3(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Inverse of rigid motions, by transposing the rotation."""
+    """Invert rigid motions by transposing the rotation."""
     R_t = T[..., :3, :3].transpose(-1, -2)
     out = torch.zeros_like(T)
     out[..., :3, :3] = R_t
@@ -26,22 +26,22 @@ def rotate_vectors(T: Float[Tensor, "*b 4 4"], vectors: Float[Tensor, "*b N 3"])
 
 
 def yaw_of(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
-    """Heading of src's x axis in dst, about dst's z axis, rad in (-π, π]."""
+    """Return the heading of the x axis of src in dst, about the z axis of dst, rad in (-π, π]."""
     return torch.atan2(T[..., 1, 0], T[..., 0, 0])
 
 
 def hat(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Cross-product matrix: hat(v) @ u = v × u."""
+    """Return the cross-product matrix: hat(v) @ u = v × u."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
 def exp_se3(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
-    """Exponential map of se(3), smooth at 0 in value and gradient.
+    """Return the exponential map of se(3). Its value and gradient are smooth at 0.
 
     Args:
-        xi: translation part (3, m) then rotation vector (3, rad).
+        xi: translation part (3, m), then rotation vector (3, rad).
     """
     rho, phi = xi[..., :3], xi[..., 3:]
     theta2 = (phi * phi).sum(-1)[..., None, None]
@@ -61,17 +61,17 @@ def exp_se3(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
 
 
 def sensor_twist(T_ego_sensor: Float[Tensor, "4 4"], twist_ego: Float[Tensor, "6"]) -> Float[Tensor, "6"]:
-    """Velocity (m/s) and turn rate (rad/s) of a sensor that is fixed to the ego frame, in its own axes.
+    """Return velocity (m/s) and turn rate (rad/s) of a sensor fixed to the ego frame, in the sensor's axes.
 
     Args:
-        twist_ego: the same of the ego frame, in the ego frame's axes.
+        twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame, in the axes of the ego frame.
     """
     linear = twist_ego[:3] + torch.linalg.cross(twist_ego[3:], T_ego_sensor[:3, 3])
     return torch.cat([T_ego_sensor[:3, :3].T @ linear, T_ego_sensor[:3, :3].T @ twist_ego[3:]])
 
 
 def log_so3(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Rotation vectors, rad, of rotations by less than π."""
+    """Return the rotation vectors, rad, of rotations by less than π."""
     v = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1
     )
@@ -83,7 +83,7 @@ def log_so3(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 def matrix_from_yaw(yaw: Float[Tensor, "*b"], xyz: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Rigid motion of a frame at `xyz` that is turned by `yaw` about z."""
+    """Return the pose of a frame at `xyz` (m) that is turned by `yaw` (rad) about z."""
     cos, sin = yaw.cos(), yaw.sin()
     T = torch.zeros(*yaw.shape, 4, 4, dtype=yaw.dtype, device=yaw.device)
     T[..., 0, 0], T[..., 0, 1] = cos, -sin

@@ -1,1 +1,1 @@
-"""Kernels, each with a plain PyTorch reference beside its fast path."""
+"""Kernels. Each fast path has a reference version in plain PyTorch."""

@@ -15,13 +15,13 @@ def attend_volume(
     points: Float[Tensor, "b Q H P 3"],
     weights: Float[Tensor, "b Q H P"],
 ) -> Float[Tensor, "b Q D"]:
-    """Multi-head deformable attention (Zhu et al. 2021, eq. 2) in 3-D.
+    """Return multi-head deformable attention (Zhu et al. 2021, eq. 2) in 3-D.
 
-    Head h reads channels [h·D/H, (h+1)·D/H) at its P points, trilinearly, zero outside, and takes the
+    Head h reads channels [h·D/H, (h+1)·D/H) at its P points, trilinearly and zero outside, and returns the
     weighted sum.
 
     Args:
-        values: channels last.
+        values: features with channels last.
         points: x y z in voxel units (voxel i spans [i, i + 1)).
         weights: attention weights, already normalised over P.
 
@@ -29,7 +29,7 @@ def attend_volume(
         float32 (float64 for float64 input), also from half precision.
 
     Raises:
-        ValueError: if D is not a multiple of H or shapes do not agree.
+        ValueError: D is not a multiple of H, or the shapes do not agree.
     """
     b, queries, heads, per_head = weights.shape
     fits = (
@@ -44,7 +44,7 @@ def attend_volume(
         raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
     small = values[:1].numel() < MAX_ITEM_SIZE
     if small and triton_can(values, points, weights):
-        from foredrive.ops.volume_triton import read_volume_triton  # there may be no Triton elsewhere
+        from foredrive.ops.volume_triton import read_volume_triton  # Triton may be missing
 
         return read_volume_triton(values, points, weights)
     if not (small and per_head <= BLOCK and numba_can(values, points, weights)):
@@ -60,7 +60,7 @@ def attend_volume_reference(
     points: Float[Tensor, "b Q H P 3"],
     weights: Float[Tensor, "b Q H P"],
 ) -> Float[Tensor, "b Q D"]:
-    """`attend_volume` in plain PyTorch."""
+    """Compute `attend_volume` in plain PyTorch."""
     with full_precision(values, points, weights) as (values, points, weights):
         b, _, heads, _ = weights.shape
         size_xyz = points.new_tensor(values.shape[1:4][::-1])

@@ -1,7 +1,7 @@
 """Sampling and compositing along rays (NeMo eq. 2 and 5).
 
-What a ray sees of a volume is Σ w_i f_i over its samples. `attention3d.attend_volume` reads it off the volume
-by the weights found here, so that no sample's feature is ever stored.
+The feature of a ray is Σ w_i f_i over its samples. `attention3d.attend_volume` computes this sum directly
+from the volume with the weights of this module, so that the features of the samples are never stored.
 """
 
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from foredrive.ops.precision import full_precision
 
 
 class Composite(NamedTuple):
-    """What is left of N samples on a ray.
+    """The compositing result of N samples on a ray.
 
     Attributes:
         weights: w_i = α_i Π_{j<i} (1 - α_j), the probability that the ray ends at sample i.
-        expected_depth: Σ w_i d_i, m. A ray that does not end adds nothing: divide by Σ w_i for the depth of
-            those that do.
+        expected_depth: Σ w_i d_i, m. A ray that does not end adds nothing. Divide by Σ w_i for the depth of
+            rays that end.
         transmittance: Π (1 - α_i), the probability that the ray passes all samples.
     """
 
@@ -29,7 +29,9 @@ class Composite(NamedTuple):
 
 
 def composite(alpha: Float[Tensor, "*b N"], depth_m: Float[Tensor, "*b N"]) -> Composite:
-    """What each sample of a ray counts, front to back (NeMo eq. 5). Exact, gradients too, at α = 0 and 1.
+    """Compute the weight of each sample of a ray, front to back (NeMo eq. 5).
+
+    Values and gradients are exact, also at α = 0 and 1.
 
     Args:
         alpha: opacity of each sample, 0 to 1.
@@ -39,7 +41,7 @@ def composite(alpha: Float[Tensor, "*b N"], depth_m: Float[Tensor, "*b N"]) -> C
         float32 (float64 for float64 input), also from half precision.
     """
     with full_precision(alpha, depth_m) as (alpha, depth_m):
-        # this costs memory traffic and little else: a numba kernel was measured to be no faster
+        # Memory traffic dominates here: a numba kernel was measured and is not faster.
         passed = torch.cumprod(1 - alpha, dim=-1)
         weights = torch.cat([torch.ones_like(alpha[..., :1]), passed[..., :-1]], dim=-1) * alpha
         return Composite(
@@ -52,13 +54,13 @@ def composite(alpha: Float[Tensor, "*b N"], depth_m: Float[Tensor, "*b N"]) -> C
 def stratified_depths(
     near_m: float, far_m: float, bins: int, shape: tuple[int, ...], generator: torch.Generator | None = None
 ) -> Float[Tensor, "*shape bins"]:
-    """One distance in each of `bins` equal parts of [near, far), ascending, for rays of the given shape.
+    """Return one distance in each of `bins` equal parts of [near, far), ascending, for each ray.
 
     Args:
-        near_m, far_m: where the samples begin and end.
-        bins: samples on a ray.
+        near_m, far_m: start and end of the sampled interval.
+        bins: number of samples on a ray.
         shape: shape of the set of rays.
-        generator: draws uniformly within each bin, on its own device; None gives the bins' centres.
+        generator: draws uniformly within each bin, on its own device. None gives the bin centres.
     """
     if generator is None:
         within = torch.full((*shape, bins), 0.5)

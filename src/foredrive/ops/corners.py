@@ -1,7 +1,7 @@
-"""What the numba kernels of lifting and of volumes share: blocks of points, and the cells around each.
+"""Shared parts of the numba kernels for lifting and volumes: blocks of points and their corners.
 
-A point lies between 4 pixels or 8 voxels, its corners. A block's points are first turned into corners and
-weights by loops that LLVM vectorises over points; then the corners are read eight channels at a time.
+The corners of a point are the 4 pixels or 8 voxels around it. First, loops that LLVM vectorises over points
+compute the corners and weights of a block. Then the corners are read, eight channels at a time.
 """
 
 from typing import NamedTuple, no_type_check
@@ -11,29 +11,29 @@ import numpy as np
 from foredrive.ops.vectors import ONE, add_dots, inlined_part, kernel_part, load, mul_add, store
 
 BLOCK = 256
-"""Most points prepared at once: their buffers stay in the first-level cache. Buffers are flat, with rows of
-constant length, which lets LLVM see that rows do not overlap."""
+"""Maximum number of points in a block. The buffers then fit into the first-level cache. They are flat with
+rows of constant length, which shows LLVM that rows do not overlap."""
 
 
 class Block(NamedTuple):
-    """The points of a block; row k of a buffer begins at k · BLOCK."""
+    """The points of a block. Row k of a buffer begins at k · BLOCK."""
 
     place: np.ndarray
-    """Float, a row an axis (x, y and for volumes z); integers are cell centres."""
+    """Float coordinates, one row per axis (x, y and, for volumes, z). Integers are cell centres."""
     weight: np.ndarray
-    """Float, one row."""
+    """Float weights of the points, one row."""
     corner: np.ndarray
-    """Int32, a row a corner: where it lies in its image's or volume's memory."""
+    """Int32 memory offset of each corner in its image or volume, one row per corner."""
     part: np.ndarray
-    """Float, likewise: the corners' parts of the weight."""
+    """Float weight of each corner (weight of the point times interpolation weight), one row per corner."""
     dots: np.ndarray
-    """Float, one after the other for each point: what its corners hold, times the gradient of the result."""
+    """Float dot product of each corner's values with the gradient of the result, point by point."""
 
 
 @kernel_part
 @no_type_check
 def new_block(axes):
-    """Buffers for points in an image (2 axes) or a volume (3)."""
+    """Return empty buffers for points in an image (2 axes) or a volume (3 axes)."""
     size = 2**axes * BLOCK
     place, weight = np.empty(axes * BLOCK, np.float32), np.empty(BLOCK, np.float32)
     return Block(
@@ -44,7 +44,10 @@ def new_block(axes):
 @inlined_part
 @no_type_check
 def read_point(values, base, block, p, corners, total, zero):
-    """Total + what point p reads, in the one or eight channels that `zero` has, from `base` on."""
+    """Return total + weighted interpolated value at point p, in the channels from `base` on.
+
+    `zero` sets the number of channels: a float32 for one, a vector for eight.
+    """
     point = zero
     for k in range(corners):
         value = load(values, base + block.corner[k * BLOCK + p], zero)
@@ -55,7 +58,7 @@ def read_point(values, base, block, p, corners, total, zero):
 @inlined_part
 @no_type_check
 def send_back(values, base, block, p, corners, grad, zero, grad_values, to_points):
-    """Send the gradient of what point p reads to `grad_values`, unless that is empty, and to `block.dots`."""
+    """Add the gradient of `read_point` to `grad_values` (unless that is empty) and to `block.dots`."""
     if to_points:
         for k in range(0, corners, 4):
             add_dots(

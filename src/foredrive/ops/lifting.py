@@ -1,4 +1,4 @@
-"""Multi-camera deformable attention: what 3-D queries read from image features (NeMo eq. 1)."""
+"""Multi-camera deformable attention: 3-D queries read image features (NeMo eq. 1)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,9 +16,9 @@ from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, tr
 from foredrive.ops.threads import in_parallel
 
 MIN_QUERIES = 64
-"""Fewer are not worth a thread of their own."""
+"""Minimum number of queries per thread."""
 CACHE_LINE = 16
-"""Floats in a cache line: threads that write to the same line slow each other down."""
+"""Number of floats in a cache line. Threads that write to the same line slow each other down."""
 
 
 def lift(
@@ -28,32 +28,32 @@ def lift(
     offsets: Float[Tensor, "b Q H L P 2"],
     weights: Float[Tensor, "b Q H L P"],
 ) -> Float[Tensor, "b Q D"]:
-    """Multi-head deformable cross-attention to L levels of image features of C cameras.
+    """Return multi-head deformable cross-attention to L levels of image features of C cameras.
 
-    Zhu et al. 2021, eq. 2, over several cameras as in BEVFormer: a query reads every camera that sees it and
-    takes the mean over these; a query that no camera sees reads 0. Head h reads channels
-    [h·D/H, (h+1)·D/H) at uv·(w, h) + offset, bilinearly, zero outside the feature map.
+    It is Zhu et al. 2021, eq. 2, over several cameras as in BEVFormer. A query reads every camera that sees
+    it, and the result is the mean over these cameras. A query that no camera sees returns 0. Head h reads
+    channels [h·D/H, (h+1)·D/H) at uv·(w, h) + offset, bilinearly and zero outside the feature map.
 
     Args:
-        values: feature maps, channels last, finest first or in any other order.
-        uv: where each query falls in each image, as a share of its width and height: (0, 0) is the top left
-            corner of the top left pixel, (1, 1) the bottom right one of the bottom right pixel. Calibration:
-            no gradient flows to it. Ignored where not visible.
-        visible: which cameras see which query.
-        offsets: in pixels of the level's own feature map, x y.
+        values: feature maps with channels last, in any order of levels.
+        uv: position of each query in each image, relative to its width and height. (0, 0) is the top left
+            corner of the top left pixel, (1, 1) the bottom right corner of the bottom right pixel. It comes
+            from calibration and gets no gradient. It is ignored where `visible` is False.
+        visible: whether each camera sees each query.
+        offsets: x y in pixels of the feature map of the level.
         weights: attention weights, already normalised over L·P.
 
     Returns:
         float32 (float64 for float64 input), also from half precision.
 
     Raises:
-        ValueError: if D is not a multiple of H or shapes do not agree.
+        ValueError: D is not a multiple of H, or the shapes do not agree.
     """
     _check(values, uv, visible, offsets, weights)
     image_size = sum(v.shape[2] * v.shape[3] for v in values) * values[0].shape[4]
     small = image_size < MAX_ITEM_SIZE
     if small and triton_can(*values, uv, offsets, weights):
-        from foredrive.ops.lifting_triton import lift_triton  # there may be no Triton elsewhere
+        from foredrive.ops.lifting_triton import lift_triton  # Triton may be missing
 
         return lift_triton(values, uv, visible, offsets, weights)
     points = weights.shape[3] * weights.shape[4]
@@ -69,7 +69,7 @@ def lift(
 def join_levels(
     values: Sequence[Float[Tensor, "b C _h _w D"]],
 ) -> tuple[Float[Tensor, "b C S D"], list[tuple[int, int, int]]]:
-    """All levels' pixels one after the other, and each level's height, width and first pixel."""
+    """Concatenate the pixels of all levels. Return them with height, width and first pixel of each level."""
     sizes, start = [], 0
     for value in values:
         sizes.append((value.shape[2], value.shape[3], start))
@@ -85,7 +85,7 @@ def lift_reference(
     offsets: Float[Tensor, "b Q H L P 2"],
     weights: Float[Tensor, "b Q H L P"],
 ) -> Float[Tensor, "b Q D"]:
-    """`lift` in plain PyTorch: samples every camera for every query, then masks."""
+    """Compute `lift` in plain PyTorch: sample every camera for every query, then mask."""
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
         b, cameras, _ = visible.shape
         heads = offsets.shape[2]
@@ -107,14 +107,14 @@ def lift_reference(
 
 
 class _Pairs(NamedTuple):
-    """Queries and cameras that see them, sorted by query; `Inputs` says what the fields are."""
+    """Pairs of a query and a camera that sees it, sorted by query. See `Inputs` for the fields."""
 
     query: np.ndarray
     image: np.ndarray
     uv: np.ndarray
     share: np.ndarray
     first: np.ndarray
-    """Int64[b·Q + 1], where the pairs of each query begin."""
+    """Int64[b·Q + 1], start of the pairs of each query."""
 
 
 def _visible_pairs(uv: Float[Tensor, "b C Q 2"], visible: Bool[Tensor, "b C Q"]) -> _Pairs:
@@ -207,7 +207,7 @@ def _inputs(values: Tensor, offsets: Tensor, weights: Tensor, sizes: np.ndarray,
 
 
 def _check(values: Sequence[Tensor], uv: Tensor, visible: Tensor, offsets: Tensor, weights: Tensor) -> None:
-    """Refuse shapes that do not fit together: the kernels index by them."""
+    """Raise `ValueError` if the shapes do not fit together, because the kernels do not check indices."""
     b, cameras, queries = visible.shape
     heads, levels, points = offsets.shape[2:5]
     channels = values[0].shape[-1] if values else 0

@@ -1,6 +1,6 @@
-"""Numba kernels of `foredrive.ops.lifting`: what visible pairs read from all levels, and its gradients.
+"""Numba kernels of `foredrive.ops.lifting`: sampling of all levels for visible pairs, and its gradients.
 
-A pair is a query and a camera that sees it. Pairs go through in blocks of some hundred points, head by head
+A pair is a query and a camera that sees it. Pairs are processed in blocks of up to 256 points, head by head
 and, within a block, level by level.
 """
 
@@ -13,24 +13,24 @@ from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, 
 
 
 class Inputs(NamedTuple):
-    """What is read. Pairs are sorted by query."""
+    """Inputs of the kernels. Pairs are sorted by query."""
 
     values: np.ndarray
-    """Float[b·C S D], the levels' pixels one after the other."""
+    """Float[b·C S D], pixels of all levels one after the other."""
     sizes: np.ndarray
     """Int32[L 3], height, width and first pixel of each level."""
     offsets: np.ndarray
-    """Float[b·Q H L P 2]."""
+    """Float[b·Q H L P 2], sampling offsets in pixels."""
     weights: np.ndarray
-    """Float[b·Q H L P]."""
+    """Float[b·Q H L P], attention weights."""
     query: np.ndarray
     """Int64[pairs], index into b·Q."""
     image: np.ndarray
     """Int64[pairs], index into b·C."""
     uv: np.ndarray
-    """Float[pairs 2]."""
+    """Float[pairs 2], position in the image relative to its size."""
     share: np.ndarray
-    """Float[pairs], one over the number of cameras that see the query."""
+    """Float[pairs], 1 / number of cameras that see the query."""
 
 
 class Gradients(NamedTuple):
@@ -45,7 +45,7 @@ class Gradients(NamedTuple):
 @kernel_part
 @no_type_check
 def _level(block, start):
-    """The buffers from a level's first point on."""
+    """Return the views of the buffers from the first point of a level on."""
     place, weight = block.place[start:], block.weight[start:]
     return Block(place, weight, block.corner[start:], block.part[start:], block.dots[4 * start :])
 
@@ -53,7 +53,7 @@ def _level(block, start):
 @kernel_part
 @no_type_check
 def _collect(inputs, block, first, last, head):
-    """Fill `block` with the points of the pairs first … last."""
+    """Fill `block` with the points of pairs first … last - 1, sorted by level, then by pair."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
     for pair in range(first, last):
@@ -73,13 +73,14 @@ def _collect(inputs, block, first, last, head):
 @kernel_part
 @no_type_check
 def _corners(block, count, size, channels):
-    """Fill corner and part of one level."""
+    """Fill `corner` and `part` for one level."""
     height, width, start = size
     corner, part = block.corner, block.part
     for i in range(count):
         x, y = block.place[i], block.place[BLOCK + i]
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+        # NaN coordinates must give NaN, although `neighbours` treats them as outside.
         w = block.weight[i] if (x == x) & (y == y) else np.float32(np.nan)
         corner[i] = (start + y0 * width + x0) * channels
         corner[BLOCK + i] = (start + y0 * width + x1) * channels
@@ -94,7 +95,7 @@ def _corners(block, count, size, channels):
 @kernel_part
 @no_type_check
 def _read(inputs, block, first, last, channel, zero, out):
-    """Add what each pair of a block reads from its image, in the channels from `channel` on."""
+    """Add the samples of each pair of a block to `out`, in the channels from `channel` on."""
     levels, points = inputs.weights.shape[2:]
     pixels, channels = inputs.values.shape[1:]
     for pair in range(first, last):
@@ -111,8 +112,9 @@ def _read(inputs, block, first, last, channel, zero, out):
 @kernel
 @no_type_check
 def lift_pairs(inputs, first_pair, last_pair, out):
-    """Add what the pairs first_pair … last_pair read to `out`, Float[b·Q D]. L·P ≤ BLOCK."""
+    """Add the samples of pairs first_pair … last_pair - 1 to `out`, Float[b·Q D]. Requires L·P ≤ BLOCK."""
     heads, width = inputs.weights.shape[1], inputs.values.shape[2] // inputs.weights.shape[1]
+    # Channels are read in vectors of WIDTH, then the rest one by one.
     whole = width - width % WIDTH
     block, step = new_block(2), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
     for first in range(first_pair, last_pair, step):
@@ -129,7 +131,7 @@ def lift_pairs(inputs, first_pair, last_pair, out):
 @kernel_part
 @no_type_check
 def _read_back(inputs, block, first, last, channel, zero, grads):
-    """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
+    """Add the gradient of the samples to the values and to `block.dots`."""
     levels, points = inputs.weights.shape[2:]
     pixels, channels = inputs.values.shape[1:]
     for pair in range(first, last):
@@ -144,7 +146,7 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
 @kernel_part
 @no_type_check
 def _slopes(block, count, size):
-    """Turn `dots` into gradients with respect to x, y and weight, which go to the first rows of `part`."""
+    """Convert `dots` into gradients with respect to x, y and weight, in the first rows of `part`."""
     height, width, _ = size
     dots, slope = block.dots, block.part
     for i in range(count):
@@ -160,7 +162,7 @@ def _slopes(block, count, size):
 @kernel_part
 @no_type_check
 def _hand_out(inputs, block, first, last, head, grads):
-    """Add the gradients of a block's points to those of their queries. Overwrites `block.part`."""
+    """Add the gradients of a block's points to those of their queries. It overwrites `block.part`."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
     for level in range(levels):
@@ -178,11 +180,11 @@ def _hand_out(inputs, block, first, last, head, grads):
 @kernel
 @no_type_check
 def lift_pairs_backward(inputs, first_pair, last_pair, head, grads):
-    """Add the gradients that one head's reading for the pairs first_pair … last_pair brings.
+    """Add the gradients of one head for the pairs first_pair … last_pair - 1.
 
-    Heads touch disjoint channels of the values and disjoint offsets and weights, batch items disjoint images:
-    calls that differ in either can run at the same time. Gradients that are not wanted have size 0 (offsets
-    and weights: both or none).
+    Heads use disjoint channels of the values and disjoint offsets and weights. Batch items use disjoint
+    images. So calls that differ in head or item can run in parallel. Gradients that are not wanted have size
+    0 (offsets and weights: both or none).
     """
     width = inputs.values.shape[2] // inputs.weights.shape[1]
     start = head * width

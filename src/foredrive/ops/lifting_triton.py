@@ -1,6 +1,6 @@
-"""The CUDA path of `foredrive.ops.lifting`: Triton kernels that read visible cameras only.
+"""The CUDA path of `foredrive.ops.lifting`: Triton kernels that read only visible cameras.
 
-A program takes a few rows (a head of a query each). It walks through levels and cameras, passes over the
+A program handles a few rows (a row is one head of one query). It loops over levels and cameras, skips the
 cameras that see none of its queries, and reads rows × points × channels at a time.
 """
 
@@ -25,9 +25,9 @@ def lift_triton(
     offsets: Float[Tensor, "b Q H L P 2"],
     weights: Float[Tensor, "b Q H L P"],
 ) -> Float[Tensor, "b Q D"]:
-    """`lift` for what lies on a GPU. Half precision is read as it is and added up in float32.
+    """Compute `lift` on a GPU. Half precision is read as it is and summed in float32.
 
-    The gradient of the values is added up by atomics: its last bits differ from run to run.
+    The gradient of the values is summed by atomics, so its last bits differ from run to run.
     """
     joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
@@ -92,7 +92,7 @@ def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | No
 @triton.jit
 @no_type_check
 def _points(offsets, weights, at, inside):
-    """Offsets and weights of rows × points."""
+    """Load offsets and weights of rows × points."""
     dx = tl.load(offsets + 2 * at, mask=inside, other=0.0).to(tl.float32)
     dy = tl.load(offsets + 2 * at + 1, mask=inside, other=0.0).to(tl.float32)
     return dx, dy, tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
@@ -101,7 +101,7 @@ def _points(offsets, weights, at, inside):
 @triton.jit
 @no_type_check
 def _places(uv, pair, seen, dx, dy, height, width):
-    """Coordinates of rows × points in the feature map of a camera and level; integers are pixel centres."""
+    """Return the coordinates of rows × points in the feature map of a level. Integers are pixel centres."""
     u = tl.load(uv + 2 * pair, mask=seen, other=0.0)
     v = tl.load(uv + 2 * pair + 1, mask=seen, other=0.0)
     return (u * width - 0.5)[:, None] + dx, (v * height - 0.5)[:, None] + dy
@@ -114,7 +114,7 @@ def _lift_rows(
     offsets,  # b·Q H L P 2
     weights,  # b·Q H L P
     uv,  # b C Q 2
-    share,  # b C Q, one over the number of cameras that see the query, 0 where this one does not
+    share,  # b C Q, 1 / number of cameras that see the query, 0 where this camera does not see it
     sizes,  # L 3: height, width and first pixel
     out,  # b·Q D
     row_count,
@@ -147,11 +147,13 @@ def _lift_rows(
                 image = query // queries * cameras + camera
                 pair = image * queries + query % queries
                 part = tl.load(share + pair, mask=exists, other=0.0)
+                # Skip the camera if it sees none of the program's queries.
                 if tl.max(part, axis=0) > 0:
                     seen = inside & (part > 0)[:, None]
                     x, y = _places(uv, pair, part > 0, dx, dy, height, width)
                     x0, x1, wx0, wx1, _, _ = neighbours(x, width)
                     y0, y1, wy0, wy1, _, _ = neighbours(y, height)
+                    # NaN coordinates must give NaN.
                     w = tl.where((x == x) & (y == y), weight * part[:, None], float("nan"))
                     w = tl.where(seen, w, 0.0)
                     base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
@@ -211,6 +213,7 @@ def _lift_rows_back(
                 image = query // queries * cameras + camera
                 pair = image * queries + query % queries
                 part = tl.load(share + pair, mask=exists, other=0.0)
+                # Skip the camera if it sees none of the program's queries.
                 if tl.max(part, axis=0) > 0:
                     seen = inside & (part > 0)[:, None]
                     x, y = _places(uv, pair, part > 0, dx, dy, height, width)
@@ -220,6 +223,7 @@ def _lift_rows_back(
                     w = tl.where(seen, w, 0.0)
                     base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
                     g = grad * part[:, None]
+                    # `met` is the dot product of the corner's value and the gradient.
                     for corner in tl.static_range(4):
                         cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
                         cy, wy, sy = (y1, wy1, sy1) if corner // 2 else (y0, wy0, sy0)

@@ -1,4 +1,4 @@
-"""Which numbers the ops compute in, and which kernels can."""
+"""Precision of the ops, and the conditions for their kernels."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 MAX_ITEM_SIZE = 2**31
-"""Kernels count floats within one image or volume in 32 bits."""
+"""Upper limit of floats in one image or volume, because kernels index them with 32 bits."""
 
 
 @contextmanager
 def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Autocast off, and the tensors in float32, or in float64 if any of them is.
+    """Disable autocast, and yield the tensors in float32, or in float64 if any of them is float64.
 
-    Sampling and compositing gain nothing from half precision, and lose places and depths.
+    Sampling and compositing are not faster in half precision, and positions and depths would lose accuracy.
     """
     dtype = torch.float64 if any(t.dtype == torch.float64 for t in tensors) else torch.float32
     with torch.autocast(tensors[0].device.type, enabled=False):
@@ -24,12 +24,12 @@ def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def numba_can(*tensors: Tensor) -> bool:
-    """Whether CPU kernels can take these: on the CPU, not in float64, and nobody traces the call."""
+    """Return whether the CPU kernels apply: all tensors on the CPU, none float64, nothing traced."""
     return _plain(tensors, "cpu")
 
 
 def triton_can(*tensors: Tensor) -> bool:
-    """Whether CUDA kernels can take these: as `numba_can`, but on a GPU, and if there is Triton."""
+    """Return whether the CUDA kernels apply: as `numba_can`, but on a GPU and with Triton installed."""
     return _plain(tensors, "cuda") and _has_triton()
 
 
@@ -44,8 +44,11 @@ def _has_triton() -> bool:
 
 
 def computes_bfloat16(device: str) -> bool:
-    """Whether bfloat16 saves time: on CPUs that know it a step takes a third of that in full precision, on
-    others more than ten times as long. A PyTorch that does not tell takes full precision."""
+    """Return whether bfloat16 saves time on a device.
+
+    On CPUs that support it, a step takes a third of the time of full precision. On other CPUs it takes more
+    than ten times as long. If PyTorch cannot tell, the answer is False.
+    """
     if device != "cpu":
         return True
     known: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()

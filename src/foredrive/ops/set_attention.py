@@ -1,4 +1,4 @@
-"""Attention within sets of tokens of any sizes, none of which are padded by those who ask."""
+"""Attention within sets of tokens of any sizes. The caller does not pad the sets."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,9 @@ from foredrive.ops.threads import in_parallel
 from foredrive.ops.vectors import ROW
 
 MIN_SETS = 8
-"""Fewer are not worth a thread of their own."""
+"""Minimum number of sets per thread."""
 BUCKETS = (8, 16, 32, 64)
-"""The reference pads sets of at most as many tokens to one length, and lets them attend together."""
+"""Set sizes of the reference version. Sets up to each size are padded to one length and attend together."""
 
 
 def attend_within(
@@ -25,14 +25,14 @@ def attend_within(
     counts: Int[Tensor, "S"],
     heads: int,
 ) -> Float[Tensor, "K C"]:
-    """What each token gathers from its set, softmax(q kᵀ / √d) v by head (Vaswani et al. 2017, equation 1).
+    """Return softmax(q kᵀ / √d) v of each token within its set, by head (Vaswani et al. 2017, eq. 1).
 
-    The kernel is for float32 on the CPU, heads of 16 channels, and where nobody asks for gradients.
+    The kernel requires float32 on the CPU, heads of 16 channels and no gradients.
 
     Args:
-        query_key: queries, and behind them keys: C2 = 2 C.
-        order: tokens set by set.
-        counts: how many each set holds, one at least.
+        query_key: queries followed by keys in the channel dimension: C2 = 2 C.
+        order: indices of the tokens, set by set.
+        counts: number of tokens in each set, at least 1.
     """
     given = (query_key, value)
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in given)
@@ -57,7 +57,7 @@ def attend_within_reference(
     counts: Int[Tensor, "S"],
     heads: int,
 ) -> Float[Tensor, "K C"]:
-    """`attend_within` in plain PyTorch."""
+    """Compute `attend_within` in plain PyTorch."""
     groups = _groups(order, counts)
     split = torch.cat([query_key, value], dim=-1)
     parts = [_attend(split[group.token], group.filled, heads) for group in groups]
@@ -66,10 +66,10 @@ def attend_within_reference(
 
 
 class _Group(NamedTuple):
-    """Sets of about as many tokens, padded to L."""
+    """Sets of similar sizes, padded to L tokens."""
 
     token: Int[Tensor, "s L"]
-    """Which they hold; a padded place has the set's first."""
+    """Tokens of each set. A padded place holds the first token of the set."""
     filled: Bool[Tensor, "s L"]
 
 

@@ -20,19 +20,22 @@ from foredrive.ops.vectors import (
 )
 
 SCALE = np.float32(np.log2(np.e) / np.sqrt(ROW))
-"""1 / √d, and powers of 2 in place of e."""
+"""1 / √d, with the change from base e to base 2."""
 NOTHING = np.float32(-1e30)
 
 
 @kernel
 @no_type_check
 def attend_sets(first, last, query_key, value, order, ends, largest, out):
-    """Sets `first` to `last` of `attend_within`, into out[K C]; in `order` they lie between ends[S + 1]."""
+    """Compute sets `first` to `last` - 1 of `attend_within` into out[K C].
+
+    The tokens of set s are order[ends[s] : ends[s + 1]].
+    """
     width = value.shape[1]
     room = (largest + ROW - 1) // ROW * ROW
-    keys = np.empty(ROW * room, np.float32)  # channel by channel: 16 keys lie side by side
+    keys = np.empty(ROW * room, np.float32)  # channel-major: 16 keys are adjacent
     values = np.empty(room * ROW, np.float32)
-    start = np.empty(room, np.float32)  # of sums over channels, which nothing is where no token is
+    start = np.empty(room, np.float32)  # initial score of each key: 0, or -1e30 for padding
     share = np.empty(room, np.float32)
     query = np.empty(ROW, np.float32)
     for member in range(first, last):
@@ -46,6 +49,7 @@ def attend_sets(first, last, query_key, value, order, ends, largest, out):
                 best = _fits(query, keys, start, room, blocks, share)
                 total = row_of(ZERO)
                 for block in range(blocks):
+                    # Softmax: exponentials relative to the best score, then the weighted mean of the values.
                     part = exp2_row(load_row(share, ROW * block) - best)
                     store(share, ROW * block, part)
                     total = total + part
@@ -56,7 +60,7 @@ def attend_sets(first, last, query_key, value, order, ends, largest, out):
 @inlined_part
 @no_type_check
 def _pack(query_key, value, tokens, channel, room, keys, values):
-    """Keys and values of a head; what pads them to whole rows is 0."""
+    """Copy keys and values of one head. The padding up to whole rows is 0."""
     width, count = value.shape[1], len(tokens)
     for place in range(count):
         token = tokens[place]
@@ -72,9 +76,10 @@ def _pack(query_key, value, tokens, channel, room, keys, values):
 @inlined_part
 @no_type_check
 def _fits(query, keys, start, room, blocks, share):
-    """How well each key fits a query, into `share`; returns the best fit."""
+    """Write the scores of all keys for one query to `share`. Return the largest score."""
     best = row_of(NOTHING)
     for block in range(blocks):
+        # Two accumulators shorten the chain of dependent additions.
         even, odd = load_row(start, ROW * block), row_of(ZERO)
         for k in range(0, ROW, 2):
             even = even + load_row(keys, room * k + ROW * block) * query[k]
@@ -88,7 +93,7 @@ def _fits(query, keys, start, room, blocks, share):
 @inlined_part
 @no_type_check
 def _weigh(share, values, blocks):
-    """The sum of values, each times its share."""
+    """Return the sum of the values, each multiplied by its share."""
     a, b, c, d = row_of(ZERO), row_of(ZERO), row_of(ZERO), row_of(ZERO)
     for place in range(0, ROW * blocks, 4):
         a = a + load_row(values, ROW * place) * share[place]

@@ -1,4 +1,4 @@
-"""Numba kernels that find which splats touch which tiles, front to back."""
+"""Numba kernels that find the splats of each tile and sort them front to back."""
 
 from typing import NamedTuple, no_type_check
 
@@ -9,25 +9,26 @@ from foredrive.ops.vectors import inlined_part, kernel
 LOG2_E = np.float32(1.4426950408889634)
 ZERO, HALF = np.float32(0), np.float32(0.5)
 SLACK = np.float32(1e-3)
-"""Of an exponent: what rounding may do to it."""
+"""Tolerance of an exponent for rounding errors."""
 LEAST = np.float32(np.log2(1 / 255) - SLACK)
-"""Splats whose opacity is below 2 to this power everywhere in a box are not listed there."""
+"""log2 of the minimum opacity (1/255, minus the tolerance). A splat whose opacity stays below it in the whole
+box is not listed."""
 
-# columns of a packed splat
+# Columns of a packed splat.
 MEAN_X, MEAN_Y, VELOCITY_X, VELOCITY_Y = 0, 1, 2, 3
 XX, XY, YY, LOG_OPACITY = 4, 5, 6, 7
-"""log2 of the opacity at d is log opacity + xx dx² + xy dx dy + yy dy²."""
+"""log2 of the opacity at offset d is log opacity + xx dx² + xy dx dy + yy dy²."""
 RANGE, SLOPE_X, SLOPE_Y, RATE = 8, 9, 10, 11
 TILT_Y, TILT_X = 12, 13
-"""Where along y the exponent is greatest is tilt_y · dx; along x, tilt_x · dy."""
+"""For given dx, the exponent is largest at dy = tilt_y · dx. For given dy, at dx = tilt_x · dy."""
 REACH_X, REACH_Y = 14, 15
-"""How far from the mean the opacity reaches 1/255."""
+"""Distance from the mean, along each axis, at which the opacity falls to 1/255."""
 COLUMNS = 16
-"""One cache line."""
+"""Number of columns: one cache line."""
 
 
 class Raw(NamedTuple):
-    """Arrays of the `Splats` that decide where a splat is; all float32 and contiguous."""
+    """Geometry arrays of `Splats`, all float32 and contiguous."""
 
     mean: np.ndarray
     inverse_covariance: np.ndarray
@@ -39,10 +40,10 @@ class Raw(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Arrays of the `TiledPoints` that say where tiles are."""
+    """Geometry arrays of `TiledPoints`."""
 
     bounds: np.ndarray
-    """Float32[T 6]."""
+    """Float32[T 6], smallest and largest x, y and time."""
     left_edge: np.ndarray
     lower_edge: np.ndarray
     first_tile: np.ndarray
@@ -55,7 +56,7 @@ class Tiles(NamedTuple):
 @kernel
 @no_type_check
 def pack_splats(start, stop, raw, period, packed):
-    """Fill rows start … stop of `packed`, Float32[N 16], with what the other kernels read of each splat."""
+    """Fill rows start … stop - 1 of `packed`, Float32[N 16], the input of the other kernels."""
     for i in range(start, stop):
         row = packed[i]
         x = raw.mean[i, 0]
@@ -74,6 +75,7 @@ def pack_splats(start, stop, raw, period, packed):
         row[RANGE], row[RATE] = raw.range_m[i], raw.range_rate_mps[i]
         row[SLOPE_X], row[SLOPE_Y] = raw.range_slope[i, 0], raw.range_slope[i, 1]
         row[TILT_Y], row[TILT_X] = -xy / yy, -xy / xx
+        # The ellipse dᵀ A d ≤ c reaches √(c · yy / det A) along x and √(c · xx / det A) along y.
         area = np.float64(xx) * np.float64(yy) - np.float64(xy) * np.float64(xy)
         square = max(2 * (log_opacity - LEAST) / LOG2_E, 0) / max(area, 1e-30)
         row[REACH_X], row[REACH_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
@@ -82,11 +84,12 @@ def pack_splats(start, stop, raw, period, packed):
 @inlined_part
 @no_type_check
 def touches(row, bounds, x):
-    """Whether the opacity of a packed splat whose mean is at x reaches 1/255 in a tile's box.
+    """Return whether the opacity of a packed splat with mean x reaches 1/255 in the box of a tile.
 
-    The greatest exponent in a box that does not hold the mean lies on one of the two sides next to it.
+    If the box does not contain the mean, the largest exponent is on one of the two sides nearest to the mean.
     """
     vx, vy, t0, t1 = row[VELOCITY_X], row[VELOCITY_Y], bounds[4], bounds[5]
+    # Bounds of the offset d = p - mean - velocity · t over the box and its time interval.
     x0, x1 = bounds[0] - x - max(vx * t0, vx * t1), bounds[1] - x - min(vx * t0, vx * t1)
     y = row[MEAN_Y]
     y0, y1 = bounds[2] - y - max(vy * t0, vy * t1), bounds[3] - y - min(vy * t0, vy * t1)
@@ -100,7 +103,7 @@ def touches(row, bounds, x):
 @inlined_part
 @no_type_check
 def turned(x, bounds, period):
-    """The mean's place x, whole periods away, that is nearest to the middle of a tile."""
+    """Return the position x shifted by whole periods to be nearest to the middle of a tile."""
     if period > 0:
         middle = HALF * (bounds[0] + bounds[1])
         return x + period * np.floor((middle - x) / period + HALF)
@@ -110,9 +113,9 @@ def turned(x, bounds, period):
 @inlined_part
 @no_type_check
 def _last_at_most(values, start, stop, x):
-    """Place of the last of ascending values[start:stop] that is at most x; start if none is.
+    """Return the index of the last element ≤ x in ascending values[start:stop]; start if there is none.
 
-    Tiles are about equally wide: a guess is seldom far off.
+    Tiles have similar widths, so linear interpolation gives a good first guess.
     """
     span = values[stop - 1] - values[start]
     guess = (x - values[start]) / span * np.float32(stop - 1 - start) if span > 0 else ZERO
@@ -127,7 +130,10 @@ def _last_at_most(values, start, stop, x):
 @inlined_part
 @no_type_check
 def _list_box(row, tiles, box, turn, found, count):
-    """Add the tiles that a splat touches within a box, x0 x1 y0 y1, that is so many turns away from it."""
+    """Add the tiles that a splat touches within a box x0 x1 y0 y1 to `found`. Return the new count.
+
+    The box is shifted by `turn` periods from the splat.
+    """
     x0, x1, y0, y1 = box
     rows = tiles.lower_edge.size
     first_row = _last_at_most(tiles.lower_edge, 0, rows, y0)
@@ -138,13 +144,14 @@ def _list_box(row, tiles, box, turn, found, count):
         t = first_here
         while t < last and tiles.left_edge[t] <= x1:
             bounds = tiles.bounds[t]
+            # `alone` means that the box overlaps a single tile.
             alone = r == first_row and t == first_here
             alone = alone and (r + 1 == rows or tiles.lower_edge[r + 1] > y1)
             alone = alone and (t + 1 == last or tiles.left_edge[t + 1] > x1)
             x = turned(row[MEAN_X], bounds, tiles.period)
             if abs(x - row[MEAN_X] - turn * tiles.period) > HALF * tiles.period:
                 yes = False  # another turn is nearer to this tile
-            elif alone:  # a small splat in one tile: a closer look would change little
+            elif alone:  # a small splat in one tile: the exact test would change little
                 yes = x0 <= bounds[1] and x1 >= bounds[0] and y0 <= bounds[3] and y1 >= bounds[2]
             else:
                 yes = touches(row, bounds, x)
@@ -160,10 +167,10 @@ def _list_box(row, tiles, box, turn, found, count):
 @kernel
 @no_type_check
 def list_tiles(start, stop, packed, tiles, per_splat, found):
-    """Write to `found`, Int32, the tiles that the splats start … stop touch, one splat after the other.
+    """Write the tiles that the splats start … stop - 1 touch to `found`, Int32, splat by splat.
 
-    Writes to `per_splat` how many each touches, and returns how many that are in all: if `found` is too
-    short for them, it has to be called again.
+    `per_splat` gets the number of tiles of each splat. Return the total number. If `found` is too short, call
+    the function again with a longer array.
     """
     count = 0
     turns = 1 if tiles.period > 0 else 0
@@ -187,10 +194,10 @@ def list_tiles(start, stop, packed, tiles, per_splat, found):
 @kernel
 @no_type_check
 def front_to_back(packed, order):
-    """Fill `order`, Int32[N], with the splats by ascending range, equal ones as they come.
+    """Fill `order`, Int32[N], with the splats sorted by ascending range. The sort is stable.
 
-    Radix sort by 11 bits at a time: the bits of positive float32 are ordered as they are themselves, those of
-    negative ones the other way round.
+    It is a radix sort with 11 bits per pass. The bits of positive float32 numbers have the order of the
+    numbers. The bits of negative ones have the reverse order.
     """
     count = order.size
     keys, other_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
@@ -198,6 +205,7 @@ def front_to_back(packed, order):
     places = np.zeros((3, 2048), np.int32)
     for i in range(count):
         key = np.float32(packed[i, RANGE]).view(np.uint32)
+        # Map the float's bits to an unsigned integer of the same order.
         key = ~key if key >> np.uint32(31) else key | np.uint32(1 << 31)
         keys[i], order[i] = key, i
         for digit in range(3):
@@ -217,13 +225,15 @@ def front_to_back(packed, order):
 @kernel
 @no_type_check
 def hand_out(order, first_slot, tile_of, first, splat, slot):
-    """Hand splats out to the tiles in the given order.
+    """Distribute the splats to the lists of the tiles, in the given order.
 
     Args:
-        first_slot: Int64[N + 1], where a splat's tiles begin in `tile_of`, Int32[L].
-        first: Int64[T + 2], zeros; the first T + 1 become where a tile's list begins.
-        splat, slot: Int32[L], the lists: which splat, and which entry of `tile_of` that is.
+        first_slot: Int64[N + 1], start of each splat's tiles in `tile_of`, Int32[L].
+        first: Int64[T + 2], zeros. On return the first T + 1 entries are the starts of the tiles' lists.
+        splat, slot: Int32[L], the lists: index of the splat, and index of the entry in `tile_of`.
     """
+    # Count per tile, shifted by two. While the lists are filled, first[t + 1] is the next free place of tile
+    # t.
     for tile in tile_of:
         first[tile + 2] += 1
     for t in range(2, first.size):

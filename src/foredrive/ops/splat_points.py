@@ -1,7 +1,7 @@
-"""Where splats are looked at: the pixels of a camera or the beams of a lidar, grouped in tiles.
+"""Sample points for splats: camera pixels or lidar beams, grouped in tiles.
 
-A tile is up to 256 neighbouring points in 16 blocks of 16. Tiles stand in rows of their own lengths, so that
-pixels and the uneven beams of real lidars are the same thing to whoever composites.
+A tile has up to 256 neighbouring points in 16 blocks of 16. Tiles form rows of different lengths. Thus pixels
+and the uneven beams of real lidars have the same structure for compositing.
 """
 
 import math
@@ -13,64 +13,64 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 LANES = 16
-"""Points in a block, blocks in a tile."""
+"""Number of points in a block, and of blocks in a tile."""
 SLOTS = LANES * LANES
-"""Most points in a tile."""
+"""Maximum number of points in a tile."""
 PARTS = 4
-"""Of a turn: no tile of beams reaches over two."""
+"""Number of parts of a turn. A tile of beams never extends over two parts."""
 SIDE_PX = 16
-"""Pixels along each side of a camera's tile; its blocks are squares of 4."""
+"""Side length of a camera tile in pixels. Its blocks have 4 by 4 pixels."""
 
 
 @dataclass(frozen=True)
 class TiledPoints:
-    """P points on a plane, in T tiles that stand in R rows. Made by `pixel_points` and `beam_points`.
+    """P points on a plane, in T tiles that form R rows. `pixel_points` and `beam_points` create it.
 
-    Slots that no point fills repeat a neighbour's place and time.
+    A slot without a point repeats the position and time of a neighbour.
     """
 
     position: Float[Tensor, "T S 2"]
-    """On the sensor's plane: u v in px, or azimuth and elevation in rad."""
+    """Position on the sensor plane: u v in px, or azimuth and elevation in rad."""
     time_s: Float[Tensor, "T S"]
-    """When the sensor looks at each point, relative to the splats' time."""
+    """Measurement time of each point, relative to the time of the splats."""
     index: Int[Tensor, "T S"]
-    """Which point fills a slot; -1: none."""
+    """Index of the point in each slot; -1 for an empty slot."""
     count: int
-    """P."""
+    """P, the number of points."""
     left_edge: Float[Tensor, "T"]
-    """Where a tile begins along x; ascending within a row, without gaps between tiles."""
+    """Start of each tile along x; ascending within a row, without gaps between tiles."""
     lower_edge: Float[Tensor, "R"]
-    """Where a row of tiles begins along y, ascending."""
+    """Start of each row of tiles along y, ascending."""
     first_tile: Int[Tensor, "R1"]
-    """Where a row's tiles begin, and T at the end."""
+    """First tile of each row, and T at the end."""
     period: float = 0.0
-    """After how much x comes back to where it was; 0: never."""
+    """Period of x; 0 if x is not periodic."""
     size_hw: tuple[int, int] | None = None
-    """Of the image whose pixels these are, row by row; None: no image."""
+    """Size of the image if the points are its pixels in row order; else None."""
 
     @cached_property
     def rows(self) -> Float[Tensor, "T 3 S"]:
-        """x, y and time, each side by side for all points of a tile."""
+        """Return x, y and time, each contiguous over the points of a tile."""
         return torch.cat([self.position, self.time_s[..., None]], -1).transpose(1, 2).contiguous()
 
     @cached_property
     def block_bounds(self) -> Float[Tensor, "T 6 B"]:
-        """Of each block: least and greatest x, then y, then time."""
+        """Return the smallest and largest x, y and time of each block."""
         blocks = self.rows.unflatten(2, (LANES, LANES))
         return torch.stack([blocks.amin(3), blocks.amax(3)], 2).flatten(1, 2)
 
     @cached_property
     def tile_bounds(self) -> Float[Tensor, "T 6"]:
-        """The same of each tile."""
+        """Return the smallest and largest x, y and time of each tile."""
         return torch.stack([self.rows.amin(2), self.rows.amax(2)], 2).flatten(1, 2)
 
     @cached_property
     def at_once(self) -> bool:
-        """Whether these are the pixels of an image of one instant."""
+        """Return whether the points are the pixels of an image of one instant."""
         return self.size_hw is not None and not bool(self.time_s.any())
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> "TiledPoints":
-        """The same on another device, in another precision; these points themselves where nothing changes."""
+        """Return the points on another device or in another precision. Return `self` if nothing changes."""
         if self.position.device == torch.device(device) and dtype in (self.position.dtype, None):
             return self
         return TiledPoints(
@@ -87,12 +87,12 @@ class TiledPoints:
 
 
 def pixel_points(size_hw: tuple[int, int], readout_s: float = 0.0) -> TiledPoints:
-    """The centres of all pixels of an image in tiles of 16×16.
+    """Return the centres of all pixels of an image in tiles of 16×16.
 
     Args:
         size_hw: image size, px.
-        readout_s: time from the first to the last row, which are read one after the other; times are relative
-            to the middle row, as in `sensors.camera_rays`.
+        readout_s: time from the first to the last row of a rolling shutter. Times are relative to the middle
+            row, as in `sensors.camera_rays`.
     """
     height, width = size_hw
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)
@@ -118,15 +118,16 @@ def pixel_points(size_hw: tuple[int, int], readout_s: float = 0.0) -> TiledPoint
 def beam_points(
     azimuth_rad: Float[Tensor, "P"], elevation_rad: Float[Tensor, "P"], time_s: Float[Tensor, "P"]
 ) -> TiledPoints:
-    """Any beams in tiles of 256.
+    """Return lidar beams in tiles of 256.
 
-    Rows of tiles hold about as many beams each, and end in the widest gap between elevations that is near:
-    between two channels where there are channels. Within a row tiles follow each other in azimuth; each lies
-    in one quarter of a turn, so that it is clear on which side of a tile a splat lies.
+    Each row of tiles holds about the same number of beams. It ends in the widest nearby gap between
+    elevations, which is between two channels if the lidar has channels. Within a row, tiles are sorted by
+    azimuth. Each tile lies in one quarter of a turn, so that the side of a tile on which a splat lies is well
+    defined.
 
     Args:
-        azimuth_rad, elevation_rad: in the sensor's frame at the moment that the beam is fired.
-        time_s: that moment, relative to the splats' time.
+        azimuth_rad, elevation_rad: beam directions in the sensor frame at the firing time.
+        time_s: firing time relative to the time of the splats.
     """
     azimuth_rad = torch.remainder(azimuth_rad + math.pi, 2 * math.pi) - math.pi
     by_elevation = elevation_rad.argsort(stable=True)
@@ -136,10 +137,10 @@ def beam_points(
     part = row * PARTS + ((azimuth_rad[order] + math.pi) * (PARTS / (2 * math.pi))).long().clamp(0, PARTS - 1)
     lengths = part.bincount(minlength=PARTS * (len(starts) - 1))
     zero = torch.zeros(1, dtype=torch.long)
-    first_in_part = torch.cat([zero, (-(-lengths // SLOTS)).cumsum(0)])  # tiles
+    first_in_part = torch.cat([zero, (-(-lengths // SLOTS)).cumsum(0)])  # in tiles
     place = torch.arange(len(order)) - torch.cat([zero, lengths.cumsum(0)])[part]
     tile = first_in_part[part] + place // SLOTS
-    quarter = tile * 4 + place % SLOTS // (SLOTS // 4)  # four columns of blocks, four blocks in each
+    quarter = tile * 4 + place % SLOTS // (SLOTS // 4)  # four columns of blocks, with four blocks in each
     order = order[_sorted_within(quarter, elevation_rad[order])]
     index = torch.full((int(first_in_part[-1]) * SLOTS,), -1)
     index[tile * SLOTS + place % SLOTS] = order
@@ -159,9 +160,9 @@ def beam_points(
 
 
 def _row_starts(ascending: Float[Tensor, "P"]) -> Int[Tensor, "R1"]:
-    """Where rows of tiles begin among beams in the order of their elevations; P at the end.
+    """Return the start of each row of tiles in beams sorted by elevation, and P at the end.
 
-    As many rows as make the tiles where most beams are about as high as wide.
+    The number of rows makes tiles about square where most beams are.
     """
     count = len(ascending)
     if count == 0:
@@ -178,6 +179,6 @@ def _row_starts(ascending: Float[Tensor, "P"]) -> Int[Tensor, "R1"]:
 
 
 def _sorted_within(group: Int[Tensor, "P"], value: Float[Tensor, "P"]) -> Int[Tensor, "P"]:
-    """Where to find the entries by ascending group, and by ascending value within each."""
+    """Return the permutation that sorts by group, and by value within each group."""
     by_value = value.argsort(stable=True)
     return by_value[group[by_value].argsort(stable=True)]

@@ -1,13 +1,14 @@
-"""Compositing of projected Gaussians on pixels and beams alike (Kerbl et al., "3D Gaussian Splatting", 2023;
-Hess et al., "SplatAD", 2025).
+"""Compositing of projected Gaussians on pixels and beams.
 
-At a point p that is looked at at time t a splat has the opacity
+Sources: Kerbl et al., "3D Gaussian Splatting", 2023; Hess et al., "SplatAD", 2025.
+
+At a point p with measurement time t, a splat has the opacity
 
     α = min(o · exp(-dᵀ A d / 2), 0.999),   d = p - mean - velocity · t,
 
-and lies at the range r = range + slope · d + range rate · t. Splats come in the order of `range_m`. A splat
-with α < 1/255 is skipped; the first that would leave a transmittance of 1e-4 or less ends the ray and is not
-counted itself.
+and the range r = range + slope · d + range rate · t. Splats are composited in the order of `range_m`. A splat
+with α < 1/255 is skipped. The first splat that would reduce the transmittance to 1e-4 or less ends the ray
+and is not counted.
 """
 
 import math
@@ -25,51 +26,51 @@ MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 REFERENCE_SIZE = 2**21
-"""Most (point, splat) pairs that plain PyTorch looks at together."""
+"""Maximum number of (point, splat) pairs that plain PyTorch processes at once."""
 
 
 class Splats(NamedTuple):
-    """N Gaussians as a sensor sees them, in any order. Lengths on the plane are px or rad."""
+    """N Gaussians projected to the plane of a sensor, in any order. Lengths on the plane are in px or rad."""
 
     mean: Float[Tensor, "N 2"]
-    """Where the centre is at time 0."""
+    """Centre at time 0."""
     inverse_covariance: Float[Tensor, "N 3"]
-    """A: its entries xx, xy, yy."""
+    """Entries xx, xy, yy of the matrix A."""
     opacity: Float[Tensor, "N"]
-    """0 to 1."""
+    """Peak opacity o, 0 to 1."""
     range_m: Float[Tensor, "N"]
-    """Of the centre at time 0: depth along a camera's axis, or a lidar's range."""
+    """Range of the centre at time 0: depth along the optical axis of a camera, or range of a lidar."""
     range_slope: Float[Tensor, "N 2"]
-    """How range changes over the plane, m per px or rad."""
+    """Change of range over the plane, m per px or rad."""
     velocity: Float[Tensor, "N 2"]
-    """Of the centre on the plane, px/s or rad/s."""
+    """Velocity of the centre on the plane, px/s or rad/s."""
     range_rate_mps: Float[Tensor, "N"]
     feature: Float[Tensor, "N D"]
 
 
 class Composited(NamedTuple):
-    """What P points see. The weight of a splat is α times the transmittance in front of it."""
+    """Result at P points. The weight of a splat is α times the transmittance in front of it."""
 
     feature: Float[Tensor, "P D"]
-    """Σ weight · feature: over a background b it is this plus (1 - alpha) · b."""
+    """Σ weight · feature. Over a background b, the feature is this plus (1 - alpha) · b."""
     expected_range_m: Float[Tensor, "P"]
     """Σ weight · range. Divide by `alpha` for the range of the rays that end."""
     median_range_m: Float[Tensor, "P"]
-    """Range of the splat that half of the light does not pass; infinite where none is; NaN if not asked for.
-    Without gradient."""
+    """Range of the splat at which the transmittance falls to one half or less. It is infinite if there is
+    none, and NaN if not requested. It has no gradient."""
     alpha: Float[Tensor, "P"]
     """Σ weight, the probability that the ray ends."""
     alpha_before_hit: Float[Tensor, "P"] | None
-    """Σ weight over the splats nearer than the hit; None if no hits are given."""
+    """Σ weight over the splats nearer than the hit. None if no hits are given."""
 
 
 class SplatLists(NamedTuple):
-    """Which splats touch which tiles."""
+    """Lists of the splats that touch each tile."""
 
     splat: Int[Tensor, "L"]
-    """Tile after tile, in each front to back."""
+    """Splat indices, tile after tile, front to back within a tile."""
     first: Int[Tensor, "T1"]
-    """Where a tile's list begins; L at the end."""
+    """Start of the list of each tile, and L at the end."""
 
 
 def composite_splats(
@@ -79,19 +80,19 @@ def composite_splats(
     *,
     median: bool = True,
 ) -> Composited:
-    """Look at splats from all points.
+    """Composite the splats at all points.
 
-    Gradients reach everything in `splats`. On a GPU gsplat makes images of one instant, if their median range
-    is not wanted; whatever else is asked for there is plain PyTorch.
+    Gradients reach every field of `splats`. On a GPU, gsplat renders images of one instant if the median
+    range is not requested. All other cases on a GPU use plain PyTorch.
 
     Args:
-        points: from `pixel_points` or `beam_points`, on the splats' device.
-        hit_range_m: where a lidar's return came from, less some margin; infinite: nowhere. It asks for
-            `alpha_before_hit`.
-        median: whether `median_range_m` is wanted; if not, it is NaN.
+        points: result of `pixel_points` or `beam_points`, on the device of the splats.
+        hit_range_m: range of the lidar return minus a margin; infinite if there is no return. It is needed
+            for `alpha_before_hit`.
+        median: whether to compute `median_range_m`; without it the field is NaN.
 
     Raises:
-        ValueError: on values that are not finite, or points of another number.
+        ValueError: values are not finite, or the number of hits is not that of the points.
         InputError: gsplat is needed and not installed.
     """
     _check(splats, points, hit_range_m)
@@ -102,7 +103,7 @@ def composite_splats(
 
 
 def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
-    from foredrive.ops.splatting_gsplat import composite_gsplat  # it may not be installed elsewhere
+    from foredrive.ops.splatting_gsplat import composite_gsplat  # it is optional
 
     assert points.size_hw is not None
     with full_precision(*splats) as fields:
@@ -121,7 +122,7 @@ def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
 def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None) -> Composited:
     if not numba_can(*splats):
         return composite_splats_reference(splats, points, hit_range_m)
-    from foredrive.ops.splatting_numba import CompositeSplats  # numba takes its time to be imported
+    from foredrive.ops.splatting_numba import CompositeSplats  # numba is slow to import
 
     *where, feature = (field.float() for field in splats)
     hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.detach().float()
@@ -133,20 +134,20 @@ def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "
 def composite_splats_reference(
     splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
 ) -> Composited:
-    """`composite_splats` in plain PyTorch."""
+    """Compute `composite_splats` in plain PyTorch."""
     return composite_lists(splats, points, list_splats(splats, points), hit_range_m)
 
 
 def composite_lists(
     splats: Splats, points: TiledPoints, lists: SplatLists, hit_range_m: Float[Tensor, "P"] | None = None
 ) -> Composited:
-    """What points see of the splats on their tiles' lists, in plain PyTorch."""
+    """Composite the splats on the lists of the tiles, in plain PyTorch."""
     points = points.to(splats.mean.device, splats.mean.dtype)
     lengths = lists.first.diff()
     hits = splats.range_m.new_zeros(points.count) if hit_range_m is None else hit_range_m
     columns = splats.feature.shape[1] + 4
     out = splats.feature.new_zeros(points.count, columns)
-    tiles = lengths.argsort(descending=True)  # alike lists together: little padding
+    tiles = lengths.argsort(descending=True)  # lists of similar lengths together: little padding
     while len(tiles):
         longest = int(lengths[tiles[0]])
         chunk, tiles = tiles.split([n := min(_chunk(points, longest), len(tiles)), len(tiles) - n])
@@ -162,7 +163,7 @@ def _composited(out: Float[Tensor, "P D4"], has_hits: bool) -> Composited:
 
 
 def _chunk(points: TiledPoints, longest: int) -> int:
-    """Of how many tiles plain PyTorch looks at the lists at once."""
+    """Return the number of tiles that plain PyTorch processes at once."""
     return max(REFERENCE_SIZE // (max(longest, 1) * points.index.shape[1]), 1)
 
 
@@ -174,7 +175,7 @@ def _look(
     tiles: Int[Tensor, "C"],
     longest: int,
 ) -> Float[Tensor, "C S D4"]:
-    """What slots of tiles see: feature, expected range, median range, alpha, alpha before the hit."""
+    """Return, per slot: feature, expected range, median range, alpha, alpha before the hit."""
     place = lists.first[tiles, None] + torch.arange(longest, device=tiles.device)  # [C L]
     listed = (place < lists.first[tiles + 1, None])[:, None]
     chosen = lists.splat[place.clamp(max=len(lists.splat) - 1)]
@@ -200,11 +201,11 @@ def _look(
 
 @torch.no_grad()
 def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
-    """For each tile the splats whose opacity reaches 1/255 somewhere in the box around its points."""
+    """Return, for each tile, the splats whose opacity reaches 1/255 in the box around its points."""
     points = points.to(splats.mean.device, splats.mean.dtype)
     low, high = points.tile_bounds[:, 0::2], points.tile_bounds[:, 1::2]  # [T 3]: x y time
     tiles, count = len(low), len(splats.opacity)
-    cut = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # least exponent that counts
+    cut = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # largest dᵀ A d that counts
     order = splats.range_m.argsort(stable=True)
     order = order[cut[order] >= 0]
     found, tile_of = [], []
@@ -226,7 +227,7 @@ def _touch(
     high: Float[Tensor, "C 3"],
     points: TiledPoints,
 ) -> Bool[Tensor, "C M"]:
-    """Whether the ellipse dᵀ A d ≤ cut of splats reaches boxes in x, y and time."""
+    """Return whether the ellipses dᵀ A d ≤ cut of splats reach boxes in x, y and time."""
     mean = splats.mean[chosen].expand(len(low), -1, -1)
     mean = _nearest_image(mean, torch.stack([low[:, :2], high[:, :2]], 1), points.period)
     moved = splats.velocity[chosen] * torch.stack([low[:, 2:], high[:, 2:]])[..., None]  # [2 C M 2]
@@ -234,7 +235,7 @@ def _touch(
     x1, y1 = (high[:, None, :2] - mean - moved.amin(0)).unbind(-1)
     xx, xy, yy = splats.inverse_covariance[chosen].unbind(-1)
     near_x, near_y = x0.clamp(min=0) + x1.clamp(max=0), y0.clamp(min=0) + y1.clamp(max=0)
-    along_y = torch.minimum(torch.maximum(-xy / yy * near_x, y0), y1)  # the least on the side that is nearest
+    along_y = torch.minimum(torch.maximum(-xy / yy * near_x, y0), y1)  # the minimum on the nearest side
     along_x = torch.minimum(torch.maximum(-xy / xx * near_y, x0), x1)
     least = torch.minimum(
         xx * near_x * near_x + 2 * xy * near_x * along_y + yy * along_y * along_y,
@@ -246,7 +247,7 @@ def _touch(
 def _nearest_image(
     mean: Float[Tensor, "C L 2"], position: Float[Tensor, "C S 2"], period: float
 ) -> Float[Tensor, "C L 2"]:
-    """Means, turned by whole periods to where they are nearest to their tile's middle."""
+    """Return the means shifted by whole periods to be nearest to the middle of their tile."""
     if not period:
         return mean
     x = position[..., 0].detach()

@@ -1,7 +1,7 @@
-"""Numba kernels that lead gradients through `composite_tiles`.
+"""Numba kernels for the gradients of `composite_tiles`.
 
-They go front to back like the forward pass: what is left of a ray's result behind a splat is the whole result
-less what has come so far, so that nothing is stored.
+They run front to back like the forward pass. The contribution of everything behind a splat is the full result
+minus the sum so far. So no intermediate values are stored.
 """
 
 from typing import NamedTuple, no_type_check
@@ -41,14 +41,17 @@ from foredrive.ops.vectors import (
 )
 
 SUMS = 12
-"""Columns of a pair's gradient in front of the features, see `composite_back`."""
+"""Number of columns in the gradient of a pair, before the features. See `composite_back`."""
 
 
 @inlined_part
 @no_type_check
 def _start_back(places, tile, out, grad_out, state, columns):
-    """Fill a block's rows: transmittance, what is left of the result times its gradient, gradients of range,
-    alpha and alpha before the hit, then of the features."""
+    """Fill the rows of each block.
+
+    The rows are: transmittance, dot product of the remaining result and its gradient, gradients of range,
+    alpha and alpha before the hit, then the gradients of the features.
+    """
     depth = columns - 5
     for s in range(POINTS):
         p = places.point[tile, s]
@@ -72,9 +75,9 @@ def _start_back(places, tile, out, grad_out, state, columns):
 @inlined_part
 @no_type_check
 def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
-    """Take a splat off what is left of a block's result, and add the features' gradient to `sums`.
+    """Subtract a splat from the remaining result of a block, and add the gradient of its feature to `sums`.
 
-    Returns whether any ray goes on, and e and h of `composite_back`.
+    Return whether any ray continues, and e and h of `composite_back`.
     """
     left = load_row(state, base)
     opacity = opacity_at(splat, dx, dy)
@@ -96,6 +99,7 @@ def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
     behind = load_row(state, base + ROW) - weight * worth
     store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
     store(state, base + ROW, behind)
+    # d/d log α: the own contribution of the splat, minus what it hides behind it.
     slope = weight * worth - alpha * behind / (row_of(ONE) - alpha)
     return bits_more(passed, MIN_LEFT) != 0, where_more(opacity, MAX_ALPHA, ZERO, slope), weight * to_range
 
@@ -103,14 +107,14 @@ def _add_back(splat, feature, base, state, dx, dy, t, hit, sums):
 @kernel
 @no_type_check
 def composite_back(start, stop, scene, places, out, grad_out, pairs):
-    """Write the gradients of tiles start … stop, pair by pair of splat and tile, to `pairs`.
+    """Write the gradients of tiles start … stop - 1 to `pairs`, one row per pair of splat and tile.
 
-    With e = dL/d log α and h = weight · dL/d range of each point, the columns are the sums over points of e,
-    e dx, e dy, e dx², e dx dy, e dy², e t dx, e t dy, h, h dx, h dy, h t, and weight · dL/d feature.
+    With e = dL/d log α and h = weight · dL/d range of each point, the columns are sums over points of e, e
+    dx, e dy, e dx², e dx dy, e dy², e t dx, e t dy, h, h dx, h dy, h t, and weight · dL/d feature.
 
     Args:
         out, grad_out: Float32[P D + 4], the result and its gradient.
-        pairs: Float32[L C], zeros; C is 12 + D or more, a multiple of 16.
+        pairs: Float32[L C], zeros. C is at least 12 + D and a multiple of 16.
     """
     columns = scene.feature.shape[1] + 5
     state, hits, sums = aligned(ROW * columns), aligned(ROW), aligned(pairs.shape[1])
@@ -137,13 +141,14 @@ def composite_back(start, stop, scene, places, out, grad_out, pairs):
 @inlined_part
 @no_type_check
 def _pass_back(scene, places, tile, at, blocks, going, hits, state, sums):
-    """Fill `sums` with the rows that add up to a pair's gradient; returns the blocks that go on."""
+    """Fill `sums` with the rows that add up to the gradient of a pair. Return the blocks that continue."""
     splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
     rows, columns = places.rows[tile], feature.size + 5
     x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = row_of(ZERO)
     for d in range(feature.size):
         store(sums, (SUMS + d) * ROW, s0)
+    # Loop over the set bits: the blocks that the splat touches and that have unfinished rays.
     while blocks != 0:
         block = lowest_bit(blocks)
         blocks &= blocks - np.uint32(1)
@@ -163,7 +168,7 @@ def _pass_back(scene, places, tile, at, blocks, going, hits, state, sums):
 
 
 class Gradients(NamedTuple):
-    """With respect to the fields of `Splats` of the same names."""
+    """Gradients with respect to the fields of `Splats` of the same names."""
 
     mean: np.ndarray
     inverse_covariance: np.ndarray
@@ -178,7 +183,7 @@ class Gradients(NamedTuple):
 @kernel
 @no_type_check
 def gather_gradients(start, stop, pairs, first_slot, raw, grads):
-    """Add up what `composite_back` wrote about the splats start … stop, which lies together."""
+    """Sum the pair gradients of splats start … stop - 1, which are contiguous; apply the chain rule."""
     sums = np.empty(SUMS + grads.feature.shape[1], np.float32)
     for i in range(start, stop):
         sums[:] = 0

@@ -1,6 +1,6 @@
 """The CUDA path of `composite_splats` for cameras: gsplat 1.5 (Ye et al., "gsplat", 2024).
 
-Its cut-offs are ours, its pixels the same. It knows neither time nor tilt nor medians.
+Its opacity thresholds and pixel centres are the same as here. It has no time, no range slope and no median.
 """
 
 import math
@@ -21,7 +21,7 @@ def composite_gsplat(
     feature: Float[Tensor, "N D"],
     size_hw: tuple[int, int],
 ) -> tuple[Float[Tensor, "P D"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Features, expected range and alpha of all pixels, row by row; the arguments are fields of `Splats`.
+    """Return features, expected range and alpha of all pixels in row order. See `Splats` for the arguments.
 
     Raises:
         InputError: gsplat is not installed.
@@ -59,7 +59,7 @@ def composite_gsplat(
 
 @torch.no_grad()
 def _reach_px(inverse_covariance: Float[Tensor, "N 3"], opacity: Float[Tensor, "N"]) -> Tensor:
-    """How far along u and v the opacity reaches 1/255, whole px; 0 where nowhere."""
+    """Return the distance along u and v at which the opacity falls to 1/255, whole px; 0 if it is lower."""
     xx, xy, yy = inverse_covariance.unbind(-1)
     square = 2 * (opacity.clamp(min=1e-30).log() + math.log(255)).clamp(min=0) / (xx * yy - xy * xy)
     return (square[:, None] * torch.stack([yy, xx], -1)).sqrt().ceil().int()

@@ -1,7 +1,7 @@
-"""Numba kernel that composites splats on tiles of points; `splatting_back_kernels` goes back.
+"""Numba kernel that composites splats on tiles of points. `splatting_back_kernels` has its gradients.
 
-Loops run over a tile's splats and, within, over the blocks of 16 points that a splat touches; what a block
-has gathered lies in the first-level cache.
+The outer loop runs over the splats of a tile, the inner one over the blocks of 16 points that a splat
+touches. The sums of a block stay in the first-level cache.
 """
 
 from typing import NamedTuple, no_type_check
@@ -47,49 +47,49 @@ from foredrive.ops.vectors import (
 
 MIN_ALPHA, MAX_ALPHA, MIN_LEFT = np.float32(1 / 255), np.float32(0.999), np.float32(1e-4)
 POINTS = ROW * ROW
-"""Slots of a tile."""
+"""Number of slots of a tile."""
 ALL = np.uint32(0xFFFF)
 EXTRA = 4
-"""Columns of a result behind the features: expected range, median range, alpha, alpha before the hit."""
+"""Number of result columns after the features: expected range, median range, alpha, alpha before the hit."""
 BATCH, AHEAD = 64, 12
-"""Splats of a tile that are looked for at once, and how long before that they are fetched."""
+"""Number of splats of a tile tested at once, and the prefetch distance in splats."""
 
 
 class Scene(NamedTuple):
-    """Splats and who sees them."""
+    """Splats and the lists of the tiles."""
 
     packed: np.ndarray
     """Float32[N 16], see `pack_splats`."""
     feature: np.ndarray
     """Float32[N D]."""
     splat: np.ndarray
-    """Int32[L], the tiles' lists one after the other."""
+    """Int32[L], lists of all tiles one after the other."""
     slot: np.ndarray
-    """Int32[L]: where a pair's gradient goes."""
+    """Int32[L], row of the gradient of each pair."""
     first: np.ndarray
-    """Int64[≥ T + 1], where a tile's list begins."""
+    """Int64[≥ T + 1], start of the list of each tile."""
 
 
 class Places(NamedTuple):
-    """What looks."""
+    """Points of the tiles."""
 
     rows: np.ndarray
-    """Float32[T 3 256]: x, y, time."""
+    """Float32[T 3 256], x, y, time."""
     block_bounds: np.ndarray
-    """Float32[T 6 16]."""
+    """Float32[T 6 16], smallest and largest x, y and time of each block."""
     tile_bounds: np.ndarray
-    """Float32[T 6]."""
+    """Float32[T 6], smallest and largest x, y and time of each tile."""
     point: np.ndarray
-    """Int32[T 256]: which point fills a slot; -1: none."""
+    """Int32[T 256], index of the point in each slot; -1 for none."""
     hit: np.ndarray
-    """Float32[P]."""
+    """Float32[P], range of the hit of each point."""
     period: np.float32
 
 
 @inlined_part
 @no_type_check
 def aligned(rows):
-    """Room for rows, at the beginning of a cache line."""
+    """Return memory for `rows` rows that starts at a cache line."""
     room = np.empty((rows + 1) * ROW, np.float32)
     skip = (ROW - room.ctypes.data // 4 % ROW) % ROW
     return room[skip : skip + rows * ROW]
@@ -98,7 +98,10 @@ def aligned(rows):
 @inlined_part
 @no_type_check
 def blocks_touched(splat, bounds, x):
-    """Bits of the blocks in which a splat's opacity reaches 1/255; see `touches`, here 16 boxes at a time."""
+    """Return a bit mask of the blocks in which the opacity of a splat reaches 1/255.
+
+    It is the test of `touches` for 16 boxes at a time.
+    """
     y, vx, vy = splat[MEAN_Y], splat[VELOCITY_X], splat[VELOCITY_Y]
     t0, t1 = load_row(bounds, 4 * ROW), load_row(bounds, 5 * ROW)
     moved, moved_to = t0 * vx, t1 * vx
@@ -119,7 +122,7 @@ def blocks_touched(splat, bounds, x):
 @inlined_part
 @no_type_check
 def offsets(splat, rows, at, x):
-    """d of a block's points from a splat, and their time."""
+    """Return the offsets d of the points of a block from a splat, and their times."""
     t = load_row(rows, 2 * POINTS + at)
     dx = load_row(rows, at) - x - t * splat[VELOCITY_X]
     dy = load_row(rows, POINTS + at) - splat[MEAN_Y] - t * splat[VELOCITY_Y]
@@ -129,23 +132,23 @@ def offsets(splat, rows, at, x):
 @inlined_part
 @no_type_check
 def opacity_at(splat, dx, dy):
-    """The opacity of a splat at d, before it is cut off above."""
+    """Return the opacity of a splat at d, before the limit of 0.999. It is 0 below 1/255."""
     exponent = dx * (dx * splat[XX] + dy * splat[XY]) + dy * dy * splat[YY]
-    opacity = exp2_row(least(exponent, ZERO) + splat[LOG_OPACITY])  # rounding may lift it above 0
+    opacity = exp2_row(least(exponent, ZERO) + splat[LOG_OPACITY])  # rounding may make it > 0
     return where_more(MIN_ALPHA, opacity, ZERO, opacity)
 
 
 @inlined_part
 @no_type_check
 def range_at(splat, dx, dy, t):
-    """The range of a splat at d, at time t."""
+    """Return the range of a splat at d and time t."""
     return dx * splat[SLOPE_X] + dy * splat[SLOPE_Y] + (t * splat[RATE] + splat[RANGE])
 
 
 @inlined_part
 @no_type_check
 def gather_hits(places, tile, hits):
-    """Fill `hits` with the hits of a tile's slots."""
+    """Fill `hits` with the hit ranges of the slots of a tile."""
     for s in range(POINTS):
         hits[s] = places.hit[max(places.point[tile, s], 0)]
 
@@ -153,7 +156,10 @@ def gather_hits(places, tile, hits):
 @inlined_part
 @no_type_check
 def _start(state, columns):
-    """Nothing seen yet: transmittance 1, then the columns of a result with the features last."""
+    """Initialise the rows of each block: transmittance 1, median range infinite, all else 0.
+
+    The order is transmittance, expected range, median range, alpha, alpha before the hit, features.
+    """
     state[:] = 0
     for block in range(ROW):
         base = block * columns * ROW
@@ -164,15 +170,18 @@ def _start(state, columns):
 @inlined_part
 @no_type_check
 def _add(splat, feature, base, state, dx, dy, t, hit):
-    """Put a splat behind what a block has seen; returns whether any of its rays goes on."""
+    """Add a splat behind the splats that a block already has. Return whether any of its rays continues."""
     left = load_row(state, base)
     alpha = least(opacity_at(splat, dx, dy), MAX_ALPHA)
     passed = left - left * alpha
+    # A ray ends, without counting the splat, when its transmittance would fall to MIN_LEFT.
     weight = where_more(passed, MIN_LEFT, left * alpha, ZERO)
     range_m = range_at(splat, dx, dy, t)
     store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
     store(state, base + ROW, load_row(state, base + ROW) + weight * range_m)
-    crossed = where_more(weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO)  # 0.5 where it may cross
+    # The median range is that of the splat at which the transmittance falls from above 0.5 to 0.5 or less.
+    # `crossed` is 0.5 at the rays where that happens, else 0.
+    crossed = where_more(weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO)
     crossed = where_more(passed, HALF, ZERO, crossed)
     median = load_row(state, base + 2 * ROW)
     store(state, base + 2 * ROW, where_more(crossed, ZERO, range_m, median))
@@ -189,7 +198,7 @@ def _add(splat, feature, base, state, dx, dy, t, hit):
 @inlined_part
 @no_type_check
 def look_for(scene, places, tile, begin, end, touched):
-    """Fill `touched` with the blocks that the entries begin … end of a tile's list touch."""
+    """Fill `touched` with the block masks of the entries begin … end - 1 of a tile's list."""
     bounds, tile_bounds = places.block_bounds[tile], places.tile_bounds[tile]
     last = scene.splat.size - 1
     for at in range(begin, end):
@@ -203,13 +212,13 @@ def look_for(scene, places, tile, begin, end, touched):
 @kernel
 @no_type_check
 def composite_tiles(start, stop, scene, places, out):
-    """Write what the points of tiles start … stop see to `out`, Float32[P D + 4], features first."""
+    """Write the results of tiles start … stop - 1 to `out`, Float32[P D + 4], features first."""
     columns = scene.feature.shape[1] + EXTRA + 1
     state, hits, touched = aligned(ROW * columns), aligned(ROW), np.empty(BATCH, np.uint32)
     for tile in range(start, stop):
         _start(state, columns)
         gather_hits(places, tile, hits)
-        going = ALL
+        going = ALL  # bit mask of the blocks that have unfinished rays
         for begin in range(scene.first[tile], scene.first[tile + 1], BATCH):
             end = min(begin + BATCH, scene.first[tile + 1])
             look_for(scene, places, tile, begin, end, touched)
@@ -223,11 +232,12 @@ def composite_tiles(start, stop, scene, places, out):
 @inlined_part
 @no_type_check
 def _pass(scene, places, tile, at, touched, going, hits, state):
-    """Put the splat of entry `at` behind what the blocks it touches have seen; returns those that go on."""
+    """Add the splat of entry `at` to the blocks that it touches. Return the blocks that continue."""
     splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
     rows, columns = places.rows[tile], feature.size + EXTRA + 1
     x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
     blocks = going & touched
+    # Loop over the set bits.
     while blocks != 0:
         block = lowest_bit(blocks)
         blocks &= blocks - np.uint32(1)

@@ -1,4 +1,4 @@
-"""The numba path of `composite_splats` as a function that autograd knows."""
+"""The numba path of `composite_splats` as an autograd function."""
 
 from typing import Any
 
@@ -24,13 +24,14 @@ from foredrive.ops.threads import in_parallel
 from foredrive.ops.vectors import ROW
 
 MIN_SPLATS, MIN_TILES = 4096, 8
-"""Fewer are not worth a thread of their own."""
+"""Minimum numbers of splats and of tiles per thread."""
 
 
 class CompositeSplats(torch.autograd.Function):
-    """For float32 on the CPU; the arguments are those of `composite_splats`, the result has its columns.
+    """Compositing for float32 on the CPU.
 
-    The result and its gradients do not depend on the number of threads.
+    The arguments are those of `composite_splats`. The columns of the result are its fields. Result and
+    gradients do not depend on the number of threads.
     """
 
     @staticmethod
@@ -41,7 +42,7 @@ class CompositeSplats(torch.autograd.Function):
         feature: Float[Tensor, "N D"],
         *where: Tensor,
     ) -> Float[Tensor, "P D4"]:
-        """Composite; `where` are the other fields of `Splats`, in the order of `Raw`."""
+        """Composite the splats. `where` holds the other fields of `Splats`, in the order of `Raw`."""
         feature, *where = (tensor.detach().contiguous() for tensor in (feature, *where))  # type: ignore[assignment]
         raw = Raw(*(tensor.numpy() for tensor in where))
         places = Places(
@@ -53,7 +54,7 @@ class CompositeSplats(torch.autograd.Function):
             np.float32(points.period),
         )
         scene, first_slot = _list(raw, feature.numpy(), points)
-        seen = np.empty((points.count, feature.shape[1] + EXTRA), np.float32)  # numpy asks for huge pages
+        seen = np.empty((points.count, feature.shape[1] + EXTRA), np.float32)  # numpy requests huge pages
 
         def job(start: int, stop: int) -> None:
             composite_tiles(start, stop, scene, places, seen)
@@ -67,7 +68,7 @@ class CompositeSplats(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of the splats' fields."""
+        """Return the gradients of the fields of `Splats`."""
         out, feature, *where = ctx.saved_tensors
         scene, places, first_slot = ctx.found
         columns = -(-(SUMS + feature.shape[1]) // ROW) * ROW
@@ -90,7 +91,7 @@ class CompositeSplats(torch.autograd.Function):
 
 
 def _list(raw: Raw, feature: np.ndarray, points: TiledPoints) -> tuple[Scene, np.ndarray]:
-    """The tiles' lists, and where the pairs of each splat begin."""
+    """Build the lists of the tiles. Return them with the start of the pairs of each splat."""
     count = len(feature)
     packed = np.empty((count, COLUMNS), np.float32)
     per_splat = np.empty(count, np.int64)

@@ -1,7 +1,7 @@
-"""Kernels release the GIL and run on Python threads, as many as torch uses.
+"""Parallel kernels on Python threads, with torch's number of threads. The kernels release the GIL.
 
-Unlike numba's own `prange` this compiles in a third of the time, can be called from several threads at once
-and leaves a forked child process alive.
+Compared with numba's `prange`, this compiles in a third of the time, can be called from several threads at
+once, and survives a fork of the process.
 """
 
 import os
@@ -15,11 +15,14 @@ import torch
 T = TypeVar("T")
 
 RANGES_PER_THREAD = 4
-"""Some slack for cores that are busy with something else."""
+"""Number of ranges per thread. More than one balances the load when some cores are busy."""
 
 
 def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> None:
-    """Call job(start, stop) on ranges that cover range(count), each at least `grain` long but the last."""
+    """Call job(start, stop) on ranges that cover range(count), with at least `grain` elements each.
+
+    The last range may be shorter.
+    """
     threads = torch.get_num_threads()
     step = max(grain, -(-count // (RANGES_PER_THREAD * threads)))
     starts = range(0, count, step)
@@ -32,7 +35,7 @@ def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> 
 
 
 def one_ahead(items: Iterator[T]) -> Iterator[T]:
-    """The same items, each made on another thread while the one before is worked on; with one thread, no."""
+    """Yield the items; another thread prepares the next item meanwhile. With one torch thread it does not."""
     if torch.get_num_threads() == 1:
         yield from items
         return

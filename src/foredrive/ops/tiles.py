@@ -1,8 +1,7 @@
-"""What Triton kernels are made of: tiles of rows × points × channels, and reading between grid cells.
+"""Shared parts of the Triton kernels: tiles of rows × points × channels, and interpolation between cells.
 
-A row is what one head reads for one query. All sums are float32, whatever the inputs are stored in. Without a
-GPU the kernels run in Triton's interpreter if TRITON_INTERPRET=1 is set before Triton is imported, as their
-tests do it.
+A row is one head of one query. All sums are in float32, for any input type. Without a GPU the kernels run in
+Triton's interpreter, if TRITON_INTERPRET=1 is set before Triton is imported. The tests do this.
 """
 
 from collections.abc import Sequence
@@ -13,13 +12,14 @@ import triton.language as tl
 from torch import Tensor
 
 TILE = 1024
-"""Numbers in a tile: eight to a thread."""
+"""Numbers in a tile: eight per thread."""
 PLACES, POINTS_AT_ONCE = 256, 16
-"""Most places and points in a tile: a place takes more registers than a number that is read there."""
+"""Maximum number of places (rows times points) and of points in a tile. A place needs more registers than a
+number that is read there."""
 
 
 class Tile(NamedTuple):
-    """What a program works on at once; all are powers of two."""
+    """The size of a program's tile. All entries are powers of two."""
 
     rows: int
     points: int
@@ -27,7 +27,7 @@ class Tile(NamedTuple):
 
 
 def tile_of(points: int, channels: int) -> Tile:
-    """The tile for rows of so many points that read so many channels: all channels, some points and rows."""
+    """Return the tile for rows of given size: it has all channels, some points and some rows."""
     wide = int(triton.next_power_of_2(channels))
     many = min(int(triton.next_power_of_2(points)), POINTS_AT_ONCE, max(TILE // wide, 1))
     return Tile(rows=max(min(TILE // wide, PLACES) // many, 1), points=many, channels=wide)
@@ -44,10 +44,10 @@ def launch(
     """Run a kernel over all rows.
 
     Args:
-        tensors: its first arguments; then come the numbers of rows and of queries.
-        sizes: its next ones.
-        weights: [b Q H … P], of what is read.
-        channels: of all heads.
+        tensors: first arguments of the kernel; the numbers of rows and of queries follow.
+        sizes: the next arguments.
+        weights: attention weights [b Q H … P].
+        channels: number of channels of all heads together.
     """
     (queries, heads), points = weights.shape[1:3], weights.shape[-1]
     rows, width = len(weights) * queries * heads, channels // heads
@@ -71,8 +71,8 @@ def launch(
 @triton.jit
 @no_type_check
 def neighbours(x, size):
-    """See `vectors.neighbours`: the cells beside a coordinate whose integers are cell centres."""
-    x = tl.where(x > -2.0, x, -2.0)  # NaN goes there too
+    """Return the two cells beside a coordinate, as `vectors.neighbours`. Integers are cell centres."""
+    x = tl.where(x > -2.0, x, -2.0)  # NaN becomes -2 too
     x = tl.where(x < size, x, size * 1.0)
     floor = tl.floor(x)
     part = x - floor
@@ -93,7 +93,7 @@ def neighbours(x, size):
 @triton.jit
 @no_type_check
 def read(values, address, part, c, WIDTH: tl.constexpr):
-    """Σ part · value over a tile's points, rows × channels; where the part is 0 nothing is looked at."""
+    """Return Σ part · value over the points of a tile, rows × channels. Values with part 0 are not read."""
     needed = (part != 0)[:, :, None] & (c < WIDTH)[None, None, :]
     value = tl.load(values + address[:, :, None] + c[None, None, :], mask=needed, other=0.0)
     return tl.sum(part[:, :, None] * value.to(tl.float32), axis=1)
@@ -113,9 +113,9 @@ def read_back(
     TO_VALUES: tl.constexpr,
     TO_POINTS: tl.constexpr,
 ):
-    """What the gradient of rows × channels does at the cells of one corner.
+    """Propagate the gradient of rows × channels to the cells of one corner.
 
-    Adds part · grad to `grad_values`, and returns the dot product of grad and value for every point.
+    It adds part · grad to `grad_values` and returns the dot product of grad and value for every point.
     """
     place = address[:, :, None] + c[None, None, :]
     dot = tl.zeros(address.shape, tl.float32)

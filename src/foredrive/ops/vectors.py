@@ -1,14 +1,14 @@
-"""Vectors of eight or sixteen float32 numbers as one value in numba kernels, and reading between grid cells.
+"""Vectors of eight or sixteen float32 numbers as one value in numba kernels, and interpolation helpers.
 
-LLVM's own vectoriser makes little of inner loops over a handful of numbers: it cannot know how many there
-are, nor that the arrays do not overlap. Here the kernel says it. LLVM lowers a vector to whatever the
-processor has: sixteen lanes are one register with AVX-512, two with AVX, four with NEON.
+LLVM's own vectoriser does not handle short inner loops well: it does not know the number of elements, nor
+that the arrays do not overlap. Here the kernels use vectors explicitly. LLVM lowers a vector to the registers
+of the processor: sixteen lanes are one register with AVX-512, two with AVX, four with NEON.
 
-Kernels that read channels take blocks of eight (`zeros8`) and then the channels left over one by one, with
-the same code for both: `load`, `store` and `mul_add` take plain float32 too. Kernels of splats and attention
-work on rows of sixteen (`ROW`), with operators.
+Kernels that read channels use blocks of eight (`zeros8`), then the remaining channels one by one, with the
+same code: `load`, `store` and `mul_add` also accept a plain float32. Kernels of splats and attention use rows
+of sixteen (`ROW`) with operators.
 
-Numba's cache on disk looks at the file of the kernel only: delete it (`*.nbi`) after changes in this one.
+Numba's disk cache checks only the file of the kernel. Delete the cache (`*.nbi`) after changes in this file.
 """
 
 import operator
@@ -23,20 +23,21 @@ from numba.extending import intrinsic, models, overload, register_model
 
 _OPTIONS = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 kernel = numba.njit(cache=True, nogil=True, **_OPTIONS)
-"""Compiled at the first call, without the GIL; NaN and infinity stay what they are."""
+"""Decorator of kernels: compiled at the first call, without the GIL. NaN and infinity are preserved."""
 kernel_part = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
-"""The same for what only kernels call, which compiles faster."""
+"""Decorator of functions that only kernels call. They compile faster."""
 inlined_part = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True, **_OPTIONS)
-"""The same for what is called so often that handing over its arguments would take long."""
+"""Decorator of small functions that are called very often. They are inlined, because passing arguments is
+slow."""
 
 WIDTH, ROW = 8, 16
-"""Lanes of the two kinds of vectors."""
+"""Lanes of the two vector types."""
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _CONTRACT, _REORDER = ("contract", "nsz"), ("contract", "nsz", "reassoc")
 
 
 class Vector(types.Type):
-    """Numba type of so many float32 lanes."""
+    """The numba type of a vector with a number of float32 lanes."""
 
     def __init__(self, lanes: int) -> None:
         super().__init__(name=f"Float32x{lanes}")
@@ -54,7 +55,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _shuffled(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: Iterable[int]) -> ir.Value:
-    """Lanes of a, and behind them those of b."""
+    """Return the chosen lanes of a and b. Lanes of b are numbered after those of a."""
     indices = list(lanes)
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(cgutils.int32_t, len(indices)), indices))
 
@@ -66,13 +67,13 @@ def _broadcast(builder: ir.IRBuilder, scalar: ir.Value, form: ir.VectorType = _F
 
 
 def _address(context: Any, builder: ir.IRBuilder, signature: Any, args: Any, form: ir.Type) -> ir.Value:
-    """Where a value of this form lies at flat index args[1] of array args[0]."""
+    """Return the address of a value of type `form` at flat index args[1] of array args[0]."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
     return builder.bitcast(builder.gep(array.data, [args[1]]), form.as_pointer())
 
 
 def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.Value:
-    """Add neighbouring runs of lanes within a and within b; the sums of a and of b alternate."""
+    """Add adjacent runs of lanes within a and within b. The sums of a and of b alternate in the result."""
     count = a.type.count
     even = [lane for lane in range(count) if lane // run % 2 == 0]
     order = [
@@ -88,7 +89,7 @@ def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.V
 @intrinsic
 @no_type_check
 def load(typing_context, array, index, like):
-    """Read a value of `like`'s type at flat `index` of a C-contiguous float32 array. No bounds check."""
+    """Read a value of `like`'s type at `index` of a C-contiguous float32 array, without bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, signature, args, args[2].type), align=4)
@@ -99,7 +100,7 @@ def load(typing_context, array, index, like):
 @intrinsic
 @no_type_check
 def load_row(typing_context, array, index):
-    """Read sixteen numbers likewise."""
+    """Read sixteen numbers at flat `index` of a C-contiguous float32 array, without a bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, signature, args, _FORM), align=4)
@@ -110,7 +111,7 @@ def load_row(typing_context, array, index):
 @intrinsic
 @no_type_check
 def store(typing_context, array, index, value):
-    """Write `value` at flat `index` of a C-contiguous float32 array. No bounds check."""
+    """Write `value` at flat `index` of a C-contiguous float32 array, without bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         builder.store(args[2], _address(context, builder, signature, args, args[2].type), align=4)
@@ -122,7 +123,7 @@ def store(typing_context, array, index, value):
 @intrinsic
 @no_type_check
 def zeros8(typing_context):
-    """Eight zeros."""
+    """Return eight zeros."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return ir.Constant(float8.form, [0.0] * WIDTH)
@@ -133,7 +134,7 @@ def zeros8(typing_context):
 @intrinsic
 @no_type_check
 def mul_add(typing_context, scale, value, total):
-    """Total + scale · value, with a scalar scale."""
+    """Return total + scale · value, with a scalar scale."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         factor = _broadcast(builder, args[0], value.form) if isinstance(value, Vector) else args[0]
@@ -170,9 +171,10 @@ def add_dots(typing_context, array, index, a, b, c, d, other):
 @kernel_part
 @no_type_check
 def neighbours(x, size):
-    """The two cells beside a coordinate whose integers are cell centres: clamped indices, weights, slopes.
+    """Return the two cells beside a coordinate: clamped indices, weights, slopes. Integers are cell centres.
 
-    Weights and slopes (their derivatives) are zero for cells outside 0 … size - 1. NaN counts as outside.
+    Slopes are the derivatives of the weights. Weights and slopes are zero for cells outside 0 … size - 1. NaN
+    counts as outside.
     """
     x = x if x > -2 else np.float32(-2)
     x = x if x < size else np.float32(size)
@@ -193,17 +195,17 @@ def neighbours(x, size):
 
 
 def _as_rows(builder: ir.IRBuilder, args: Any) -> list[ir.Value]:
-    """Arguments as rows, scalars broadcast."""
+    """Return the arguments as rows. Scalars are broadcast."""
     return [value if value.type == _FORM else _broadcast(builder, value) for value in args]
 
 
 def _kinds(*given: types.Type) -> list[types.Type]:
-    """Types of arguments that are each a row or a float32."""
+    """Return the numba types of arguments that are each a row or a float32."""
     return [kind if kind is a_row else types.float32 for kind in given]
 
 
 def _elementwise(emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> Any:
-    """An intrinsic of two rows, one of which may be a float32."""
+    """Return an intrinsic of two rows, one of which may be a float32."""
 
     @intrinsic
     @no_type_check
@@ -227,9 +229,9 @@ def _select(order: str) -> Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]:
 
 
 least = _elementwise(_select("<"))
-"""The lesser of each pair; the second where one is NaN."""
+"""Elementwise minimum. It returns the second argument where one is NaN."""
 greatest = _elementwise(_select(">"))
-"""The greater of each pair; the second where one is NaN."""
+"""Elementwise maximum. It returns the second argument where one is NaN."""
 
 
 def _operator(symbol: Any, emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> None:
@@ -252,7 +254,7 @@ _operator(operator.truediv, lambda builder, args: builder.fdiv(*args, flags=_REO
 @intrinsic
 @no_type_check
 def row_of(typing_context, scalar):
-    """Sixteen times the same."""
+    """Return a row with sixteen copies of a scalar."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return _broadcast(builder, args[0])
@@ -263,7 +265,7 @@ def row_of(typing_context, scalar):
 @intrinsic
 @no_type_check
 def where_more(typing_context, a, b, yes, no):
-    """Numbers of `yes` where a > b, else those of `no`; each a row or a float32."""
+    """Return `yes` where a > b, else `no`, elementwise. Each argument is a row or a float32."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         a, b, yes, no = _as_rows(builder, args)
@@ -275,7 +277,7 @@ def where_more(typing_context, a, b, yes, no):
 @intrinsic
 @no_type_check
 def bits_more(typing_context, a, b):
-    """An integer whose bit k says whether number k of a is above that of b."""
+    """Return an integer with bit k set where a > b in lane k."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         above = builder.fcmp_ordered(">", *_as_rows(builder, args))
@@ -287,7 +289,7 @@ def bits_more(typing_context, a, b):
 @intrinsic
 @no_type_check
 def lowest_bit(typing_context, bits):
-    """Place of the lowest bit of an integer that is not 0."""
+    """Return the position of the lowest set bit of a non-zero integer."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         return builder.zext(builder.cttz(args[0], ir.Constant(ir.IntType(1), 1)), cgutils.intp_t)
@@ -296,7 +298,7 @@ def lowest_bit(typing_context, bits):
 
 
 def _halving(pair: Callable[[ir.IRBuilder, ir.Value, ir.Value], ir.Value]) -> Any:
-    """An intrinsic that makes one float32 of a row, halves at a time."""
+    """Return an intrinsic that reduces a row to one float32 by halving it repeatedly."""
 
     @intrinsic
     @no_type_check
@@ -314,21 +316,21 @@ def _halving(pair: Callable[[ir.IRBuilder, ir.Value, ir.Value], ir.Value]) -> An
 
 
 total_of = _halving(lambda builder, a, b: builder.fadd(a, b, flags=_REORDER))
-"""The sum of a row's numbers."""
+"""Sum of the numbers of a row."""
 greatest_in = _halving(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
-"""The greatest of a row's numbers."""
+"""Largest number of a row."""
 
 
 @intrinsic
 @no_type_check
 def totals(typing_context, array, index):
-    """The sums of sixteen rows that follow each other from flat `index` of an array, as one row."""
+    """Return the sums of sixteen consecutive rows from flat `index` of an array, as one row."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         first = _address(context, builder, signature, args, _FORM)
         places = [builder.gep(first, [ir.Constant(cgutils.int32_t, k)]) for k in range(ROW)]
         rows = [builder.load(place, align=4) for place in places]
-        while len(rows) > 1:  # halve the rows and the lanes that belong to the same row
+        while len(rows) > 1:  # halve the rows, and the lanes of each row
             run = ROW // len(rows)
             rows = [_add_runs(builder, a, b, run) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
@@ -339,11 +341,11 @@ def totals(typing_context, array, index):
 @intrinsic
 @no_type_check
 def prefetch(typing_context, array, index):
-    """Have the cache line at flat `index` of an array come nearer."""
+    """Prefetch the cache line at flat `index` of an array."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         place = _address(context, builder, signature, args, ir.IntType(8))
-        flags = [ir.Constant(cgutils.int32_t, k) for k in (0, 3, 1)]  # to read, soon, data
+        flags = [ir.Constant(cgutils.int32_t, k) for k in (0, 3, 1)]  # read, high locality, data
         kind = ir.FunctionType(ir.VoidType(), [place.type, *(flag.type for flag in flags)])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         builder.call(function, [place, *flags])
@@ -366,7 +368,7 @@ def _floor(typing_context, row):
 @intrinsic
 @no_type_check
 def _power_of_2(typing_context, row):
-    """2^n of whole numbers n from -126 to 127, written into the exponent."""
+    """Return 2^n of integers n from -126 to 127, written directly into the exponent bits."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         whole = builder.add(builder.fptosi(args[0], _WHOLE), ir.Constant(_WHOLE, [127] * ROW))
@@ -378,15 +380,15 @@ def _power_of_2(typing_context, row):
 _C5, _C4, _C3, _C2, _C1 = (
     np.float32(c) for c in (1.86713e-3, 9.01703e-3, 5.579991e-2, 2.4016445e-1, 6.9315131e-1)
 )
-"""2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1, to within 8e-8 of it: the least greatest relative error of
-degree 5, found by reweighted least squares."""
+"""Coefficients of 2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1, with relative error below 8e-8. They are
+the minimax polynomial of degree 5, found by reweighted least squares."""
 _LEAST = np.float32(-126)
 
 
 @inlined_part
 @no_type_check
 def exp2_row(x):
-    """2^x for x ≤ 127, to within 3e-7 of it; below 2^-126 that."""
+    """Return 2^x for x ≤ 127, with relative error below 3e-7. For x < -126 return 2^-126."""
     x = greatest(x, _LEAST)
     whole = _floor(x)
     f = x - whole

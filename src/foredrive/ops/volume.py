@@ -1,6 +1,7 @@
-"""Reading volumes between their voxels, and warping them (NeMo eq. 7-8).
+"""Interpolation in volumes, and warping of volumes (NeMo eq. 7-8).
 
-Coordinates in volumes are in voxel units, order x y z: voxel i spans [i, i + 1), its centre lies at i + 0.5.
+Coordinates in volumes are in voxel units, in the order x y z. Voxel i spans [i, i + 1), and its centre is at
+i + 0.5.
 """
 
 import torch
@@ -16,23 +17,23 @@ from foredrive.ops.volume_reading import ReadVolume, readers_of
 def sample_volume(
     volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
 ) -> Float[Tensor, "b N D"]:
-    """Trilinear reading of a volume, zero outside.
+    """Sample a volume by trilinear interpolation, with zero outside.
 
     Args:
-        volume: channels last.
-        points: x y z in voxel units. NaN reads NaN, infinity reads 0.
+        volume: features with channels last.
+        points: x y z in voxel units. NaN gives NaN, infinity gives 0.
 
     Returns:
         float32 (float64 for float64 input), also from half precision.
 
     Raises:
-        ValueError: if the batches differ or the volume has no voxels.
+        ValueError: the batch sizes differ, or the volume has no voxels.
     """
     if len(volume) != len(points) or min(volume.shape[1:]) == 0:
         raise ValueError(f"sample_volume: cannot read {(*points.shape,)} from {(*volume.shape,)}")
     small = volume[:1].numel() < MAX_ITEM_SIZE
     if small and triton_can(volume, points):
-        from foredrive.ops.volume_triton import sample_volume_triton  # there may be no Triton elsewhere
+        from foredrive.ops.volume_triton import sample_volume_triton  # Triton may be missing
 
         return sample_volume_triton(volume, points)
     if not (small and numba_can(volume, points)):
@@ -47,7 +48,7 @@ def sample_volume(
 def sample_volume_reference(
     volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
 ) -> Float[Tensor, "b N D"]:
-    """`sample_volume` in plain PyTorch."""
+    """Compute `sample_volume` in plain PyTorch."""
     with full_precision(volume, points) as (volume, points):
         size_xyz = points.new_tensor(volume.shape[1:4][::-1])
         grid = 2 * points.clamp(-torch.ones_like(size_xyz), size_xyz + 1) / size_xyz - 1
@@ -65,15 +66,16 @@ def warp_volume(
 ) -> Float[Tensor, "b D Z Y X"]:
     """Move a volume by a flow and a rigid motion, by gathering (NeMo eq. 7-8).
 
-    out[z] = volume[R (z + f(z)) + t] at every voxel centre z (m, ego frame) of the result. The result lies in
-    the frame dst (the future), the given volume in src (now): flow and (R, t) = `T_src_dst` both lead from
-    the future frame's coordinates back to now's. Zero where that falls outside the volume.
+    out[z] = volume[R (z + f(z)) + t] at every voxel centre z (m, ego frame) of the result. The result is in
+    the frame dst (the future), the given volume in the frame src (now). Both the flow and (R, t) =
+    `T_src_dst` lead from coordinates of the future frame back to those of now. The result is zero where the
+    source is outside the volume.
 
     Args:
-        volume: on a grid in the frame src; no copy is made if it lies channels-last in memory.
+        volume: grid in the frame src. No copy is made if it is channels-last in memory.
         flow: f, metres along x y z of dst.
-        T_src_dst: points of dst -> src.
-        lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, the same in both frames.
+        T_src_dst: maps points of dst to src.
+        lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, equal in both frames.
     """
     with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
         read = sample_volume(
@@ -88,7 +90,10 @@ def places_before(
     lower_m: tuple[float, float, float],
     voxel_m: float,
 ) -> Float[Tensor, "b Z Y X 3"]:
-    """Where `warp_volume` reads: ẑ = R (z + f) + t of every voxel centre z, x y z in voxel units."""
+    """Return the source positions of `warp_volume`: ẑ = R (z + f) + t of every voxel centre z.
+
+    They are x y z in voxel units.
+    """
     axes = [torch.arange(n, dtype=flow.dtype, device=flow.device) + 0.5 for n in flow.shape[2:]]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     lower = flow.new_tensor(lower_m)

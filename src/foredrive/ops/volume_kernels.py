@@ -1,6 +1,6 @@
-"""Numba kernels behind `sample_volume` and `attend_volume`: weighted sums of trilinear readings.
+"""Numba kernels of `sample_volume` and `attend_volume`: weighted sums of trilinear samples.
 
-Queries go through in blocks of some hundred points, head by head.
+Queries are processed in blocks of up to 256 points, head by head.
 """
 
 from typing import NamedTuple, no_type_check
@@ -12,14 +12,14 @@ from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, 
 
 
 class Inputs(NamedTuple):
-    """What is read."""
+    """Inputs of the kernels."""
 
     values: np.ndarray
-    """Float[b Z Y X D]."""
+    """Float[b Z Y X D], features."""
     points: np.ndarray
     """Float[b Q H P 3], x y z in voxel units."""
     weights: np.ndarray
-    """Float[b Q H P]."""
+    """Float[b Q H P], weights."""
 
 
 class Gradients(NamedTuple):
@@ -28,13 +28,13 @@ class Gradients(NamedTuple):
     out: np.ndarray
     values: np.ndarray
     points: np.ndarray
-    """Float[b Q slots P 3]."""
+    """Float[b Q slots P 3], one slot per reader."""
     weights: np.ndarray
-    """Float[b Q slots P]."""
+    """Float[b Q slots P], one slot per reader."""
 
 
 class Reader(NamedTuple):
-    """Which channels of a query are read at the points of which head, and where their gradients go."""
+    """A range of channels of one head, and the slot for the gradients of its points."""
 
     head: int
     first_channel: int
@@ -45,7 +45,7 @@ class Reader(NamedTuple):
 @kernel_part
 @no_type_check
 def _collect(inputs, block, item, first, last, head):
-    """Fill `block` with the points of the queries first … last of a batch item."""
+    """Fill `block` with the points of the queries first … last - 1 of a batch item."""
     points = inputs.weights.shape[3]
     for q in range(first, last):
         i = (q - first) * points
@@ -59,7 +59,7 @@ def _collect(inputs, block, item, first, last, head):
 @kernel_part
 @no_type_check
 def _corners(block, count, shape):
-    """Fill corner and part."""
+    """Fill `corner` and `part` of a block."""
     place, corner, part = block.place, block.corner, block.part
     depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
     channels = np.int32(shape[4])
@@ -68,6 +68,7 @@ def _corners(block, count, shape):
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
         z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
+        # NaN coordinates must give NaN, although `neighbours` treats them as outside.
         w = block.weight[i] if (x == x) & (y == y) & (z == z) else np.float32(np.nan)
         row00, row01 = (z0 * height + y0) * width, (z0 * height + y1) * width
         row10, row11 = (z1 * height + y0) * width, (z1 * height + y1) * width
@@ -92,7 +93,7 @@ def _corners(block, count, shape):
 @kernel_part
 @no_type_check
 def _read(inputs, block, item, first, last, channel, zero, out):
-    """Write what each query of a block reads, in the channels from `channel` on."""
+    """Write the samples of each query of a block, in the channels from `channel` on."""
     points, channels = inputs.weights.shape[3], inputs.values.shape[4]
     queries = out.shape[1]
     base = item * inputs.values[0].size + channel
@@ -107,9 +108,13 @@ def _read(inputs, block, item, first, last, channel, zero, out):
 @kernel
 @no_type_check
 def read_queries(inputs, item, first_query, last_query, out):
-    """Write what the queries first_query … last_query of an item read to `out`, Float[b Q D]. P ≤ BLOCK."""
+    """Write the samples of queries first_query … last_query - 1 to `out`, Float[b Q D].
+
+    Requires P ≤ BLOCK.
+    """
     heads = inputs.weights.shape[2]
     width = inputs.values.shape[4] // heads
+    # Channels are read in vectors of WIDTH, then the rest one by one.
     whole = width - width % WIDTH
     block, step = new_block(3), BLOCK // inputs.weights.shape[3]
     for first in range(first_query, last_query, step):
@@ -126,7 +131,7 @@ def read_queries(inputs, item, first_query, last_query, out):
 @kernel_part
 @no_type_check
 def _read_back(inputs, block, item, first, last, channel, zero, grads):
-    """Send the result's gradient to the values, and what it says about each corner to `block.dots`."""
+    """Add the gradient of the samples to the values and to `block.dots`."""
     points, channels = inputs.weights.shape[3], inputs.values.shape[4]
     queries = grads.out.shape[1]
     base = item * inputs.values[0].size + channel
@@ -141,7 +146,7 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
 @kernel_part
 @no_type_check
 def _slopes(block, count, shape):
-    """Turn `dots` into gradients with respect to x, y, z and weight, which go to the first rows of `part`."""
+    """Convert `dots` into gradients with respect to x, y, z and weight, in the first rows of `part`."""
     place, slope = block.place, block.part
     depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
     for i in range(count):
@@ -170,7 +175,7 @@ def _slopes(block, count, shape):
 @kernel_part
 @no_type_check
 def _hand_out(inputs, block, item, first, last, slot, grads):
-    """Write the gradients of a block's points. Overwrites `block.part`."""
+    """Write the gradients of a block's points. It overwrites `block.part`."""
     points = inputs.weights.shape[3]
     slope = block.part
     _slopes(block, (last - first) * points, inputs.values.shape)
@@ -187,10 +192,10 @@ def _hand_out(inputs, block, item, first, last, slot, grads):
 @kernel
 @no_type_check
 def read_back(inputs, item, reader, grads):
-    """Add the values' gradients that one reader of a batch item brings, and write those of its points.
+    """Add the gradients of the values for one reader of a batch item, and write those of its points.
 
-    Readers touch disjoint channels and slots, batch items disjoint volumes: calls that differ in either can
-    run at the same time. Gradients that are not wanted have size 0.
+    Readers use disjoint channels and slots, and batch items use disjoint volumes. So calls that differ in
+    reader or item can run in parallel. Gradients that are not wanted have size 0.
     """
     width = reader.last_channel - reader.first_channel
     whole = reader.first_channel + width - width % WIDTH

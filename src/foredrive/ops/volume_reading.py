@@ -1,4 +1,4 @@
-"""The numba path of `sample_volume` and `attend_volume` as a function that autograd knows."""
+"""The numba path of `sample_volume` and `attend_volume` as an autograd function."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from foredrive.ops.threads import in_parallel
 from foredrive.ops.volume_kernels import Gradients, Inputs, Reader, read_back, read_queries
 
 MIN_QUERIES = 256
-"""Fewer are not worth a thread of their own."""
+"""Minimum number of queries per thread."""
 CHANNELS_AT_ONCE = 16
-"""The backward pass runs in parallel over slices of one cache line."""
+"""Channels of a reader: one cache line. The backward pass runs in parallel over readers."""
 
 
 def readers_of(heads: int, channels: int) -> tuple[Reader, ...]:
-    """Who reads which channels in the backward pass: for each head, slices of its share of the channels."""
+    """Return the readers of the backward pass: each head's channels in slices of `CHANNELS_AT_ONCE`."""
     width = channels // heads
     slices = [
         (head, start, min(start + CHANNELS_AT_ONCE, (head + 1) * width))
@@ -28,11 +28,11 @@ def readers_of(heads: int, channels: int) -> tuple[Reader, ...]:
 
 
 class ReadVolume(torch.autograd.Function):
-    """Weighted sums of trilinear readings, for float32 on the CPU; `attend_volume` says what they are.
+    """Weighted sums of trilinear samples, for float32 on the CPU. See `attend_volume`.
 
-    The backward pass runs reader by reader. There may be several to a head, each with some of its channels;
-    each has its own slot for the gradients of the points, and the slots of a head are added up at the end.
-    The result does not depend on the number of threads.
+    The backward pass runs reader by reader. A head may have several readers, each with some of its channels.
+    Each reader has its own slot for the gradients of the points. The slots of a head are summed at the end,
+    so the result does not depend on the number of threads.
     """
 
     @staticmethod
@@ -43,7 +43,7 @@ class ReadVolume(torch.autograd.Function):
         weights: Float[Tensor, "b Q H P"],
         readers: tuple[Reader, ...],
     ) -> Float[Tensor, "b Q D"]:
-        """Read; the last argument says which channels the backward pass takes together."""
+        """Compute the sums. `readers` gives the channel slices of the backward pass."""
         values, points, weights = values.contiguous(), points.contiguous(), weights.contiguous()
         ctx.save_for_backward(values, points, weights)
         ctx.readers = readers
@@ -63,7 +63,7 @@ class ReadVolume(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of values, points and weights, where they are wanted."""
+        """Return the gradients of values, points and weights, where they are wanted."""
         values, points, weights = ctx.saved_tensors
         wants_values, wants_points, wants_weights, _ = ctx.needs_input_grad
         readers: tuple[Reader, ...] = ctx.readers

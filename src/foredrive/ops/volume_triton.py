@@ -1,6 +1,6 @@
-"""The CUDA path of `sample_volume` and `attend_volume`: Triton kernels of sums of trilinear readings.
+"""The CUDA path of `sample_volume` and `attend_volume`: Triton kernels for sums of trilinear samples.
 
-A program takes a few rows (a head of a query each) and reads rows × points × channels at a time.
+A program handles a few rows (a row is one head of one query) and reads rows × points × channels at a time.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ def read_volume_triton(
     points: Float[Tensor, "b Q H P 3"],
     weights: Float[Tensor, "b Q H P"],
 ) -> Float[Tensor, "b Q D"]:
-    """`attend_volume` for what lies on a GPU. Half precision is read as it is and added up in float32.
+    """Compute `attend_volume` on a GPU. Half precision is read as it is and summed in float32.
 
-    The gradient of the values is added up by atomics: its last bits differ from run to run.
+    The gradient of the values is summed by atomics, so its last bits differ from run to run.
     """
     out: Tensor = _ReadVolume.apply(values, points, weights)
     return out
@@ -32,7 +32,7 @@ def read_volume_triton(
 def sample_volume_triton(
     volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
 ) -> Float[Tensor, "b N D"]:
-    """`sample_volume` for what lies on a GPU: one head with one point of weight 1."""
+    """Compute `sample_volume` on a GPU: one head with one point of weight 1."""
     one = torch.ones(*points.shape[:2], 1, 1, device=points.device)
     return read_volume_triton(volume, points[:, :, None, None], one)
 
@@ -82,11 +82,12 @@ def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | No
 @triton.jit
 @no_type_check
 def _places(points, weights, at, inside):
-    """Coordinates (integers are voxel centres) and weights of rows × points."""
+    """Load coordinates (integers are voxel centres) and weights of rows × points."""
     x = tl.load(points + 3 * at, mask=inside, other=0.0).to(tl.float32) - 0.5
     y = tl.load(points + 3 * at + 1, mask=inside, other=0.0).to(tl.float32) - 0.5
     z = tl.load(points + 3 * at + 2, mask=inside, other=0.0).to(tl.float32) - 0.5
     weight = tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
+    # NaN coordinates must give NaN.
     weight = tl.where((x == x) & (y == y) & (z == z), weight, float("nan"))
     return x, y, z, tl.where(inside, weight, 0.0)
 
@@ -176,6 +177,7 @@ def _read_rows_back(
         z0, z1, wz0, wz1, sz0, sz1 = neighbours(z, depth)
         to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
         to_z, to_weight = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
+        # `met` is the dot product of the corner's value and the gradient.
         for corner in tl.static_range(8):
             cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
             cy, wy, sy = (y1, wy1, sy1) if corner // 2 % 2 else (y0, wy0, sy0)

@@ -1,4 +1,4 @@
-"""The types every part of Foredrive reads and writes, and the protocols it is put together from."""
+"""The types that every part of Foredrive reads and writes, and the protocols between the parts."""
 
 from foredrive.scene.boxes import Boxes, Category
 from foredrive.scene.clip import Clip, Command, Example

@@ -10,7 +10,7 @@ from foredrive.scene.record import Record
 
 
 class Category(enum.IntEnum):
-    """What a box holds. The classes of nuScenes' detection task, plus animals and everything else."""
+    """Classes of a box: those of the nuScenes detection task, animals, and everything else."""
 
     CAR = 0
     TRUCK = 1
@@ -28,7 +28,7 @@ class Category(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Boxes(Record):
-    """Boxes in the ego frame of their time step, padded to M; padding has `valid` False.
+    """Boxes in the ego frame of their time step, padded to M. Padding has `valid` False.
 
     In a `Clip` the leading dimensions are [b T].
     """
@@ -40,9 +40,9 @@ class Boxes(Record):
     yaw: Float[Tensor, "*b M"]
     """Heading about ego z, rad, 0 along ego x, counter-clockwise."""
     velocity: Float[Tensor, "*b M 2"]
-    """Velocity over ground expressed in the ego frame's axes, m/s; NaN where the log has none."""
+    """Velocity over ground, in the axes of the ego frame, m/s. NaN where the log has none."""
     track_id: Int[Tensor, "*b M"]
-    """The same number for the same object within one log."""
+    """Identity of the object, constant within one log."""
     category: Int[Tensor, "*b M"]
-    """A `Category`."""
+    """Index of the `Category`."""
     valid: Bool[Tensor, "*b M"]

@@ -1,4 +1,4 @@
-"""The one thing every part of Foredrive reads."""
+"""The clip: the input of every part of Foredrive."""
 
 import dataclasses
 import enum
@@ -21,7 +21,7 @@ NOW_TOLERANCE_S = 1e-4
 
 
 class Command(enum.IntEnum):
-    """Where the route leads next."""
+    """Direction in which the route continues."""
 
     LEFT = 0
     RIGHT = 1
@@ -30,54 +30,59 @@ class Command(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Clip(Record):
-    """Key frames of one drive: what was sensed up to now and, for training and scoring, what came after.
+    """Key frames of one drive: sensor data up to now, and the future for training and evaluation.
 
-    Frames are ordered in time; `t_s` is 0 at now, negative before it, positive after it, and now is at the
-    same index for the whole batch. Whatever a log lacks is masked (`*_valid`), never invented; masked
-    entries hold zeros.
+    Frames are ordered in time. `t_s` is 0 at now, negative before it and positive after it. Now has the same
+    index in the whole batch. Data that a log lacks are masked (`*_valid`), never invented. Masked entries are
+    0.
     """
 
     t_s: Float[Tensor, "*b T"]
     """Time of each key frame relative to now, s."""
     T_world_ego: Float64[Tensor, "*b T 4 4"]
-    """ego (x forward, y left, z up, rear axle on the ground) -> world; double precision: worlds are large."""
+    """ego (x forward, y left, z up, origin at the rear axle on the ground) -> world. Double precision,
+    because world coordinates are large."""
     images: UInt8[Tensor, "*b T C 3 H W"]
     """RGB."""
     image_valid: Bool[Tensor, "*b T C"]
     rig: CameraRig
     """Leading dimensions [b T]."""
     sweeps: LidarSweep
-    """Leading dimensions [b T]; N may be 0 when lidar was not asked for."""
+    """Leading dimensions [b T]. N is 0 when no lidar was requested."""
     sweep_valid: Bool[Tensor, "*b T"]
     misses_known: Bool[Tensor, "*b T"]
-    """Whether a sweep holds the beams that did not return."""
+    """Whether a sweep includes the beams that did not return."""
     boxes: Boxes
-    """Leading dimensions [b T], in the ego frame of their own time step."""
+    """Leading dimensions [b T]. Each box is in the ego frame of its own time step."""
     boxes_valid: Bool[Tensor, "*b T"]
-    """Whether the frame is annotated (no boxes and no annotation are two things)."""
+    """Whether the frame is annotated. An annotated frame may have no boxes."""
     ego_speed_mps: Float[Tensor, "*b T"]
     ego_speed_valid: Bool[Tensor, "*b T"]
     command: Int[Tensor, "*b"]
-    """A `Command`, at now."""
+    """The `Command` at now."""
     command_valid: Bool[Tensor, "*b"]
     target_xy: Float[Tensor, "*b 2"]
-    """Where the route is 20 m on from beside the vehicle (`data.commands.LOOKAHEAD_M`), in the ego frame at
-    now, m: what CARLA's global plan tells an agent beyond the command."""
+    """Route point 20 m (`data.commands.LOOKAHEAD_M`) ahead of the route point beside the vehicle, in the ego
+    frame at now, m. CARLA's global plan gives an agent this point in addition to the command."""
     target_valid: Bool[Tensor, "*b"]
     future: Trajectory
-    """The driven future (M = 1): what an agent is trained and judged on, and must not see."""
+    """The recorded future (M = 1): target of training and evaluation, hidden from the agent."""
     map: MapPatch | None = None
 
     @property
     def now(self) -> int:
-        """Index of the frame at t = 0."""
+        """Return the index of the frame at t = 0.
+
+        Raises:
+            InputError: no single frame is at t = 0, or its index differs within the batch.
+        """
         at_now = self.t_s.reshape(-1, self.t_s.shape[-1]).abs() <= NOW_TOLERANCE_S
         if not bool((at_now == at_now[:1]).all()) or int(at_now[0].sum()) != 1:
             raise InputError(f"a clip needs one frame at t = 0, the same for the batch, got t_s = {self.t_s}")
         return int(at_now[0].nonzero().item())
 
     def frames(self, index: slice | list[int]) -> "Clip":
-        """The clip with some of its frames only."""
+        """Return the clip with a subset of its frames."""
         batch_dims = self.t_s.dim() - 1
         where = (slice(None),) * batch_dims + (index,)
         per_frame = (
@@ -87,7 +92,7 @@ class Clip(Record):
         return dataclasses.replace(self, **{name: getattr(self, name)[where] for name in per_frame.split()})
 
     def through(self, cameras: list[int]) -> "Clip":
-        """The clip with some of its cameras only, in this order."""
+        """Return the clip with a subset of its cameras, in the given order."""
         where = (slice(None),) * self.t_s.dim() + (cameras,)
         rig = dataclasses.replace(self.rig[where], names=tuple(self.rig.names[k] for k in cameras))
         return dataclasses.replace(
@@ -95,7 +100,7 @@ class Clip(Record):
         )
 
     def observed(self) -> "Clip":
-        """What an agent may see: frames up to now, the future masked."""
+        """Return the part that an agent may see: frames up to now, with the future masked."""
         past = self.frames(slice(0, self.now + 1))
         unknown = dataclasses.replace(
             self.future,
@@ -108,13 +113,13 @@ class Clip(Record):
 
 @dataclass(frozen=True)
 class Example(Record):
-    """A clip with the voxel labels made from its raw data: one item of training and of evaluation."""
+    """A clip and its voxel labels: one item of training and evaluation."""
 
     clip: Clip
     occupancy: VoxelGrid
-    """[b T 1 Z Y X]: 1 occupied, 0 free where `known`; each frame in its own ego frame."""
+    """[b T 1 Z Y X]: 1 is occupied, 0 is free, defined where `known`. Each frame is in its own ego frame."""
     flow: VoxelGrid
-    """[b T 3 Z Y X]: velocity over ground of what occupies a voxel, in the ego axes of its frame, m/s;
-    known where the log has tracks and the voxel is occupied."""
+    """[b T 3 Z Y X]: velocity over ground of the content of a voxel, in the ego axes of its frame, m/s. Known
+    where the log has tracks and the voxel is occupied."""
     key: tuple[str, ...]
-    """Log name and time of now, one per item of the batch: names the item in errors and reports."""
+    """Log name and time of now for each item of the batch. Errors and reports show it."""

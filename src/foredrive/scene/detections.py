@@ -1,4 +1,4 @@
-"""What a 3-D detector says, with enough of its uncertainty for set likelihoods."""
+"""Output of a 3-D detector, with the uncertainty that set likelihoods need."""
 
 from dataclasses import dataclass
 
@@ -10,15 +10,18 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class Detections(Record):
-    """M detections in the ego frame at now, padded; state is centre (3), log lwh (3), sin yaw, cos yaw."""
+    """M detections in the ego frame at now, padded.
+
+    The state is centre (3, m), log lwh (3), sin yaw, cos yaw.
+    """
 
     existence: Float[Tensor, "*b M"]
     """Probability that the object exists."""
     log_class: Float[Tensor, "*b M K"]
-    """Log-probability of each class, given existence."""
+    """Log-probability of each class, given that the object exists."""
     mean: Float[Tensor, "*b M 8"]
     chol: Float[Tensor, "*b M 8 8"]
-    """Lower Cholesky factor of the state's covariance."""
+    """Lower Cholesky factor of the covariance of the state."""
     valid: Bool[Tensor, "*b M"]
     background_rate: Float[Tensor, "*b K"] | None = None
-    """Expected number of undetected objects per class (the Poisson part of a PMB); None if not modelled."""
+    """Expected number of undetected objects per class (the Poisson part of a PMB). None if not modelled."""

@@ -1,4 +1,4 @@
-"""The part of a clip that world models read."""
+"""The input of world models: the part of a clip up to now."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from foredrive.scene.rig import CameraRig
 
 @dataclass(frozen=True)
 class Frames(Record):
-    """The last T key frames of a clip, now last."""
+    """The last T key frames of a clip. Now is the last."""
 
     t_s: Float[Tensor, "b T"]
     """0 at now, negative before it."""
     T_now_ego: Float64[Tensor, "b T 4 4"]
-    """Each frame's ego frame -> the ego frame at now."""
+    """Ego frame of each key frame -> ego frame at now."""
     images: UInt8[Tensor, "b T C 3 H W"]
     """RGB."""
     image_valid: Bool[Tensor, "b T C"]
     rig: CameraRig
     """Leading dimensions [b T]."""
     speed_mps: Float[Tensor, "b T"]
-    """Of the ego vehicle."""
+    """Speed of the ego vehicle."""
     speed_valid: Bool[Tensor, "b T"]
 
 
@@ -34,7 +34,7 @@ def last_frames(clip: Clip, past_frames: int) -> Frames:
     """Return now and the `past_frames` key frames before it.
 
     Raises:
-        InputError: the clip shows the future or has too few frames.
+        InputError: the clip contains the future, or it has too few frames.
     """
     frames = clip.t_s.shape[-1]
     if clip.now != frames - 1:

@@ -1,4 +1,4 @@
-"""The piece of a map around the ego vehicle."""
+"""The part of a map around the ego vehicle."""
 
 import enum
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from foredrive.scene.record import Record
 
 
 class MapKind(enum.IntEnum):
-    """What a polyline of a `MapPatch` traces. Areas are given by their closed outline."""
+    """Kinds of polylines in a `MapPatch`. An area is given by its closed outline."""
 
     LANE_CENTRE = 0
     LANE_BOUNDARY = 1
@@ -26,7 +26,7 @@ class MapPatch(Record):
     """P polylines of at most V vertices around the ego vehicle, in the ego frame at now."""
 
     vertices: Float[Tensor, "*b P V 3"]
-    """m; z is 0 where the map has no heights."""
+    """Vertices, m. z is 0 where the map has no heights."""
     valid: Bool[Tensor, "*b P V"]
     kind: Int[Tensor, "*b P"]
-    """A `MapKind`; -1 for padding."""
+    """A `MapKind`, or -1 for padding."""

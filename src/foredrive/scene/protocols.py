@@ -1,4 +1,4 @@
-"""What the parts of Foredrive ask of each other."""
+"""Protocols between the parts of Foredrive, and the types that they exchange."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,52 +17,52 @@ from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelSpec
 
 Task = Literal["occupancy", "forecast", "plan"]
-"""What features are wanted for: the scene now, the scene later, a path."""
+"""Purpose of the features: the scene now, the scene later, or a path."""
 
 
 @dataclass(frozen=True)
 class Belief(Record):
-    """What a world model holds to be the case at one time, in the ego frame of that time."""
+    """State of a world model at one time, in the ego frame of that time."""
 
     volume: Float[Tensor, "b D Z Y X"]
     state: Float[Tensor, "b S"] | None = None
-    """Latent state, for models that have one."""
+    """Latent state, for models with one."""
     history: Float[Tensor, "b T D Z Y X"] | None = None
-    """Volumes of the past frames, now last, where imagining needs them."""
+    """Volumes of the past frames, now last. Given if `imagine` needs them."""
     statics: Float[Tensor, "b _C Y X"] | None = None
-    """What stands, as features of the plane, for models that hand it on without warping."""
+    """Features of the static scene in the plane, for models that pass them on without warping."""
     flow_mps: Float[Tensor, "b 3 Z Y X"] | None = None
-    """Velocity over ground of each voxel's content, in the ego axes, where imagining it gave one."""
+    """Velocity over ground of the content of each voxel, in the ego axes. Given if imagining predicted it."""
     T_now_ego: Float[Tensor, "b 4 4"] | None = None
-    """Predicted ego motion: this belief's ego frame -> the ego frame at now; None for now's belief."""
+    """Predicted ego motion: ego frame of this belief -> ego frame at now. None for the belief at now."""
 
 
 @dataclass(frozen=True)
 class Decoded(Record):
-    """What can be read off a belief."""
+    """The decoded output of a belief."""
 
     occupancy_logit: Float[Tensor, "b Z Y X"]
     feature: Float[Tensor, "b D Z Y X"]
     """Features to composite along rays."""
     flow: Float[Tensor, "b 3 Z Y X"] | None = None
-    """Velocity of each voxel's content in the ego axes, m/s."""
+    """Velocity of the content of each voxel, in the ego axes, m/s."""
     action: Float[Tensor, "b A"] | None = None
 
 
 class RenderedRays(NamedTuple):
-    """What R rays through a volume see."""
+    """Colour, range and opacity of R rays through a volume."""
 
     rgb: Float[Tensor, "b R 3"]
-    """0 to 1."""
+    """RGB, 0 to 1."""
     range_m: Float[Tensor, "b R"]
-    """Expected distance of the hit; a ray without a hit counts with the far end."""
+    """Expected distance of the hit, m. A ray without a hit counts with the far end."""
     alpha: Float[Tensor, "b R"]
     """Probability that the ray ends inside the volume."""
 
 
 @runtime_checkable
 class RayRenderer(Protocol):
-    """Renders colour and range along rays through a decoded belief."""
+    """A renderer of colour and range along rays through a decoded belief."""
 
     def __call__(
         self,
@@ -72,64 +72,64 @@ class RayRenderer(Protocol):
         direction: Float[Tensor, "b R 3"],
         generator: torch.Generator | None = None,
     ) -> RenderedRays:
-        """Render rays given in the belief's ego frame; a generator jitters the samples along them."""
+        """Render rays given in the ego frame of the belief. A generator jitters the samples along them."""
         ...
 
 
 @runtime_checkable
 class WorldModel(Protocol):
-    """Observes the present, imagines the next key frames and decodes both (NeMo, DriveWorld).
+    """A model that observes the present, imagines the next key frames and decodes both (NeMo, DriveWorld).
 
-    An implementation is a `torch.nn.Module` too: its parameters are what training changes.
+    An implementation is also a `torch.nn.Module`. Training changes its parameters.
     """
 
     @property
     def spec(self) -> VoxelSpec:
-        """The grid of its volumes."""
+        """Return the grid of the volumes."""
         ...
 
     @property
     def channels(self) -> int:
-        """D, the channels of its volumes."""
+        """Return D, the number of channels of the volumes."""
         ...
 
     @property
     def past_frames(self) -> int:
-        """The number of key frames before now that it reads."""
+        """Return the number of key frames before now that the model reads."""
         ...
 
     @property
     def dt_s(self) -> float:
-        """The time between key frames, s."""
+        """Return the time between key frames, s."""
         ...
 
     @property
     def max_steps(self) -> int | None:
-        """The most key frames it imagines; None if there is no limit."""
+        """Return the maximum number of key frames that the model can imagine. None means no limit."""
         ...
 
     @property
     def samples_futures(self) -> bool:
-        """Whether `imagine` draws another future with each state of its generator."""
+        """Return whether `imagine` draws a different future for each state of its generator."""
         ...
 
     @property
     def renderer(self) -> RayRenderer | None:
-        """Renders what it decodes; None if the model cannot be rendered."""
+        """Return the renderer of decoded beliefs. None if the model cannot be rendered."""
         ...
 
     def observe(self, clip: Clip) -> Belief:
         """Return the belief about now from the frames up to now.
 
         Raises:
-            InputError: the clip shows the future or has too few frames.
+            InputError: the clip contains the future, or it has too few frames.
         """
         ...
 
     def encode(self, frames: Frames) -> Belief:
         """Return the belief about now from T = `past_frames` + 1 frames.
 
-        No step depends on the values of the data, so that it can be traced for export.
+        The control flow does not depend on data values, so that the method can be traced for export.
         """
         ...
 
@@ -140,11 +140,11 @@ class WorldModel(Protocol):
         actions: Float[Tensor, "b K A"] | None = None,
         generator: torch.Generator | None = None,
     ) -> list[Belief]:
-        """Return the next `steps` key frames, each in its own predicted ego frame.
+        """Return the beliefs of the next `steps` key frames, each in its own predicted ego frame.
 
         Args:
-            actions: given to models that take actions.
-            generator: draws one of many futures from models that sample; without one they return the mean.
+            actions: input of models that take actions.
+            generator: source of randomness for models that sample futures. Without one they return the mean.
         """
         ...
 
@@ -159,16 +159,16 @@ class WorldModel(Protocol):
 
 @runtime_checkable
 class Agent(Protocol):
-    """Something that drives."""
+    """A policy that plans the path of the ego vehicle."""
 
     def act(self, observation: Clip) -> Trajectory:
-        """The plan from now on, in the ego frame at now."""
+        """Return the plan from now on, in the ego frame at now."""
         ...
 
 
 @dataclass(frozen=True)
 class Control:
-    """What moves the vehicle for one simulation step."""
+    """Control of the vehicle for one simulation step."""
 
     acceleration_mps2: float
     steering_rad: float
@@ -177,21 +177,21 @@ class Control:
 
 @dataclass(frozen=True)
 class Event:
-    """Something a simulator noticed: a collision, a red light run, a route's end."""
+    """An event that a simulator detected: a collision, a red light run, the end of a route."""
 
     kind: str
     t_s: float
     xy_world: tuple[float, float]
     detail: str = ""
     what: str = ""
-    """What was hit or run."""
+    """Object of the event: the object hit, the light or sign that was run, the lane that was left."""
     severity: float = 0.0
-    """Of a collision the speed at which it came about, m/s; of leaving the lanes the way driven so, m."""
+    """For a collision the impact speed, m/s. For leaving the lanes the distance driven outside, m."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """What follows from one control."""
+    """Result of one simulation step."""
 
     clip: Clip
     events: Sequence[Event]
@@ -228,7 +228,7 @@ class Standing:
 
 @runtime_checkable
 class Simulator(Protocol):
-    """A world to drive a route in: a town, a rebuilt log, CARLA."""
+    """A simulated world that reacts to controls: a town, a reconstructed log, CARLA."""
 
     def reset(self, scenario: Any) -> Clip:
         """Start a drive and return its first key frame."""
@@ -249,31 +249,31 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True)
 class Rendered(Record):
-    """What the sensors of a vehicle see at one time, unbatched."""
+    """Images and lidar of a vehicle at one time, unbatched."""
 
     images: UInt8[Tensor, "C 3 H W"]
-    """RGB, in the order of the renderer's rig."""
+    """RGB, in the camera order of the renderer's rig."""
     sweep: LidarSweep | None
-    """One revolution in the ego frame, beams that do not return included; None: there is no lidar."""
+    """One revolution in the ego frame, with the beams that do not return. None if there is no lidar."""
 
 
 @runtime_checkable
 class Renderer(Protocol):
-    """A scene as the sensors of a vehicle see it that may be anywhere in it: a rebuilt log."""
+    """A sensor renderer of a reconstructed log. The vehicle may have any pose in the scene."""
 
     @property
     def rig(self) -> CameraRig:
-        """The cameras, without leading dimensions, all exposed at the time that is asked for."""
+        """Return the cameras, without leading dimensions. All are exposed at the requested time."""
         ...
 
     def render(
         self, T_world_ego: Float64[Tensor, "4 4"], twist_ego: Float[Tensor, "6"], t_s: float
     ) -> Rendered:
-        """What is seen from a pose at a time of the scene.
+        """Render the sensors from a pose at a time of the scene.
 
         Args:
-            T_world_ego: where the vehicle is.
-            twist_ego: its velocity (m/s), then turn rate (rad/s), over ground in its own axes.
-            t_s: since the scene's first moment.
+            T_world_ego: pose of the vehicle.
+            twist_ego: velocity (m/s) and turn rate (rad/s) over ground, in the axes of the vehicle.
+            t_s: time since the start of the scene.
         """
         ...

@@ -1,4 +1,4 @@
-"""What the scene types share: they are frozen dataclasses of tensors that move and slice as one."""
+"""The base class of the scene types: frozen dataclasses of tensors that are moved and sliced together."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,10 +12,10 @@ R = TypeVar("R", bound="Record")
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """A frozen record whose fields are tensors, other records, None, or constants shared by a batch."""
+    """A frozen record. Its fields are tensors, other records, None, or constants shared by a batch."""
 
     def map_tensors(self: R, fn: Callable[[Tensor], Tensor]) -> R:
-        """Apply `fn` to every tensor of this record and of the records in it."""
+        """Apply `fn` to every tensor of this record and of nested records."""
 
         def apply(value: Any) -> Any:
             if isinstance(value, Tensor):

@@ -10,29 +10,30 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class LidarSweep(Record):
-    """N beams, hits and misses alike, padded to N; padding has `valid` False.
+    """N beams, hits and misses, padded. Padding has `valid` False.
 
-    In a `Clip` the leading dimensions are [b T], and the ego frame is the one of the frame's time: beams
-    are motion-compensated. Misses are kept because free space and ray drop need them; a log that stores
-    returns only has none, which `misses_known` of the clip says.
+    In a `Clip` the leading dimensions are [b T]. Beams are motion-compensated to the ego frame at the time of
+    the frame. Misses are kept because free space and ray drop need them. A log that stores only returns has
+    no misses; then `misses_known` of the clip is False.
     """
 
     origin_ego: Float[Tensor, "*b N 3"]
-    """Where the beam left the sensor, m."""
+    """Position of the sensor when it fired the beam, m."""
     dir_ego: Float[Tensor, "*b N 3"]
-    """Unit direction."""
+    """Unit direction of the beam."""
     range_m: Float[Tensor, "*b N"]
-    """Distance to the return; for a miss the range up to which the beam is known to be free (0: unknown)."""
+    """Distance to the return, m. For a miss, the range up to which the beam is known to be free (0 if
+    unknown)."""
     returned: Bool[Tensor, "*b N"]
     intensity: Float[Tensor, "*b N"]
-    """0 to 1; 0 for a miss."""
+    """Intensity from 0 to 1; 0 for a miss."""
     dt_s: Float[Tensor, "*b N"]
-    """Firing time relative to the frame's time."""
+    """Firing time relative to the time of the frame, s."""
     beam: Int[Tensor, "*b N"]
-    """Channel number, -1 where the log does not say."""
+    """Channel number; -1 where the log has none."""
     valid: Bool[Tensor, "*b N"]
 
     @property
     def points_ego(self) -> Float[Tensor, "*b N 3"]:
-        """End points of the beams in the ego frame, m; meaningful where `returned & valid`."""
+        """Return the end points of the beams in the ego frame, m, meaningful where `returned & valid`."""
         return self.origin_ego + self.dir_ego * self.range_m[..., None]

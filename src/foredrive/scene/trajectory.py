@@ -10,9 +10,9 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class Trajectory(Record):
-    """M alternatives of T steps in the ego frame at now; step k lies at (k+1)·`dt_s`.
+    """M alternative paths of T steps in the ego frame at now. Step k is at time (k+1)·`dt_s`.
 
-    A driven future or a single plan has M = 1.
+    A recorded future or a single plan has M = 1.
     """
 
     xy: Float[Tensor, "*b M T 2"]
@@ -21,5 +21,5 @@ class Trajectory(Record):
     """Heading relative to the ego heading at now, rad."""
     valid: Bool[Tensor, "*b M T"]
     log_prob: Float[Tensor, "*b M"]
-    """Log-probability of each alternative; 0 for a single one."""
+    """Log-probability of each alternative. 0 for a single one."""
     dt_s: float

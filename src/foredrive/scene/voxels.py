@@ -11,23 +11,23 @@ from foredrive.scene.record import Record
 
 @dataclass(frozen=True)
 class VoxelSpec:
-    """Where a grid lies in the ego frame and how fine it is. Index order is Z, Y, X throughout."""
+    """Position and resolution of a grid in the ego frame. The index order is Z, Y, X."""
 
     lower_m: tuple[float, float, float]
-    """x, y, z of the grid's lower corner."""
+    """x, y, z of the grid's lower corner, m."""
     voxel_m: float
-    """Edge length of the cubic voxels."""
+    """Edge length of the cubic voxels, m."""
     shape_zyx: tuple[int, int, int]
 
     @property
     def upper_m(self) -> tuple[float, float, float]:
-        """x, y, z of the grid's upper corner."""
+        """Return x, y, z of the grid's upper corner, m."""
         nz, ny, nx = self.shape_zyx
         x, y, z = self.lower_m
         return (x + nx * self.voxel_m, y + ny * self.voxel_m, z + nz * self.voxel_m)
 
     def centres_m(self, device: torch.device | str = "cpu") -> Float[Tensor, "Z Y X 3"]:
-        """Voxel centres in the ego frame, m, last dimension x y z."""
+        """Return the voxel centres in the ego frame, m. The last dimension is x y z."""
         axes = [
             low + (torch.arange(n, device=device, dtype=torch.float32) + 0.5) * self.voxel_m
             for low, n in zip(self.lower_m, self.shape_zyx[::-1], strict=True)
@@ -38,7 +38,7 @@ class VoxelSpec:
 
 @dataclass(frozen=True)
 class VoxelGrid(Record):
-    """Values on a grid. Unknown voxels (never seen by a beam) are not free ones: `known` tells them apart."""
+    """Values on a grid. `known` is False for voxels that no beam has observed; these are not free voxels."""
 
     spec: VoxelSpec
     values: Float[Tensor, "*b D Z Y X"]

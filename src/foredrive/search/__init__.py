@@ -1,1 +1,1 @@
-"""Finding data by asking for it: towers, an index of logs, queries."""
+"""Search in driving logs: towers (encoders), an index of logs, queries."""

@@ -1,4 +1,4 @@
-"""Choosing few that differ, or few that stand for many."""
+"""Selection of a few diverse or representative vectors."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,14 +6,14 @@ from numpy import ndarray
 
 
 def k_centre(vectors: Float[ndarray, "n D"], count: int, worth: Float[ndarray, "n"]) -> list[int]:
-    """Each next one is the farthest from those chosen, by its distance times its worth (> 0).
+    """Choose greedily the vector with the largest distance to the chosen ones times its worth (> 0).
 
-    With equal worth it is the greedy 2-approximation of the k-centre problem (Gonzalez 1985; Sener & Savarese
-    2018). The first one is the worthiest, of equals the first.
+    With equal worth this is the greedy 2-approximation of the k-centre problem (Gonzalez 1985; Sener &
+    Savarese 2018). The first choice has the largest worth; among equals it is the first.
 
     Args:
-        vectors: of length 1; distances are Euclidean.
-        count: how many to choose, at most n.
+        vectors: unit vectors. Distances are Euclidean.
+        count: number to choose, at most n.
     """
     if not len(vectors):
         return []
@@ -29,13 +29,14 @@ def k_centre(vectors: Float[ndarray, "n D"], count: int, worth: Float[ndarray, "
 
 
 def facility_location(vectors: Float[ndarray, "n D"], count: int, worth: Float[ndarray, "n"]) -> list[int]:
-    """Each next one adds most to Σ_i worth_i max_{j chosen} (1 + cos(i, j)) / 2: how well all are stood for.
+    """Choose greedily the vector that adds most to Σ_i worth_i max_{j chosen} (1 + cos(i, j)) / 2.
 
-    Greedy, which for this monotone submodular sum is within 1 - 1/e of the best (Nemhauser et al. 1978).
+    The sum measures how well the chosen vectors represent all. It is monotone and submodular, so the greedy
+    result is within 1 - 1/e of the optimum (Nemhauser et al. 1978).
 
     Args:
-        vectors: of length 1.
-        count: how many to choose, at most n.
+        vectors: unit vectors.
+        count: number to choose, at most n.
     """
     likeness = (1 + vectors @ vectors.T) / 2
     covered = np.zeros(len(vectors))

@@ -1,4 +1,4 @@
-"""Towers that were trained here: images beside a sentence encoder, lidar beside any images."""
+"""Towers trained in Foredrive: images with a sentence encoder, lidar with any image towers."""
 
 import functools
 import json
@@ -25,23 +25,23 @@ from foredrive.search.towers import Towers, weights_digest
 CARD, IMAGE, LIDAR = "towers.json", "image.safetensors", "lidar.safetensors"
 TEXT_MEAN = "text_mean"
 AT_ONCE = 8
-"""Sectors embedded together: more no longer fit into a core's cache."""
+"""Number of sectors embedded together. More do not fit into the cache of a core."""
 
 
 @dataclass(frozen=True)
 class ImageSize:
-    """See `models.image_tower.ImageTower`."""
+    """Size of an image tower, see `models.image_tower.ImageTower`."""
 
     widths: tuple[int, ...]
     depths: tuple[int, ...]
     heads: int
     side_px: int
-    """Of the images that it was trained on, the shorter one."""
+    """Length of the shorter side of the training images."""
 
 
 @dataclass(frozen=True)
 class LidarSize:
-    """See `models.lidar_clip.LidarEncoder`."""
+    """Size of a lidar tower, see `models.lidar_clip.LidarEncoder`."""
 
     width: int = 128
     heads: int = 8
@@ -52,25 +52,25 @@ class LidarSize:
 
 @dataclass(frozen=True)
 class TowerCard:
-    """What a folder of towers says of itself."""
+    """Description of a folder of towers."""
 
     dim: int
     text: str
-    """The sentence encoder, or the CLIP or SigLIP model that the lidar tower stands beside."""
+    """Name of the sentence encoder, or of the CLIP or SigLIP model that the lidar tower belongs to."""
     image: ImageSize | None
-    """None: the image tower is that model's, too."""
+    """Size of the image tower. None if the image tower is that of the model `text`."""
     base_fingerprint: str
-    """Of the towers that the lidar tower was trained beside."""
+    """Fingerprint of the towers that the lidar tower was trained with."""
     lidar: LidarSize | None
     trained: dict[str, object]
-    """On what, for how long, and how well: for people to read."""
+    """Training data, duration and quality, for people to read."""
 
 
 class SentenceTowers:
-    """An image tower that was trained beside a frozen sentence encoder; see `Towers`.
+    """An image tower trained with a frozen sentence encoder. See `Towers`.
 
-    What all captions of the training set have in common, their mean, is taken off every text: what is left
-    tells them apart.
+    The mean embedding of all training captions is subtracted from every text. The remainder separates the
+    texts better.
     """
 
     has_lidar = False
@@ -85,27 +85,27 @@ class SentenceTowers:
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed images, see `Towers`."""
         return torch.cat(
             [self.tower(images[start : start + AT_ONCE]) for start in range(0, len(images), AT_ONCE)]
         )
 
     def embed_sweeps(self, sweeps: LidarSweep) -> None:
-        """See `Towers`."""
+        """Return None, because there is no lidar tower."""
         return
 
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed texts, see `Towers`."""
         return self._encoder(texts) - self.text_mean
 
     @functools.cached_property
     def _encoder(self) -> TextEncoder:
-        """Loaded when it is first asked: to make an index takes no text."""
+        """Load the sentence encoder at the first use. Building an index does not need it."""
         return TextEncoder(self.text)
 
 
 class LidarTowers:
-    """Any towers and, beside them, one for lidar that learned from their images alone; see `Towers`."""
+    """Any towers with a lidar tower that was trained from their image embeddings. See `Towers`."""
 
     has_lidar = True
 
@@ -115,28 +115,28 @@ class LidarTowers:
         self.fingerprint = f"{base.fingerprint}-lidar-{weights_digest(encoder.state_dict())}"
 
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed images, see `Towers`."""
         return self.base.embed_images(images)
 
     @torch.no_grad()
     def embed_sweeps(self, sweeps: LidarSweep) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed sweeps, see `Towers`."""
         rows = len(sweeps.valid)
         parts = [sweeps[start : start + AT_ONCE] for start in range(0, rows, AT_ONCE)]
         return torch.cat([self.encoder(PointCloud.of_sweeps(part), len(part.valid)) for part in parts])
 
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed texts, see `Towers`."""
         return self.base.embed_text(texts)
 
 
 def build_image_tower(size: ImageSize, dim: int) -> ImageTower:
-    """An untrained one."""
+    """Return an untrained image tower."""
     return ImageTower(widths=size.widths, depths=size.depths, heads=size.heads, dim=dim)
 
 
 def build_lidar_tower(size: LidarSize, dim: int) -> LidarEncoder:
-    """An untrained one."""
+    """Return an untrained lidar tower."""
     return LidarEncoder(PillarGrid(), dim=dim, **asdict(size))
 
 
@@ -146,10 +146,10 @@ def save_towers(
     image: tuple[ImageTower, Float[Tensor, "D"]] | None,
     lidar: LidarEncoder | None,
 ) -> None:
-    """Write towers as a folder, weights in half precision.
+    """Write towers to a folder, with weights in half precision.
 
     Args:
-        image: the image tower and the mean of the texts, unless it is a model's of `card.text`.
+        image: image tower and mean of the texts. None if the image tower is that of the model `card.text`.
     """
     with atomic_path(folder) as temporary:
         temporary.mkdir()
@@ -162,10 +162,11 @@ def save_towers(
 
 
 def load_towers(folder: Path) -> Towers:
-    """The towers of a folder that `save_towers` wrote.
+    """Load towers from a folder of `save_towers`.
 
     Raises:
-        InputError: it holds none, they are damaged, or what they stand beside has other weights now.
+        InputError: there are no towers, they are damaged, or the base model has other weights than in
+            training.
     """
     try:
         card = TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
@@ -202,7 +203,7 @@ def _halved(model: nn.Module) -> dict[str, Tensor]:
 
 
 def _load_weights(model: nn.Module, file: Path) -> dict[str, Tensor]:
-    """Load weights into a model; returns what else the file holds."""
+    """Load weights into a model. Return the other entries of the file."""
     try:
         state = load_file(file)
         rest = {name: state.pop(name) for name in state.keys() - model.state_dict().keys()}

@@ -1,4 +1,4 @@
-"""From frames of a log to rows of an index: every sector embedded, and the whole of them."""
+"""Embedding of log frames into rows of an index: one row per sector and one per whole scene."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ from foredrive.search.sectors import Sector, blind_sectors
 from foredrive.search.towers import Towers, unit
 
 FRAMES_AT_ONCE = 8
-"""Read and embedded together: memory stays flat over a log of any length."""
+"""Number of frames read and embedded together. It limits memory for logs of any length."""
 _SMALLEST = 1e-12
 
 
 @dataclass(frozen=True)
 class View:
-    """One sector of one moment, with whatever sees it."""
+    """One sector at one moment, with its image and sweep."""
 
     sector: Sector
     image: Tensor | None
@@ -36,10 +36,10 @@ class View:
 
 
 def embed_frames(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
-    """The rows of some frames, those of one frame together, its whole first.
+    """Return the rows of some frames, sorted by frame. The row of the whole scene comes first in each frame.
 
     Raises:
-        InputError: on data that cannot be read.
+        InputError: data cannot be read.
     """
     parts = [
         _embed_few(log, frames[start : start + FRAMES_AT_ONCE], towers)
@@ -72,7 +72,10 @@ def _embed_few(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
 def _embed_by_name(
     towers: Towers, seen: Sequence[Mapping[str, View]]
 ) -> dict[tuple[int, str], Float[np.ndarray, "2 D"]]:
-    """By moment and view its unit vectors, image and lidar; cameras' images differ in size, so one by one."""
+    """Return image and lidar unit vectors by moment and view. Views of one name are embedded together.
+
+    Cameras are embedded one by one, because their image sizes differ.
+    """
     vectors: dict[tuple[int, str], np.ndarray] = {}
     for name in {name for views in seen for name in views}:
         moments = [now for now, views in enumerate(seen) if name in views]
@@ -82,7 +85,10 @@ def _embed_by_name(
 
 
 def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[str, View]:
-    """Every sector of a moment by its name: those of cameras that have an image, or four around."""
+    """Read all sectors of a moment by name.
+
+    They are the sectors of cameras with an image, or four sectors around the vehicle if there is none.
+    """
     found = read_sweep(log, frame) if with_lidar else None
     sweep = None if found is None else found[0][found[0].valid & found[0].returned]
     views = {}
@@ -99,7 +105,7 @@ def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[
 
 
 def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2 D"]:
-    """Unit vectors of views of one size, by image and by lidar; NaN where a tower has nothing to look at."""
+    """Return image and lidar unit vectors of views with one image size. NaN where the input is missing."""
     out = np.full((len(views), 2, towers.dim), np.nan, dtype=np.float32)
     images = [(n, view.image) for n, view in enumerate(views) if view.image is not None]
     sweeps = [(n, v.sweep) for n, v in enumerate(views) if v.sweep is not None and len(v.sweep.valid)]
@@ -114,14 +120,14 @@ def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2
 
 
 def mean_direction(vectors: Float[np.ndarray, "n *m D"]) -> Float[np.ndarray, "*m D"]:
-    """The normalised sum over n of unit vectors; those that are NaN are left out, NaN where all are."""
+    """Return the normalised sum of unit vectors over n. NaN vectors are left out; NaN if all are NaN."""
     total = np.nansum(vectors, axis=0)
     total /= np.linalg.norm(total, axis=-1, keepdims=True).clip(min=_SMALLEST)
     return np.where(np.isnan(vectors).any(-1).all(0)[..., None], np.float32(np.nan), total)
 
 
 def _vector_column(vectors: Float[np.ndarray, "n D"]) -> pa.FixedSizeListArray:
-    """Vectors as Arrow has them; null where they are NaN."""
+    """Return vectors as an Arrow column. NaN vectors become null."""
     missing = np.isnan(vectors).any(-1)
     flat = pa.array(np.where(missing[:, None], 0, vectors).astype(np.float32).reshape(-1))
     return pa.FixedSizeListArray.from_arrays(flat, vectors.shape[-1], mask=pa.array(missing))
@@ -149,7 +155,7 @@ def _facts(log: Log, frame: int) -> dict[str, object]:
 
 
 def _counts(log: Log, frame: int, views: Mapping[str, View]) -> dict[str, dict[str, int | None]]:
-    """Annotated objects by class, of the whole scene and of each view; None where nothing is annotated."""
+    """Count annotated objects by class, for the whole scene and each view. None if not annotated."""
     boxes = read_boxes(log, frame)
     if boxes is None:
         return {name: dict.fromkeys(COUNTS.values()) for name in (WHOLE, *views)}

@@ -1,4 +1,4 @@
-"""What is true of a view: who is in it, where and how they move; when, in what weather, at what place."""
+"""Facts of a view: objects with position and motion, time, weather and place."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -24,9 +24,9 @@ from foredrive.towns.labels.captions import (
 
 NEAR_M, FAR_M = 12.0, 25.0
 IN_FOG_M = 25.0
-"""How far things are worth a word in fog."""
+"""Maximum distance of objects in fog."""
 ROAD_HALF_M = 8.0
-"""Who moves across the way this close to it crosses the road."""
+"""Half width of the road. An object that moves sideways within it is "crossing"."""
 NOUNS = {
     Category.CAR: "car",
     Category.TRUCK: "truck",
@@ -44,19 +44,19 @@ COUNTS = {1: "one", 2: "two", 3: "three"}
 MANY = "many"
 DAY = ("morning", "midday", "afternoon")
 EMPTY = "nobody"
-"""The fact that there is nothing of `NOUNS` to be seen."""
+"""The fact that no object of `NOUNS` is visible."""
 
 
 class Thing(NamedTuple):
-    """One annotated object that can be seen."""
+    """One visible annotated object."""
 
     noun: str
     manners: tuple[str, ...]
-    """Of near, far, oncoming, crossing, moving, standing: those that it has."""
+    """Its properties among near, far, oncoming, crossing, moving, standing."""
 
 
 class ViewFacts(NamedTuple):
-    """What is true of one view; None is what the log does not tell."""
+    """Facts of one view. None is unknown."""
 
     time_of_day: str | None
     weather: str | None
@@ -65,7 +65,7 @@ class ViewFacts(NamedTuple):
 
     @property
     def facts(self) -> frozenset[str]:
-        """All of it as single words: "night", "two car", "crossing pedestrian", "nobody"."""
+        """Return all facts as short strings: "night", "two car", "crossing pedestrian", "nobody"."""
         found = {fact for fact in self[:3] if fact is not None}
         if self.time_of_day in DAY:
             found.add("day")
@@ -85,13 +85,13 @@ def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
 
 
 def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, ViewFacts]:
-    """The facts of each sector of a moment, by its name.
+    """Return the facts of each sector of a moment, by sector name.
 
-    Time, weather and place are those of the moment's recorded setting, where there is one. Things are boxes
-    whose centre lies in the sector, near enough and not hidden, where the log knows that.
+    Time, weather and place come from the recorded setting, if there is one. The objects are boxes whose
+    centre is in the sector, near enough and, if the log records visibility, not hidden.
 
     Raises:
-        InputError: on data that cannot be read.
+        InputError: data cannot be read.
     """
     told = read_setting(log, frame)
     setting: tuple[str | None, str | None, str | None] = (None, None, None)

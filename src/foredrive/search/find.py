@@ -1,4 +1,4 @@
-"""Answering a query: candidates from the index, compared in full, neighbours collapsed, ranked."""
+"""Answering of queries: select candidates, compare, merge neighbours, rank."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,46 +19,47 @@ from foredrive.search.tables import quoted
 from foredrive.search.target import Target
 
 CANDIDATES_PER_HIT = 25
-"""Rows looked at for each hit, where not all are, or ranked again: neighbours and other views of a moment are
-many."""
+"""Number of candidate rows per wanted hit, if not all rows are compared, or for reranking. It is large
+because many rows are neighbours or other views of one moment."""
 MORE = 4
 POOL_PER_HIT = 10
-"""Hits to choose diverse ones from, for each that is wanted."""
+"""Number of hits per wanted hit from which diverse ones are chosen."""
 SMALLEST_WORTH = 1e-3
 
 
 @dataclass(frozen=True)
 class Hit:
-    """A moment and the view of it that fits best."""
+    """A moment with its best matching view."""
 
     facts: dict[str, object]
-    """The row's columns, without embeddings."""
+    """Columns of the row, without embeddings."""
     score: float
-    """What it was ranked by."""
+    """Score used for ranking."""
     scores: dict[str, float]
-    """Cosine with the query by modality, where there is one."""
+    """Cosine with the query by modality, if it exists."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """An answer."""
+    """Result of a query."""
 
     hits: list[Hit]
     compared: int
-    """Rows that were compared in full."""
+    """Number of rows that were compared exactly."""
     exact: bool
-    """Whether that was all rows that the conditions leave."""
+    """Whether all rows that satisfy the conditions were compared."""
 
 
 def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to: int = EXACT_UP_TO) -> Found:
-    """The hits of a query, best first (in the order of choice if they are to be diverse).
+    """Find the hits of a query, best first. Diverse hits are in order of selection.
 
     Args:
-        target: what rows are compared with; None where the query compares with nothing.
-        exact_up_to: so many rows are all compared; of more those that are looked up.
+        target: vectors to compare rows with. None if the query does not compare.
+        exact_up_to: maximum number of rows for exact comparison. With more rows, approximate search selects
+            the candidates.
 
     Raises:
-        InputError: the condition does not parse; the query asks for what neither towers nor logs have.
+        InputError: the condition cannot be parsed, or the query needs data that towers or logs do not have.
     """
     _check(query, target)
     where = _conditions(index, query, target)
@@ -71,7 +72,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
         rows = _candidates(index, query, target, where, None if exact else limit)
         score = _rank(rows, query, target)
         order = collapse(score, rows["log"].to_pylist(), _column(rows, "t_us"), query.gap_s, wanted)
-        reranked = query.modality == "joint" and query.rule == "rerank"  # of so many and no more
+        reranked = query.modality == "joint" and query.rule == "rerank"  # a fixed number of rows is reranked
         if exact or reranked or len(order) >= wanted or limit >= total:
             break
         limit *= MORE
@@ -88,7 +89,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
 def collapse(
     score: Float[ndarray, "n"], logs: Sequence[str], t_us: Int[ndarray, "n"], gap_s: float, top: int
 ) -> list[int]:
-    """The best rows, best first, none closer than `gap_s` to a better one of its log; NaN is left out."""
+    """Return the best rows, best first, at least `gap_s` apart within a log. NaN scores are left out."""
     kept: list[int] = []
     times: dict[str, list[int]] = {}
     for n in np.argsort(-score, kind="stable").tolist():
@@ -130,14 +131,14 @@ def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str |
         near = f"t_us > {t_us - gap_us} AND t_us < {t_us + gap_us}"
         conditions.append(f"NOT (log = {quoted(log)} AND {near})")
     if query.where:
-        index.count(query.where)  # alone, so that an error names what the user wrote
+        index.count(query.where)  # checked alone, so that the error shows the user's text
     return " AND ".join(conditions) or None
 
 
 def _candidates(
     index: FrameIndex, query: Query, target: Target | None, where: str | None, limit: int | None
 ) -> pa.Table:
-    """All rows, or those that are nearest by what the query ranks by; with embeddings if they are needed."""
+    """Return all rows, or the nearest ones by the modality of the ranking, with embeddings if needed."""
     columns = list(FACTS.names)
     if target is not None or query.diverse is not None:
         columns += ["image", "lidar", *(["joint"] if query.modality == "joint" else [])]
@@ -161,7 +162,7 @@ def _without_twins(rows: pa.Table) -> pa.Table:
 
 
 def _rank(rows: pa.Table, query: Query, target: Target | None) -> Float[ndarray, "n"]:
-    """What rows are ranked by; NaN for those that are out."""
+    """Return the ranking score of each row. NaN excludes a row."""
     score = np.zeros(len(rows)) if target is None else _likeness(rows, query, target)
     if query.by is None:
         return score
@@ -171,13 +172,13 @@ def _rank(rows: pa.Table, query: Query, target: Target | None) -> Float[ndarray,
 
 
 def _likeness(rows: pa.Table, query: Query, target: Target) -> Float[ndarray, "n"]:
-    """How like the target rows are, by the query's modality and rule (Paper B)."""
+    """Return the similarity of rows to the target, by modality and rule of the query (Paper B)."""
     if query.modality != "joint" or query.rule == "features":
         return vectors_of(rows, query.modality) @ _vectors(target)[query.modality]
     if target.image is None or target.lidar is None:
         raise InputError(f"{query.rule} need an image and a sweep, and the example has one of them only")
     image, lidar = vectors_of(rows, "image") @ target.image, vectors_of(rows, "lidar") @ target.lidar
-    if query.rule == "logits":  # a row with one modality counts it twice, to its neither good nor harm
+    if query.rule == "logits":  # a row with one modality counts it twice, to be comparable
         return np.where(np.isnan(lidar), 2 * image, np.where(np.isnan(image), 2 * lidar, image + lidar))
     best = np.argsort(-image, kind="stable")[: query.top * CANDIDATES_PER_HIT]
     again = np.full(len(image), np.nan)
@@ -186,9 +187,10 @@ def _likeness(rows: pa.Table, query: Query, target: Target) -> Float[ndarray, "n
 
 
 def _scores(rows: pa.Table, target: Target | None, query: Query) -> list[dict[str, float]]:
-    """Of each row its cosine with the target by modality; the joint one only where there are two to join.
+    """Return the cosines of each row with the target by modality.
 
-    Joined as the query joins them: of logits the mean, and nothing where lidar ranks again.
+    The joint value exists only if both modalities do. It follows the rule of the query: the mean for logits,
+    and no value for reranking.
     """
     if target is None:
         return [{} for _ in range(len(rows))]
@@ -208,14 +210,14 @@ def _scores(rows: pa.Table, target: Target | None, query: Query) -> list[dict[st
 
 
 def _vectors(target: Target) -> dict[str, ndarray]:
-    """A target's unit vectors by modality."""
+    """Return the unit vectors of a target by modality."""
     there = {"image": target.image, "lidar": target.lidar}
     vectors = {name: vector for name, vector in there.items() if vector is not None}
     return {**vectors, "joint": mean_direction(np.stack(list(vectors.values())))}
 
 
 def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """0 for the least to 1 for the greatest, equals alike; NaN stays."""
+    """Return ranks scaled from 0 (smallest) to 1 (largest). Equal values have equal ranks, NaN stays NaN."""
     there = ~np.isnan(values)
     out = np.full(len(values), np.nan)
     _, rank = np.unique(values[there], return_inverse=True)
@@ -224,7 +226,7 @@ def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
 
 
 def _diverse(rows: pa.Table, order: list[int], score: Float[ndarray, "n"], query: Query) -> list[int]:
-    """Which of the collapsed hits, in the order of choice."""
+    """Return the diverse hits among the collapsed ones, in order of selection."""
     pool = rows.take(pa.array(order, pa.int64()))
     vectors = np.nan_to_num(vectors_of(pool, query.modality))
     worth = np.maximum(_by_rank(score[order]), SMALLEST_WORTH)
@@ -233,7 +235,7 @@ def _diverse(rows: pa.Table, order: list[int], score: Float[ndarray, "n"], query
 
 
 def vectors_of(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
-    """The embeddings of rows; NaN where there are none."""
+    """Return the embeddings of rows. Missing ones are NaN."""
     dim = rows.schema.field(name).type.list_size
     column = rows[name].combine_chunks()
     if isinstance(column, pa.ChunkedArray):

@@ -1,4 +1,4 @@
-"""An index of logs: a LanceDB table with a row for each moment and view, which remembers how it was made."""
+"""An index of logs: a LanceDB table with one row per moment and view, and its provenance."""
 
 import datetime
 import json
@@ -16,28 +16,28 @@ from foredrive.search.rows import EMBEDDINGS, FACTS, SCORES, row_schema
 from foredrive.search.tables import all_rows, find_table, make_table, quoted, quoted_list, understanding
 
 EXACT_UP_TO = 100_000
-"""So many rows are compared one by one; of more, those near a query are looked up and then compared."""
+"""Maximum number of rows for exact comparison. Above it, approximate search finds candidates first."""
 KEPT_VERSIONS = datetime.timedelta(hours=1)
-"""Whoever reads meanwhile has so long to finish."""
+"""Time for which old versions are kept, so that concurrent readers can finish."""
 PARTITION_ROWS, GROWN = 4096, 2
-"""Rows that lie together around a centre; centres are chosen anew once rows are so many times as many."""
+"""Number of rows per partition, and the growth factor of the table at which partitions are rebuilt."""
 PROBES, REFINEMENT = 32, 3
-"""Partitions that are looked through, and how many times as many rows as are wanted are then compared in
-full: partitions know vectors to 8 bits."""
+"""Number of partitions searched, and the factor of additional rows compared exactly. The factor is needed
+because partitions store vectors with 8 bits."""
 FRAMES, PARTS = "frames", "parts"
 _REMEMBERED = b"foredrive"
 _PART_SCHEMA = pa.schema(
     [("log", pa.string()), ("first", pa.int32()), ("last", pa.int32()), ("digest", pa.string())]
 )
 Scores = Mapping[str, Mapping[str, float]]
-"""By the key of a moment, and the names in `rows.SCORES`."""
+"""Scores by the key of a moment, then by the names in `rows.SCORES`."""
 SCORED_AT_ONCE = 2000
-"""Moments whose rows are written anew together."""
+"""Number of moments whose rows are rewritten together."""
 
 
 @dataclass(frozen=True)
 class Making:
-    """How the rows of an index were made; all of them alike."""
+    """Settings with which all rows of an index were made."""
 
     towers: str
     fingerprint: str
@@ -46,23 +46,23 @@ class Making:
 
 
 class Part(NamedTuple):
-    """Some frames of a log, indexed together."""
+    """Frames of a log that were indexed together."""
 
     log: str
     first: int
     last: int
     digest: str
-    """Of the log's files."""
+    """Digest of the log's files."""
 
 
 class FrameIndex:
-    """An index that is open.
+    """An open index.
 
     Args:
-        uri: a folder or a place on object storage.
+        uri: a folder or a location on object storage.
 
     Raises:
-        InputError: there is none, or it is not one of ours.
+        InputError: there is no index, or it is not one of Foredrive.
     """
 
     making: Making
@@ -80,10 +80,10 @@ class FrameIndex:
 
     @classmethod
     def make(cls, uri: str, making: Making) -> "FrameIndex":
-        """Open an index to add to, or begin one.
+        """Open an index for adding rows, or create it.
 
         Raises:
-            InputError: there is one that was made otherwise.
+            InputError: an index exists that was made with other towers or another stride.
         """
         if find_table(uri, FRAMES) is None:
             schema = row_schema(making.dim).with_metadata({_REMEMBERED: json.dumps(asdict(making))})
@@ -98,10 +98,10 @@ class FrameIndex:
         return index
 
     def check_towers(self, name: str, fingerprint: str) -> None:
-        """Whether what towers embed can be compared with what is here.
+        """Check that embeddings of these towers can be compared with those of the index.
 
         Raises:
-            InputError: other towers made this index.
+            InputError: the index was made by other towers.
         """
         ours = self.making
         if ours.fingerprint != fingerprint:
@@ -111,11 +111,11 @@ class FrameIndex:
             )
 
     def parts(self) -> set[Part]:
-        """What is in."""
+        """Return the parts in the index."""
         return {Part(**row) for row in all_rows(find_table(self.uri, PARTS))}  # type: ignore[arg-type]
 
     def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
-        """Put parts in; rows of the same moments, which an interrupted call has left, give way."""
+        """Add parts. Rows of the same moments, e.g. from an interrupted call, are replaced."""
         rows = pa.concat_tables([rows for _, rows in parts])
         told = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
         with naming(self.uri):
@@ -124,22 +124,22 @@ class FrameIndex:
             make_table(self.uri, PARTS, _PART_SCHEMA).add(told)
 
     def drop(self, log: str) -> None:
-        """Take a log out: it has changed."""
+        """Remove a log, because it has changed."""
         table = find_table(self.uri, PARTS)
-        if table is not None:  # first: a log whose rows are gone must not count as in
+        if table is not None:  # first, so that a log without rows is never listed as indexed
             table.delete(f"log = {quoted(log)}")
         self._frames.delete(f"log = {quoted(log)}")
 
     def compact(self) -> None:
-        """Merge small files and drop old versions; put new rows into partitions that there are."""
+        """Merge small files, delete old versions and add new rows to the existing partitions."""
         with naming(self.uri):
             self._frames.optimize(cleanup_older_than=KEPT_VERSIONS)
 
     def optimise(self, *, exact_up_to: int = EXACT_UP_TO) -> None:
-        """Compact, and partition the rows of which there are many by what they are looked up by.
+        """Compact the index, and partition large tables by their embeddings for fast search.
 
         Args:
-            exact_up_to: so many rows need no partitions.
+            exact_up_to: maximum number of rows without partitions.
         """
         self.compact()
         if self.count() > exact_up_to:
@@ -149,7 +149,10 @@ class FrameIndex:
                     self._partition(name, max(1, rows // PARTITION_ROWS))
 
     def _partition(self, column: str, partitions: int) -> None:
-        """Partition the rows by an embedding, unless they are: how many there were then is in its name."""
+        """Partition the rows by an embedding, unless a recent partition exists.
+
+        The number of partitions is stored in the name.
+        """
         from lancedb.index import IvfSq
 
         there = [index.name for index in self._frames.list_indices() if column in index.columns]
@@ -161,16 +164,20 @@ class FrameIndex:
             self._frames.drop_index(name)
 
     def count(self, where: str | None = None) -> int:
-        """Rows for which a condition in SQL holds.
+        """Count the rows that satisfy an SQL condition.
 
         Raises:
-            InputError: it does not parse, or names a column that there is not.
+            InputError: the condition cannot be parsed, or names an unknown column.
         """
         with understanding(where):
             return int(self._frames.count_rows(where))
 
     def select(self, where: str | None, columns: Sequence[str]) -> pa.Table:
-        """Rows for which a condition holds. Raises `InputError` as `count`."""
+        """Return the rows that satisfy a condition.
+
+        Raises:
+            InputError: as `count`.
+        """
         query = self._frames.search().select(list(columns)).limit(None)
         with understanding(where):
             return (query if where is None else query.where(where)).to_arrow()
@@ -178,20 +185,21 @@ class FrameIndex:
     def nearest(
         self, vector: Float[np.ndarray, "D"], to: str, where: str | None, columns: Sequence[str], limit: int
     ) -> pa.Table:
-        """Nearly all of the `limit` rows whose embedding `to` lies nearest to a unit vector.
+        """Return approximately the `limit` rows whose embedding `to` is nearest to a unit vector.
 
-        Raises `InputError` as `count`.
+        Raises:
+            InputError: as `count`.
         """
         query = self._frames.search(vector, vector_column_name=to).distance_type("cosine")
         query = query.select([*columns, "_distance"]).limit(limit)
-        query = query.minimum_nprobes(PROBES).maximum_nprobes(0)  # more, if conditions leave too few
+        query = query.minimum_nprobes(PROBES).maximum_nprobes(0)  # search more if conditions leave too few
         query = query.refine_factor(REFINEMENT)
         with understanding(where):
             found = (query if where is None else query.where(where, prefilter=True)).to_arrow()
         return found.select(list(columns))
 
     def set_scores(self, scores: Scores) -> int:
-        """Give moments their scores, in place of those they had; how many rows there are of them."""
+        """Replace the scores of moments. Return the number of changed rows."""
         changed = 0
         keys = list(scores)
         for start in range(0, len(keys), SCORED_AT_ONCE):
@@ -210,4 +218,4 @@ class FrameIndex:
         return changed
 
     def _put(self, rows: pa.Table) -> None:
-        self._frames.add(rows, on_bad_vectors="null")  # else it takes rows without an embedding for mistakes
+        self._frames.add(rows, on_bad_vectors="null")  # otherwise it rejects rows without embedding

@@ -1,6 +1,6 @@
-"""What users keep in an index: tags on moments, and queries by name.
+"""User data in an index: tags of moments, and named queries.
 
-Both lie in tables of their own: they outlast a log's being indexed anew.
+Both have their own tables, so they survive when a log is indexed again.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ _QUERIES = pa.schema([("name", pa.string()), ("query", pa.string())])
 
 
 def add_tag(uri: str, tag: str, keys: Iterable[str]) -> None:
-    """Give moments of the index at `uri`, by their keys, a tag; those that have it keep it."""
+    """Add a tag to moments, given by their keys, in the index at `uri`."""
     rows = [{"tag": tag, "key": key} for key in sorted({*keys} - {*tagged(uri, tag)})]
     if rows:
         with naming(uri):
@@ -23,7 +23,7 @@ def add_tag(uri: str, tag: str, keys: Iterable[str]) -> None:
 
 
 def remove_tag(uri: str, tag: str) -> None:
-    """Take a tag away from all that have it."""
+    """Remove a tag from all moments."""
     table = find_table(uri, "tags")
     if table is not None:
         with naming(uri):
@@ -31,18 +31,18 @@ def remove_tag(uri: str, tag: str) -> None:
 
 
 def tagged(uri: str, tag: str) -> list[str]:
-    """The keys of the moments that have a tag."""
+    """Return the keys of the moments with a tag."""
     return [str(row["key"]) for row in all_rows(find_table(uri, "tags"), f"tag = {quoted(tag)}")]
 
 
 def where_tagged(uri: str, tag: str) -> str:
-    """A condition that holds for the moments that have a tag."""
+    """Return an SQL condition for the moments with a tag."""
     keys = tagged(uri, tag)
     return f"key IN ({quoted_list(keys)})" if keys else "false"
 
 
 def save_query(uri: str, name: str, query: str) -> None:
-    """Keep a query, in place of one of the same name."""
+    """Save a query. It replaces a query of the same name."""
     with naming(uri):
         table = make_table(uri, "queries", _QUERIES)
         table.delete(f"name = {quoted(name)}")
@@ -50,5 +50,5 @@ def save_query(uri: str, name: str, query: str) -> None:
 
 
 def saved_queries(uri: str) -> dict[str, str]:
-    """Queries that were kept, by name."""
+    """Return the saved queries by name."""
     return {str(row["name"]): str(row["query"]) for row in all_rows(find_table(uri, "queries"))}

@@ -1,4 +1,4 @@
-"""Short English texts that are true of a view, and which of its facts each of them says."""
+"""Short English texts that are true of a view, with the facts that each text states."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ NAMES = {
     "cyclist": ("cyclist", "bicycle"),
     "pedestrian": ("pedestrian", "person"),
 }
-"""Of what has more names than one."""
+"""Alternative names of objects."""
 PLURALS = {"person": "people", "bus": "buses", "lorry": "lorries"}
 MANNERS = {
     "": ("{}",),
@@ -45,27 +45,27 @@ MANNERS = {
     "standing": ("stationary {}", "{} standing still"),
 }
 ON_FOOT = {"moving": ("{} walking", "walking {}"), "standing": ("{} standing", "standing {}")}
-"""What of `MANNERS` is said otherwise of pedestrians."""
+"""Wordings that differ from `MANNERS` for pedestrians."""
 NOBODY = ("nobody around", "no one in sight", "no other traffic")
 ALONE = ("{}", "a drive {}", "driving {}", "a scene {}")
-"""What is said of a setting by itself."""
+"""Templates for a text with settings only."""
 TOLD = ("crossing", "oncoming", "near")
-"""What a caption tells of all of a noun, the first that holds."""
+"""Properties that a caption states if all objects of a noun have them; the first that holds is used."""
 _WORDED, _ALL, _SUBJECT = 0.3, 0.3, 0.75
-"""How often a text is worded as a prompt, names everyone, names anyone."""
+"""Probabilities that a text uses a prompt template, names all objects, names any object."""
 
 
 class Phrase(NamedTuple):
-    """A text, and the facts that a view must have for it to be true."""
+    """A text and the facts that make it true."""
 
     text: str
     facts: frozenset[str]
 
 
 def phrases(view: ViewFacts, seed: int, count: int) -> list[Phrase]:
-    """Texts that are true of a view: single facts and several together, as people ask and as captions tell.
+    """Return texts that are true of a view, with one or several facts, worded as queries or captions.
 
-    The seed chooses what is said and how, never what is true. None for a view of which nothing is known.
+    The seed selects facts and wording. Return an empty list for a view without known facts.
     """
     if not view.facts:
         return []
@@ -74,7 +74,7 @@ def phrases(view: ViewFacts, seed: int, count: int) -> list[Phrase]:
 
 
 def whole_caption(view: ViewFacts) -> str | None:
-    """One sentence of all that is known of a view, always in the same words; None where nothing is."""
+    """Return one sentence with all known facts of a view, in fixed wording. None if nothing is known."""
     settings = [
         SETTINGS[fact][0] for fact in (view.place, view.time_of_day, view.weather) if fact is not None
     ]
@@ -86,7 +86,7 @@ def whole_caption(view: ViewFacts) -> str | None:
 
 
 def _counted(manners: Sequence[Sequence[str]], noun: str) -> str:
-    """How many of a noun, and what of `TOLD` is true of all of them."""
+    """Return the number of objects of a noun, with the property of `TOLD` that all of them have."""
     number = COUNTS.get(len(manners), MANY)
     name = noun if len(manners) == 1 else PLURALS.get(noun, f"{noun}s")
     told = [manner for manner in TOLD if all(manner in those for those in manners)]
@@ -128,7 +128,7 @@ def _subject(view: ViewFacts, rng: np.random.Generator) -> tuple[str, set[str]]:
 
 
 def _group(view: ViewFacts, noun: str, rng: np.random.Generator) -> tuple[str, str]:
-    """Those of one noun that have something in common, counted or "a": a text and its fact."""
+    """Return a text and a fact about the objects of one noun with a common property."""
     assert view.things is not None
     manners = [thing.manners for thing in view.things if thing.noun == noun]
     shared = ["", *sorted({manner for those in manners for manner in those})]

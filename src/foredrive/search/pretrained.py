@@ -1,4 +1,4 @@
-"""CLIP (Radford et al. 2021) and SigLIP (Zhai et al. 2023) as towers, through transformers."""
+"""CLIP (Radford et al. 2021) and SigLIP (Zhai et al. 2023) as towers, with the transformers library."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,24 +16,25 @@ from foredrive.search.towers import weights_digest
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
-"""RGB statistics that the released models were trained with."""
+"""RGB statistics of the training of the released models."""
 SIGLIP_TOKENS = 64
-"""SigLIP was trained on texts padded to this many tokens, and its text tower reads the last."""
+"""Length to which texts are padded in SigLIP's training. Its text tower reads the last token."""
 HUB_ANSWERS_S = 5.0
 KINDS = ("clip", "siglip", "siglip2")
 
 
 class PretrainedTowers:
-    """The towers of a CLIP or SigLIP model; they have none for lidar.
+    """The towers of a CLIP or SigLIP model. There is no lidar tower.
 
-    CLIP sees the middle square of an image and SigLIP all of it squeezed into one, as each was trained.
+    CLIP uses the central square of an image. SigLIP squeezes the whole image into a square. Both are as in
+    training.
 
     Args:
-        model: a name on Hugging Face's hub, or a local folder. A folder with a configuration but without
-            weights gives random ones, the same every time, and says so.
+        model: a name on the Hugging Face hub, or a local folder. A folder with a configuration but without
+            weights gives random weights with a fixed seed, and a warning.
 
     Raises:
-        InputError: there is no such model here, or it is of another kind.
+        InputError: the model is not available, or it is of another kind.
     """
 
     has_lidar = False
@@ -51,7 +52,7 @@ class PretrainedTowers:
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """See `Towers`."""
+        """Embed images, see `Towers`."""
         side = self.image_side_px
         if self.is_clip:
             images = _middle_square(images)
@@ -62,12 +63,12 @@ class PretrainedTowers:
         return _features(found)
 
     def embed_sweeps(self, sweeps: LidarSweep) -> None:
-        """See `Towers`."""
+        """Return None, because there is no lidar tower."""
         return
 
     @torch.no_grad()
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
-        """See `Towers`; what goes beyond the longest text that the tower can read is cut off."""
+        """Embed texts, see `Towers`. Texts longer than the tower's maximum are cut."""
         longest = int(self.model.config.text_config.max_position_embeddings)
         padded = {"padding": True, "max_length": longest} if self.is_clip else {
             "padding": "max_length", "max_length": min(SIGLIP_TOKENS, longest)
@@ -96,7 +97,7 @@ def _not_loaded(model: str, error: Exception) -> InputError:
 
 
 def _load(model: str) -> tuple[Any, Any]:
-    """A model and its tokenizer: what lies here, else from the hub, if that answers at all."""
+    """Load a model and its tokenizer from local files, or else from the hub if it can be reached."""
     try:
         return _from_files(model, local_files_only=True)
     except InputError:
@@ -114,10 +115,10 @@ def _load(model: str) -> tuple[Any, Any]:
 
 
 def _reach_hub(model: str) -> None:
-    """Ask the hub once: asked for files, it would be asked again and again for 20 s.
+    """Contact the hub once. The library itself would retry for 20 s.
 
     Raises:
-        InputError: it does not answer.
+        InputError: the hub does not answer.
     """
     from huggingface_hub import constants
     from huggingface_hub.utils import get_session
@@ -126,7 +127,7 @@ def _reach_hub(model: str) -> None:
         raise _not_loaded(model, OSError("it is not here, and HF_HUB_OFFLINE forbids to look elsewhere"))
     try:
         get_session().head(constants.ENDPOINT, timeout=HUB_ANSWERS_S)
-    except Exception as error:  # of whatever client the hub's library uses
+    except Exception as error:  # the type depends on the library's HTTP client
         reason = f"it is not here, and {constants.ENDPOINT} cannot be reached ({error})"
         raise _not_loaded(model, OSError(reason)) from error
 

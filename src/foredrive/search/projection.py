@@ -1,4 +1,4 @@
-"""All that is indexed on a plane: what lies close together there is alike."""
+"""Projection of the indexed scenes to a plane, where similar scenes are close together."""
 
 from typing import NamedTuple
 
@@ -15,23 +15,23 @@ MOST_POINTS = 5000
 
 
 class Plane(NamedTuple):
-    """Whole scenes and where they lie."""
+    """Whole scenes with their positions on the plane."""
 
     xy: Float[ndarray, "n 2"]
-    """The two directions in which their embeddings vary most, scaled to -1 to 1."""
+    """The first two principal components, scaled to -1 … 1."""
     rows: list[dict[str, object]]
-    """`SHOWN` of each."""
+    """The columns `SHOWN` of each scene."""
     share: float
-    """Of the variance that the plane shows."""
+    """Share of the variance that the plane shows."""
     total: int
-    """Whole scenes that there are; of more than `MOST_POINTS` as many, evenly."""
+    """Number of all whole scenes. Above `MOST_POINTS`, an even subsample is shown."""
 
 
 SHOWN = ("key", "log", "t_s", "view", "place", "weather", "time_of_day")
 
 
 def project_scenes(index: FrameIndex) -> Plane:
-    """Principal components of the whole scenes' image embeddings."""
+    """Compute the principal components of the image embeddings of whole scenes."""
     where = f"view = {quoted(WHOLE)} AND image IS NOT NULL"
     total = index.count(where)
     step = -(-total // MOST_POINTS) if total else 1

@@ -1,4 +1,4 @@
-"""What is asked of an index."""
+"""Queries to an index."""
 
 import json
 import re
@@ -19,50 +19,50 @@ ANY_VIEW, ANY_SECTOR = "any", "sectors"
 
 
 class Like(NamedTuple):
-    """An example: a moment of a log, one view of it, or a crop of that."""
+    """An example: a moment of a log, one of its views, or a crop of a view."""
 
     log: str
     t_s: float
-    """Since the log's start."""
+    """Time, s since the log's start."""
     view: str
     crop_px: tuple[int, int, int, int] | None
-    """Left, top, right, bottom in the log's own image."""
+    """Left, top, right, bottom in px of the log's original image."""
 
 
 @dataclass(frozen=True)
 class Query:
-    """A question; what is left out does not matter.
+    """A query to an index. Fields that are not set do not restrict it.
 
     Raises:
-        InputError: nothing is asked for, or what is asked for does not go together.
+        InputError: the query is empty or inconsistent.
     """
 
     text: str | None = None
     image_text: str | None = None
-    """What images are compared with, where that differs from `text`."""
+    """Text to compare images with, if it differs from `text`."""
     lidar_text: str | None = None
-    """What sweeps are compared with, where that differs from `text`."""
+    """Text to compare sweeps with, if it differs from `text`."""
     like: str | None = None
     """LOG@SECONDSs, LOG@SECONDSs/VIEW or LOG@SECONDSs/VIEW:LEFT,TOP,RIGHT,BOTTOM."""
     modality: Modality = "image"
     rule: Rule = "features"
-    """How two modalities are joined (Paper B): the sum of features, the sum of logits, or the best by image
-    ranked again by lidar."""
+    """Rule to combine two modalities (Paper B): sum of features, sum of logits, or the best by image reranked
+    by lidar."""
     where: str | None = None
-    """A condition in SQL on the index' columns."""
+    """SQL condition on the index' columns."""
     tag: str | None = None
-    """Only moments that have it."""
+    """Tag that moments must have."""
     view: str = ANY_VIEW
-    """"any", "sectors", "all" for whole scenes, or the name of one."""
+    """Views: "any", "sectors", "all" for whole scenes, or the name of one view."""
     top: int = 20
     gap_s: float = 5.0
-    """Moments of one log that are closer than this are one hit."""
+    """Time in s within which moments of one log count as one hit."""
     diverse: Diversity | None = None
-    """Of the best ten times as many, those that differ most or stand for most."""
+    """Method that selects diverse or representative hits among the best ten times as many."""
     by: str | None = None
-    """A column of numbers that makes moments more wanted, such as score_missed."""
+    """Numeric column whose large values raise the rank of moments, such as score_missed."""
     mix: float = 0.5
-    """What `by` weighs beside likeness, 0 to 1; both count by their ranks."""
+    """Weight of `by` relative to similarity, 0 to 1. Both are converted to ranks."""
 
     def __post_init__(self) -> None:
         for name in ("text", "image_text", "lidar_text", "like", "where"):
@@ -83,35 +83,35 @@ class Query:
 
     @property
     def compares(self) -> bool:
-        """Whether rows are compared with a text or an example."""
+        """Return whether rows are compared with a text or an example."""
         return any((self.text, self.image_text, self.lidar_text, self.like))
 
     @property
     def example(self) -> Like | None:
-        """The example, taken apart.
+        """Return the parsed example.
 
         Raises:
-            InputError: it is not written as one.
+            InputError: the example has a wrong format.
         """
         return None if self.like is None else parse_like(self.like)
 
     @property
     def where_view(self) -> str | None:
-        """The condition on rows' views."""
+        """Return the SQL condition on the view."""
         if self.view == ANY_VIEW:
             return None
         return f"view != {quoted(WHOLE)}" if self.view == ANY_SECTOR else f"view = {quoted(self.view)}"
 
     def to_json(self) -> str:
-        """What `from_json` reads."""
+        """Return the query as JSON for `from_json`."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> "Query":
-        """A query that was kept.
+        """Restore a saved query.
 
         Raises:
-            InputError: it is none, or of another version.
+            InputError: the text is not a query, or it is of another version.
         """
         try:
             told: dict[str, Any] = json.loads(text)
@@ -121,10 +121,10 @@ class Query:
 
 
 def parse_like(text: str) -> Like:
-    """Take an example apart: LOG@12.5s, LOG@12.5s/VIEW, LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM.
+    """Parse an example: LOG@12.5s, LOG@12.5s/VIEW, LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM.
 
     Raises:
-        InputError: it is not written so.
+        InputError: the text has a wrong format.
     """
     found = re.fullmatch(r"(.+)@(\d+(?:\.\d*)?)s?(?:/([^:/]+))?(?::(\d+),(\d+),(\d+),(\d+))?", text.strip())
     if found is None or (found[4] is not None and found[3] is None):

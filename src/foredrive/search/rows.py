@@ -1,20 +1,23 @@
-"""The columns of an index: one row for each moment of a log and each view of it."""
+"""Columns of an index. It has one row per moment of a log and view."""
 
 import pyarrow as pa
 
 from foredrive.scene import Category
 
 WHOLE = "all"
-"""The view that takes all sectors of a moment together; the others have the names of cameras or sectors."""
+"""Name of the view of the whole scene. Other views have the names of cameras or sectors."""
 EMBEDDINGS = ("image", "lidar", "joint")
-"""Unit vectors; `joint` is the normalised sum of the other two, or the one there is (thesis, Paper B)."""
+"""Columns of unit vectors. `joint` is the normalised sum of the other two, or the available one (thesis,
+Paper B)."""
 SCORES = ("nll", "localisation", "classification", "false", "missed")
-"""How likely a frame's detections made the truth, in nats, and its parts (`foredrive.sets`)."""
+"""Negative log-likelihood of the true objects under a frame's detections, in nats, and its parts
+(`foredrive.sets`)."""
 COUNTS = {category: f"n_{category.name.lower()}" for category in Category}
-"""Annotated objects by class: of the whole scene, or of those whose centre lies in the sector."""
+"""Columns with the number of annotated objects by class, of the whole scene or of the sector that contains
+their centre."""
 FACTS = pa.schema(
     [
-        ("key", pa.string()),  # of the moment: LOG@T_US, as clips have it
+        ("key", pa.string()),  # of the moment: LOG@T_US, as in clips
         ("log", pa.string()),  # split/name
         ("folder", pa.string()),
         ("maps_dir", pa.string()),
@@ -22,7 +25,8 @@ FACTS = pa.schema(
         ("t_us", pa.int64()),  # in the time of the log
         ("t_s", pa.float64()),  # since the log's start
         ("view", pa.string()),
-        ("azimuth_deg", pa.float32()),  # of the sector's middle, from ahead to the left; null of the whole
+        # Azimuth of the sector's middle, counter-clockwise from ahead; null for the whole scene.
+        ("azimuth_deg", pa.float32()),
         ("dataset", pa.string()),
         ("place", pa.string()),  # town or city
         ("ego_speed", pa.float32()),  # m/s
@@ -33,10 +37,10 @@ FACTS = pa.schema(
         *[(f"score_{name}", pa.float32()) for name in SCORES],
     ]
 )
-"""All but the embeddings. What a log does not tell is null."""
+"""All columns except the embeddings. Values that a log does not have are null."""
 
 
 def row_schema(dim: int) -> pa.Schema:
-    """The columns of an index whose embeddings have `dim` numbers."""
+    """Return the columns of an index with embeddings of length `dim`."""
     vector = pa.list_(pa.float32(), dim)
     return pa.schema([*FACTS, *[pa.field(name, vector) for name in EMBEDDINGS]])

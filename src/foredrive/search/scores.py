@@ -1,4 +1,4 @@
-"""Per-frame scores of detections (`foredrive.sets`), from a file."""
+"""Reading of per-frame detection scores (`foredrive.sets`) from a file."""
 
 import json
 from pathlib import Path
@@ -8,13 +8,13 @@ from foredrive.search.rows import SCORES
 
 
 def read_scores(path: Path) -> dict[str, dict[str, float]]:
-    """Scores by the key of a moment and their names; one JSON object a line.
+    """Read scores by moment key and name, from a file with one JSON object per line.
 
-    A line is {"frame": "SPLIT/NAME@T_US", "nll": 31.2, "missed": 4.0, …} with any of `rows.SCORES`; frames
-    are named as clips are (`Example.key`).
+    A line is {"frame": "SPLIT/NAME@T_US", "nll": 31.2, "missed": 4.0, …} with any of `rows.SCORES`. Frames
+    have the same names as clips (`Example.key`).
 
     Raises:
-        InputError: a line that is not such an object.
+        InputError: a line is not such an object.
     """
     found: dict[str, dict[str, float]] = {}
     try:

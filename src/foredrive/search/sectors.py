@@ -1,4 +1,4 @@
-"""What lies in the sector that a camera looks at: its beams, its objects; sectors of logs without cameras."""
+"""Sectors of a scene: the part that a camera sees, or one of four directions in logs without cameras."""
 
 import dataclasses
 import math
@@ -14,28 +14,28 @@ from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, rotate_vectors,
 from foredrive.scene import LidarSweep
 
 BLIND_SECTORS = {"ahead": 0.0, "left": 90.0, "behind": 180.0, "right": -90.0}
-"""Sectors of logs without cameras, by the direction of their middle, degrees from ahead to the left."""
+"""Sectors of logs without cameras: azimuth of their middle, degrees counter-clockwise from ahead."""
 _HALF_RAD = math.pi / 4
 
 
 class Sector(NamedTuple):
-    """A direction, and what of a scene lies in it."""
+    """A sector of a scene around a direction."""
 
     azimuth_rad: float
-    """Of its middle in the ego frame, from ahead to the left."""
+    """Azimuth of its middle in the ego frame, counter-clockwise from ahead."""
     camera: CameraFrame | None = None
-    """Whose image bounds it; None: 45 degrees to either side of the middle."""
+    """Camera whose image bounds the sector. None means 45 degrees on both sides of the middle."""
     size_hw: tuple[int, int] = (0, 0)
-    """Of the camera's images, px."""
+    """Height and width of the camera's images, px."""
 
     @classmethod
     def of_camera(cls, camera: CameraFrame, size_hw: tuple[int, int]) -> "Sector":
-        """The sector a camera looks at."""
+        """Return the sector of a camera."""
         forward = camera.T_ego_cam[:2, 2]
         return cls(float(torch.atan2(forward[1], forward[0])), camera, size_hw)
 
     def contains(self, points_ego: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
-        """Which points lie in the sector."""
+        """Return whether points are in the sector."""
         if self.camera is None:
             off_rad = torch.atan2(points_ego[:, 1], points_ego[:, 0]) - self.azimuth_rad
             return torch.atan2(off_rad.sin(), off_rad.cos()).abs() <= _HALF_RAD
@@ -43,7 +43,7 @@ class Sector(NamedTuple):
         return project(points_cam, self.camera.K, self.camera.dist, self.size_hw)[2]
 
     def sweep(self, sweep: LidarSweep) -> LidarSweep:
-        """The returns of an unbatched sweep that lie in the sector, x along its middle (see `Towers`)."""
+        """Return an unbatched sweep's returns in the sector, with x along its middle (see `Towers`)."""
         inside = sweep[sweep.valid & sweep.returned & self.contains(sweep.points_ego)]
         T_sector_ego = matrix_from_yaw(torch.tensor(-self.azimuth_rad), torch.zeros(3))
         return dataclasses.replace(
@@ -54,5 +54,5 @@ class Sector(NamedTuple):
 
 
 def blind_sectors() -> dict[str, Sector]:
-    """Four sectors around a vehicle without cameras."""
+    """Return four sectors around a vehicle without cameras."""
     return {name: Sector(math.radians(deg)) for name, deg in BLIND_SECTORS.items()}

@@ -1,4 +1,4 @@
-"""LanceDB, as far as an index needs it; imported late, and here alone."""
+"""The LanceDB functions that an index needs. LanceDB is imported late, and only here."""
 
 import contextlib
 from collections.abc import Iterable, Iterator
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from lancedb.table import Table
 
 _TROUBLE = (ValueError, RuntimeError, OSError)
-"""What LanceDB raises: its own mistakes, those of a query, and those of a disk, all of these kinds."""
+"""Exception types of LanceDB, for its own errors, those of a query and those of a disk alike."""
 
 
 def connect(uri: str) -> "DBConnection":
-    """The tables at a folder or a place on object storage ("s3://…"), which has its own credentials.
+    """Connect to the tables in a folder or on object storage ("s3://…"), which has its own credentials.
 
     Raises:
         InputError: LanceDB is not installed.
@@ -32,10 +32,10 @@ def connect(uri: str) -> "DBConnection":
 
 
 def find_table(uri: str, name: str) -> "Table | None":
-    """A table that is there already; None if it is not. Nothing is written.
+    """Return an existing table, or None. Nothing is written.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the table cannot be read.
     """
     if "://" not in uri and not (Path(uri) / f"{name}.lance").exists():
         return None
@@ -48,11 +48,11 @@ def find_table(uri: str, name: str) -> "Table | None":
 
 
 def make_table(uri: str, name: str, schema: pa.Schema) -> "Table":
-    """A table, made if it is not there.
+    """Return a table. It is created if it does not exist.
 
     Raises:
         InputError: no folder can be made there.
-        OSError: the disk refuses it.
+        OSError: the operating system refuses it.
     """
     if "://" not in uri:
         make_folder(Path(uri))
@@ -60,7 +60,7 @@ def make_table(uri: str, name: str, schema: pa.Schema) -> "Table":
 
 
 def all_rows(table: "Table | None", where: str | None = None) -> list[dict[str, object]]:
-    """Rows of a small table."""
+    """Return all rows of a small table."""
     if table is None:
         return []
     query = table.search() if where is None else table.search().where(where)
@@ -70,10 +70,10 @@ def all_rows(table: "Table | None", where: str | None = None) -> list[dict[str, 
 
 @contextlib.contextmanager
 def understanding(where: str | None) -> Iterator[None]:
-    """Say of a condition that LanceDB does not understand that it is at fault.
+    """Convert LanceDB's errors about the condition `where` into an `InputError` of one line.
 
     Raises:
-        InputError: in one line.
+        InputError: LanceDB rejects the condition.
     """
     try:
         yield
@@ -84,15 +84,15 @@ def understanding(where: str | None) -> Iterator[None]:
 
 
 def first_line(error: BaseException) -> str:
-    """What LanceDB says, without where in its code it does."""
+    """Return the first line of LanceDB's message, without the position in its source code."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0].split(", rust/")[0]
 
 
 def quoted_list(texts: Iterable[str]) -> str:
-    """Texts as SQL lists them."""
+    """Return texts as an SQL list."""
     return ", ".join(map(quoted, texts))
 
 
 def quoted(text: str) -> str:
-    """A text as SQL writes it."""
+    """Return a text as an SQL literal."""
     return "'" + text.replace("'", "''") + "'"

@@ -1,4 +1,4 @@
-"""The vectors a query's rows are compared with: of its texts, or of its example."""
+"""Target vectors of a query, from its texts or its example."""
 
 import dataclasses
 from pathlib import Path
@@ -25,19 +25,21 @@ _ALONE = ("{}",)
 
 
 class Target(NamedTuple):
-    """Unit vectors by modality, None where there is none; and the moment that they were taken from."""
+    """Unit vectors by modality (None if missing), and the moment that they come from."""
 
     image: Float[np.ndarray, "D"] | None
     lidar: Float[np.ndarray, "D"] | None
     moment: tuple[str, int] | None = None
-    """Log and time in µs of an example: it is not to be found again."""
+    """Log and time in µs of an example. It is excluded from the results."""
 
 
 def text_target(query: Query, towers: Towers, *, ensemble: bool = True) -> Target:
-    """Of texts: sweeps and images live in one space, so one text does for both if no other is given.
+    """Return the target of a query's texts.
+
+    Sweeps and images are embedded in one space, so one text is used for both if the other is missing.
 
     Args:
-        ensemble: word each text in several ways (`towers.PROMPTS`).
+        ensemble: whether to use several wordings of each text (`towers.PROMPTS`).
 
     Raises:
         InputError: a text is empty.
@@ -53,16 +55,16 @@ def text_target(query: Query, towers: Towers, *, ensemble: bool = True) -> Targe
 
 
 class ExampleViews(NamedTuple):
-    """An example, read."""
+    """The views of an example."""
 
     views: dict[str, View]
-    """By name: one view, or all of a moment."""
+    """Views by name: one view, or all views of a moment."""
     moment: tuple[str, int]
     """Log, and time in µs."""
 
 
 def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
-    """Of a moment, a view or a crop of a log, which need not be in the index.
+    """Return the target of a moment, view or crop of a log. The log need not be in the index.
 
     Raises:
         InputError: there is no such log, moment or view, or it cannot be read.
@@ -74,10 +76,13 @@ def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
 
 
 def example_views(index: FrameIndex | None, like: Like, towers: Towers) -> ExampleViews:
-    """What towers are shown of an example. Raises as `example_target`.
+    """Read the views of an example.
 
     Args:
-        index: None knows logs by their folders only.
+        index: index in which logs are found by name. With None, logs are given by their folders.
+
+    Raises:
+        InputError: as `example_target`.
     """
     log = Log(_find_log(index, like.log))
     frame, found = log.nearest_frames(np.array([log.t_us[0] + like.t_s * 1e6]))
@@ -119,7 +124,7 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
 
 
 def _cropped(log: Log, frame: int, like: Like, *, with_lidar: bool) -> View:
-    """A part of an image as a view of its own: a camera with another middle."""
+    """Return a crop of an image as a view: a camera with a shifted principal point."""
     metadata = find_camera(pinhole_cameras(log), like.view)
     if metadata is None:
         there = told_cameras(pinhole_cameras(log).values())

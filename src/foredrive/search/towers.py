@@ -1,4 +1,4 @@
-"""What an index asks of the towers that embed images, sweeps and texts into one space."""
+"""The protocol of towers, which embed images, sweeps and texts into one space."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -24,49 +24,49 @@ PROMPTS = (
 
 @runtime_checkable
 class Towers(Protocol):
-    """An image tower, a text tower and, maybe, a lidar tower of the same space.
+    """An image tower, a text tower and optionally a lidar tower with a common embedding space.
 
-    Embeddings come as the towers make them, of any length; who compares them normalises (`unit`). Towers are
-    asked under `torch.no_grad`, and what they answer depends on weights and input alone, not on the batch.
+    Embeddings have any length; the caller normalises them (`unit`). Towers are called under `torch.no_grad`.
+    Their output depends only on weights and input, not on the batch.
     """
 
     name: str
-    """What a user calls them by."""
+    """Name of the towers for users."""
     fingerprint: str
-    """Changes with the weights and with all that embeddings depend on; an index remembers it."""
+    """Digest of the weights and of everything else that embeddings depend on. An index stores it."""
     dim: int
     """D, the length of an embedding."""
     image_side_px: int
-    """Images are read so that their shorter side has this length, aspect kept."""
+    """Length of the shorter side of the input images, with the aspect ratio kept."""
     has_lidar: bool
 
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """RGB images, of one camera sector each."""
+        """Embed RGB images of one camera sector each."""
         ...
 
     def embed_sweeps(self, sweeps: LidarSweep) -> Float[Tensor, "n D"] | None:
-        """Sweeps [n N], of one sector each; None where there is no lidar tower.
+        """Embed sweeps [n N] of one sector each. Return None if there is no lidar tower.
 
-        Each holds the returns that lie in its sector, in the axes of a frame below the ego vehicle's rear
-        axle that is turned about z until x points along the sector's middle; padding has `valid` False.
+        Each sweep has the returns in its sector. Its frame is the ego frame turned about z, so that x points
+        along the middle of the sector. Padding has `valid` False.
         """
         ...
 
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
-        """Texts, each by itself."""
+        """Embed texts, each independently."""
         ...
 
 
 def unit(embeddings: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
-    """Embeddings of length 1; zeros stay zeros."""
+    """Return embeddings of length 1. Zeros stay zeros."""
     return F.normalize(embeddings.float(), dim=-1)
 
 
 def embed_prompt(towers: Towers, text: str, templates: Sequence[str] = PROMPTS) -> Float[Tensor, "D"]:
-    """One text in several wordings as one unit vector: the mean of their unit vectors, normalised.
+    """Return one text in several wordings as one unit vector: the normalised mean of their unit vectors.
 
     Args:
-        templates: each with one {} for the text; ("{}",) takes the text alone.
+        templates: wordings with one {} for the text. ("{}",) is the text alone.
 
     Raises:
         InputError: the text is empty.
@@ -78,7 +78,7 @@ def embed_prompt(towers: Towers, text: str, templates: Sequence[str] = PROMPTS) 
 
 
 def weights_digest(weights: Mapping[str, Tensor]) -> str:
-    """Of every weight, by name: what a fingerprint is made of."""
+    """Return the digest of all weights and their names, for a fingerprint."""
     digest = hashlib.sha256()
     for name, tensor in sorted(weights.items()):
         digest.update(name.encode())

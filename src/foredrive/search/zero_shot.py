@@ -1,4 +1,4 @@
-"""Naming what views show by texts alone, untrained for it (Radford et al. 2021, section 3.1)."""
+"""Zero-shot classification of views by texts (Radford et al. 2021, section 3.1)."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,7 +10,7 @@ from foredrive.search.towers import Towers, embed_prompt, unit
 
 
 def class_vectors(towers: Towers, classes: Mapping[str, Sequence[str]]) -> Float[Tensor, "C D"]:
-    """A unit vector for each class: the mean direction of its texts, each worded in several ways.
+    """Return a unit vector per class: the mean direction of its texts, each in several wordings.
 
     Args:
         classes: texts by name, such as {"night": ("at night", "in the dark"), "day": ("by day",)}.
@@ -27,5 +27,5 @@ def class_vectors(towers: Towers, classes: Mapping[str, Sequence[str]]) -> Float
 
 
 def classify(embeddings: Float[Tensor, "n D"], classes: Float[Tensor, "C D"]) -> Int[Tensor, "n"]:
-    """The class whose direction is nearest to each embedding's, of images and sweeps alike."""
+    """Return the class with the nearest direction for each embedding of an image or sweep."""
     return (unit(embeddings) @ classes.T).argmax(-1)

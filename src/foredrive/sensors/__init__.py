@@ -1,4 +1,4 @@
-"""Camera and lidar models: pixels and beams to timed rays."""
+"""Camera and lidar models: they turn pixels and beams into timed rays."""
 
 from foredrive.sensors.camera import camera_rays, readout_time_s
 from foredrive.sensors.lidar import SpinningLidar

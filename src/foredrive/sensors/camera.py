@@ -1,4 +1,4 @@
-"""Cameras: pixels to timed rays."""
+"""Timed rays of camera pixels."""
 
 import torch
 from jaxtyping import Float
@@ -11,15 +11,16 @@ from foredrive.sensors.rays import TimedRays
 
 
 def camera_rays(rig: CameraRig, samples_per_pixel: int = 1) -> TimedRays:
-    """Rays of all pixels of every camera.
+    """Return the rays of all pixels of every camera.
 
     Args:
-        rig: leading dimensions *b.
-        samples_per_pixel: 1, or a square number n²: n×n evenly spaced points within each pixel.
+        rig: cameras with leading dimensions *b.
+        samples_per_pixel: 1, or a square number n² for n×n evenly spaced points in each pixel.
 
     Returns:
-        Rays [*b C N], N = H·W·samples, rows first, the samples of a pixel next to each other; the time is
-        relative to the exposure of the image's middle row, and the ego frame is the one `T_ego_cam` leads to.
+        Rays [*b C N] with N = H·W·samples, in row order. The samples of a pixel are adjacent. The time is
+        relative to the exposure of the middle image row. The ego frame is the destination frame of
+        `T_ego_cam`.
     """
     offsets = _subpixel_offsets(samples_per_pixel).to(rig.K)
     uv = (pixel_centres(rig.size_hw).to(rig.K)[:, :, None] + offsets).reshape(-1, 2)  # [H·W·samples, 2]
@@ -33,7 +34,7 @@ def camera_rays(rig: CameraRig, samples_per_pixel: int = 1) -> TimedRays:
 
 
 def readout_time_s(v_px: Float[Tensor, "N"], rig: CameraRig) -> Float[Tensor, "*b C N"]:
-    """When a rolling shutter reads row coordinate v (px), relative to the image's middle row."""
+    """Return the time at which a rolling shutter reads row v (px), relative to the middle row, s."""
     return (v_px / rig.size_hw[0] - 0.5) * rig.readout_s[..., None]
 
 

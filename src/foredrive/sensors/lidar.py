@@ -1,4 +1,4 @@
-"""Spinning lidars: beams as timed rays."""
+"""Timed rays of spinning lidars."""
 
 import math
 from dataclasses import dataclass
@@ -17,22 +17,23 @@ GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 @dataclass(frozen=True)
 class SpinningLidar:
-    """A column of lasers that turns clockwise, seen from above, and fires column by column.
+    """A column of lasers that turns clockwise (seen from above) and fires column by column.
 
-    A revolution starts and ends looking backwards, and the frame's time is its end, so that all of a frame
-    has been seen by then: straight ahead was seen half a period before. `lidar_models` has real ones.
+    A revolution starts and ends in the backward direction. The time of the frame is the end of the
+    revolution, so all beams of a frame were fired before it. The forward beams were fired half a period
+    earlier. `lidar_models` has real devices.
 
     Raises:
-        ValueError: a table with another number of channels, lasers that fire longer than a column takes, no
-            rays for a beam.
+        ValueError: a table has a different number of channels, the lasers of a column need more time than a
+            column takes, or `rays_per_beam` is below 1.
     """
 
     elevation_rad: tuple[float, ...]
-    """Elevation of each channel in the lidar frame, positive is up."""
+    """Elevation of each channel in the lidar frame, positive upwards."""
     azimuth_steps: int
-    """Columns a revolution."""
+    """Columns per revolution."""
     rate_hz: float
-    """Revolutions a second."""
+    """Revolutions per second."""
     min_range_m: float
     max_range_m: float
     range_noise_m: float
@@ -40,17 +41,17 @@ class SpinningLidar:
     T_ego_lidar: Float[Tensor, "4 4"]
     """lidar (x forward, y left, z up) -> ego."""
     firing_s: tuple[float, ...] | None = None
-    """When each channel fires, the head turning meanwhile; None: a whole column at once."""
+    """Firing time of each channel within its column; the head turns meanwhile. None: all at the same time."""
     azimuth_offset_rad: tuple[float, ...] | None = None
-    """How far each channel looks counter-clockwise of its column; None: all along it."""
+    """Counter-clockwise azimuth offset of each channel from its column. None means 0."""
     divergence_rad: float = 0.0
-    """Full angle of the cone that a beam is."""
+    """Full opening angle of the beam cone."""
     rays_per_beam: int = 1
-    """Rays that stand for a beam's footprint; 1: its axis alone."""
+    """Number of rays that sample the footprint of a beam. 1 is the axis alone."""
     pulse_m: float = 0.75
-    """Depth within which the echoes of one pulse are one echo: half the length of a pulse of 5 ns."""
+    """Depth interval in which the echoes of one pulse merge: half the length of a 5 ns pulse."""
     echo: Literal["strongest", "last"] = "strongest"
-    """Which of a beam's echoes is returned."""
+    """The echo of a beam that is returned."""
 
     def __post_init__(self) -> None:
         if self.rays_per_beam < 1:
@@ -64,20 +65,20 @@ class SpinningLidar:
 
     @property
     def channel(self) -> Int[Tensor, "N"]:
-        """Channel of every beam, in the order of `beams`."""
+        """Return the channel of every beam, in the order of `beams`."""
         return torch.arange(len(self.elevation_rad)).repeat(self.azimuth_steps)
 
     def beams(self, twist_ego: Float[Tensor, "6"]) -> TimedRays:
-        """The beams of one revolution, column by column, channels within a column in their order.
+        """Return the beams of one revolution: column by column, and in channel order within a column.
 
-        A column's azimuth and time are those of the channel that fires last.
+        The azimuth and time of a column are those of the channel that fires last.
 
         Args:
-            twist_ego: the ego frame's velocity (m/s), then its turn rate (rad/s), in its own axes, taken
-                as constant over the revolution.
+            twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame in its own axes, assumed constant
+                over the revolution.
 
         Returns:
-            Rays [N] in the ego frame at the end of the revolution; dt_s runs from -1/rate to 0.
+            Rays [N] in the ego frame at the end of the revolution. dt_s runs from -1/rate to 0.
         """
         dt_s, direction = self._firing
         T_end_then = exp_se3(dt_s[..., None] * twist_ego)  # ego frame at firing -> at the end
@@ -91,7 +92,7 @@ class SpinningLidar:
 
     @cached_property
     def _firing(self) -> tuple[Float[Tensor, "columns moments"], Float[Tensor, "columns moments _ 3"]]:
-        """When beams are fired, relative to the end of the revolution, and where to in the lidar frame."""
+        """Return firing times relative to the end of the revolution, s, and directions in the lidar frame."""
         steps = torch.arange(self.azimuth_steps)
         dt_s = (((steps + 1) / self.azimuth_steps - 1) / self.rate_hz)[:, None]
         azimuth = (math.pi - (steps + 0.5) * (2 * math.pi / self.azimuth_steps))[:, None]
@@ -111,14 +112,14 @@ class SpinningLidar:
             ],
             dim=-1,
         )  # [columns, channels, 3], lidar frame
-        moments = dt_s.shape[1]  # of a column: 1, or one for each channel
+        moments = dt_s.shape[1]  # firing times per column: 1, or one per channel
         return dt_s, direction.reshape(self.azimuth_steps, moments, -1, 3)
 
     def footprints(self, beams: TimedRays) -> TimedRays:
-        """The rays of all beams [N · rays_per_beam], those of a beam next to each other.
+        """Return the rays of all beams [N · rays_per_beam]. The rays of a beam are adjacent.
 
-        They fill the cone evenly (Vogel, "A better way to construct the sunflower head", 1979), so that each
-        carries the same share of the pulse.
+        The rays fill the beam cone evenly (Vogel, "A better way to construct the sunflower head", 1979), so
+        each ray carries the same share of the pulse.
         """
         if self.rays_per_beam == 1:
             return beams

@@ -1,7 +1,7 @@
-"""Lidars that are on real cars: channels, firing times and limits as their makers publish them.
+"""Real automotive lidars, with channels, firing times and limits from their manuals.
 
-What no manual of theirs gives is taken to be typical: the divergence of the HDL-32E and the Pandar64 is that
-of Velodyne's VLP-16, and beams are round cones although those of real lasers are wider than high.
+Values missing from the manuals are assumed. The divergence of the HDL-32E and the Pandar64 is that of
+Velodyne's VLP-16. Beams are round cones, although the beams of real lasers are wider than high.
 """
 
 import math
@@ -32,14 +32,15 @@ _PANDAR64_PAIRS = (
     *((22, 37), (16, 31), (10, 25), (19, 34), (13, 28), (20, 35), (14, 29), (8, 23), (17, 32), (11, 26)),
     *((18, 38), (12, 40)),
 )
-"""Lasers that fire together, those of the last pair first."""
+"""Pairs of lasers that fire together. The last pair to fire comes first."""
 
 
 def pandar64(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
-    """Hesai's Pandar64, PandaSet's lidar: dense from -6° to 2°; channel 0 looks highest, as Hesai counts.
+    """Return Hesai's Pandar64, the lidar of PandaSet.
 
-    Angles, azimuth offsets and firing times of the user's manual, appendices I and II; each device comes with
-    a calibration of its own, off by some hundredths of a degree.
+    Its channels are dense from -6° to 2°. Channel 0 is the highest, as in Hesai's numbering. Angles, azimuth
+    offsets and firing times are from the user's manual, appendices I and II. Each real device has its own
+    calibration, which differs by some hundredths of a degree.
     """
     before_end_us = [0.0] * 64
     for k, pair in enumerate(_PANDAR64_PAIRS):
@@ -61,18 +62,20 @@ def pandar64(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> Spinni
 
 
 def hdl32e(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
-    """Velodyne's HDL-32E, nuScenes' lidar (there at 20 Hz): -30.67° to 10.67°; channel 0 looks lowest.
+    """Return Velodyne's HDL-32E, the lidar of nuScenes (there at 20 Hz).
 
-    User's manual: a laser fires every 1.152 µs, lower and upper half in turn, a column every 46.08 µs.
+    Its channels run from -30.67° to 10.67°. Channel 0 is the lowest. By the user's manual a laser fires every
+    1.152 µs, with lower and upper half alternating, and a column takes 46.08 µs.
     """
     elevation_deg = tuple((-92.0 + 4.0 * ring) / 3.0 for ring in range(32))
     return _two_halves(elevation_deg, 1.152, 46.08, 0.02, T_ego_lidar, rate_hz)
 
 
 def vlp16(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> SpinningLidar:
-    """Velodyne's VLP-16: -15° to 15° in steps of 2°; channel 0 looks lowest.
+    """Return Velodyne's VLP-16.
 
-    User's manual: a laser fires every 2.304 µs, lower and upper half in turn, a column every 55.296 µs.
+    Its channels run from -15° to 15° in steps of 2°. Channel 0 is the lowest. By the user's manual a laser
+    fires every 2.304 µs, with lower and upper half alternating, and a column takes 55.296 µs.
     """
     elevation_deg = tuple(-15.0 + 2.0 * ring for ring in range(16))
     return _two_halves(elevation_deg, 2.304, 55.296, 0.03, T_ego_lidar, rate_hz)
@@ -86,7 +89,7 @@ def _two_halves(
     T_ego_lidar: Float[Tensor, "4 4"],
     rate_hz: float,
 ) -> SpinningLidar:
-    """A Velodyne whose lower and upper lasers fire in turn."""
+    """Return a Velodyne lidar whose lower and upper lasers fire alternately."""
     return SpinningLidar(
         elevation_rad=_radians(elevation_deg),
         azimuth_steps=round(1e6 / (column_us * rate_hz)),
@@ -105,7 +108,7 @@ def _radians(angles_deg: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _in_turn(channels: int, step_s: float) -> tuple[float, ...]:
-    """Firing times where the lower and the upper half of the channels take turns, each from below."""
+    """Return firing times, s: lower and upper half of the channels alternate, each from the bottom up."""
     half = channels // 2
     order = [2 * ring if ring < half else 2 * (ring - half) + 1 for ring in range(channels)]
     return tuple(step_s * k for k in order)

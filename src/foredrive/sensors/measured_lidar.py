@@ -1,4 +1,4 @@
-"""Which lidar fired a sweep, told from its beams."""
+"""Estimation of a lidar model from the beams of a sweep."""
 
 import math
 
@@ -11,23 +11,24 @@ from foredrive.scene import LidarSweep
 from foredrive.sensors.lidar import SpinningLidar
 
 _MOST_SPREAD_RAD = math.radians(0.25)
-"""How far a channel's beams may lie (standard deviation) from one elevation; more, and they are not one
-channel's, or the lidar is mounted askew."""
+"""Maximum standard deviation of the elevations of one channel. If it is larger, the beams are not from one
+channel, or the lidar is tilted."""
 
 
 def measure_lidar(
     sweep: LidarSweep, twist_ego: Float[Tensor, "6"], *, period_s: float, reach_m: float
 ) -> SpinningLidar | None:
-    """Channels, columns, rate and position; None where the channels of beams are not known, or uneven.
+    """Estimate channels, columns, rate and position of the lidar that fired a sweep.
 
-    Axes are taken to be those of the vehicle, columns to fire at once, and beams that are missing to miss in
-    some channels only: the fullest says how many columns there are.
+    The lidar axes are assumed to be the vehicle axes, and all lasers of a column to fire at the same time.
+    Beams may be missing in some channels: the channel with the most beams gives the number of columns. Return
+    None if the channels of the beams are unknown, or if the elevation within a channel varies too much.
 
     Args:
-        sweep: valid beams of one lidar, unbatched, in the ego frame at the sweep's time.
-        twist_ego: velocity (m/s) then turn rate (rad/s) of the ego frame in its own axes.
-        period_s: of a revolution, where beams carry no times.
-        reach_m: how far it sees.
+        sweep: valid beams of one lidar, unbatched, in the ego frame at the time of the sweep.
+        twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame in its own axes.
+        period_s: time of one revolution, used where beams have no times.
+        reach_m: maximum range.
     """
     if not len(sweep.beam) or bool((sweep.beam < 0).any()):
         return None

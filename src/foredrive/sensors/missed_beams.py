@@ -1,4 +1,4 @@
-"""Beams that did not return, of sweeps that were recorded without them."""
+"""Reconstruction of beams that did not return, for sweeps recorded without them."""
 
 import math
 
@@ -11,30 +11,30 @@ from foredrive.scene import LidarSweep
 from foredrive.sensors.lidar import SpinningLidar
 
 _FEWEST = 20
-"""Returns from which a channel's own azimuth is taken; with fewer the table's."""
+"""Minimum number of returns to estimate the azimuth of a channel. Below it the table is used."""
 
 
 _NEAR_STEPS = 0.75
-"""Within so many columns of a return no beam is said to have missed: real columns are not quite even."""
+"""Distance from a return, in columns, within which no miss is added. Real columns are not quite even."""
 
 
 def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[Tensor, "6"]) -> LidarSweep:
-    """Put back what a lidar fired but did not see: where its pattern has no return, a beam missed.
+    """Add the beams that a lidar fired but that did not return.
 
-    Every return is given the channel whose elevation is nearest, and its place on that channel's round. A
-    channel's azimuths are those of its returns, and its elevation is their mean, since no two devices are
-    alike; what is known of a miss is that it happened (its range is 0).
+    A beam missed where the firing pattern has no return. Each return is assigned to the channel with the
+    nearest elevation, and to a position on the circle of that channel. Azimuth and elevation of a channel are
+    estimated from its returns, because devices differ. The range of a miss is 0 (unknown).
 
     Args:
-        sweep: returns alone, unbatched, in the ego frame at the sweep's time.
-        lidar: the pattern; of `T_ego_lidar` the rotation and, for misses, the position matter.
-        twist_ego: velocity (m/s) then turn rate (rad/s) of the ego frame in its own axes.
+        sweep: returns only, unbatched, in the ego frame at the time of the sweep.
+        lidar: firing pattern. Of `T_ego_lidar` the rotation is used, and for misses also the position.
+        twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame in its own axes.
     """
     T_then_ego = exp_se3(-sweep.dt_s[:, None] * twist_ego)
     fired = rotate_vectors(T_then_ego, sweep.dir_ego[:, None])[:, 0] @ lidar.T_ego_lidar[:3, :3]
     elevation = torch.asin(fired[:, 2].clamp(-1, 1))
     channel = (elevation[:, None] - torch.tensor(lidar.elevation_rad)).abs().argmin(1)
-    # clockwise angle, less what the head turns: nearly constant within a channel
+    # Clockwise angle minus the rotation of the head: nearly constant within a channel.
     turn_radps = 2 * math.pi * lidar.rate_hz
     lag = -torch.atan2(fired[:, 1], fired[:, 0]) - turn_radps * sweep.dt_s
     begin_s = float(sweep.dt_s.min()) if len(sweep.dt_s) else 0.0
@@ -59,7 +59,7 @@ def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[
 
 
 def _alone(place: Float[Tensor, "S"], taken: Float[Tensor, "N"], reach: float) -> Float[Tensor, "M"]:
-    """The places on a circle without anything taken within reach."""
+    """Return the places on a circle (rad) that have no element of `taken` within `reach`."""
     place, taken = place % (2 * math.pi), (taken % (2 * math.pi)).sort().values
     taken = torch.cat([taken - 2 * math.pi, taken, taken + 2 * math.pi])
     if not len(taken):

@@ -1,4 +1,4 @@
-"""What a camera makes of light: exposure, the time it takes, and the noise of its sensor."""
+"""Camera exposure: brightness, exposure time and sensor noise."""
 
 import math
 from dataclasses import dataclass
@@ -9,27 +9,27 @@ from jaxtyping import Float32
 
 @dataclass(frozen=True)
 class CameraOptics:
-    """Exposure of all cameras of a vehicle; by default clean images of one instant.
+    """Exposure settings of all cameras of a vehicle. The default is noise-free images of one instant.
 
-    How long a rolling shutter takes from the first row to the last is `CameraRig.readout_s`.
+    The readout time of a rolling shutter is `CameraRig.readout_s`.
 
     Raises:
-        ValueError: a time, gain or noise that cannot be.
+        ValueError: a time, gain or noise is out of range.
     """
 
     exposure_ev: float = 0.0
-    """Stops above the exposure that the scene is metered at."""
+    """Exposure in stops, relative to the metered exposure of the scene."""
     shutter_s: float = 0.0
-    """How long each row is exposed, about the time of its readout; 0: an instant, nothing is blurred."""
+    """Exposure time of each row, centred on its readout, s. 0 is an instant without motion blur."""
     sub_exposures: int = 8
-    """Instants that are averaged where `shutter_s` is above 0."""
+    """Number of instants that are averaged if `shutter_s` is above 0."""
     white_electrons: float = math.inf
-    """Electrons of a pixel whose linear value is 1, at gain 1; infinite: no noise. Pixels of 3 µm hold about
+    """Electrons of a pixel with linear value 1, at gain 1. Infinity means no noise. Pixels of 3 µm hold about
     10 000."""
     read_noise_electrons: float = 0.0
-    """Standard deviation of what the readout adds, about 3."""
+    """Standard deviation of the readout noise in electrons, typically about 3."""
     gain: float = 1.0
-    """Amplification, as of ISO speed: so many times fewer electrons make the same picture."""
+    """Amplification, as ISO speed: g times fewer electrons give the same image."""
 
     def __post_init__(self) -> None:
         if self.shutter_s < 0 or self.sub_exposures < 1:
@@ -39,19 +39,20 @@ class CameraOptics:
 
     @property
     def sub_exposure_dt_s(self) -> tuple[float, ...]:
-        """Times of the sub-exposures relative to the middle of the exposure."""
+        """Return the times of the sub-exposures, relative to the middle of the exposure, s."""
         count = self.sub_exposures
         return tuple(self.shutter_s * ((k + 0.5) / count - 0.5) for k in range(count))
 
     def with_noise(
         self, linear: Float32[np.ndarray, "*shape"], rng: np.random.Generator
     ) -> Float32[np.ndarray, "*shape"]:
-        """Linear values with the sensor's noise: photons arrive at random, and the readout errs.
+        """Add photon noise and readout noise to linear values.
 
-        A value x is n = x · white_electrons / gain electrons on average. Their number varies by √n, the
-        readout adds σ electrons: with w = white_electrons and g = gain the variance of the result is
-        x · g/w + (σ · g/w)² (the linear model of EMVA 1288 without dark current). Normal numbers stand for
-        Poisson's, as in Foi et al., "Practical Poissonian-Gaussian noise modeling", 2008.
+        A value x corresponds to n = x · white_electrons / gain electrons on average. Their number has
+        standard deviation √n, and the readout adds noise of σ electrons. With w = white_electrons and g =
+        gain, the variance of the result is x · g/w + (σ · g/w)² (the linear model of EMVA 1288 without dark
+        current). The Poisson distribution is approximated by a normal one, as in Foi et al., "Practical
+        Poissonian-Gaussian noise modeling", 2008.
         """
         if math.isinf(self.white_electrons):
             return linear

@@ -1,4 +1,4 @@
-"""What a sensor looks along: rays with the time at which each of them looks."""
+"""Timed rays: the viewing rays of a sensor with their times."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ class TimedRays(Record):
     """N rays in the ego frame of one reference time."""
 
     origin_ego: Float[Tensor, "*b N 3"]
-    """m."""
+    """Start of the ray, m."""
     dir_ego: Float[Tensor, "*b N 3"]
     """Unit direction."""
     dt_s: Float[Tensor, "*b N"]
-    """When the ray looks, relative to the reference time."""
+    """Time of the measurement relative to the reference time, s."""

@@ -1,11 +1,12 @@
 """The best and the K best partial assignments of rows to columns, by shortest augmenting paths.
 
-A row takes one column at `cost[row, column]`, or none at `free[row]`; a column that no row takes costs
-nothing. Prices (`row_price`, `column_price` ≤ 0) keep `cost - row_price - column_price ≥ 0`, with equality
-where a row has its column, so that after a change one augmenting path mends a solution.
+A row takes one column at `cost[row, column]`, or no column at `free[row]`. A column that no row takes costs
+nothing. The dual prices (`row_price`, and `column_price` ≤ 0) satisfy `cost - row_price - column_price ≥ 0`,
+with equality for assigned pairs. Because of this, one augmenting path repairs a solution after a change.
 
-Sources: Jonker and Volgenant (1987) for the paths; Murty (1968) for the partition of what is left into
-disjoint subproblems; Miller, Stone and Cox (1997) for starting each from the solution it was cut from.
+Sources: Jonker and Volgenant (1987) for the augmenting paths; Murty (1968) for the partition of the remaining
+assignments into disjoint subproblems; Miller, Stone and Cox (1997) for starting each subproblem from the
+solution of its parent.
 """
 
 from typing import NamedTuple, no_type_check
@@ -19,48 +20,48 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Assignment(NamedTuple):
-    """The best assignment and the prices that prove it."""
+    """The best assignment and the dual prices that prove its optimality."""
 
     column: Int[ndarray, "R"]
-    """Column of each row; -1: none."""
+    """Column of each row; -1 if it has none."""
     row_price: Float[ndarray, "R"]
     column_price: Float[ndarray, "C"]
-    """Never positive; 0 where no row has the column."""
+    """Never positive. 0 where the column is not assigned."""
 
 
 class RankedAssignments(NamedTuple):
-    """Distinct assignments in order of cost."""
+    """Distinct assignments in order of increasing cost."""
 
     column: Int[ndarray, "k R"]
-    """Column of each row; -1: none."""
+    """Column of each row; -1 if it has none."""
     cost: Float[ndarray, "k"]
 
 
 class _Search(NamedTuple):
-    """Where a search for a path stands, by node."""
+    """State of a shortest-path search, by node."""
 
     distance: Float[ndarray, "nodes"]
     before: Int[ndarray, "nodes"]
-    """The row from which a node is reached, or `_BY_UNUSED`."""
+    """Row from which the node is reached, or `_BY_UNUSED`."""
     done: Bool[ndarray, "nodes"]
     row_of: Int[ndarray, "nodes"]
-    """The row that has the node; -1: it is unused."""
+    """Row that holds the node; -1 if the node is unused."""
 
 
 _BY_UNUSED = -2
 
 
 def best_assignment(cost: Float[ndarray, "R C"], free: Float[ndarray, "R"]) -> Assignment:
-    """The assignment of least cost.
+    """Return the assignment of minimum cost.
 
-    Entries of `cost` may be +inf (forbidden) or negative; `free` must be finite. Fastest with R ≤ C.
+    Entries of `cost` may be +inf (forbidden) or negative. `free` must be finite. It is fastest with R ≤ C.
     """
     column, row_price, column_price = solve(_as_costs(cost), _as_costs(free))
     return Assignment(np.where(column == cost.shape[1], -1, column), row_price, column_price)
 
 
 def k_best_assignments(cost: Float[ndarray, "R C"], free: Float[ndarray, "R"], k: int) -> RankedAssignments:
-    """The k assignments of least cost, or all there are of finite cost if they are fewer. k is at least 1."""
+    """Return the k (≥ 1) assignments of minimum cost, or all of finite cost if there are fewer."""
     column, total = _rank(_as_costs(cost), _as_costs(free), k)
     return RankedAssignments(np.where(column == cost.shape[1], -1, column), total)
 
@@ -72,9 +73,10 @@ def _as_costs(values: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
 @_kernel
 @no_type_check
 def solve(cost, free):
-    """`best_assignment` within kernels: add the rows one after the other.
+    """Solve `best_assignment` inside a kernel: add one row after the other.
 
-    Column C stands for none, of which every row has its own.
+    Return the column of each row, the row prices and the column prices. Column C means "no column". Every row
+    has its own such column, so these never conflict.
     """
     rows, columns = cost.shape
     column_of = np.full(rows, -1)
@@ -83,16 +85,20 @@ def solve(cost, free):
     distance = np.empty(columns)
     before = np.empty(columns, np.int64)  # the row from which a column is reached
     done = np.empty(columns, np.bool_)
+    # Each round adds row `start` by Dijkstra's algorithm on reduced costs. The path alternates between rows
+    # and the columns that they hold.
     for start in range(rows):
         distance[:] = np.inf
         done[:] = False
         row, reached = start, 0.0
         none_distance, none_row = np.inf, -1
         while True:
+            # A path may end at any reached row that takes "no column". Keep the shortest such path.
             to_none = reached + free[row] - u[row]
             if to_none < none_distance:
                 none_distance, none_row = to_none, row
             nearest, end = np.inf, columns
+            # Relax the edges from `row`, and find the nearest column that is not done.
             for c in range(columns):
                 if done[c]:
                     continue
@@ -102,19 +108,25 @@ def solve(cost, free):
                     before[c] = row
                 if distance[c] < nearest:
                     nearest, end = distance[c], c
+            # Ending with "no column" is shortest.
             if none_distance <= nearest:
                 reached, end = none_distance, columns
                 break
             reached = nearest
+            # The nearest column is unassigned: the path ends there.
             if row_of[end] < 0:
                 break
+            # The nearest column is assigned: its row needs another column.
             done[end] = True
             row = row_of[end]
+        # Update the prices of the rows and columns on the search tree, so that reduced costs stay ≥ 0 and are
+        # 0 for assigned pairs.
         u[start] += reached
         for c in range(columns):
             if done[c]:
                 u[row_of[c]] += reached - distance[c]
                 v[c] -= reached - distance[c]
+        # Augment: follow the path backwards. Each row takes its new column and gives up its old one.
         row = none_row if end == columns else before[end]
         while True:
             if end < columns:
@@ -129,14 +141,19 @@ def solve(cost, free):
 @_kernel
 @no_type_check
 def _rank(cost, free, k):
-    """Murty's partition: a subproblem is cut at each of its open rows, the rows before keeping theirs."""
+    """Return the k best assignments and their costs, by Murty's partition.
+
+    Every ranked assignment is split into one subproblem per open row r: the rows before r keep their columns,
+    and r must not take its own. Only the cost of a subproblem is computed at first. Its assignment is
+    computed when it is the cheapest one left.
+    """
     rows, columns = cost.shape
     column_of, total = np.empty((k, rows), np.int64), np.empty(k)
     u, v = np.empty((k, rows)), np.zeros((k, columns + rows))
     first_open = np.zeros(k, np.int64)  # rows before it keep their columns
-    banned = np.zeros((k, columns + 1), np.bool_)  # what the first open row must not take
+    banned = np.zeros((k, columns + 1), np.bool_)  # columns that the first open row must not take
     no_ban = np.zeros(columns + 1, np.bool_)
-    waiting = np.full(k, np.inf)  # costs of as many subproblems as are still asked for, in rising order
+    waiting = np.full(k, np.inf)  # costs of the cheapest unsolved subproblems, in increasing order
     parent_of, row_cut = np.empty(k, np.int64), np.empty(k, np.int64)
     nodes = columns + rows
     search = _Search(
@@ -150,6 +167,8 @@ def _rank(cost, free, k):
         total[0] += free[r] if c == columns else cost[r, c]
     count = 1
     while count < k:
+        # Split the assignment that was ranked last. A subproblem that costs more than the `wanted` cheapest
+        # ones cannot be ranked: `room` is the largest extra cost that is still of interest.
         parent, wanted = count - 1, k - count
         for r in range(first_open[parent], rows):
             room = waiting[wanted - 1] - total[parent]
@@ -159,9 +178,12 @@ def _rank(cost, free, k):
                 _insert(waiting, parent_of, row_cut, wanted, total[parent] + extra, parent, r)
         if waiting[0] == np.inf:
             break
+        # The cheapest waiting subproblem is the next assignment. Solve it, starting from its parent's
+        # solution.
         parent, r, total[count] = parent_of[0], row_cut[0], waiting[0]
         _drop_first(waiting, parent_of, row_cut)
         column_of[count], u[count], v[count], first_open[count] = column_of[parent], u[parent], v[parent], r
+        # Bans accumulate while the same row is cut again. Otherwise only the parent's column is banned.
         if r == first_open[parent]:
             banned[count] = banned[parent]
         extra, reached_unused, unused = _reroute(
@@ -176,7 +198,7 @@ def _rank(cost, free, k):
 @_kernel
 @no_type_check
 def _insert(waiting, parent_of, row_cut, wanted, cost, parent, row):
-    """Put a subproblem into its place among the `wanted` cheapest; the dearest falls off."""
+    """Insert a subproblem into the sorted list of the `wanted` cheapest ones. The last one drops out."""
     place = wanted - 1
     while place > 0 and waiting[place - 1] > cost:
         waiting[place], parent_of[place] = waiting[place - 1], parent_of[place - 1]
@@ -195,12 +217,18 @@ def _drop_first(waiting, parent_of, row_cut):
 @_kernel
 @no_type_check
 def _reroute(cost, free, column_of, u, v, start, ban, room, search):
-    """Shortest way to give row `start` another column when rows before it keep theirs and it loses its own.
+    """Find the shortest path that gives row `start` another node. Rows before `start` keep theirs.
 
-    Nodes are the columns, then each row's own "none". Unused nodes are alike: think of idle rows that have
-    them, at no cost. A path that reaches one may go on to any node, which becomes unused in turn; it ends at
-    the node that `start` gives up. Returns its length (inf if that is not below `room`), the distance of the
-    first unused node on it (inf: there is none), and that node.
+    Nodes are the C columns, followed by each row's own "no column" node. `start` must not take a node in
+    `ban`, nor the node that it holds now (`target`). The path ends at `target`, which `start` gives up.
+
+    An unused node behaves as if an idle row held it at zero cost. A path that reaches an unused node may
+    continue to any node. That node then becomes unused.
+
+    Returns:
+        The length of the path (inf if it is not below `room`).
+        The distance of the first unused node on it (inf if it has none).
+        That node (-1 if it has none).
     """
     rows, columns = cost.shape
     distance, before, done, row_of = search
@@ -210,12 +238,14 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
     for r in range(rows):
         node = column_of[r] if column_of[r] < columns else columns + r
         row_of[node] = r
+        # Nodes of fixed rows are not available.
         if r < start:
             done[node] = done[columns + r] = True
     target = column_of[start] if column_of[start] < columns else columns + start
     row, reached, reached_unused, unused = start, 0.0, np.inf, -1
     while True:
         if row >= 0:
+            # Relax the edges from `row` to the columns and to its own "no column" node.
             offset = reached - u[row]
             for c in range(columns):
                 d = offset + cost[row, c] - v[c]
@@ -225,6 +255,7 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
             d = offset + free[row] - v[own]
             if d < distance[own] and not done[own] and not (row == start and (ban[columns] or own == target)):
                 distance[own], before[own] = d, row
+        # Continue with the nearest node that is not done.
         nearest, end = room, -1
         for x in range(columns + rows):
             if distance[x] < nearest and not done[x]:
@@ -237,6 +268,8 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
         done[end] = True
         row = row_of[end]
         if row < 0:
+            # The first unused node is reached. All unused nodes are equivalent from here on. An idle row has
+            # cost 0, so its reduced cost to node x is -v[x] ≥ 0.
             reached_unused, unused = reached, end
             for x in range(columns + rows):
                 if done[x]:
@@ -250,14 +283,15 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
 @_kernel
 @no_type_check
 def _apply(column_of, u, v, start, length, reached_unused, unused, search):
-    """Follow a path that `_reroute` found: new columns, and prices that fit them."""
+    """Apply the path found by `_reroute` in place: update the assignment and the prices."""
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows
-    rise = length - reached_unused if reached_unused < np.inf else 0.0  # unused nodes keep their price of 0
+    # The usual update would lower the price of unused nodes. `rise` shifts all prices so that it stays 0.
+    rise = length - reached_unused if reached_unused < np.inf else 0.0
     for x in range(len(v)):
         r = row_of[x]
-        if r < start:  # unused, or kept by its row
+        if r < start:  # the node is unused, or its row is fixed
             continue
         v[x] += rise
         u[r] -= rise
@@ -266,10 +300,12 @@ def _apply(column_of, u, v, start, length, reached_unused, unused, search):
         elif done[x]:
             v[x] += distance[x] - length
             u[r] += length - distance[x]
+    # Follow the path backwards from the node that `start` gives up.
     end = column_of[start] if column_of[start] < columns else columns + start
     while True:
         row = before[end]
         if row == _BY_UNUSED:
+            # An idle row took this node and freed `unused`, so the path continues from there.
             end = unused
             row = before[end]
         given_up = column_of[row] if column_of[row] < columns else columns + row

@@ -1,8 +1,8 @@
-"""The sum over all associations of detections with objects: exact in small components, bounded elsewhere.
+"""The sum over all associations of detections with objects: exact in small components, bounded in large ones.
 
-An association pairs some detections with one object each; the other detections are absent and the other
-objects are background. Its weight is the product of what every pair, absent detection and background object
-weighs (PMB density, thesis eq. 3.10-3.12, where each summand is one association).
+An association pairs some detections with one object each. The other detections are absent, and the other
+objects belong to the background. Its weight is the product of the weights of all pairs, absent detections and
+background objects (PMB density, thesis eq. 3.10-3.12, where each summand is one association).
 """
 
 from collections.abc import Callable
@@ -19,39 +19,40 @@ from foredrive.sets.gating import bound_left_out, gate, thin
 from foredrive.sets.interval import bound_choices, bound_component
 
 _THINNER_NATS = (1e-6, 1e-4, 1e-2, 0.1, 1.0, 10.0)
-"""What leaving out pairs of a component that is too large to be summed may take off it, until it is not."""
+"""Steps of the thinning of a large component: limit of the loss in nats, until the component can be summed.
+"""
 _WIDE_NATS = 1.0
-"""A wider interval is worth a second bound."""
+"""Width in nats of an interval from which a second upper bound is computed."""
 
 
 @dataclass(frozen=True)
 class AssociationSum:
-    """Logarithm of the sum over associations, as an interval, and the distribution over associations."""
+    """The logarithm of the sum over associations, as an interval, and the distribution over associations."""
 
     log_lower: float
-    """What was summed; -inf if no association is possible."""
+    """Logarithm of the weights that were summed; -inf if no association is possible."""
     log_upper: float
-    """The sum is proven to be no more."""
+    """Proven upper bound of the logarithm of the sum."""
     detection: Int[ndarray, "E"]
-    """Detection of each pair that may belong together; all other pairs have probability 0."""
+    """Detection of each pair with a probability above 0. All other pairs have probability 0."""
     object: Int[ndarray, "E"]
     """Object of each of these pairs."""
     probability: Float[ndarray, "E"]
-    """That the pair belongs together."""
+    """Probability that the pair belongs together."""
     absent: Float[ndarray, "M"]
     """Probability that a detection has no object."""
     background: Float[ndarray, "N"]
     """Probability that an object has no detection."""
     best: Int[ndarray, "N"]
-    """Detection of each object in the most likely association; -1: background."""
+    """Detection of each object in the most likely association; -1 for background."""
     impossible_detections: Int[ndarray, "_"]
-    """Detections that are certain and yet without an object, in the association with fewest such faults."""
+    """Certain detections without an object, in the association with the fewest impossible members."""
     impossible_objects: Int[ndarray, "_"]
-    """Objects that no detection and no background explains, in the same association."""
+    """Objects without a detection that the background cannot explain, in the same association."""
 
     @property
     def pair(self) -> Float[ndarray, "M N"]:
-        """Probability that detection i and object j belong together."""
+        """Return the probability that detection i and object j belong together."""
         pair = np.zeros((len(self.absent), len(self.background)))
         pair[self.detection, self.object] = self.probability
         return pair
@@ -66,16 +67,17 @@ def sum_associations(
     max_states: int = 1 << 21,
     gate_nats: float = 1e-10,
 ) -> AssociationSum:
-    """Sum the weights of all associations; -inf is a weight of zero.
+    """Sum the weights of all associations. -inf is the logarithm of a zero weight.
 
-    Pairs are left out (gated) as long as that takes no more than `gate_nats` off the logarithm. What
-    remains falls into connected components, each of which is summed exactly where that takes at most
-    `max_states` numbers. Of a larger one the least likely pairs are left out, step by step, until its parts
-    can be summed; what cannot be, even then, is summed over its `k` best associations. The interval of the
-    result holds what either may have missed. A component without any possible association makes the sum
-    zero; its probabilities are then those of the association with fewest impossible members.
+    First, unlikely pairs are left out (gating), at a loss of at most `gate_nats` in the logarithm. The
+    remaining pairs form connected components. A component is summed exactly if that takes at most
+    `max_states` numbers. From a larger component, the least likely pairs are left out step by step until its
+    parts can be summed. A part that still cannot be summed contributes its `k` best associations. The
+    interval of the result contains everything that was left out. If a component has no possible association,
+    the sum is zero; the probabilities are then those of the association with the fewest impossible members.
 
-    Raises `InputError` for weights that are NaN or infinite, naming them, and for a `k` below 1.
+    Raises:
+        InputError: a weight is NaN or infinite (the message names it), or `k` is below 1.
     """
     if k < 1:
         raise InputError(f"k is {k}: at least the best association must be listed")
@@ -98,17 +100,17 @@ def sum_associations(
 
 @dataclass
 class _Found:
-    """What is known of a scene, or of a part of it; detections are rows, objects columns."""
+    """Result for a scene or a part of it. Rows are detections, columns are objects."""
 
     log_lower: float
     log_upper: float
-    """Of the sum over associations of pairs that were kept."""
+    """Bounds of the logarithm of the sum over associations of kept pairs."""
     row: Int[ndarray, "E"]
-    """Of the pairs that were kept."""
+    """Row of each kept pair."""
     column: Int[ndarray, "E"]
     share: Float[ndarray, "E"]
     log_freed: Float[ndarray, "C"]
-    """Upper bound of the logarithm of the sum without a column over the sum."""
+    """Upper bound of log(sum without the column / sum), for each column."""
     best: Int[ndarray, "C"]
     bad_rows: Bool[ndarray, "R"]
     bad_columns: Bool[ndarray, "C"]
@@ -123,7 +125,7 @@ def _sum_kept(
     max_states: int,
     sum_large: Callable[[ndarray, ndarray, ndarray], _Found],
 ) -> _Found:
-    """Sum every component of the pairs that are kept; `sum_large` has those that are too large."""
+    """Sum every component of the kept pairs. `sum_large` handles components that are too large."""
     components = find_components(row, column, len(log_row), len(log_column))
     log_edge = log_pair[row, column]
     exact = sum_components(components, row, column, log_edge, log_row, log_column, max_states)
@@ -155,7 +157,7 @@ def _sum_kept(
 def _members(
     components: Components, n: np.integer
 ) -> tuple[Int[ndarray, "_"], Int[ndarray, "_"], Int[ndarray, "_"]]:
-    """Rows, columns and edges of a component."""
+    """Return the rows, columns and edges of component `n`."""
     return (
         components.row[slice(*components.row_start[n : n + 2])],
         components.column[slice(*components.column_start[n : n + 2])],
@@ -170,12 +172,12 @@ def _sum_large(
     k: int,
     max_states: int,
 ) -> _Found:
-    """Sum fewer pairs of a component that is too large, and bound what the others add."""
+    """Sum a subset of the pairs of a component that is too large, and bound the contribution of the rest."""
     found = _sum_thinner(log_pair, log_row, log_column, k, max_states, _THINNER_NATS)
     left_out = log_pair > -np.inf
     left_out[found.row, found.column] = False
     row, column = np.nonzero(left_out)
-    alone = log_row[row] > -np.inf  # thinning spares rows that cannot be
+    alone = log_row[row] > -np.inf  # thinning keeps all pairs of rows that cannot be alone
     log_weight = np.full(len(row), np.inf)
     log_weight[alone] = (log_pair[row, column] + found.log_freed[column])[alone] - log_row[row][alone]
     found.log_upper += bound_left_out(log_weight, row, column)
@@ -192,7 +194,7 @@ def _sum_thinner(
     max_states: int,
     thinner_nats: tuple[float, ...],
 ) -> _Found:
-    """Leave out pairs until what is kept can be summed; list the best associations if it never can."""
+    """Leave out pairs until the rest can be summed. If it never can, sum the k best associations."""
     scaled = scale(log_pair, log_row, log_column)
     if thinner_nats:
         row, column = thin(scaled, thinner_nats[0])

@@ -1,4 +1,4 @@
-"""Log-densities of many boxes under many densities, without gradients; `boxes` has the reference."""
+"""Log-densities of many boxes under many densities, without gradients. `boxes` has the reference version."""
 
 import math
 from typing import no_type_check
@@ -15,7 +15,10 @@ _NEGLIGIBLE_NATS = 40.0
 @_kernel
 @no_type_check
 def box_log_prob(mean, chol, state, laplace):
-    """Without heading: mean [M D], chol [M D D], state [N D] → [M N]."""
+    """Return the log-densities without heading: mean [M D], chol [M D D], state [N D] → [M N].
+
+    It solves L w = state - mean by forward substitution, with boxes in the innermost loops for vectorisation.
+    """
     components, dims = mean.shape
     boxes = len(state)
     by_dim = np.ascontiguousarray(state.T)
@@ -30,6 +33,7 @@ def box_log_prob(mean, chol, state, laplace):
             offset, scale, row = mean[i, d], 1.0 / chol[i, d, d], white[d]
             at = by_dim[d]
             for j in range(boxes):
+                # w[d] = (offset[d] - Σ_e<d L[d, e] w[e]) / L[d, d]
                 row[j] = at[j] - offset
             for e in range(d):
                 factor, other = chol[i, d, e], white[e]
@@ -50,7 +54,10 @@ def box_log_prob(mean, chol, state, laplace):
 @_kernel
 @no_type_check
 def add_heading(log_prob, mean_yaw, concentration, log_i0e, yaw):
-    """Add the von Mises log-densities of headings: mean_yaw, concentration, log_i0e [M], yaw [N]."""
+    """Add the von Mises log-densities of the headings to `log_prob` [M N] in place.
+
+    The shapes are mean_yaw, concentration, log_i0e [M] and yaw [N].
+    """
     cos, sin = np.cos(yaw), np.sin(yaw)
     for i in range(len(mean_yaw)):
         out, kappa = log_prob[i], concentration[i]
@@ -63,7 +70,7 @@ def add_heading(log_prob, mean_yaw, concentration, log_i0e, yaw):
 @_kernel
 @no_type_check
 def log_sum_exp(log_terms):
-    """Over the rows of [M N] → [N]."""
+    """Return the log-sum-exp over the rows: [M N] → [N]. Terms 40 nats below the largest are skipped."""
     total = np.empty(log_terms.shape[1])
     top = np.full(log_terms.shape[1], -np.inf)
     for row in log_terms:

@@ -1,8 +1,8 @@
-"""Labelled boxes, and densities over boxes: position and size on a line each, heading on the circle.
+"""Labelled boxes and densities over boxes. Position and size are real-valued; heading is an angle.
 
-A box's `state` is what a density is taken over: in images the pixel coordinates of two corners, or centre and
-size (the density is the same: the change of variables has determinant 1); in 3-D the centre in m and the
-logarithm of length, width and height in m, beside which the heading in rad stands alone.
+The density is taken over the `state` of a box. In images it is the pixel coordinates of two corners, or
+centre and size; both give the same density, because the change of variables has determinant 1. In 3-D it is
+the centre in m and the logarithm of length, width and height in m. The heading in rad is separate.
 """
 
 import math
@@ -23,7 +23,7 @@ _LOG_2PI = math.log(2 * math.pi)
 
 @dataclass(frozen=True)
 class LabelledBoxes(Record):
-    """Objects of one frame. All of them have a heading, or none has."""
+    """The objects of one frame. Either all have a heading, or none has."""
 
     label: Int[Tensor, "*b N"]
     state: Float[Tensor, "*b N D"]
@@ -32,12 +32,15 @@ class LabelledBoxes(Record):
 
 @dataclass(frozen=True)
 class BoxDensity(Record):
-    """M densities over boxes, each with the heading independent of the rest; computed in float64.
+    """M densities over boxes, computed in float64. In each, the heading is independent of the state.
 
-    With L = `chol`, L⁻¹(state - mean) has independent coordinates of mean 0 and variance 1: normal, or
-    Laplace (of scale 1/√2). So L Lᵀ is the covariance either way. The heading is von Mises distributed.
+    With L = `chol`, L⁻¹(state - mean) has independent coordinates of mean 0 and variance 1. They are normal,
+    or Laplace with scale 1/√2. So L Lᵀ is the covariance in both cases. The heading has a von Mises
+    distribution.
 
-    Raises `InputError` where a covariance is not positive definite or a value not finite, naming the first.
+    Raises:
+        InputError: a covariance is not positive definite, or a value is not finite. The message names the
+            first.
     """
 
     mean: Float[Tensor, "*b M D"]
@@ -45,7 +48,7 @@ class BoxDensity(Record):
     """Lower Cholesky factor of the covariance."""
     yaw: Float[Tensor, "*b M"] | None = None
     concentration: Float[Tensor, "*b M"] | None = None
-    """κ of the heading; 0 is uniform, about 1/σ² where it is large."""
+    """Concentration κ of the heading. 0 is uniform; a large κ is about 1/σ²."""
     family: Literal["gaussian", "laplace"] = "gaussian"
 
     def __post_init__(self) -> None:
@@ -60,9 +63,10 @@ class BoxDensity(Record):
             require("concentration", self.concentration.isfinite() & (self.concentration >= 0))
 
     def log_prob(self, boxes: LabelledBoxes) -> Float[Tensor, "*b M N"]:
-        """Log-density of each box under each component, float64.
+        """Return the log-density of each box under each component, float64.
 
-        Raises `InputError` for boxes that are not finite, or without a heading where one is expected.
+        Raises:
+            InputError: a box is not finite, or it has no heading although the density has one.
         """
         self._require_boxes(boxes)
         if self.mean.dim() == 2 and self.mean.device.type == "cpu" and not needs_gradient(self, boxes):
@@ -80,7 +84,7 @@ class BoxDensity(Record):
     def log_prob_of_pairs(
         self, component: Int[Tensor, "E"], boxes: LabelledBoxes, box: Int[Tensor, "E"]
     ) -> Float[Tensor, "E"]:
-        """`log_prob` at pairs of a component and a box of one frame."""
+        """Return `log_prob` at pairs of a component and a box of one frame."""
         chol = self.chol[component].double()
         offset = boxes.state[box].double() - self.mean[component].double()
         white = torch.linalg.solve_triangular(chol, offset[..., None], upper=False)[..., 0]
@@ -96,7 +100,7 @@ class BoxDensity(Record):
         return -(math.sqrt(2) * white.abs() + 0.5 * math.log(2)).sum(-1)
 
     def _values(self, boxes: LabelledBoxes) -> Float[np.ndarray, "M N"]:
-        """`log_prob` without gradients."""
+        """Return `log_prob` without gradients."""
         mean, chol, state = (_numbers(values) for values in (self.mean, self.chol, boxes.state))
         log_prob = box_log_prob(mean, chol, state, self.family == "laplace")
         if self.yaw is not None and self.concentration is not None and boxes.yaw is not None:
@@ -116,7 +120,7 @@ class BoxDensity(Record):
     def sample(
         self, rng: np.random.Generator
     ) -> tuple[Float[Tensor, "*b M D"], Float[Tensor, "*b M"] | None]:
-        """One state and heading from each component, float64."""
+        """Draw one state and one heading from each component, float64."""
         shape = self.mean.shape
         scale = math.sqrt(0.5)
         white = rng.normal(size=shape) if self.family == "gaussian" else rng.laplace(0.0, scale, shape)
@@ -129,7 +133,7 @@ class BoxDensity(Record):
 
 
 def needs_gradient(*records: Record) -> bool:
-    """Whether a gradient is asked for with respect to any tensor of the records."""
+    """Return whether any tensor of the records needs a gradient."""
     return torch.is_grad_enabled() and any(
         value.requires_grad
         for record in records
@@ -143,11 +147,11 @@ def _numbers(values: Tensor) -> Float[np.ndarray, "..."]:
 
 
 def _log_von_mises(turn: Float[Tensor, "*e"], kappa: Float[Tensor, "..."]) -> Float[Tensor, "*e"]:
-    # i0e(κ) = I₀(κ)·exp(-κ): without it large concentrations overflow.
+    # i0e(κ) = I₀(κ)·exp(-κ). I₀ itself overflows for large concentrations.
     return kappa * (turn.cos() - 1) - torch.special.i0e(kappa).log() - _LOG_2PI
 
 
 def require(what: str, valid: Bool[Tensor, "..."]) -> None:
-    """Raise `InputError` that names the first entry that is not valid."""
+    """Raise `InputError` with the index of the first invalid entry."""
     if not bool(valid.all()):
         raise InputError(f"{what} {tuple((~valid).nonzero()[0].tolist())} is not valid")

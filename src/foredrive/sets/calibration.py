@@ -1,4 +1,4 @@
-"""Calibration of probabilities of existence and of covariances, after training."""
+"""Calibration of existence probabilities and of covariances, after training."""
 
 import dataclasses
 import math
@@ -19,21 +19,21 @@ from foredrive.sets.processes import MultiBernoulli, PoissonMultiBernoulli, Pois
 
 @dataclass(frozen=True)
 class ExistenceMap:
-    """A rising map of probabilities, piecewise linear."""
+    """An increasing, piecewise linear map from predicted to calibrated probabilities."""
 
     said: Float[ndarray, "n"]
     meant: Float[ndarray, "n"]
 
     def __call__(self, probability: Float[ndarray, "m"]) -> Float[ndarray, "m"]:
-        """Calibrated probabilities."""
+        """Return the calibrated probabilities."""
         return np.interp(probability, self.said, self.meant)
 
 
 def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n"]) -> ExistenceMap:
-    """Isotonic regression of what happened on what was said.
+    """Fit the outcomes to the predicted probabilities by isotonic regression.
 
-    `happened` may be probabilities, such as those of `AssociationSum.absent`, taken from 1. The ends are
-    kept from 0 and 1 by half an observation, so that no likelihood becomes zero.
+    `happened` may hold probabilities, such as 1 - `AssociationSum.absent`. The fitted values keep a distance
+    of half an observation from 0 and 1, so that no likelihood becomes zero.
     """
     if len(probability) == 0:
         raise InputError("calibration of existence needs detections")
@@ -47,16 +47,16 @@ def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n
 
 
 def whiten(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray, "n D"]:
-    """L⁻¹(state - mean) of box i under density i."""
+    """Return L⁻¹(state - mean) of box i under density i."""
     with torch.no_grad():
         offset = (objects.state.double() - boxes.mean.double())[..., None]
         return torch.linalg.solve_triangular(boxes.chol.double(), offset, upper=False)[..., 0].cpu().numpy()
 
 
 def fit_scale(boxes: BoxDensity, objects: LabelledBoxes, weight: Float[ndarray, "n"] | None = None) -> float:
-    """Factor on standard deviations that makes box i likeliest under density i.
+    """Return the factor on standard deviations that maximises the likelihood of box i under density i.
 
-    Weights may be probabilities of association.
+    The weights may be association probabilities.
     """
     white = whiten(boxes, objects)
     weight = np.ones(len(white)) if weight is None else weight
@@ -69,13 +69,13 @@ def fit_scale(boxes: BoxDensity, objects: LabelledBoxes, weight: Float[ndarray, 
 
 @dataclass(frozen=True)
 class SetCalibration:
-    """What to make of a detector's probabilities of existence and of its standard deviations."""
+    """Calibration of the existence probabilities and the standard deviations of a detector."""
 
     existence: ExistenceMap
     std_factor: float
 
     def __call__(self, detected: MultiBernoulli) -> MultiBernoulli:
-        """What was said, as it was meant."""
+        """Return the detections with calibrated existence and covariance."""
         r = torch.as_tensor(self.existence(detected.log_existence.exp().cpu().numpy()))
         r = r.to(detected.log_existence)
         boxes = dataclasses.replace(detected.boxes, chol=detected.boxes.chol * self.std_factor)
@@ -85,9 +85,10 @@ class SetCalibration:
 def fit_set_calibration(
     detected: Sequence[MultiBernoulli], objects: Sequence[LabelledBoxes], background: PoissonProcess
 ) -> SetCalibration:
-    """Isotonic existence and one factor on standard deviations, from frames that were not trained on.
+    """Fit isotonic existence and one factor on standard deviations, on frames outside the training set.
 
-    By the associations of each frame, objects that no detection explains being of the `background`.
+    Detections are matched by the associations of each frame. Objects without a detection belong to
+    `background`.
     """
     existence, has_object, boxes, paired = [], [], [], []
     for found, truth in zip(detected, objects, strict=True):
@@ -111,10 +112,11 @@ def fit_set_calibration(
 
 
 def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float) -> float:
-    """q such that boxes mean ± q·σ hold all coordinates of a new object with probability ≥ `coverage`.
+    """Return q such that mean ± q·σ contains a new object with probability ≥ `coverage`.
 
-    Split conformal prediction with the largest |error| / σ as its score: holds for whatever distribution if
-    new pairs are exchangeable with these. +inf if there are too few for that.
+    All coordinates must be inside. This is split conformal prediction with the largest |error| / σ as score.
+    It is valid for any distribution if the new pairs are exchangeable with these. Return +inf if there are
+    too few pairs.
     """
     score = np.sort(conformal_scores(boxes, objects))
     rank = math.ceil((len(score) + 1) * coverage)
@@ -122,7 +124,7 @@ def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float)
 
 
 def conformal_scores(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray, "n"]:
-    """Largest |error| / σ over the coordinates of box i."""
+    """Return the largest |error| / σ over the coordinates of box i."""
     with torch.no_grad():
         error = (objects.state.double() - boxes.mean.double()).abs()
         std = boxes.chol.double().square().sum(-1).sqrt()

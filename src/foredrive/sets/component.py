@@ -1,4 +1,4 @@
-"""The sums over all associations within each connected component, exactly where that is affordable."""
+"""Sums over all associations in each connected component, exact where that is affordable."""
 
 from typing import NamedTuple, no_type_check
 
@@ -14,28 +14,34 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Scaled(NamedTuple):
-    """Weights times such powers that the best association weighs 1 and no factor of any is larger."""
+    """Weights of a component, rescaled by rows and columns.
+
+    The best association weighs 1, and no factor exceeds 1.
+    """
 
     cost: Float[ndarray, "R C"]
     free: Float[ndarray, "R"]
-    """What `assignment` works on: the impossible has a finite price."""
+    """Input of `assignment`, with a finite cost in place of infinity."""
     column_free: Float[ndarray, "C"]
-    """What a column costs that no row takes; `cost` has it subtracted."""
+    """Cost of a column that no row takes. It is already subtracted from `cost`."""
     column: Int[ndarray, "R"]
-    """Of the best association; C: none."""
+    """Column of each row in the best association; C if it has none."""
     bad_rows: Bool[ndarray, "R"]
     bad_columns: Bool[ndarray, "C"]
     log_pair: Float[ndarray, "R C"]
     row_alone: Float[ndarray, "R"]
     column_alone: Float[ndarray, "C"]
     log_column_scale: Float[ndarray, "C"]
-    """Logarithm of what the weights of a column were multiplied by."""
+    """Logarithm of the factor by which the weights of each column were multiplied."""
     log_best: float
-    """What the best association weighs unscaled; -inf if none is possible."""
+    """Logarithm of the unscaled weight of the best association; -inf if none is possible."""
 
 
 class Components(NamedTuple):
-    """What lies in which component, in the order of the components."""
+    """Members of the connected components, sorted by component.
+
+    Component n is the slice start[n] : start[n + 1].
+    """
 
     row: Int[ndarray, "_"]
     row_start: Int[ndarray, "components_1"]
@@ -46,26 +52,27 @@ class Components(NamedTuple):
 
 
 class ComponentSums(NamedTuple):
-    """The components that could be summed exactly, together."""
+    """Total of all components that could be summed exactly."""
 
     log_sum: float
     share: Float[ndarray, "E"]
     """Probability of each edge."""
     log_freed: Float[ndarray, "C"]
-    """Logarithm of the sum without a column over the sum, where that is positive."""
+    """log(sum without the column / sum), valid where the sum is positive."""
     best: Int[ndarray, "C"]
-    """Row of each column in the most likely association; -1: none."""
+    """Row of each column in the most likely association; -1 if it has none."""
     bad_rows: Bool[ndarray, "R"]
     bad_columns: Bool[ndarray, "C"]
     too_large: Int[ndarray, "_"]
-    """Components that are left to be summed."""
+    """Components that were not summed because they are too large."""
 
 
 @_kernel
 @no_type_check
 def find_components(row: Int[ndarray, "E"], column: Int[ndarray, "E"], rows: int, columns: int) -> Components:
-    """Connected components that have an edge; members in rising order."""
+    """Find the connected components that have an edge. Members are in increasing order."""
     parent = np.arange(rows + columns)
+    # Union-find: the root of a component is its smallest node. Columns are numbered after the rows.
     for e in range(len(row)):
         a, b = _root(parent, row[e]), _root(parent, rows + column[e])
         if a != b:
@@ -87,7 +94,10 @@ def find_components(row: Int[ndarray, "E"], column: Int[ndarray, "E"], rows: int
 @_kernel
 @no_type_check
 def sum_components(components, row, column, log_edge, log_row, log_column, max_states):
-    """Sum what takes at most `max_states` numbers, and what is in no component; see `ComponentSums`."""
+    """Sum each component that needs at most `max_states` numbers, and all nodes without an edge.
+
+    See `ComponentSums` for the result.
+    """
     share, best, log_freed = np.zeros(len(row)), np.full(len(log_column), -1), -log_column
     alone, unpaired = np.ones(len(log_row), np.bool_), np.ones(len(log_column), np.bool_)
     alone[components.row] = False
@@ -101,6 +111,7 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
         i = components.row[components.row_start[n] : components.row_start[n + 1]]
         j = components.column[components.column_start[n] : components.column_start[n + 1]]
         edges = components.edge[components.edge_start[n] : components.edge_start[n + 1]]
+        # Copy the edges of the component into a dense matrix.
         for p in range(len(i)):
             place[i[p]] = p
         for p in range(len(j)):
@@ -129,10 +140,14 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
 @_kernel
 @no_type_check
 def sum_scaled(scaled, max_states):
-    """Whether a component could be summed exactly, the logarithm of its sum, shares, and `column_freed`.
+    """Sum a component exactly, if that is affordable.
 
-    The frontier runs over whichever side keeps it narrower. Where no association is possible the pairs are
-    those of the association with fewest impossible members.
+    The sweep runs over the side (rows or columns) that needs fewer states. If no association is possible, the
+    pairs are those of the association with the fewest impossible members.
+
+    Returns:
+        Whether the component was summed, the logarithm of its sum, the probability of each pair, and
+        `column_freed` of `AssignmentTotals`.
     """
     rows, columns = scaled.log_pair.shape
     if scaled.log_best == -np.inf:
@@ -160,7 +175,7 @@ def sum_scaled(scaled, max_states):
 def scale(
     log_pair: Float[ndarray, "R C"], log_row: Float[ndarray, "R"], log_column: Float[ndarray, "C"]
 ) -> Scaled:
-    """Scale by the prices of the best assignment."""
+    """Rescale the weights by the dual prices of the best assignment."""
     rows, columns = log_pair.shape
     price = _price_of_the_impossible(log_pair, log_row, log_column)
     no_row, no_column = log_row == -np.inf, log_column == -np.inf
@@ -186,7 +201,7 @@ def scale(
         log_best += 0.0 if taken[c] else log_column[c]
     log_scaled = np.empty((rows, columns))
     for r in range(rows):
-        for c in range(columns):  # above 0 by rounding alone
+        for c in range(columns):  # values above 0 come from rounding
             log_scaled[r, c] = min(row_price[r] + column_price[c] - cost[r, c], 0.0)
     row_alone = np.where(no_row, 0.0, np.exp(row_price - free))
     column_alone = np.where(no_column, 0.0, np.exp(column_price))
@@ -209,14 +224,14 @@ def scale(
 @_kernel
 @no_type_check
 def turn_costs(cost, free, column_free):
-    """`cost` and `free` of the same problem with columns as rows, but for Σ free - Σ column_free."""
+    """Return `cost` and `free` of the transposed problem. The totals differ by Σ free - Σ column_free."""
     return np.ascontiguousarray(cost.T) + column_free[:, None] - free, column_free
 
 
 @_kernel
 @no_type_check
 def _price_of_the_impossible(log_pair, log_row, log_column):
-    """A finite cost in place of infinity that outweighs whatever could be gained by paying it."""
+    """Return a finite cost that replaces infinity. It is larger than any possible gain from paying it."""
     total = 0.0
     for r in range(len(log_row)):
         largest = 0.0 if log_row[r] == -np.inf else abs(log_row[r])
@@ -241,7 +256,7 @@ def _root(parent, node):
 @_kernel
 @no_type_check
 def _group(of, count):
-    """Indices by the group they are `of` (those of -1 are in none), and where each group starts."""
+    """Group indices by `of` (-1 is no group). Return the indices by group, and the start of each group."""
     start = np.zeros(count + 1, np.int64)
     for group in of:
         if group >= 0:

@@ -1,4 +1,4 @@
-"""The package's own 3-D detections and boxes, as random finite sets."""
+"""Conversion of 3-D detections and boxes into random finite sets."""
 
 import dataclasses
 
@@ -20,25 +20,27 @@ def pmb_from_detections(
     lower: Float[Tensor, "6"] | None = None,
     upper: Float[Tensor, "6"] | None = None,
 ) -> PoissonMultiBernoulli:
-    """Detections of one frame; their background is spread evenly over states between `lower` and `upper`.
+    """Convert the detections of one frame into a PMB density.
 
-    A state is centre (ego frame, m) and log lwh (m). Of its covariance with the heading nothing is kept; the
-    heading is von Mises distributed with κ = 1/σ², σ² being the variance of the angle to first order.
+    The background is uniform over states between `lower` and `upper`. A state is the centre (ego frame, m)
+    and log lwh (m). The covariance between state and heading is dropped. The heading has a von Mises
+    distribution with κ = 1/σ², where σ² is the first-order variance of the angle.
 
-    Raises `InputError` for probabilities outside [0, 1], covariances that are not positive definite, and a
-    background without a region.
+    Raises:
+        InputError: a probability is outside [0, 1], a covariance is not positive definite, or a background
+            has no region.
     """
     found = dataclasses.replace(detections, background_rate=None)[detections.valid]
     existence = found.existence.double()
     require("existence of detection", (existence >= 0) & (existence <= 1))
     sin, cos = found.mean[:, 6].double(), found.mean[:, 7].double()
-    # dθ = (cos · d sin - sin · d cos) / ρ², whatever length ρ the two have
+    # dθ = (cos · d sin - sin · d cos) / ρ², for any length ρ of the vector (sin, cos).
     square = (sin.square() + cos.square()).clamp_min(_TINY)
     across = torch.stack([cos, -sin], dim=-1) / square[:, None]
     variance = (across[:, None] @ found.chol[:, 6:].double()).square().sum((-2, -1))
     boxes = BoxDensity(
         mean=found.mean[:, :6],
-        chol=found.chol[:, :6, :6],  # of the marginal: the factor is lower triangular
+        chol=found.chol[:, :6, :6],  # the marginal: the factor is lower triangular
         yaw=torch.atan2(sin, cos),
         concentration=1.0 / variance.clamp_min(_TINY),
     )
@@ -51,7 +53,11 @@ def pmb_from_detections(
 
 
 def objects_from_boxes(boxes: Boxes) -> LabelledBoxes:
-    """Valid boxes of one time step. Raises `InputError` that names the first of a size that is none."""
+    """Return the valid boxes of one time step as objects.
+
+    Raises:
+        InputError: a size is not positive. The message names the first such box.
+    """
     require("size of box", (boxes.size_lwh > 0).all(-1) | ~boxes.valid)
     found = boxes[boxes.valid]
     state = torch.cat([found.centre.double(), found.size_lwh.double().log()], dim=-1)

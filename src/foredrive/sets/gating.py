@@ -1,4 +1,4 @@
-"""Which pairs matter to a sum over associations, and what the others add to it at most."""
+"""Selection of the pairs that matter in a sum over associations, with bounds on the others."""
 
 from typing import no_type_check
 
@@ -20,12 +20,12 @@ def gate(
     log_column: Float[ndarray, "C"],
     budget_nats: float,
 ) -> tuple[Int[ndarray, "E"], Int[ndarray, "E"], float]:
-    """Pairs that are kept, and a bound on what the others add to the logarithm of the sum.
+    """Return the kept pairs, and a bound on the contribution of the others to the logarithm of the sum.
 
-    An association without its left-out pairs is one of those that stay; each pair put back multiplies its
-    weight by the pair's odds against being absent and background. Hence sum ≤ (sum of those that stay) ·
-    Π_j (1 + Σ_i odds_ij), over the pairs left out. Prices decide where odds are infinite: at certain
-    detections and objects without background.
+    Removing the left-out pairs of an association gives an association of kept pairs. Adding such a pair back
+    multiplies its weight by the odds of the pair against "absent and background". Hence sum ≤ (sum over kept
+    pairs) · Π_j (1 + Σ_i odds_ij), over the left-out pairs. Odds are infinite for certain detections and for
+    objects without background. There, prices decide instead (see `_prices`).
     """
     infinite = bool((log_row == -np.inf).any() or (log_column == -np.inf).any())
     by_odds = (0.5 if infinite else 1.0) * budget_nats
@@ -48,9 +48,10 @@ def _keep_likely(
     log_column: Float[ndarray, "C"],
     budget_nats: float,
 ) -> tuple[Int[ndarray, "E"], Int[ndarray, "E"], float]:
-    """All pairs but those of least odds, which together are no more than the budget; what these add.
+    """Leave out the pairs with the smallest odds, at a total loss within the budget.
 
-    None of odds of at least 1 is left out: others are in no best association.
+    Return the kept pairs and the loss in nats. Pairs with odds of at least 1 are always kept. The pairs left
+    out are in no best association.
     """
     log_least = np.log(0.5 * budget_nats / max(log_pair.size, 1))
     row, column, log_odds, lost_nats = _list_odds(log_pair, log_row, log_column, log_least)
@@ -66,7 +67,11 @@ def _keep_likely(
 @_kernel
 @no_type_check
 def _list_odds(log_pair, log_row, log_column, log_least):
-    """Pairs of larger odds than the least, these, and what all others may add to the logarithm."""
+    """List the pairs with log-odds above `log_least`.
+
+    Return their rows, columns and log-odds, and a bound on the contribution of the other pairs to the
+    logarithm.
+    """
     rows, columns = log_pair.shape
     row, column = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.int64)
     odds, count, lost = np.empty(rows * columns), 0, np.zeros(columns)
@@ -86,10 +91,11 @@ def _list_odds(log_pair, log_row, log_column, log_least):
 @_kernel
 @no_type_check
 def _prices(scaled):
-    """What to take off a scaled pair, by row and by column, to bound what all associations with it weigh.
+    """Return log-prices by row and by column. They bound the weight of all associations with a pair.
 
-    They weigh no more than the pair times what the other rows (or columns) can choose from, each without
-    regard to the rest. The best association weighs 1, so that nothing of it is ever left out.
+    This weight is at most the weight of the pair times the product, over the other rows (or columns), of the
+    sum of all their choices, each made independently. The best association weighs 1, so its pairs are always
+    kept.
     """
     rows, columns = scaled.log_pair.shape
     by_row, by_column = scaled.row_alone.copy(), scaled.column_alone.copy()
@@ -108,9 +114,9 @@ def _prices(scaled):
 
 
 def thin(scaled: Scaled, limit_nats: float) -> tuple[Int[ndarray, "E"], Int[ndarray, "E"]]:
-    """Pairs that are kept when about `limit_nats` may be lost, by what `bound_left_out` is likely to say.
+    """Return the pairs to keep when about `limit_nats` may be lost, by an estimate of `bound_left_out`.
 
-    Kept are, whatever they weigh, those of the best association and of rows that cannot be alone.
+    The pairs of the best association and of rows that cannot be alone are always kept.
     """
     row, column, charge = _estimate_charges(np.exp(scaled.log_pair), scaled.row_alone, scaled.column_alone)
     order = np.argsort(charge)
@@ -123,11 +129,16 @@ def thin(scaled: Scaled, limit_nats: float) -> tuple[Int[ndarray, "E"], Int[ndar
 @_kernel
 @no_type_check
 def _estimate_charges(pair, row_alone, column_alone):
-    """Possible pairs, and what `bound_left_out` charges for each, by belief propagation: exact on trees."""
+    """Return the possible pairs and an estimate of the term of each in `bound_left_out`.
+
+    The estimate comes from belief propagation, which is exact on trees.
+    """
     row, column = np.nonzero(pair)
     weight, to_column, to_row = np.empty(len(row)), np.empty(len(row)), np.zeros(len(row))
     for e in range(len(row)):
         weight[e] = pair[row[e], column[e]]
+
+    # Messages along each pair: its weight over the sum of all other choices of the sending node.
     for _ in range(_ROUNDS):
         total = row_alone.copy()
         for e in range(len(row)):
@@ -150,16 +161,20 @@ def _estimate_charges(pair, row_alone, column_alone):
 def bound_left_out(
     log_weight: Float[ndarray, "E"], row: Int[ndarray, "E"], column: Int[ndarray, "E"]
 ) -> float:
-    """What pairs that were left out add to the logarithm of a sum at most.
+    """Bound the contribution of left-out pairs to the logarithm of a sum, from above.
 
-    `log_weight` is that of the pair, over the row's alone, times the sum without the column over the sum.
+    `log_weight` is the logarithm of (weight of the pair / weight of the row alone) · (sum without the column
+    / sum).
 
-    Associations with left-out pairs of rows I and columns J weigh what these do times what is left, S without
-    I and J. With I alone that is a part of S without J: all of them together are at most
-    Σ Π_pairs (w_ij / alone_i) · (S without J). Of two columns, (S without both) · S is no more than the
-    product of S without either: the difference is a sum over the paths between them of squares, positive
-    where paths have an even number of edges (Heilmann and Lieb 1972). Hence (S without J) / S is at most the
-    product over J of that of each column, and the whole at most that over columns, or rows, of 1 + Σ.
+    Let S be the sum over the kept pairs. Consider associations with left-out pairs between rows I and columns
+    J. Their weight is that of these pairs times S without I and J. With the rows of I alone, S without I and
+    J is a part of S without J. So all of them together weigh at most Σ Π_pairs (w_ij / alone_i) · (S without
+    J).
+
+    For two columns, (S without both) · S ≤ product of S without each: the difference is a sum of squares over
+    the paths between the columns, with positive sign if the paths have an even number of edges (Heilmann and
+    Lieb 1972). Hence (S without J) / S is at most the product of this ratio for each column of J. The whole
+    is at most the product of 1 + Σ over columns, or over rows.
     """
     with np.errstate(over="ignore"):
         weight = np.exp(log_weight)

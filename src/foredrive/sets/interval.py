@@ -1,4 +1,4 @@
-"""An interval for the sum over all associations of a component that is too large to be summed."""
+"""Bounds for the sum over all associations of a component that is too large to be summed exactly."""
 
 from typing import NamedTuple, no_type_check
 
@@ -16,20 +16,20 @@ _ROUNDS, _CHEAPEST = 50, 1e-100
 
 
 class Interval(NamedTuple):
-    """The logarithm of a sum over associations lies between `log_lower` and `log_upper`."""
+    """An interval [`log_lower`, `log_upper`] that contains the logarithm of a sum."""
 
     log_lower: float
     log_upper: float
     share: Float[ndarray, "R C"]
-    """Probability of each pair, given that one of the associations that were summed is true."""
+    """Probability of each pair, given that one of the summed associations is true."""
     best: Int[ndarray, "C"]
-    """Row of each column in the most likely association; -1: none."""
+    """Row of each column in the most likely association; -1 if it has none."""
 
 
 def bound_component(scaled: Scaled, k: int) -> Interval:
-    """From below the `k` best associations, from above choices without regard to each other.
+    """Bound the sum from below by the `k` best associations and from above by independent choices.
 
-    Some association must be possible.
+    At least one association must be possible.
     """
     rows, columns = scaled.log_pair.shape
     column, cost = _k_best(scaled, k)
@@ -49,7 +49,7 @@ def bound_component(scaled: Scaled, k: int) -> Interval:
 
 
 def bound_choices(scaled: Scaled) -> float:
-    """Upper bound of the logarithm of the sum over associations, by `choice_bound` of either side."""
+    """Return an upper bound of the logarithm of the sum: the smaller `choice_bound` of rows and columns."""
     pair = np.exp(scaled.log_pair)
     by_row = choice_bound(pair, scaled.row_alone, scaled.column_alone)
     by_column = choice_bound(np.ascontiguousarray(pair.T), scaled.column_alone, scaled.row_alone)
@@ -57,7 +57,10 @@ def bound_choices(scaled: Scaled) -> float:
 
 
 def _k_best(scaled: Scaled, k: int) -> RankedAssignments:
-    """Assign whichever are fewer; the costs are those of the rows' problem but for a constant."""
+    """Rank the `k` best assignments, with the smaller side as rows of the problem.
+
+    The costs are those of the untransposed problem, up to a constant.
+    """
     rows, columns = scaled.log_pair.shape
     if rows <= columns:
         return k_best_assignments(scaled.cost, scaled.free, k)
@@ -74,11 +77,12 @@ def _k_best(scaled: Scaled, k: int) -> RankedAssignments:
 def choice_bound(
     pair: Float[ndarray, "R C"], row_alone: Float[ndarray, "R"], column_alone: Float[ndarray, "C"]
 ) -> float:
-    """Upper bound of the logarithm of the sum over assignments; weights as in `sum_assignments`, at most 1.
+    """Return an upper bound of the logarithm of the sum over assignments.
 
-    Let every column cost c_j ≥ what it weighs alone, and rows choose without regard to each other: no
-    assignment is left out, so that the sum is at most Π_j c_j Π_i (alone_i + Σ_j pair_ij / c_j). The costs
-    at which each column is chosen once on average make that least; Sinkhorn's iteration leads there.
+    The weights are as in `sum_assignments` and at most 1. Give every column j a cost c_j ≥ its alone weight,
+    and let the rows choose independently. This includes every assignment, so the sum is at most Π_j c_j Π_i
+    (alone_i + Σ_j pair_ij / c_j). The bound is smallest when each column is chosen once on average.
+    Sinkhorn's iteration converges to these costs.
     """
     column, start = list_true(pair > 0.0)
     cost, least = np.ones(pair.shape[1]), np.inf
@@ -94,5 +98,6 @@ def choice_bound(
             for c in mine:
                 chosen[c] += pair[r, c] / cost[c] / total
         least = min(least, log_bound)
+        # Sinkhorn step: raise the cost of a column that is chosen more than once on average.
         cost = np.maximum(np.maximum(column_alone, cost * chosen), _CHEAPEST)
     return least

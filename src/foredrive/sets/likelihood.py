@@ -1,4 +1,4 @@
-"""Negative log-likelihood of a set of objects under what a detector says, and what it is made of."""
+"""Negative log-likelihood of a set of objects under the output of a detector, and its parts."""
 
 import math
 from dataclasses import dataclass
@@ -15,34 +15,36 @@ from foredrive.sets.processes import PoissonMultiBernoulli
 
 @dataclass(frozen=True)
 class SetNll:
-    """-log f(Y) in nats, as the sum of its parts; all float64, and with gradients.
+    """-log f(Y) in nats and its parts, float64 with gradients.
 
-    Parts are expectations over associations, given the truth. Since f sums over associations, they add up to
-    more than the whole by the entropy of the associations, which `ambiguity` takes off.
+    The parts are expectations over associations, given the true objects. f is a sum over associations, so the
+    parts add up to more than the whole. The difference is the entropy of the associations; `ambiguity`
+    subtracts it.
     """
 
     nll: Float[Tensor, ""]
-    """Exact, or an upper bound; +inf if no association is possible. Its gradient is that of what it sums."""
+    """Exact value or upper bound; +inf if no association is possible. The gradient is that of the summed
+    terms."""
     lower: float
-    """The true value lies between here and `nll`."""
+    """Lower bound: the true value lies between `lower` and `nll`."""
     localisation: Float[Tensor, ""]
-    """Boxes of objects that are detected."""
+    """Part of the boxes of detected objects."""
     classification: Float[Tensor, ""]
-    """Existence and class of objects that are detected."""
+    """Part of existence and class of detected objects."""
     false: Float[Tensor, ""]
-    """Detections without an object; inf if a certain one has none."""
+    """Part of detections without an object; inf if a certain detection has none."""
     missed: Float[Tensor, ""]
-    """Objects left to the background, -log λ; inf where it allows none."""
+    """Part of objects assigned to the background, -log λ; inf if the background does not allow one."""
     expected_background: Float[Tensor, ""]
-    """∫λ."""
+    """Expected number of background objects, ∫λ."""
     ambiguity: Float[Tensor, ""]
-    """Minus the entropy of the associations, never positive but for rounding; NaN if `nll` is infinite."""
+    """Minus the entropy of the associations, ≤ 0 up to rounding. NaN if `nll` is infinite."""
     associations: AssociationSum
-    """Who belongs to whom, and which detections or objects make the value infinite."""
+    """Association probabilities, and the detections or objects that make the value infinite."""
     pair_log_box: Float[Tensor, "E"]
-    """Log-density of the object's box, of each pair in `associations`."""
+    """Log-density of the object's box under the detection, for each pair in `associations`."""
     pair_log_label: Float[Tensor, "E"]
-    """Log-probability that the detection exists with the object's label."""
+    """Log-probability that the detection exists with the object's label, for each pair."""
     log_background: Float[Tensor, "N"]
     """Log λ at each object."""
 
@@ -55,10 +57,12 @@ def set_nll(
     max_states: int = 1 << 21,
     gate_nats: float = 1e-10,
 ) -> SetNll:
-    """PMB-NLL of one frame (thesis eq. 3.12, Paper A); MB-NLL if there is no background.
+    """Compute the PMB-NLL of one frame (thesis eq. 3.12, Paper A). Without a background it is the MB-NLL.
 
-    `k`, `max_states` and `gate_nats` as in `sum_associations`. Raises `InputError` for values that are not
-    finite, or labels that are unknown, naming the first.
+    `k`, `max_states` and `gate_nats` are those of `sum_associations`.
+
+    Raises:
+        InputError: a value is not finite, or a label is unknown. The message names the first.
     """
     detected, background = predicted.detected, predicted.background
     log_absent = detected.log_absence.double()
@@ -93,7 +97,7 @@ def set_nll(
 
 
 def _expected(probability: Float[np.ndarray, "..."], log: Float[Tensor, "..."]) -> Float[Tensor, ""]:
-    """Σ -P log, over what is possible."""
+    """Return Σ -P log, over the possible entries."""
     weight = torch.as_tensor(probability, device=log.device)
     counts = (weight > 0) & log.isfinite()
     return -(weight[counts] * log[counts]).sum()

@@ -1,4 +1,4 @@
-"""Random finite sets of labelled boxes: multi-Bernoulli, Poisson, and the union of the two."""
+"""Random finite sets of labelled boxes: multi-Bernoulli, Poisson, and their union."""
 
 import math
 from collections.abc import Sequence
@@ -15,15 +15,17 @@ from foredrive.scene.record import Record
 from foredrive.sets.box_kernel import log_sum_exp
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes, require
 
-_ROUNDING = 1e-4  # of probabilities that were computed in float32
+_ROUNDING = 1e-4  # tolerance for probabilities computed in float32
 
 
 @dataclass(frozen=True)
 class MultiBernoulli(Record):
-    """M objects that may exist, independently of one another (thesis eq. 3.9 and 3.10).
+    """M objects that exist independently of each other (thesis eq. 3.9 and 3.10).
 
-    Existence is kept as two logarithms: 1 - r loses all digits where r is close to 1. Raises `InputError` for
-    logarithms of what is no probability.
+    Existence is stored as two logarithms, because 1 - r loses all digits where r is close to 1.
+
+    Raises:
+        InputError: a value is not the logarithm of a probability.
     """
 
     log_existence: Float[Tensor, "*b M"]
@@ -31,7 +33,7 @@ class MultiBernoulli(Record):
     log_absence: Float[Tensor, "*b M"]
     """log(1 - r)."""
     log_class: Float[Tensor, "*b M K"]
-    """Log-probability of each class, given existence."""
+    """Log-probability of each class, given that the object exists."""
     boxes: BoxDensity
 
     def __post_init__(self) -> None:
@@ -43,14 +45,17 @@ class MultiBernoulli(Record):
 
     @classmethod
     def from_softmax(cls, logits: Float[Tensor, "*b M K_1"], boxes: BoxDensity) -> "MultiBernoulli":
-        """From a detector with one softmax over the classes and, last, no object (DETR)."""
+        """Convert the logits of a detector with one softmax over the classes and "no object" (DETR)."""
         log_prob = logits.double().log_softmax(-1)
         log_existence = log_prob[..., :-1].logsumexp(-1)
         return cls(log_existence, log_prob[..., -1], log_prob[..., :-1] - log_existence[..., None], boxes)
 
     @classmethod
     def from_sigmoid(cls, logits: Float[Tensor, "*b M K"], boxes: BoxDensity) -> "MultiBernoulli":
-        """With a sigmoid per class (RetinaNet): r is the largest, classes are in proportion."""
+        """Convert the logits of a detector with one sigmoid per class (RetinaNet).
+
+        r is the largest sigmoid. The class probabilities are proportional to the sigmoids.
+        """
         top = logits.double().amax(-1)
         log_score = torch.nn.functional.logsigmoid(logits.double())
         log_class = log_score - log_score.logsumexp(-1, keepdim=True)
@@ -59,7 +64,7 @@ class MultiBernoulli(Record):
         )
 
     def log_label(self, objects: LabelledBoxes) -> Float[Tensor, "*b M N"]:
-        """Log-probability that each object exists with its label."""
+        """Return the log-probability that each object exists with its label."""
         label = checked_labels(objects.label, self.log_class.shape[-1])
         index = label[..., None, :].expand(*self.log_class.shape[:-1], label.shape[-1])
         return self.log_existence.double()[..., None] + self.log_class.double().gather(-1, index)
@@ -67,12 +72,12 @@ class MultiBernoulli(Record):
     def log_label_of_pairs(
         self, component: Int[Tensor, "E"], objects: LabelledBoxes, box: Int[Tensor, "E"]
     ) -> Float[Tensor, "E"]:
-        """`log_label` at pairs of a component and an object of one frame."""
+        """Return `log_label` at pairs of a component and an object of one frame."""
         log_class = self.log_class[component, objects.label.long()[box]]
         return self.log_existence[component].double() + log_class.double()
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set; of one frame only."""
+        """Draw one set. The process must have one frame only."""
         exists = torch.as_tensor(rng.random(len(self.log_existence)) < self.log_existence.exp().cpu().numpy())
         state, yaw = self.boxes.sample(rng)
         label = _sample_labels(self.log_class, rng)
@@ -81,25 +86,25 @@ class MultiBernoulli(Record):
 
 @runtime_checkable
 class PoissonProcess(Protocol):
-    """Objects that come independently, any number of them (thesis eq. 3.11)."""
+    """Independent objects of unlimited number (thesis eq. 3.11)."""
 
     @property
     def expected_count(self) -> Float[Tensor, ""]:
-        """∫λ."""
+        """Return ∫λ."""
         ...
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
-        """Log λ at each object, float64."""
+        """Return log λ at each object, float64."""
         ...
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set."""
+        """Draw one set."""
         ...
 
 
 @dataclass(frozen=True)
 class UniformPoisson(Record):
-    """Objects spread evenly over a box of states and, if they have one, over all headings."""
+    """Objects uniformly distributed over a box of states and, with `has_yaw`, over all headings."""
 
     rate: Float[Tensor, "K"]
     """Expected number of objects of each class."""
@@ -115,11 +120,11 @@ class UniformPoisson(Record):
 
     @property
     def expected_count(self) -> Float[Tensor, ""]:
-        """∫λ."""
+        """Return ∫λ."""
         return self.rate.double().sum()
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
-        """Log λ at each object, float64; -inf outside the region."""
+        """Return log λ at each object, float64. It is -inf outside the region."""
         label = checked_labels(objects.label, len(self.rate))
         log_volume = (self.upper - self.lower).double().log().sum()
         log_volume = log_volume + (math.log(2 * math.pi) if self.has_yaw else 0.0)
@@ -127,7 +132,7 @@ class UniformPoisson(Record):
         return torch.where(inside, self.rate.double().log()[label] - log_volume, -math.inf)
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set."""
+        """Draw one set."""
         counts = rng.poisson(self.rate.cpu().numpy())
         label = torch.as_tensor(np.repeat(np.arange(len(counts)), counts))
         unit = torch.as_tensor(rng.random((len(label), len(self.lower))))
@@ -138,7 +143,7 @@ class UniformPoisson(Record):
 
 @dataclass(frozen=True)
 class MixturePoisson(Record):
-    """Objects that come around M places: λ(y) = Σ_i rate_i p_i(y)."""
+    """Objects around M places: λ(y) = Σ_i rate_i p_i(y)."""
 
     log_rate: Float[Tensor, "M"]
     """Logarithm of the expected number of objects of each component."""
@@ -147,11 +152,11 @@ class MixturePoisson(Record):
 
     @property
     def expected_count(self) -> Float[Tensor, ""]:
-        """∫λ."""
+        """Return ∫λ."""
         return self.log_rate.double().exp().sum()
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
-        """Log λ at each object, float64."""
+        """Return log λ at each object, float64."""
         label = checked_labels(objects.label, self.log_class.shape[-1])
         log_class = self.log_class.double()[:, label]
         log_each = self.log_rate.double()[:, None] + log_class + self.boxes.log_prob(objects)
@@ -160,7 +165,7 @@ class MixturePoisson(Record):
         return torch.as_tensor(log_sum_exp(log_each.numpy()))
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set."""
+        """Draw one set."""
         counts = torch.as_tensor(rng.poisson(self.log_rate.double().exp().cpu().numpy()))
         which = torch.arange(len(counts)).repeat_interleave(counts)
         state, yaw = self.boxes[which].sample(rng)
@@ -169,27 +174,27 @@ class MixturePoisson(Record):
 
 @dataclass(frozen=True)
 class SumPoisson:
-    """The union of independent Poisson processes, which is one whose intensity is the sum."""
+    """The union of independent Poisson processes. It is a Poisson process with the sum of the intensities."""
 
     parts: tuple[PoissonProcess, ...]
 
     @property
     def expected_count(self) -> Float[Tensor, ""]:
-        """∫λ."""
+        """Return ∫λ."""
         return torch.stack([part.expected_count for part in self.parts]).sum()
 
     def log_intensity(self, objects: LabelledBoxes) -> Float[Tensor, "N"]:
-        """Log λ at each object, float64."""
+        """Return log λ at each object, float64."""
         return torch.stack([part.log_intensity(objects) for part in self.parts]).logsumexp(0)
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set."""
+        """Draw one set."""
         return _joined([part.sample(rng) for part in self.parts])
 
 
 @dataclass(frozen=True)
 class PoissonMultiBernoulli:
-    """The union of a multi-Bernoulli and a Poisson process (thesis eq. 3.12), or the former alone."""
+    """The union of a multi-Bernoulli and a Poisson process (thesis eq. 3.12), or a multi-Bernoulli alone."""
 
     detected: MultiBernoulli
     background: PoissonProcess | None = None
@@ -198,10 +203,10 @@ class PoissonMultiBernoulli:
     def from_detections(
         cls, detections: MultiBernoulli, confidence: float = 0.1, other: PoissonProcess | None = None
     ) -> "PoissonMultiBernoulli":
-        """Detections of one frame; those with r ≤ `confidence` become the Poisson process (Paper A).
+        """Convert the detections of one frame into a PMB density (Paper A).
 
-        With an `other` process, such as a uniform one, added to it: without, objects far from any detection
-        have next to no density.
+        Detections with r ≤ `confidence` become the Poisson process. The process `other`, such as a uniform
+        one, is added to it. Without it, objects far from every detection have almost zero density.
         """
         low = detections.log_existence <= math.log(confidence)
         few = detections[low]
@@ -209,7 +214,7 @@ class PoissonMultiBernoulli:
         return cls(detections[~low], mixture if other is None else SumPoisson((mixture, other)))
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """One set."""
+        """Draw one set."""
         found = self.detected.sample(rng)
         if self.background is None:
             return found
@@ -217,7 +222,7 @@ class PoissonMultiBernoulli:
 
 
 def poisson_log_prob(process: PoissonProcess, objects: LabelledBoxes) -> Float[Tensor, ""]:
-    """Log-density of a set of objects under a Poisson process (thesis eq. 3.11)."""
+    """Return the log-density of a set of objects under a Poisson process (thesis eq. 3.11)."""
     return process.log_intensity(objects).sum() - process.expected_count
 
 
@@ -228,7 +233,11 @@ def _joined(sets: Sequence[LabelledBoxes]) -> LabelledBoxes:
 
 
 def checked_labels(label: Int[Tensor, "..."], classes: int) -> Int[Tensor, "..."]:
-    """Labels as indices. Raises `InputError` that names the first that is none."""
+    """Return labels as indices.
+
+    Raises:
+        InputError: a label is out of range. The message names the first.
+    """
     wrong = ((label < 0) | (label >= classes)).nonzero()
     if len(wrong):
         at = tuple(wrong[0].tolist())
