@@ -73,7 +73,7 @@ def score(
 def _compared(
     scores: "list[FrameScore]", against: Path, truth: Path, family: Family, k: int
 ) -> dict[str, Any]:
-    """The others' figures, and the difference to them."""
+    """Return the metrics of the other results, and the difference to them."""
     from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
 
     other = read_detections(against, truth, family)
