@@ -1,5 +1,4 @@
-"""Scores of the privileged expert on Town05, the upper bound of every student: `foredrive bench
-drive-expert`.
+"""Score the privileged expert on Town05, as the upper bound of students: `foredrive bench drive-expert`.
 
 Drives are kept in runs/drive_expert/COMMIT, so that an interrupted benchmark continues with the next route.
 """

@@ -1,5 +1,4 @@
-"""Closed-loop driving of NeMo, and the effect of pre-training: `foredrive bench drive-nemo`, many hours on
-two cores.
+"""Closed-loop driving of NeMo with and without pre-training: `foredrive bench drive-nemo`, many hours.
 
 DAgger demonstrations are driven in the training towns, and `nemo_drive` is trained on them. Every run drives
 the routes of Town05, as do the MLP that it starts from and constant velocity. Everything is kept in

@@ -48,8 +48,8 @@ def in_towns(name: str) -> Callable[[int], dict[str, float]]:
 
 
 def on_pandaset(name: str, *, pretrained: bool) -> Callable[[int], dict[str, float]]:
-    """Return an arm that trains a recipe's world model on the first frames of the real log and evaluates the
-    others.
+    """Return an arm that trains a recipe's world model on the first frames of the real log, and tests on the
+    rest.
     """
 
     def measure(seed: int) -> dict[str, float]:

@@ -1,5 +1,4 @@
-"""One training step of DriveWorld compared with one of NeMo, on the same clips: `foredrive bench
-driveworld_speed`.
+"""Time of a training step of DriveWorld and of NeMo on the same clips: `foredrive bench driveworld_speed`.
 
 Twenty seconds of Town01 are recorded first. The models take turns, so that a busy machine slows both alike;
 their ratio is one of CPU times, on a GPU of wall times. If there is a GPU, the base size is measured too.

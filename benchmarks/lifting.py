@@ -32,8 +32,8 @@ class Case(NamedTuple):
 
 
 def case(device: str) -> Case:
-    """Return the case: 20 k voxels, six cameras all around, four levels of 448×800 images, 8 heads of 8
-    points, D = 64.
+    """Return 20 k voxels, six cameras all around, four levels of 448×800 images, 8 heads of 8 points, D =
+    64.
     """
     spec = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=2.0, shape_zyx=(8, 50, 50))
     height, width, cameras, heads, points, channels = 448, 800, 6, 8, 8, 64

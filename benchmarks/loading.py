@@ -1,5 +1,4 @@
-"""Loading speed of recorded clips from disk at nemo_tiny's sizes, and growth of memory: `foredrive bench
-loading`.
+"""Loading speed of clips from disk at nemo_tiny's sizes, and growth of memory: `foredrive bench loading`.
 
 A town is recorded first, at 10 Hz as by `foredrive record`. A first pass, which is not measured, makes labels
 and shrunk images, as training does in its first epoch.
@@ -28,9 +27,7 @@ COUNTED_FROM = 0.2
 
 
 def measure(seed: int) -> dict[str, float]:
-    """Return clips per second over all clips, and the growth of memory of this process and its workers,
-    MiB.
-    """
+    """Return clips per second, and the growth of memory of this process and its workers, MiB."""
     with tempfile.TemporaryDirectory() as folder:
         log = record(TOWN, SECONDS, seed, Path(folder))
         dataset = ClipDataset([log], find_recipe("nemo_tiny").clips, Path(folder, "cache"))
@@ -84,8 +81,7 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """Return a process's memory, swapped out or not, without pages of files; shared pages count in parts,
-    MiB.
+    """Return a process's memory without pages of files, swapped out or not, MiB; shared pages count in parts.
 
     The parts make the sum over processes equal to the machine's use. Workers share the modules of the process
     that they are forked from. A worker that writes to such a page gets its own copy. That is growth, although

@@ -183,7 +183,7 @@ class Bench:
 
 
 def forward_pass() -> dict[str, float]:
-    """Measure one forward pass with its losses, without gradients, at full size; count its floating point
+    """Measure one forward pass with losses, without gradients, at full size; count floating point
     operations.
     """
     bench = Bench(FULL_M)
@@ -224,9 +224,7 @@ def forward_pass() -> dict[str, float]:
 
 
 def training_step(voxel_m: float, path: str) -> dict[str, float]:
-    """Measure training steps with the kernels ("fast") or the plain references; return nothing if memory is
-    too small.
-    """
+    """Measure training steps by the kernels ("fast") or the plain references; {} if memory is too small."""
     bench = Bench(voxel_m)
     forget_peak(DEVICE)
     try:
@@ -245,8 +243,8 @@ def measure_step(seed: int) -> dict[str, float]:
 
 
 def measure_speedup(seed: int) -> dict[str, float]:
-    """Measure training steps of both paths on the finest voxels for which the references have enough
-    memory.
+    """Measure training steps of the two paths on the finest voxels that fit into memory with the
+    references.
     """
     for voxel_m in COARSER_M:
         reference = in_a_process(__file__, "step", str(voxel_m), "reference")

@@ -188,9 +188,7 @@ def _pick(scenes: Scenes, chosen: Tensor) -> Scenes:
 
 @torch.no_grad()
 def _errors_m(model: Sighted, test: Scenes, ego_mlp: EgoMLP) -> tuple[float, float]:
-    """Return the mean distance to the driven path over all steps of all complete plans, of the planner and of
-    the MLP.
-    """
+    """Return the mean distance to the driven path of the planner and of the MLP, over all complete plans."""
     errors = []
     for chosen in torch.arange(len(test.truth)).split(64):
         batch = _pick(test, chosen)

@@ -43,9 +43,7 @@ def _folder(arm: str, seed: int) -> Path:
 
 
 def planned(pretrained: bool, share: float) -> Callable[[int], dict[str, float]]:
-    """Return an arm: the full recipe, fine-tuned on a share of the drives, with pre-training on all of them
-    or without.
-    """
+    """Return an arm: the full recipe, fine-tuned on a share of the drives, pre-trained on all or on none."""
 
     def measure(seed: int) -> dict[str, float]:
         logs, recipe = _logs(), seeded(find_recipe(RECIPE), seed)

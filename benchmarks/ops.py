@@ -23,9 +23,7 @@ RUNS = 7
 
 
 class Case(NamedTuple):
-    """One op at one size: the op and its reference as functions of the inputs that they are differentiated
-    by.
-    """
+    """One op at one size: the op and its reference as functions of their differentiable inputs."""
 
     fast: Callable[..., Tensor]
     reference: Callable[..., Tensor]

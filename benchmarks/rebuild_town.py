@@ -1,5 +1,4 @@
-"""Reconstruct a drive of a town, and evaluate it where the truth is known: off the driven lane, and after
-edits.
+"""Reconstruct a drive of a town; evaluate it off the driven lane and after edits, where the truth is known.
 
 `foredrive bench rebuild-town`. Training uses the front camera and the lidar of every second frame. The scene
 is then rendered from the held-out poses, from poses beside them, and with an actor removed or moved. Each
@@ -58,8 +57,7 @@ def truth() -> TownTruth:
 
 @functools.cache
 def passed() -> int:
-    """Return the car in the lane to the right that is ahead in most evaluated frames; the ego vehicle passes
-    it.
+    """Return the car in the lane to the right that is ahead in most evaluated frames; the ego passes it.
 
     The rounding of a machine's arithmetic decides which car drives there, so that its id is not fixed.
     """
@@ -99,8 +97,8 @@ def true_views(name: str) -> list[TrueViews]:
 
 
 def rebuilt(arm: str, seed: int) -> dict[str, float]:
-    """Return the metrics of one run: "VIEWS.METRIC", and "VIEWS.changed.METRIC" for the pixels and beams that
-    an edit changes.
+    """Return the metrics of one run: "VIEWS.METRIC", and "VIEWS.changed.METRIC" where an edit changes the
+    views.
     """
     recipe = dataclasses.replace(ARMS[arm], schedule=dataclasses.replace(ARMS[arm].schedule, seed=seed))
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
@@ -129,9 +127,7 @@ def judge(run: Rebuilt, views: Sequence[TrueViews], graph: SceneGraph) -> dict[s
 
 
 def judge_changed(run: Rebuilt, name: str, graph: SceneGraph) -> dict[str, float]:
-    """Return the same metrics over the changed pixels and beams only, for the scene with and without the
-    edit.
-    """
+    """Return the same metrics over changed pixels and beams only, for the scene with and without the edit."""
     pixels, beams = [], []
     for before, after in zip(true_views("held_out"), true_views(name), strict=True):
         pixels += list(zip(after.cameras, map(changed_pixels, before.cameras, after.cameras), strict=True))

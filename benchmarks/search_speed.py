@@ -62,9 +62,7 @@ def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def drives(seed: int, number: int = 0) -> Iterator[np.ndarray]:
-    """Yield the unit vectors of drives from a number on, [DRIVE DIM] each; a seed always gives the same
-    ones.
-    """
+    """Yield the unit vectors of drives from a number on, [DRIVE DIM] each, reproducible by the seed."""
     shared = np.random.default_rng(seed)
     mean, kinds = MEAN * spectrum(shared, 1), KIND * spectrum(shared, KINDS)
     while True:
@@ -100,9 +98,7 @@ def nearest(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
 
 
 def asked(answer: Callable[[np.ndarray], np.ndarray], seed: int, truth: np.ndarray) -> dict[str, float]:
-    """Measure the time of a warm query, its slow tail (the slowest of twenty), and the recall of the nearest
-    rows.
-    """
+    """Measure the time of a warm query (median and 95th percentile) and the recall of the nearest rows."""
     took_ms, found = [], []
     every = queries(seed)
     for query in every[:5]:
@@ -214,8 +210,7 @@ def with_lancedb(seed: int) -> dict[str, float]:
 
 
 def lidar_tower(seed: int) -> dict[str, float]:
-    """Measure an untrained tower on whole sweeps, cut into the sectors of six cameras; weights do not change
-    speed.
+    """Measure an untrained tower on whole sweeps, cut into six sectors; weights do not change the speed.
 
     It runs as in an index: in parallel on every core, with one thread each.
     """

@@ -1,5 +1,4 @@
-"""Speed of set likelihoods, compared with Murty's algorithm on SciPy's assignments and with the best
-assignment.
+"""Speed of set likelihoods, compared with Murty's algorithm on SciPy and with the best assignment alone.
 
 Times are CPU times of one thread, so that other programs matter less, and the minimum of several runs:
 `foredrive bench sets-speed`.
@@ -111,7 +110,7 @@ def least_ms(run: Callable[[], object], runs: int = 9) -> float:
 
 
 def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
-    """Measure the PMB-NLL with its parts, or the MB-NLL without a background, and the width of its
+    """Measure the PMB-NLL with its parts, or the MB-NLL without a background; also the width of the
     interval.
     """
     torch.set_num_threads(1)
@@ -127,9 +126,7 @@ def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
 
 
 def k_best(seed: int) -> dict[str, float]:
-    """Measure the K best assignments, ungated, by our kernel and by Murty's algorithm on SciPy; they must
-    agree.
-    """
+    """Measure the K best assignments, ungated, by our kernel and by Murty on SciPy; they must agree."""
     figures = {}
     for size in ("100x50", "900x200"):
         cost, free = costs(size, seed)
@@ -160,9 +157,7 @@ def with_background(cost: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def murty_on_scipy(cost: np.ndarray, free: np.ndarray, k: int) -> np.ndarray:
-    """Return the costs of the k best assignments by Murty's partition; each subproblem is solved from
-    scratch.
-    """
+    """Return the costs of the k best assignments by Murty's partition; solve each subproblem from scratch."""
     whole = with_background(cost, free)
     count = itertools.count()
 

@@ -1,5 +1,4 @@
-"""The same as sets-training on a real log, PandaSet 002: training on its first frames, testing on its last
-ones.
+"""The same as sets-training on a real log, PandaSet 002: the first frames train, the last ones test.
 
 The log lasts 5.5 s: training and testing have the same street and mostly the same objects. It shows whether
 the head and its losses work on a real Pandar64 and real boxes, not how they generalise. `foredrive bench

@@ -192,9 +192,7 @@ def textbook(packed: Any, feature: Any, splat: Any, first: Any, place: Any, inde
 
 
 def _textbook(view: View) -> dict[str, float]:
-    """Measure compositing alone on one thread, on our lists; and our path on one thread, including the
-    lists.
-    """
+    """Measure compositing alone on one thread, on our lists; and our path on one thread, with the lists."""
     with torch.no_grad():
         splats, points = view.project(view.gaussians), view.points
         seen = composite_splats(splats, points, median=False)

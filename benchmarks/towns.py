@@ -70,9 +70,7 @@ def sensors(seed: int) -> dict[str, float]:
 
 
 def disk(seed: int) -> dict[str, float]:
-    """Measure key frames per second into a log with everything that `foredrive record` writes, and the start
-    time.
-    """
+    """Measure key frames per second into a log with all labels of `foredrive record`, and the start time."""
     _record(seed, 1)  # compiles
     took_s = {frames: _record(seed, frames) for frames in (FRAMES // 4, FRAMES)}
     write_hz = (FRAMES - FRAMES // 4) / (took_s[FRAMES] - took_s[FRAMES // 4])

@@ -25,9 +25,7 @@ CHUNK_S = 900.0
 
 
 def measure(seed: int, town: str, hours: float = HOURS) -> Mapping[str, float]:
-    """Return violations, lane changes and kilometres of the expert per simulated hour, and the time of a
-    step, ms.
-    """
+    """Return violations, lane changes and kilometres of the expert per simulated hour, and ms per step."""
     town_map = load_town_map(town)
     found: dict[str, float] = {}
     seconds, changes, driven_m, speeds, took_s = 0.0, 0, 0.0, [], []

@@ -100,7 +100,7 @@ def hits_volume(sweep: LidarSweep, spec: VoxelSpec) -> Float[Tensor, "1 Z Y X"]:
 
 
 def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
-    """Return the objects of one clip at now: of a known class, inside the volume's ground area, and hit by
+    """Return the objects of one clip at now: of a known class, over the volume's ground area, hit by
     lidar.
     """
     sweep, boxes = clip.sweeps[clip.now], clip.boxes[clip.now]
@@ -115,9 +115,7 @@ def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
 
 
 def unexplained(spec: VoxelSpec) -> UniformPoisson:
-    """Return a prior of one undetected object per frame, uniform over classes and the volume's ground
-    area.
-    """
+    """Return a prior of one undetected object per frame, uniform over classes and the ground area."""
     lower, upper = _ground(spec)
     rest = torch.tensor([HALF_HEIGHT_M, *[LARGEST_LOG_SIZE] * 3])
     rate = torch.full((len(CLASSES),), 1 / len(CLASSES))
@@ -128,9 +126,7 @@ def unexplained(spec: VoxelSpec) -> UniformPoisson:
 def judge(
     detected: Sequence[MultiBernoulli], samples: Sequence[DetectionSample], spec: VoxelSpec
 ) -> dict[str, float]:
-    """Return the metrics of `foredrive score` for detections: likelihood, its parts, mAP, calibration; NaN
-    for none.
-    """
+    """Return the metrics of `foredrive score`: likelihood, its parts, mAP, calibration; NaN for none."""
     region = unexplained(spec)
     frames = [
         Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())

@@ -20,8 +20,7 @@ BATCH = 4
 def forecasting(
     recipe: Recipe, part_s: tuple[float, float], stride_s: float, future_frames: int | None = None
 ) -> Recipe:
-    """Return a recipe that fine-tunes only the world model, with the losses of pre-training, on a part of
-    each log.
+    """Return a recipe that trains only the world model, with the losses of pre-training, on parts of logs.
 
     Args:
         part_s: see `ClipConfig`.
@@ -41,8 +40,7 @@ def forecasting(
 
 
 def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float]) -> dict[str, float]:
-    """Evaluate occupancy and flow of another part of logs, now and at each imagined frame, beside
-    persistence.
+    """Evaluate occupancy and flow of another part of logs, now and later, beside persistence.
 
     Raises:
         InputError: there is nothing to evaluate.

@@ -17,9 +17,7 @@ from torch import Tensor
 
 
 def in_a_process(program: str, *arguments: str) -> dict[str, float]:
-    """Run `program`, a Python file that prints metrics as JSON, and return them. Numba compiles again
-    there.
-    """
+    """Run `program`, a Python file that prints metrics as JSON; return them. Numba compiles again there."""
     with tempfile.TemporaryDirectory() as empty_cache:
         done = subprocess.run(
             [sys.executable, program, *arguments],

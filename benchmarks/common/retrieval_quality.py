@@ -83,8 +83,7 @@ def questions() -> list[Question]:
 
 
 def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
-    """Return P@K by modality, then by "pool.kind.p_at_K"; bounds of its 95 % interval end in "_low" and
-    "_high".
+    """Return P@K by modality under "pool.kind.p_at_K", and its 95 % interval under "..._low" and "..._high".
 
     Pools are the drives of one weather, and all drives. Kinds are those of `Question`, and all queries. The
     interval resamples drives. "_above_image" is the difference to the image tower, over the same resampled

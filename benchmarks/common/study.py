@@ -1,6 +1,4 @@
-"""Studies: arms that differ in one thing, trained on the same recorded towns and evaluated in a held-out
-town.
-"""
+"""Studies: arms that differ in one thing, trained on the same towns and evaluated in a held-out town."""
 
 import dataclasses
 import os
@@ -52,9 +50,7 @@ class StudyLogs:
 
 
 def work_folder(root: Path) -> Path:
-    """Return the folder for drives, labels and runs of a study with the present commit; a study continues
-    there.
-    """
+    """Return the folder of a study with the present commit, where it also continues after an interruption."""
     return root / str(collect_provenance()["commit"] or "no_commit")
 
 
@@ -77,8 +73,7 @@ def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
 
 
 def pandaset_log(root: Path) -> LogPath:
-    """Return the first log of the raw PandaSet in FOREDRIVE_REAL_DATA; convert it into `root` if it is not
-    there.
+    """Return the first log of the raw PandaSet in FOREDRIVE_REAL_DATA; convert it into `root` if necessary.
 
     Raises:
         InputError: there is no raw PandaSet here.
@@ -130,9 +125,7 @@ def shortened(recipe: Recipe) -> Recipe:
 
 
 def occupancy_alone(recipe: NemoRecipe) -> NemoRecipe:
-    """Return a recipe of one stage that learns only the present occupancy, for as many steps as pre-
-    training.
-    """
+    """Return a recipe of one stage that learns only the present occupancy, as long as pre-training."""
     stage = recipe.pretrain
     assert stage is not None
     weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
@@ -165,9 +158,7 @@ def run_arm(
 
 
 def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Return the metrics that a study keeps of a summary; planning metrics mean nothing for a recipe without
-    planning.
-    """
+    """Return the metrics that a study keeps; planning metrics mean nothing for a recipe without planning."""
     headline = f"planning.{HEADLINE}"
     kept = {
         "occupancy_iou": "occupancy.above_ground.iou_now",

@@ -121,9 +121,7 @@ def _give_up(reason: str) -> int:
 
 
 def _last_words(error: BaseException) -> str:
-    """Return an error's message. An error of a worker process has a traceback as text: return its last
-    line.
-    """
+    """Return an error's message; if it contains the traceback of a worker process, only the last line."""
     lines = str(error).strip().splitlines()
     if lines and lines[0].startswith("Caught "):
         return lines[-1].partition(": ")[2]

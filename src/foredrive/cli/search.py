@@ -58,8 +58,7 @@ def search(
 
 
 def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhost", port: int = 8090) -> None:
-    """Search in the browser: a grid of hits, conditions, and a map of all scenes in which you can select
-    some.
+    """Search in the browser: a grid of hits, conditions, and a map of all scenes with a lasso.
 
     Args:
         index: The index: a folder, or a location in object storage.

@@ -1,6 +1,4 @@
-"""Options of `foredrive search`, in groups: what to find, among which moments, which hits, and what to do
-with them.
-"""
+"""Options of `foredrive search`, in groups: the query, the moments, the ranking, and the use of the hits."""
 
 from dataclasses import dataclass
 from pathlib import Path

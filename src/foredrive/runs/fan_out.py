@@ -38,8 +38,7 @@ R = TypeVar("R")
 def fan_out(
     jobs: Sequence[J], work: Callable[[J], R], workers: int, *, on_ray: bool = False
 ) -> Generator[tuple[J, R | BaseException], None, None]:
-    """Yield each job when it ends, with its result or its error. At most as many jobs are submitted as run at
-    a time.
+    """Yield each job when it ends, with its result or its error; submit only as many jobs as run at a time.
 
     Close the generator to stop early (`contextlib.closing`).
 
@@ -79,9 +78,7 @@ def reason(name: str, error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
-    """Run jobs in worker processes; start new ones after a worker has died. At the end the workers have
-    removed their unfinished files.
-    """
+    """Run jobs in worker processes, which remove their unfinished files at the end; replace a dead worker."""
     start_fork_server(preload=_module_of(work))
     context = multiprocessing.get_context("forkserver")
     stop, alive = context.Pipe(duplex=False)  # an event would wait for ever for a dead process

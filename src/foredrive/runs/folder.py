@@ -1,6 +1,4 @@
-"""Run folders: one process writes at a time, the same request continues an interrupted run, the commit is
-noted.
-"""
+"""Run folders: one process writes at a time, an interrupted run continues, and the commit is noted."""
 
 import contextlib
 import json
@@ -27,7 +25,7 @@ CONFIG, LOGS, LOG, WEIGHTS, SUMMARY = (
 RECIPE = "recipe.json"
 """File of retrieval towers: the recipe and the logs."""
 SUITE, DRIVES = "suite.json", "drives"
-"""Of suites of drives: the file of the suite, and the folder with a file for each drive."""
+"""Files of a suite of drives: the suite's file, and the folder with a file for each drive."""
 MADE_BY = "made_by.json"
 """File that notes the commit with which a run began."""
 LOCK = ".lock"
@@ -35,9 +33,7 @@ LOCK = ".lock"
 leaves the folder free.
 """
 _RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")
-"""Environment variables that tell apart processes that train together; the first process holds the lock for
-all.
-"""
+"""Variables that number processes that train together; the first process holds the lock for all."""
 _log = logging.getLogger(__name__)
 
 

@@ -23,8 +23,7 @@ MOVING_MPS = 0.5  # slower boxes get no arrow
 
 
 def draw_bev(ax: Axes, clip: Clip, reach_m: float, plan: Trajectory | None = None) -> None:
-    """Draw the contents of a clip's present frame: map, lidar, boxes, the driven future and, if given, a
-    plan.
+    """Draw a clip's present frame: map, lidar, boxes, the driven future and, if given, a plan.
 
     Args:
         ax: axes to draw in; the function sets their limits, ticks and colours.

@@ -1,6 +1,4 @@
-"""One sheet with many drives: a few images of the front camera and the path through the town for each
-drive.
-"""
+"""A sheet of many drives: a few images of the front camera and the path through the town for each."""
 
 from collections import Counter
 from collections.abc import Sequence

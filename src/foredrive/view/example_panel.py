@@ -94,9 +94,7 @@ def show_panel(panel: ExamplePanel) -> ShownPanel:
 
 
 def front_camera(clip: Clip) -> int | None:
-    """Return the index of the camera with an image at now that points most straight ahead; None: there is
-    none.
-    """
+    """Return the camera with an image at now that points most straight ahead; None: there is none."""
     ahead = clip.rig.T_ego_cam[clip.now, :, 0, 2].masked_fill(~clip.image_valid[clip.now], -torch.inf)
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
@@ -201,9 +199,7 @@ def _above(panel: ExamplePanel) -> list[Picture]:
 
 
 def _how_much(panel: ExamplePanel, step: int) -> str:
-    """Return the end of a caption that tells whether any voxel is occupied: without any, the picture is
-    black.
-    """
+    """Return the end of a caption, which says whether any voxel is occupied; the picture is black without."""
     return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
 
 

@@ -163,8 +163,7 @@ def _projected_lines(segments_cam: Float[Tensor, "S 2 3"], camera: Camera) -> li
 def _clip_to_view(
     segments_cam: Float[Tensor, "S 2 3"], camera: Camera
 ) -> tuple[Float[Tensor, "S 2 3"], Tensor]:
-    """Cut segments at the near plane and at the sides of the viewing frustum; also return a mask of those
-    left.
+    """Cut segments at the near plane and the sides of the viewing frustum; also return which are left.
 
     Segments are cut in 3-D, before the division by depth. Otherwise an edge that passes beside or behind the
     camera would run across the picture.

@@ -68,8 +68,7 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
 
 
 def camera_rows(rig: CameraRig) -> list[list[int]]:
-    """Return the camera indices in rows as around the car: cameras that look ahead above those that look
-    back.
+    """Return rows of camera indices as around the car: cameras that look ahead above those that look back.
 
     In both rows the cameras on the left of the car are on the left.
     """

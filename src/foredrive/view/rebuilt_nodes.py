@@ -1,6 +1,4 @@
-"""A reconstructed scene as nodes that the browser draws: the static background, and actors in moving
-frames.
-"""
+"""A reconstructed scene as nodes in the browser: the static background, and actors in moving frames."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,9 +21,7 @@ from foredrive.view.splat_nodes import show_splats, thinned
 ROOT = "/scene"
 """Name of the scene's frame; nodes beside it are in the ego frame at the time shown."""
 MOST_SPLATS = 400_000
-"""Maximum number of drawn splats; more are thinned out. At 32 bytes each, the browser fetches and sorts 13
-MB.
-"""
+"""Maximum number of drawn splats; more are thinned out. These are 13 MB at 32 bytes each."""
 AWAY_M = (0.0, 0.0, -1e6)
 """Position of hidden splats, m: the browser draws the splats of invisible nodes too."""
 HERE_M = (0.0, 0.0, 0.0)

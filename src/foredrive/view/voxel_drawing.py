@@ -83,9 +83,7 @@ def draw_voxels(
 
 
 def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
-    """Return colours of heights from dark (-0.5 m above the ego ground) to bright (4 m), the same in every
-    picture.
-    """
+    """Return fixed colours of heights, dark (-0.5 m above the ego ground) to bright (4 m)."""
     z = spec.lower_m[2] + (np.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
     rgb = palette.HEIGHT_MAP(0.12 + 0.88 * np.clip((z + 0.5) / 4.5, 0, 1))[:, :3]
     return np.broadcast_to((rgb * 255).astype(np.uint8)[:, None, None], (*spec.shape_zyx, 3))

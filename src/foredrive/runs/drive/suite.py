@@ -69,12 +69,12 @@ class Source(Protocol):
 
     @property
     def in_turn(self) -> bool:
-        """Whether drives run one after another in this process, because they share a large object."""
+        """Return whether drives run one after another in this process, because they share a large object."""
         ...
 
     @property
     def grows(self) -> tuple[str, ...]:
-        """Names of the fields that a later call may change in the same folder."""
+        """Return the names of the fields that a later call may change in the same folder."""
         ...
 
     def noted(self) -> Mapping[str, object]:

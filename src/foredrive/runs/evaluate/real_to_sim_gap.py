@@ -1,6 +1,4 @@
-"""The real-to-sim gap: the predictions of a trained run on real images and on rendered images of the same
-times.
-"""
+"""The real-to-sim gap: predictions of a trained run on real and on rendered images of the same times."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -45,8 +43,7 @@ _SAME_S = 1e-3
 def measure_gap(
     run: Run, rebuilt: Path, out: Path, on_items: Callable[[int, int], None] = lambda done, of: None
 ) -> Figures:
-    """Compare a model's predictions on real and on rendered images at the held-out times of a reconstructed
-    log.
+    """Compare predictions on real and on rendered images at the held-out times of a reconstructed log.
 
     Write `out/gap.json` with three groups of metrics of `evaluate`: real images against the labels
     (`real.…`), rendered images against the labels (`rendered.…`), and rendered images against the predictions

@@ -91,9 +91,7 @@ def _whose_images(
     sweeps: Sequence[SweepView],
     tracks: Tracks,
 ) -> str | None:
-    """Return the camera whose pose fits a camera's images clearly better; None if there is none, or if the
-    own pose fits well enough.
-    """
+    """Return the camera whose pose fits a camera's images clearly better; None if there is none."""
     own = agreement(seen[name])
     if own is None or own >= _POOR:
         return None

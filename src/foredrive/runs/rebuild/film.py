@@ -1,6 +1,4 @@
-"""Render the sensors on a drive through a reconstructed log, with or without edits, one time after
-another.
-"""
+"""Render the sensors on a drive through a reconstructed log, with or without edits, time by time."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

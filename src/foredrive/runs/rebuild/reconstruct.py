@@ -123,9 +123,7 @@ def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Mater
 
 
 def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:
-    """Read a log's frames and split them into training and held-out frames; warn about missing sensors or
-    tracks.
-    """
+    """Read a log's frames and split them into training and held-out frames; warn if sensors are missing."""
     drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
     if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
         raise InputError(f"{path.folder}: neither images nor lidar sweeps, nothing to rebuild from")

@@ -27,9 +27,7 @@ PART_FRAMES = 64
 FLUSH_ROWS, FLUSH_S = 20_000, 60.0
 """Rows are written in large batches, but at least once a minute, so that a crash loses at most that."""
 COMPACT_WRITES = 100
-"""Number of writes before files are merged. The disk then holds all rows twice until old versions are
-dropped.
-"""
+"""Number of writes before files are merged. Until old versions are dropped, the disk holds all rows twice."""
 
 
 @dataclass(frozen=True)

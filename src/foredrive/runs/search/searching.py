@@ -35,8 +35,8 @@ def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool)
 
 
 def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[str, object]:
-    """Return the hits as a list of clips (`data.clip_list`), each with `before_s` and `after_s` around the
-    hit.
+    """Return the hits as a list of clips (`data.clip_list`), each from `before_s` before to `after_s`
+    after.
     """
     clips, notes = [], []
     for hit in hits:

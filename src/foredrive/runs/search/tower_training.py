@@ -70,8 +70,8 @@ def embedded_recipe(
     lidar_steps: int | None = None,
     seed: int = 0,
 ) -> TowerRecipe:
-    """Return the recipe of the towers that need no download; given steps change the length of the
-    training.
+    """Return the recipe of the towers that need no download; `image_steps` and `lidar_steps` set its
+    length.
     """
     contrast = Schedule(batch_size=64, lr=1e-3, epochs=20, weight_decay=0.05, warmup_steps=100, seed=seed)
     distil = Schedule(batch_size=32, lr=1e-3, epochs=10, weight_decay=0.05, warmup_steps=100, seed=seed)
