@@ -17,7 +17,7 @@ ROWS = [name for name in RECIPES if name.startswith("nemo_town")]
 
 
 def row(name: str) -> Callable[[int], dict[str, float]]:
-    """Return an arm that trains one recipe on all drives; rows with the same pre-training share that stage."""
+    """Return an arm that trains a recipe on all drives; rows with the same pre-training share that stage."""
 
     def measure(seed: int) -> dict[str, float]:
         logs = record_study(TOWNS, WORK / "towns", workers=2)
