@@ -1,4 +1,4 @@
-"""How far the towns' sensors are from real ones: statistics of lidar sweeps and images, side by side.
+"""Difference between the towns' sensors and real ones: statistics of lidar sweeps and images, side by side.
 
 `foredrive bench domain-gap`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset.
 """
@@ -32,9 +32,9 @@ SIZE_HW = (216, 384)
 FRAMES, SPACING_S = 10, 2.0
 VEHICLES, PEOPLE = 60, 40
 BEAMS = 64 * 1800
-"""Of a Pandar64 at 10 Hz."""
+"""Number of beams of a Pandar64 at 10 Hz."""
 BANDS_DEG = (-14.0, -6.0, 2.0)
-"""Between the Pandar64's dense channels and its sparse ones."""
+"""Elevations between the Pandar64's dense and sparse channels, degrees."""
 
 
 class Sensed(NamedTuple):
@@ -45,7 +45,7 @@ class Sensed(NamedTuple):
 
 
 def real() -> Iterator[Sensed]:
-    """Frames of the PandaSet log, spread over it."""
+    """Yield frames of the PandaSet log, spread over it."""
     source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
     if not source.is_dir():
         raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
@@ -66,7 +66,7 @@ def real() -> Iterator[Sensed]:
 
 
 def town(name: str, conditions: str, seed: int) -> Iterator[Sensed]:
-    """Frames of a drive, with a Pandar64 on the roof."""
+    """Yield frames of a drive with a Pandar64 on the roof."""
     town_map = load_town_map(name)
     world = World(town_map, seed, CONDITIONS[conditions])
     sensors = SensorSuite(camera_rig(SIZE_HW), find_lidar("pandar64"))
@@ -77,7 +77,7 @@ def town(name: str, conditions: str, seed: int) -> Iterator[Sensed]:
 
 
 def statistics(frames: Iterator[Sensed]) -> dict[str, float]:
-    """Figures over all frames."""
+    """Return the statistics over all frames."""
     lidar: list[Float[np.ndarray, "N 3"]] = []
     pictures: list[dict[str, float]] = []
     points = []

@@ -1,6 +1,6 @@
-"""What the privileged expert scores on Town05: the ceiling of every learner. `foredrive bench drive-expert`.
+"""Score the privileged expert on Town05, as the upper bound of students: `foredrive bench drive-expert`.
 
-Drives are kept in runs/drive_expert/COMMIT, so that an interrupted benchmark goes on route by route.
+Drives are kept in runs/drive_expert/COMMIT, so that an interrupted benchmark continues with the next route.
 """
 
 import functools
@@ -27,7 +27,7 @@ FIGURES = (
 
 
 def scores(seed: int, name: str) -> Mapping[str, float]:
-    """The figures of one repetition of a set of routes."""
+    """Return the metrics of one repetition of a set of routes."""
     suite = DriveSuite("expert", TownRoutes(SETS[name], seed=seed), sensors=False)
     driven = drive_suite(suite, WORK / f"{name}_seed{seed}", workers=len(os.sched_getaffinity(0)))
     if driven.broken:

@@ -1,8 +1,8 @@
-"""Does NeMo drive, and does pre-training help it to? `foredrive bench drive-nemo`, many hours on two cores.
+"""Closed-loop driving of NeMo with and without pre-training: `foredrive bench drive-nemo`, many hours.
 
-Lessons are driven in the training towns, `nemo_drive` is trained on them, and every run drives the routes of
-Town05, as do the MLP that it starts from and constant velocity. Everything is kept in runs/drive_nemo/COMMIT,
-so that an interrupted benchmark goes on drive by drive and run by run.
+DAgger demonstrations are driven in the training towns, and `nemo_drive` is trained on them. Every run drives
+the routes of Town05, as do the MLP that it starts from and constant velocity. Everything is kept in
+runs/drive_nemo/COMMIT, so that an interrupted benchmark continues with the next drive or run.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ def _lessons() -> tuple[LogPath, ...]:
 
 
 def _scores(driver: str, name: str, seed: int) -> dict[str, float]:
-    """Of the repetition of each set that the seed stands for."""
+    """Return the metrics of one repetition of each set of routes; the seed selects the repetition."""
     figures = {}
     for short, routes in JUDGED.items():
         suite = DriveSuite(driver, TownRoutes(routes, seed=seed), sensors=False)
@@ -67,7 +67,7 @@ def _scores(driver: str, name: str, seed: int) -> dict[str, float]:
 
 
 def learned(pretrained: bool) -> Callable[[int], Mapping[str, float]]:
-    """`nemo_drive`, pre-trained on the lessons or from scratch."""
+    """Return an arm of `nemo_drive`, pre-trained on the demonstrations or trained from scratch."""
 
     def measure(seed: int) -> Mapping[str, float]:
         recipe, name = seeded(find_recipe(RECIPE), seed), "pretrained" if pretrained else "scratch"
@@ -86,7 +86,7 @@ def learned(pretrained: bool) -> Callable[[int], Mapping[str, float]]:
 
 
 def ego_mlp(seed: int) -> Mapping[str, float]:
-    """The MLP that the runs start from, which sees nothing."""
+    """Score the MLP that the runs start from; it uses no sensors."""
     folder = (WORK / "runs" / f"pretrained_seed{seed}").absolute()
     if not folder.is_dir():
         learned(pretrained=True)(seed)
@@ -94,7 +94,7 @@ def ego_mlp(seed: int) -> Mapping[str, float]:
 
 
 def constant_velocity(seed: int) -> Mapping[str, float]:
-    """Straight on at 5 m/s."""
+    """Score driving straight on at 5 m/s."""
     return _scores("constant-velocity", "constant_velocity", seed)
 
 

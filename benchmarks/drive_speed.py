@@ -1,8 +1,9 @@
-"""How fast closed-loop driving is, with sensors and without, and whether its memory stays.
+"""Speed of closed-loop driving, with and without sensors, and growth of its memory.
 
 `foredrive bench drive-speed`.
 
-The expert drives Town05's long routes among 40 vehicles and 20 people; only the simulator's steps are timed.
+The expert drives Town05's long routes among 40 vehicles and 20 pedestrians; only the simulator's steps are
+timed.
 """
 
 import time
@@ -42,7 +43,7 @@ def _suite() -> SensorSuite:
 
 
 def _steps(seed: int, sensors: SensorSuite | None, seconds: float) -> Iterator[tuple[float, Clip]]:
-    """What each simulation step takes and what it shows, over one drive after another."""
+    """Yield the time of each simulation step, s, and its observation, over one drive after another."""
     simulator, left_s = TownSimulator(), seconds
     for waypoints in cycle(load_route_set(ROUTES)):
         route = snap_route(waypoints)
@@ -64,7 +65,7 @@ def _steps(seed: int, sensors: SensorSuite | None, seconds: float) -> Iterator[t
 
 
 def sensors(seed: int) -> Mapping[str, float]:
-    """Key frames a second, everything between them included; and what a plan of nemo_tiny takes."""
+    """Return key frames per second, with all steps between them, and the planning time of nemo_tiny."""
     took, clip = 0.0, None
     for step_s, seen in _steps(seed, _suite(), SECONDS):
         took, clip = took + step_s, seen
@@ -84,13 +85,13 @@ def sensors(seed: int) -> Mapping[str, float]:
 
 
 def bare(seed: int) -> Mapping[str, float]:
-    """How much faster than life the simulator is without sensors."""
+    """Return the speed of the simulator without sensors relative to real time."""
     took = sum(step_s for step_s, _ in _steps(seed, None, SECONDS))
     return {"bare_realtime_factor": SECONDS / took, "step_ms": 1000 * took * STEP_S / SECONDS}
 
 
 def hour(seed: int) -> Mapping[str, float]:
-    """Growth of memory over an hour of driving with sensors, after the first minutes."""
+    """Return the growth of memory over an hour of driving with sensors, after the first minutes, MiB."""
     t_s, before, most = 0.0, 0.0, 0.0
     for _ in _steps(seed, _suite(), HOUR_S):
         t_s += STEP_S

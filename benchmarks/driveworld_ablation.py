@@ -1,9 +1,8 @@
-"""The rows of DriveWorld's Tables 1 and 2 at the size of towns, beside NeMo: hours of
-`foredrive bench driveworld_ablation`.
+"""The rows of DriveWorld's Tables 1 and 2 at the scale of towns, beside NeMo.
 
-Drives, cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretraining. Both world models
-see the same drives, for as many steps: fewer than their recipes have, and in bfloat16, so that a run takes a
-quarter of an hour on one core.
+`foredrive bench driveworld_ablation` takes hours. Drives, cache and runs are kept in runs/nemo_study/COMMIT,
+beside those of nemo_pretraining. Both world models are trained on the same drives for equally many steps. The
+steps are fewer than in their recipes, and in bfloat16, so that a run takes a quarter of an hour on one core.
 """
 
 import dataclasses
@@ -30,7 +29,7 @@ ARMS = {name: shortened(RECIPES[name]) for name in RECIPES if name.startswith(FU
 
 
 def row(name: str) -> Callable[[int], dict[str, float]]:
-    """One recipe, both stages on all drives."""
+    """Return an arm that trains one recipe, both stages on all drives."""
 
     def measure(seed: int) -> dict[str, float]:
         return _arm(name, seed, _logs())
@@ -39,7 +38,7 @@ def row(name: str) -> Callable[[int], dict[str, float]]:
 
 
 def pretrained_on(share: float) -> Callable[[int], dict[str, float]]:
-    """The full recipe, pre-trained on a share of the drives and fine-tuned on all."""
+    """Return an arm: the full recipe, pre-trained on a share of the drives and fine-tuned on all."""
 
     def measure(seed: int) -> dict[str, float]:
         logs, first = _logs(), f"{FULL}_first_{100 * share:.0f}pct"
@@ -50,7 +49,7 @@ def pretrained_on(share: float) -> Callable[[int], dict[str, float]]:
 
 
 def finetuned_on(share: float) -> Callable[[int], dict[str, float]]:
-    """The full recipe, pre-trained on all drives and fine-tuned on a share of them."""
+    """Return an arm: the full recipe, pre-trained on all drives and fine-tuned on a share of them."""
 
     def measure(seed: int) -> dict[str, float]:
         logs = _logs()

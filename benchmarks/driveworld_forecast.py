@@ -1,4 +1,4 @@
-"""Occupancy forecast against copies of the present, in towns and on a real log.
+"""Occupancy forecasts compared with persistence, in towns and on a real log.
 
 `foredrive bench driveworld_forecast`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Drives,
 cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretraining and driveworld_ablation.
@@ -26,16 +26,18 @@ WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()
 DRIVEWORLD, CARRIED, NEMO = "driveworld_town", "driveworld_town_carried", "nemo_town"
 RECIPE = {name: shortened(RECIPES[name]) for name in (DRIVEWORLD, CARRIED, NEMO)}
-"""As driveworld_ablation trains them, whose runs are taken where they lie."""
+"""Recipes as in driveworld_ablation, so that its runs are used again."""
 LEARNED_S, STRIDE_S = 3.95, 0.1
-"""The first 40 frames of a log of 10 Hz, and every frame as a now."""
+"""End of the training part, s (the first 40 frames of a log at 10 Hz), and time between nows, s (every
+frame).
+"""
 FRAMES = 2
-"""1 s is imagined there: of the 56 frames no clip of 2 s begins after the first 40."""
+"""Number of imagined frames, 1 s: the log has 56 frames, and no clip of 2 s begins after the first 40."""
 WHOLE_S = 1e6
 
 
 def in_towns(name: str) -> Callable[[int], dict[str, float]]:
-    """A recipe as it is, on the drives of Town05."""
+    """Return an arm that evaluates an unchanged recipe on the drives of Town05."""
 
     def measure(seed: int) -> dict[str, float]:
         logs = record_study(TOWNS, WORK / "towns", workers=2)
@@ -46,7 +48,9 @@ def in_towns(name: str) -> Callable[[int], dict[str, float]]:
 
 
 def on_pandaset(name: str, *, pretrained: bool) -> Callable[[int], dict[str, float]]:
-    """A recipe's world model, learned from the first frames of the real log and judged on the others."""
+    """Return an arm that trains a recipe's world model on the first frames of the real log, and tests on the
+    rest.
+    """
 
     def measure(seed: int) -> dict[str, float]:
         log, recipe = pandaset_log(WORK / "pandaset"), seeded(RECIPE[name], seed)

@@ -1,4 +1,4 @@
-"""Whether five times as many steps of pre-training make DriveWorld's futures better than copies of now.
+"""Test whether five times as many steps of pre-training make DriveWorld's futures better than persistence.
 
 `foredrive bench driveworld_longer`. Drives, cache and runs are kept in runs/nemo_study/COMMIT, beside those
 of driveworld_ablation, whose recipes take 300 steps.
@@ -22,7 +22,7 @@ STEPS = 1500
 
 
 def longer(name: str) -> Recipe:
-    """Pre-training alone, with more steps of the same schedule."""
+    """Return a recipe of pre-training alone, with more steps of the same schedule."""
     short = shortened(RECIPES[name])
     stage = short.pretrain
     assert stage is not None

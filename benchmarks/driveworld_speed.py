@@ -1,8 +1,7 @@
-"""One training step of DriveWorld beside one of NeMo, on the same clips: `foredrive bench driveworld_speed`.
+"""Time of a training step of DriveWorld and of NeMo on the same clips: `foredrive bench driveworld_speed`.
 
-Twenty seconds of Town01 are recorded first. Steps are taken in turns, so that a busy machine slows both
-alike; their ratio is that of the time that computing took. Where there is a GPU, the base size is measured
-too.
+Twenty seconds of Town01 are recorded first. The models take turns, so that a busy machine slows both alike;
+their ratio is one of CPU times, on a GPU of wall times. If there is a GPU, the base size is measured too.
 """
 
 import dataclasses
@@ -31,7 +30,7 @@ STAGES = ("pretrain", "finetune")
 
 
 class Stepper:
-    """A recipe's stage with its optimizer and one batch, ready to be stepped."""
+    """A recipe's stage with its optimizer and one batch, ready for training steps."""
 
     def __init__(self, recipe: Recipe, stage_name: str, folder: Path, seed: int) -> None:
         stage = recipe.pretrain if stage_name == "pretrain" else recipe.finetune
@@ -49,7 +48,7 @@ class Stepper:
         self.objective, self.optimizer = self.fabric.setup(objective, optimizer)
 
     def step(self) -> None:
-        """As `training.train` does it."""
+        """Do one step as `training.train` does."""
         loss = self.objective(self.example, torch.Generator().manual_seed(0))["loss"]
         self.optimizer.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
@@ -58,7 +57,7 @@ class Stepper:
 
 
 def beside(name: str, nemo: str) -> Callable[[int], dict[str, float]]:
-    """A DriveWorld's steps and a NeMo's, in turns."""
+    """Return an arm that measures steps of a DriveWorld and of a NeMo in turns."""
 
     def run(seed: int) -> dict[str, float]:
         figures: dict[str, float] = {}
@@ -80,7 +79,7 @@ def beside(name: str, nemo: str) -> Callable[[int], dict[str, float]]:
 
 
 def _figures(stage: str, took: dict[str, list[Took]]) -> dict[str, float]:
-    """Medians without the first turn; ratios by computing on a CPU, by the clock on a GPU."""
+    """Return medians without the first turn, and ratios of CPU times on a CPU, of wall times on a GPU."""
     figures = {}
     for model, turns in took.items():
         for kind in ("wall_s", "cpu_s"):

@@ -1,10 +1,10 @@
 """Record the towns that `learning` trains and tests on: `python benchmarks/learning_towns.py --out FOLDER`.
 
-252 drives of a minute over the seven training towns at 2 Hz (about three CPU hours, 11 GB), and six through
-Town05. Drives that lie there whole are skipped, so that the command can be interrupted and started again.
+252 drives of a minute over the seven training towns at 2 Hz (about three CPU hours, 11 GB), and six drives
+through Town05. Complete drives are skipped, so that an interrupted command can be started again.
 
-Every other drive is in bright daylight, the others under all conditions in turn. Two drives in three vary the
-camera rig: mounts, heights, directions and fields of view. The drives for testing keep the nominal rig.
+Every other drive is in bright daylight; the others take all conditions in turn. Two drives in three vary the
+camera rig: mounts, heights, directions and fields of view. The test drives keep the nominal rig.
 """
 
 import argparse
@@ -32,11 +32,13 @@ TRAIN_SEEDS, TEST_SEEDS = tuple(range(1, 37)), tuple(range(1, 7))
 SECONDS, RATE_HZ, IMAGE_HW = 60.0, 2.0, (144, 256)
 VEHICLES, PEOPLE = (15, 60), (10, 40)
 SHIFT_M, RAISE_M, TURN_DEG, TILT_DEG, ZOOM = 0.2, 0.3, 6.0, 2.0, 1.2
-"""At most: one camera's shift, the height all of them are raised by, one camera's turn, tilt and zoom."""
+"""Maximum changes: shift of one camera (m), height of all cameras (m), rotation and tilt of one camera
+(degrees), and zoom.
+"""
 
 
 def plan_learning() -> list[DrivePlan]:
-    """Return the drives for testing, then those for training by seed and then by town."""
+    """Return the test drives, then the training drives by seed and then by town."""
     test = plan_drives(Campaign(TEST_TOWNS, TEST_SEEDS, seconds=SECONDS, rate_hz=RATE_HZ))
     train = []
     for conditions, seeds in (((), TRAIN_SEEDS[1::2]), ((ANY_CONDITIONS,), TRAIN_SEEDS[::2])):
@@ -47,7 +49,7 @@ def plan_learning() -> list[DrivePlan]:
 
 
 def rig_of(plan: DrivePlan) -> CameraRig:
-    """Return the nominal rig for testing and every third seed, else one drawn from town and seed."""
+    """Return the nominal rig for testing and every third seed, otherwise a rig drawn from town and seed."""
     nominal = camera_rig(IMAGE_HW)
     if plan.town in TEST_TOWNS or plan.seed % 3 == 0:
         return nominal

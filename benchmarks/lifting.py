@@ -1,6 +1,6 @@
-"""How fast lifting is and how much memory it takes, beside plain PyTorch: `foredrive bench lifting`.
+"""Speed and memory of lifting, compared with plain PyTorch: `foredrive bench lifting`.
 
-On the CPU (numba) and, where there is one, on a GPU (Triton); each path runs in a process of its own.
+It runs on the CPU (numba) and, if there is one, on a GPU (Triton); each path runs in its own process.
 """
 
 import json
@@ -24,7 +24,7 @@ RUNS = 7
 
 
 class Case(NamedTuple):
-    """The op and its reference as functions of what they are differentiated by."""
+    """The op and its reference as functions of the inputs that they are differentiated by."""
 
     fast: Callable[..., Tensor]
     reference: Callable[..., Tensor]
@@ -32,7 +32,9 @@ class Case(NamedTuple):
 
 
 def case(device: str) -> Case:
-    """20 k voxels, six cameras all around, four levels of 448×800 images, 8 heads of 8 points, D = 64."""
+    """Return 20 k voxels, six cameras all around, four levels of 448×800 images, 8 heads of 8 points, D =
+    64.
+    """
     spec = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=2.0, shape_zyx=(8, 50, 50))
     height, width, cameras, heads, points, channels = 448, 800, 6, 8, 8, 64
     T_ego_cam = matrix_from_yaw(torch.arange(cameras) * (2 * math.pi / cameras), torch.zeros(cameras, 3))
@@ -58,7 +60,7 @@ def case(device: str) -> Case:
 
 
 def measure(device: str) -> dict[str, float]:
-    """Both paths' figures, and their ratios."""
+    """Return the metrics of both paths and their ratios."""
     fast, reference = (in_a_process(__file__, device, path) for path in ("fast", "reference"))
     return {"threads": torch.get_num_threads()} | compare(fast, reference)
 
@@ -75,7 +77,7 @@ def _measure_here(device: str, path: str) -> dict[str, float]:
 
 
 def _compile(device: str) -> None:
-    """Call the kernels on next to nothing."""
+    """Call the kernels on tiny inputs, so that they compile."""
     one = torch.ones(1, 1, 1, 1, 1, device=device, requires_grad=True)
     seen = torch.ones(1, 1, 1, dtype=torch.bool, device=device)
     offsets = torch.ones(1, 1, 1, 1, 1, 2, device=device)

@@ -1,7 +1,7 @@
-"""How fast clips of recorded towns come from disk at nemo_tiny's sizes, and whether memory stays flat.
+"""Loading speed of clips from disk at nemo_tiny's sizes, and growth of memory: `foredrive bench loading`.
 
-A town is recorded first, at 10 Hz as `foredrive record` does it; labels and shrunk images are then made on a
-first pass that is not counted, as training makes them in its first epoch: `foredrive bench loading`.
+A town is recorded first, at 10 Hz as by `foredrive record`. A first pass, which is not measured, makes labels
+and shrunk images, as training does in its first epoch.
 """
 
 import itertools
@@ -23,11 +23,11 @@ from foredrive.training.interrupts import start_fork_server
 TOWN, SECONDS = "Town02", 30.0
 WORKERS, BATCH_SIZE, CLIPS = 2, 4, 5000
 COUNTED_FROM = 0.2
-"""Memory is compared from this share of the clips on: before, caches of the libraries fill."""
+"""Share of the clips after which memory is compared; before it, caches of the libraries fill."""
 
 
 def measure(seed: int) -> dict[str, float]:
-    """Clips per second over all clips; growth of what this process and its workers hold, MiB."""
+    """Return clips per second, and the growth of memory of this process and its workers, MiB."""
     with tempfile.TemporaryDirectory() as folder:
         log = record(TOWN, SECONDS, seed, Path(folder))
         dataset = ClipDataset([log], find_recipe("nemo_tiny").clips, Path(folder, "cache"))
@@ -50,7 +50,7 @@ def measure(seed: int) -> dict[str, float]:
 
 
 def _batches(dataset: ClipDataset) -> Iterator[Example]:
-    """Epoch after epoch from the same workers."""
+    """Yield batches, epoch after epoch, from the same workers."""
     start_fork_server(preload=type(dataset).__module__)
     loader = DataLoader(
         dataset,
@@ -66,12 +66,12 @@ def _batches(dataset: ClipDataset) -> Iterator[Example]:
 
 
 def _memory_mib() -> float:
-    """Memory of this process and all below it."""
+    """Return the memory of this process and all its descendants, MiB."""
     parents = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = status.read_text().rpartition(")")[2].split()
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         parents[int(status.parent.name)] = int(fields[1])
     family = {os.getpid()}
@@ -81,11 +81,11 @@ def _memory_mib() -> float:
 
 
 def _resident_mib(pid: int) -> float:
-    """What a process holds, swapped out or not, files' pages aside; shared pages count in parts.
+    """Return a process's memory without pages of files, swapped out or not, MiB; shared pages count in parts.
 
-    In parts, so that the sum over processes is what the machine holds. Workers are born with the modules of
-    the process that they are forked from. Where one writes to such a page it gets a copy of its own: that is
-    growth, though each process by itself holds as much as before (its RssAnon does not change).
+    The parts make the sum over processes equal to the machine's use. Workers share the modules of the process
+    that they are forked from. A worker that writes to such a page gets its own copy. That is growth, although
+    the memory of each single process (RssAnon) does not change.
     """
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()

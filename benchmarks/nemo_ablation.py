@@ -1,4 +1,4 @@
-"""The rows of NeMo's Tables 1 and 3 at the size of towns: hours of `foredrive bench nemo_ablation`.
+"""The rows of NeMo's Tables 1 and 3 at the scale of towns: `foredrive bench nemo_ablation` takes hours.
 
 Drives, cache and runs are kept in runs/nemo_study/COMMIT, beside those of nemo_pretraining.
 """
@@ -17,7 +17,7 @@ ROWS = [name for name in RECIPES if name.startswith("nemo_town")]
 
 
 def row(name: str) -> Callable[[int], dict[str, float]]:
-    """One recipe, both stages on all drives; rows that are pre-trained alike share that stage."""
+    """Return an arm that trains a recipe on all drives; rows with the same pre-training share that stage."""
 
     def measure(seed: int) -> dict[str, float]:
         logs = record_study(TOWNS, WORK / "towns", workers=2)
@@ -32,7 +32,7 @@ def row(name: str) -> Callable[[int], dict[str, float]]:
 
 
 def _alike(name: str) -> str:
-    """The first row with the same pre-training of the same world model."""
+    """Return the first row with the same pre-training of the same world model."""
 
     def world(row: str) -> tuple[object, ...]:
         return RECIPES[row].pretrain, RECIPES[row].model, RECIPES[row].clips

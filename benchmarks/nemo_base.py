@@ -1,8 +1,8 @@
-"""What nemo_base costs at full size, on a made-up clip: `foredrive bench nemo-base`.
+"""Cost of nemo_base at full size, on a synthetic clip: `foredrive bench nemo-base`.
 
-Six cameras of 448×800, two frames seen and three imagined, 200×200×16 voxels, batch 1, in the second stage of
-training, but for the perceptual loss, whose weights are not everywhere. On a GPU where there is one;
-elsewhere a training step is measured on coarser voxels only.
+The clip has six cameras of 448×800, two observed and three imagined frames, 200×200×16 voxels, batch 1. The
+benchmark runs the second stage of training, without the perceptual loss, whose weights are not always
+installed. It uses a GPU if there is one; without a GPU it measures a training step only on coarser voxels.
 """
 
 import dataclasses
@@ -33,14 +33,14 @@ from foredrive.training import make_fabric
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 STEPS = 5 if DEVICE == "cuda" else 1
-"""Timed."""
+"""Number of timed steps."""
 FULL_M, COARSER_M = 0.5, {"cuda": (0.5, 1.0, 2.0), "cpu": (2.0,)}[DEVICE]
-"""Size of a voxel; those at which the plain references may have enough memory."""
+"""Voxel size, m, and the voxel sizes for which the plain references may have enough memory."""
 CAMERAS, FIELD_OF_VIEW_DEG, CAMERA_HEIGHT_M = 6, 74.0, 1.6
 
 
 def made_up(recipe: Recipe) -> Example:
-    """Noise at the recipe's sizes: cameras that look all around, no lidar, nothing annotated."""
+    """Return noise at the recipe's sizes: cameras that look all around, no lidar, no annotations."""
     clips, rng = recipe.clips, torch.Generator().manual_seed(0)
     frames, (height, width) = clips.past_frames + 1 + clips.future_frames, clips.image_hw
     shape, steps = (1, frames), clips.horizon_steps
@@ -109,7 +109,7 @@ def _rig(frames: int, height: int, width: int) -> CameraRig:
 
 
 def recipe_at(voxel_m: float) -> Recipe:
-    """nemo_base with voxels of this size and no perceptual loss."""
+    """Return nemo_base with voxels of this size and without the perceptual loss."""
     recipe = find_recipe("nemo_base")
     spec = recipe.clips.voxels
     shape_zyx = tuple(round(n * spec.voxel_m / voxel_m) for n in spec.shape_zyx)
@@ -121,7 +121,7 @@ def recipe_at(voxel_m: float) -> Recipe:
 
 @contextmanager
 def kernels_as(change: Callable[[str, Callable[..., Tensor]], Callable[..., Tensor]]) -> Iterator[None]:
-    """The model with every kernel `op` replaced by change(name, op)."""
+    """Replace every kernel `op` of the model by change(name, op) within the context."""
     places = [(lifting, "lift"), (lifting, "attend_volume"), (rendering, "attend_volume")]
     places += [(rendering, "sample_volume"), (volume, "sample_volume")]
     kept = [getattr(module, name) for module, name in places]
@@ -142,7 +142,7 @@ REFERENCES = {
 
 
 class Bench:
-    """An objective, its optimizer and an example, ready to be stepped."""
+    """An objective, its optimizer and an example, ready for training steps."""
 
     def __init__(self, voxel_m: float) -> None:
         torch.manual_seed(0)
@@ -155,12 +155,12 @@ class Bench:
         self.example = made_up(recipe).to(DEVICE)
 
     def forward(self) -> Tensor:
-        """The loss."""
+        """Return the loss."""
         losses: dict[str, Tensor] = self.objective(self.example, torch.Generator().manual_seed(0))
         return losses["loss"]
 
     def step(self) -> None:
-        """As `training.train` does it."""
+        """Do one step as `training.train` does."""
         loss = self.forward()
         self.optimizer.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
@@ -168,7 +168,7 @@ class Bench:
         self.optimizer.step()
 
     def parameters(self) -> dict[str, float]:
-        """How many, by part."""
+        """Return the number of parameters of each part."""
         world = self.agent.world_model
         parts = {
             "backbone": world.backbone,
@@ -183,14 +183,16 @@ class Bench:
 
 
 def forward_pass() -> dict[str, float]:
-    """One forward pass with its losses and without gradients, at full size; its floating point operations."""
+    """Measure one forward pass with losses, without gradients, at full size; count floating point
+    operations.
+    """
     bench = Bench(FULL_M)
     bench.agent.requires_grad_(False)
     kernel_flops = {"lift": 0, "attend_volume": 0, "sample_volume": 0}
 
     def counting(name: str, op: Callable[..., Tensor]) -> Callable[..., Tensor]:
         def run(*inputs: Any) -> Tensor:
-            if name == "lift":  # four pixels around a point, a product and a sum for each channel of its head
+            if name == "lift":  # four pixels around a point; a product and a sum for each channel of its head
                 values, _, visible, _, weights = inputs
                 kernel_flops[name] += 8 * int(visible.sum()) * weights[0, 0, 0].numel() * values[0].shape[-1]
             else:
@@ -222,7 +224,7 @@ def forward_pass() -> dict[str, float]:
 
 
 def training_step(voxel_m: float, path: str) -> dict[str, float]:
-    """Training steps by the kernels ("fast") or the plain references; nothing if memory does not suffice."""
+    """Measure training steps by the kernels ("fast") or the plain references; {} if memory is too small."""
     bench = Bench(voxel_m)
     forget_peak(DEVICE)
     try:
@@ -236,12 +238,14 @@ def training_step(voxel_m: float, path: str) -> dict[str, float]:
 
 
 def measure_step(seed: int) -> dict[str, float]:
-    """A training step at full size."""
+    """Measure a training step at full size."""
     return in_a_process(__file__, "step", str(FULL_M), "fast")
 
 
 def measure_speedup(seed: int) -> dict[str, float]:
-    """Training steps of both paths on the finest voxels for which the references have enough memory."""
+    """Measure training steps of the two paths on the finest voxels that fit into memory with the
+    references.
+    """
     for voxel_m in COARSER_M:
         reference = in_a_process(__file__, "step", str(voxel_m), "reference")
         if reference:

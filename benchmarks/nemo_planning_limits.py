@@ -1,8 +1,8 @@
-"""What could NeMo's planner gain by looking if it saw perfectly? `foredrive bench nemo-planning-limits`.
+"""Possible gain of NeMo's planner from perfect perception: `foredrive bench nemo-planning-limits`.
 
-The planner of `nemo_town` is trained on the demonstrations of the studies, with the true map and the true
-boxes, drawn from above, in place of what a volume shows: on as few as fine-tuning can afford on two cores,
-and on 16 times as many. What it does not gain here no encoder can bring.
+The planner of `nemo_town` is trained on the demonstrations of the studies. The true map and the true boxes,
+drawn from above, replace the features of a volume. It uses as few demonstrations as fine-tuning can afford on
+two cores, and 16 times as many. No encoder can bring a gain that the planner does not reach here.
 """
 
 import dataclasses
@@ -33,30 +33,32 @@ TOWNS = StudyTowns()
 RECIPE = find_recipe("nemo_town")
 KINDS = (MapKind.LANE_CENTRE, MapKind.ROAD_EDGE, MapKind.CROSSWALK, MapKind.WALKWAY, MapKind.STOP_ZONE)
 CHANNELS = len(KINDS) + 3
-"""And the vehicles now, those one key frame ago, the people now."""
+"""Number of channels: one for each kind, the vehicles now, the vehicles one key frame ago, the pedestrians
+now.
+"""
 HIDDEN = 32
 BATCH, LEARNING_RATE = 8, 1e-3
 SEEN = (2_000, 8_000, 32_000)
-"""Demonstrations that are learned from, with repetition."""
+"""Number of demonstrations used in training, with repetition."""
 PER_SEGMENT = 16
-"""Points that stand for a piece of a line."""
+"""Number of points drawn for each segment of a line."""
 
 
 class Scenes(NamedTuple):
-    """Clips and what is true around them."""
+    """Clips and the true surroundings of each."""
 
     clip: Clip
-    """A batch of them all, without images."""
+    """A batch of all clips, without images."""
     truth: Float[Tensor, "N K 1 Y X"]
 
 
 def plane(spec: VoxelSpec) -> VoxelSpec:
-    """The grid, one voxel high."""
+    """Return the grid with one voxel of height."""
     return dataclasses.replace(spec, shape_zyx=(1, *spec.shape_zyx[1:]))
 
 
 def draw(clip: Clip, spec: VoxelSpec) -> Float[Tensor, "K Y X"]:
-    """What is true around one clip, from above."""
+    """Draw the true surroundings of one clip from above."""
     assert clip.map is not None
     image = torch.zeros(CHANNELS, *spec.shape_zyx[1:])
     for channel, kind in enumerate(KINDS):
@@ -89,7 +91,10 @@ def _draw_lines(image: Float[Tensor, "Y X"], lines: MapPatch, kind: MapKind, spe
 def _boxes_from_above(
     boxes: Boxes, chosen: Tensor, T_now_boxes: Float[Tensor, "4 4"], spec: VoxelSpec
 ) -> Float[Tensor, "Y X"]:
-    """Cells whose middle is at most half a cell from a box; boxes of another time come with their frame."""
+    """Return the cells whose centre is at most half a cell from a box.
+
+    Boxes of another time come with the pose of their frame.
+    """
     middles = spec.centres_m()[0]
     there = torch.linalg.inv(T_now_boxes)
     flat = middles @ there[:3, :3].T + there[:3, 3]
@@ -101,7 +106,7 @@ def _boxes_from_above(
 
 
 def read_scenes(logs: tuple[LogPath, ...], what: str) -> Scenes:
-    """All clips of some logs."""
+    """Read all clips of some logs."""
     config = dataclasses.replace(RECIPE.clips, cameras=(), future_frames=0, future_images=False, map=True)
     dataset, spec = ClipDataset(logs, config, None), plane(config.voxels)
     clips, images = [], []
@@ -114,7 +119,7 @@ def read_scenes(logs: tuple[LogPath, ...], what: str) -> Scenes:
 
 @functools.cache
 def scenes() -> tuple[Scenes, Scenes, EgoMLP]:
-    """For training, for testing, and the MLP that both planners start from."""
+    """Return the training scenes, the test scenes, and the MLP that both planners start from."""
     logs = record_study(TOWNS, WORK / "towns", workers=2)
     train, test = read_scenes(logs.train, "demonstrations"), read_scenes(logs.test, "tests")
     past_frames, dt_s = RECIPE.planner.history, RECIPE.clips.horizon_dt_s
@@ -123,7 +128,7 @@ def scenes() -> tuple[Scenes, Scenes, EgoMLP]:
 
 
 class Sighted(nn.Module):
-    """NeMo's planner on a plane that holds the truth, seen through three convolutions."""
+    """NeMo's planner on a plane with the truth, after three convolutions."""
 
     def __init__(self, ego_mlp: EgoMLP, path: PathCorrectionConfig | None) -> None:
         super().__init__()
@@ -143,7 +148,7 @@ class Sighted(nn.Module):
         self.planner.ego_mlp = ego_mlp.requires_grad_(False)
 
     def forward(self, scenes: Scenes) -> Trajectory:
-        """The plan of every clip."""
+        """Return the plan of every clip."""
         clip = scenes.clip
         volume = self.see(scenes.truth[:, :, 0].float())[:, :, None]
         poses, speeds = ego_motion(clip, self.planner.history)
@@ -153,7 +158,7 @@ class Sighted(nn.Module):
 
 
 def planned(seen: int, path: PathCorrectionConfig | None) -> Callable[[int], dict[str, float]]:
-    """Learned from so many demonstrations, with or without reading the plane along the path."""
+    """Return an arm that trains on `seen` demonstrations, with or without path features of the plane."""
 
     def measure(seed: int) -> dict[str, float]:
         train, test, ego_mlp = scenes()
@@ -183,7 +188,7 @@ def _pick(scenes: Scenes, chosen: Tensor) -> Scenes:
 
 @torch.no_grad()
 def _errors_m(model: Sighted, test: Scenes, ego_mlp: EgoMLP) -> tuple[float, float]:
-    """Mean distance to what was driven, over all steps of all whole plans, of the planner and of the MLP."""
+    """Return the mean distance to the driven path of the planner and of the MLP, over all complete plans."""
     errors = []
     for chosen in torch.arange(len(test.truth)).split(64):
         batch = _pick(test, chosen)

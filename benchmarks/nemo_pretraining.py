@@ -1,7 +1,7 @@
-"""Does NeMo's self-supervised pre-training help? `foredrive bench nemo_pretraining`, hours on two cores.
+"""Effect of NeMo's self-supervised pre-training: `foredrive bench nemo_pretraining`, hours on two cores.
 
-Everything is kept in runs/nemo_study/COMMIT, so that an interrupted study goes on where it stopped: drives,
-the cache of labels, and a run folder for every arm and seed.
+Drives, the cache of labels, and a run folder for every arm and seed are kept in runs/nemo_study/COMMIT, so
+that an interrupted study continues where it stopped.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ def _folder(arm: str, seed: int) -> Path:
 
 
 def planned(pretrained: bool, share: float) -> Callable[[int], dict[str, float]]:
-    """The full recipe, fine-tuned on a share of the drives, after pre-training on all of them or none."""
+    """Return an arm: the full recipe, fine-tuned on a share of the drives, pre-trained on all or on none."""
 
     def measure(seed: int) -> dict[str, float]:
         logs, recipe = _logs(), seeded(find_recipe(RECIPE), seed)
@@ -64,13 +64,16 @@ def _name(pretrained: bool, share: float) -> str:
 
 
 def occupancy(seed: int) -> dict[str, float]:
-    """NeMo's encoder on the occupancy of the present alone."""
+    """Train NeMo's encoder on the present occupancy alone."""
     recipe = _of_steps(occupancy_alone(seeded(find_recipe(RECIPE), seed)), OCCUPANCY_STEPS)
     return _seen(run_arm(recipe, _logs(), _folder("occupancy", seed), WORK / "cache"))
 
 
 def occupancy_averaging(seed: int) -> dict[str, float]:
-    """The averaging encoder on the same, for as long as NeMo's encoder takes: by steps timed in turns."""
+    """Train the averaging encoder on the same, for the same time as NeMo's encoder.
+
+    The number of steps follows from step times measured in turns.
+    """
     nemo = seeded(find_recipe(RECIPE), seed)
     averaging = dataclasses.replace(nemo, model=dataclasses.replace(nemo.model, encoder=AVERAGING))
     logs, took_s = _logs(), {}
@@ -91,7 +94,7 @@ def _of_steps(recipe: Recipe, steps: int) -> Recipe:
 
 
 def _seen(figures: dict[str, float]) -> dict[str, float]:
-    """Without what an untrained planner says."""
+    """Remove the metrics of the untrained planner."""
     return {name: value for name, value in figures.items() if "l2" not in name and "collision" not in name}
 
 

@@ -1,7 +1,6 @@
-"""How fast the CPU kernels that read volumes are and how much memory they take, beside plain PyTorch.
+"""Speed and memory of the CPU kernels that read volumes, compared with plain PyTorch: `foredrive bench ops`.
 
-Every kernel runs in a process of its own, and its reference in another: `foredrive bench ops`. Lifting has a
-benchmark of its own.
+Every kernel and every reference runs in its own process. Lifting has its own benchmark.
 """
 
 import json
@@ -24,7 +23,7 @@ RUNS = 7
 
 
 class Case(NamedTuple):
-    """One op at one size: the op and its reference as functions of what they are differentiated by."""
+    """One op at one size: the op and its reference as functions of their differentiable inputs."""
 
     fast: Callable[..., Tensor]
     reference: Callable[..., Tensor]
@@ -32,7 +31,7 @@ class Case(NamedTuple):
 
 
 def attention3d() -> Case:
-    """Self-attention of four volumes of 8×64×64, 4 heads of 4 points, D = 32."""
+    """Return self-attention of four volumes of 8×64×64, 4 heads of 4 points, D = 32."""
     spec = VoxelSpec(lower_m=(0.0, 0.0, 0.0), voxel_m=1.0, shape_zyx=(8, 64, 64))
     centres = spec.centres_m().flatten(0, 2)
     points = centres[:, None, None] + 2 * torch.randn(4, len(centres), 4, 4, 3)
@@ -41,7 +40,7 @@ def attention3d() -> Case:
 
 
 def rays() -> Case:
-    """2048 rays of 48 samples through a volume of 8×64×64, 33 channels."""
+    """Return 2048 rays of 48 samples through a volume of 8×64×64, 33 channels."""
     direction = torch.nn.functional.normalize(torch.randn(2048, 1, 3) * torch.tensor([1.0, 1.0, 0.1]), dim=-1)
     points = torch.tensor([32.0, 32.0, 4.0]) + direction * torch.linspace(1, 40, 48)[:, None]
     volume = torch.randn(1, 8, 64, 64, 33)
@@ -49,7 +48,7 @@ def rays() -> Case:
 
 
 def warp() -> Case:
-    """Four volumes of 8×64×64, D = 32, moved by a small motion."""
+    """Return four volumes of 8×64×64, D = 32, moved by a small motion."""
     T = exp_se3(torch.tensor([[0.5, 0.1, 0.0, 0.0, 0.0, 0.05]] * 4))
     lower_m, voxel_m = (-24.0, -24.0, -1.5), 0.75
 
@@ -69,7 +68,7 @@ CASES: dict[str, Callable[[], Case]] = {case.__name__: case for case in (attenti
 
 
 def measure(case: str) -> dict[str, float]:
-    """Both paths' figures, and their ratios."""
+    """Return the metrics of both paths and their ratios."""
     fast, reference = (in_a_process(__file__, case, path) for path in ("fast", "reference"))
     return {"threads": torch.get_num_threads()} | compare(fast, reference)
 
@@ -86,7 +85,7 @@ def _measure_here(case: str, path: str) -> dict[str, float]:
 
 
 def _compile() -> None:
-    """Call the kernels on next to nothing."""
+    """Call the kernels on tiny inputs, so that they compile."""
     values, points = torch.ones(1, 1, 1, 1, 1, requires_grad=True), torch.ones(1, 1, 1, 1, 3)
     attend_volume(values, points, torch.ones(1, 1, 1, 1)).sum().backward()
 

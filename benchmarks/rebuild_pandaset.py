@@ -1,8 +1,8 @@
-"""A real log rebuilt, and what each part of the sensors' models is worth.
+"""Reconstruct a real log, and measure the effect of each part of the sensor models.
 
-`foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. The front
-camera and the lidar are learned from every second frame and judged on the others. Each arm is a run, kept in
-runs/rebuild/COMMIT, that goes on where it stopped.
+`foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Training uses
+the front camera and the lidar of every second frame; the other frames are for evaluation. Each arm is a run
+in runs/rebuild/COMMIT, which continues where it stopped.
 """
 
 import dataclasses
@@ -26,8 +26,9 @@ FIGURES = (
     *("minutes", "computing_minutes", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
     *("nearest.psnr_db", "nearest.ssim", "moving.psnr_db", "moving.nearest.psnr_db"),
 )
-"""`nearest` is the nearest image in time that was learned from, `moving` the frames in which the ego vehicle
-drives."""
+"""Metrics: `nearest` compares with the training image nearest in time; `moving` uses the frames in which the
+ego vehicle drives.
+"""
 
 
 def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:

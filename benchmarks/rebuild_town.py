@@ -1,9 +1,9 @@
-"""A drive of a town rebuilt, and judged where the truth is known: off the driven lane, and after edits.
+"""Reconstruct a drive of a town; evaluate it off the driven lane and after edits, where the truth is known.
 
-`foredrive bench rebuild-town`. The front camera and the lidar of a drive are learned from every second frame.
-The scene is then looked at from the poses that were held out, from beside them, and with a road user removed
-or moved; beside each view stands what the town's own sensors see there. Each arm is a run, kept in
-runs/rebuild_town/COMMIT, that goes on where it stopped.
+`foredrive bench rebuild-town`. Training uses the front camera and the lidar of every second frame. The scene
+is then rendered from the held-out poses, from poses beside them, and with an actor removed or moved. Each
+view is compared with the town's own sensors at the same pose. Each arm is a run in runs/rebuild_town/COMMIT,
+which continues where it stopped.
 """
 
 import dataclasses
@@ -30,14 +30,16 @@ from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 WORK = work_folder(Path("runs/rebuild_town"))
 DRIVE = TownDrive("Town10HD", seed=3)
 ASIDE_M, AHEAD_M = (-5.0, -2.0), (2.0, 25.0)
-"""Where the lane to the right is, and how far ahead a car in it is looked for."""
+"""Lateral position of the lane to the right, and the distance ahead in which a car in it is searched, m."""
 NAMES = ("held_out", "left_2m", "left_3m", "right_2m", "right_3m", "removed", "moved")
 JUDGED_EVERY = 8
-"""Of the frames, from the second on: a quarter of those that are held out."""
+"""Every eighth frame from the second on is evaluated: a quarter of the held-out frames."""
 CHANGED, CHANGED_M = 4, 0.1
-"""What an edit really changes: pixels by more than this (of 255), and beams whose range is another."""
+"""Thresholds of a change by an edit: pixels by more than 4 (of 255), and beams whose range differs by more
+than 0.1 m.
+"""
 FEWEST = 20
-"""Pixels or beams that must have changed for a view to count."""
+"""Minimum number of changed pixels or beams of a view that counts."""
 OF_IMAGES = ("psnr_db", "ssim", "nearest.psnr_db", "nearest.ssim")
 OF_SWEEPS = ("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2")
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=DRIVE.cameras)
@@ -49,15 +51,15 @@ ARMS: dict[str, RebuildRecipe] = {
 
 @functools.cache
 def truth() -> TownTruth:
-    """The town that is driven in."""
+    """Return the town of the drive."""
     return TownTruth(DRIVE)
 
 
 @functools.cache
 def passed() -> int:
-    """The car in the lane to the right that is ahead in most of the judged frames: it is passed.
+    """Return the car in the lane to the right that is ahead in most evaluated frames; the ego passes it.
 
-    Who drives there depends on the last digits of a machine's arithmetic, so it is not known by its number.
+    The rounding of a machine's arithmetic decides which car drives there, so that its id is not fixed.
     """
     ahead: Counter[int] = Counter()
     for moment in truth().moments[1::JUDGED_EVERY]:
@@ -75,7 +77,7 @@ def inside(value: float, bounds: tuple[float, float]) -> bool:
 
 @functools.cache
 def edits_of(name: str) -> tuple[Edit, ...]:
-    """The edits that one of `NAMES` stands for."""
+    """Return the edits of one of `NAMES`."""
     every: dict[str, tuple[Edit, ...]] = {
         "held_out": (),
         "left_2m": (ShiftEgo((0.0, 2.0, 0.0)),),
@@ -90,12 +92,14 @@ def edits_of(name: str) -> tuple[Edit, ...]:
 
 @functools.cache
 def true_views(name: str) -> list[TrueViews]:
-    """What is really seen after the edits of a name."""
+    """Return the true views after the edits of a name."""
     return [truth().seen(frame, edits_of(name)) for frame in range(1, DRIVE.frames, JUDGED_EVERY)]
 
 
 def rebuilt(arm: str, seed: int) -> dict[str, float]:
-    """Figures of one run: "VIEWS.FIGURE", and "VIEWS.changed.FIGURE" of what an edit really changes."""
+    """Return the metrics of one run: "VIEWS.METRIC", and "VIEWS.changed.METRIC" where an edit changes the
+    views.
+    """
     recipe = dataclasses.replace(ARMS[arm], schedule=dataclasses.replace(ARMS[arm].schedule, seed=seed))
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
     figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
@@ -115,7 +119,7 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
 
 
 def judge(run: Rebuilt, views: Sequence[TrueViews], graph: SceneGraph) -> dict[str, float]:
-    """All figures of views, over all they show."""
+    """Return all metrics of views, over all their pixels and beams."""
     cameras = [camera for view in views for camera in view.cameras]
     found = judge_cameras(run.scene, cameras, run.learned.cameras, graph)
     found |= judge_sweeps(run.scene, [view.sweep for view in views], graph=graph)
@@ -123,7 +127,7 @@ def judge(run: Rebuilt, views: Sequence[TrueViews], graph: SceneGraph) -> dict[s
 
 
 def judge_changed(run: Rebuilt, name: str, graph: SceneGraph) -> dict[str, float]:
-    """The same of what an edit really changes alone, and of the scene without that edit."""
+    """Return the same metrics over changed pixels and beams only, for the scene with and without the edit."""
     pixels, beams = [], []
     for before, after in zip(true_views("held_out"), true_views(name), strict=True):
         pixels += list(zip(after.cameras, map(changed_pixels, before.cameras, after.cameras), strict=True))

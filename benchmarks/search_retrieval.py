@@ -1,10 +1,9 @@
-"""What do towers find in a town that they have never seen? `foredrive bench search-retrieval`.
+"""Retrieval quality of towers in a town that they have never seen: `foredrive bench search-retrieval`.
 
-Drives of the held-out town under four kinds of weather, each with the same routes and traffic. Everything
-that is known of a view is asked for (common/retrieval_quality.py); P@K counts moments of one drive that are
-closer than 5 s once, and its 95 % interval is over drives. SEARCH_RETRIEVAL_TOWERS names the towers, as
-`--towers` of `foredrive search index` does, one for each seed with : between them; by default they are those
-that come along.
+Drives of the held-out town under four kinds of weather have the same routes and traffic. All known facts of
+the views are queried (common/retrieval_quality.py). P@K counts moments of one drive that are closer than 5 s
+once, and its 95 % interval is over drives. SEARCH_RETRIEVAL_TOWERS names the towers as `--towers` of
+`foredrive search index` does, one for each seed, separated by ":"; by default they are the embedded towers.
 """
 
 import functools
@@ -26,7 +25,7 @@ SECONDS, RATE_HZ, IMAGE_HW, CROWD = 40.0, 0.5, (144, 256), (40, 40)
 
 
 def drives() -> list[LogPath]:
-    """Recorded if they do not lie there yet."""
+    """Return the drives; record them if they do not exist yet."""
     campaign = Campaign((TOWN,), SEEDS, WEATHERS, CROWD, CROWD, SECONDS, RATE_HZ)
     plans = plan_drives(campaign)
     done = record_drives(plans, WORK / "towns", IMAGE_HW, workers=os.cpu_count() or 1)
@@ -36,7 +35,7 @@ def drives() -> list[LogPath]:
 
 @functools.cache
 def judged(seed: int) -> dict[str, dict[str, float]]:
-    """Figures by modality."""
+    """Return the metrics by modality."""
     towers = find_towers(TOWERS[seed])
     logs = drives()
     views = gather_views(logs, 1 / RATE_HZ, towers.image_side_px, WORK)

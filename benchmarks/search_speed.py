@@ -1,15 +1,15 @@
-"""How long a query takes over a million embeddings, how much it misses, and what building the index holds.
+"""Query time and recall over a million embeddings, and memory for building the index.
 
-LanceDB as `foredrive.search` uses it, beside comparing all in NumPy and in FAISS, and FAISS' partitions of
-vectors kept to 8 bits, as LanceDB's are. And how many sweeps of a recorded town the lidar tower embeds a
-second, by the clock and by what a core computes.
+LanceDB as `foredrive.search` uses it is compared with exhaustive search in NumPy and FAISS, and with FAISS'
+partitions of 8-bit vectors, as LanceDB has them. The benchmark also measures how many sweeps of a recorded
+town the lidar tower embeds per second, by wall time and by CPU time.
 
-The embeddings of queries are made: directions of falling variance about a common mean, as those of image
-towers are, in kinds of scenes, drives of a kind, and moments along a drive that follow one another. Half of
-the queries are moments that are not in the index; the other half lie off to one side of all of them, as texts
-do.
+The embeddings are synthetic. Like those of image towers, they are directions of falling variance about a
+common mean. They are grouped in kinds of scenes, drives of a kind, and consecutive moments of a drive. Half
+of the queries are moments that are not in the index; the other half lie off to one side of all of them, as
+texts do.
 
-Needs 4 GiB of disk while it runs. SEARCH_SPEED_ROWS takes fewer rows, to try it.
+It needs 4 GiB of disk while it runs. SEARCH_SPEED_ROWS sets a smaller number of rows for a trial.
 """
 
 import os
@@ -43,18 +43,18 @@ from foredrive.towns.campaign import DrivePlan
 
 ROWS = int(os.environ.get("SEARCH_SPEED_ROWS", "1000000"))
 DIM, KINDS, DRIVE = 384, 300, 400
-"""Rows of a drive: 57 moments of seven views."""
+"""Dimension, number of kinds of scenes, and rows of a drive: 57 moments of seven views."""
 MEAN, KIND, ALONG, NOISE = 0.6, 0.55, 0.3, 0.25
-"""Lengths of what a direction is made of: two random moments have a cosine of about 0.4."""
+"""Lengths of the components of an embedding: two random moments have a cosine of about 0.4."""
 ASIDE = 0.8
 QUERIES, TOP = 60, 20
 SWEEPS = 8
-"""Embedded together, sector by sector, as an index does it."""
+"""Number of sweeps embedded together, sector by sector, as in an index."""
 REPEATS = 9
 
 
 def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Random vectors of length about 1 whose variance falls as 1 / (1 + k / 20)."""
+    """Draw random vectors of length about 1 whose variance falls as 1 / (1 + k / 20)."""
     scale = 1 / np.sqrt(1 + np.arange(DIM) / 20)
     return rng.normal(size=(count, DIM)).astype(np.float32) * (scale / np.linalg.norm(scale)).astype(
         np.float32
@@ -62,7 +62,7 @@ def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def drives(seed: int, number: int = 0) -> Iterator[np.ndarray]:
-    """Unit vectors of drives from a number on, [DRIVE DIM] each, always the same for a seed."""
+    """Yield the unit vectors of drives from a number on, [DRIVE DIM] each, reproducible by the seed."""
     shared = np.random.default_rng(seed)
     mean, kinds = MEAN * spectrum(shared, 1), KIND * spectrum(shared, KINDS)
     while True:
@@ -76,13 +76,13 @@ def drives(seed: int, number: int = 0) -> Iterator[np.ndarray]:
 
 
 def embeddings(seed: int) -> np.ndarray:
-    """All rows, [ROWS DIM]."""
+    """Return all rows, [ROWS DIM]."""
     made = drives(seed)
     return np.concatenate([next(made) for _ in range(-(-ROWS // DRIVE))])[:ROWS]
 
 
 def queries(seed: int) -> np.ndarray:
-    """Unit vectors that are asked for, [QUERIES DIM]."""
+    """Return the unit vectors of the queries, [QUERIES DIM]."""
     made = drives(seed, -(-ROWS // DRIVE))
     rng = np.random.default_rng((seed, 1 << 40))
     asked = np.stack([next(made)[rng.integers(DRIVE)] for _ in range(QUERIES)])
@@ -91,14 +91,14 @@ def queries(seed: int) -> np.ndarray:
 
 
 def nearest(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """The rows nearest to a query, by comparing all."""
+    """Return the rows nearest to a query by exhaustive search."""
     likeness = vectors @ query
     best = np.argpartition(-likeness, TOP)[:TOP]
     return best[np.argsort(-likeness[best])]
 
 
 def asked(answer: Callable[[np.ndarray], np.ndarray], seed: int, truth: np.ndarray) -> dict[str, float]:
-    """Time of a warm query, the slowest of twenty, and what share of the nearest rows is found."""
+    """Measure the time of a warm query (median and 95th percentile) and the recall of the nearest rows."""
     took_ms, found = [], []
     every = queries(seed)
     for query in every[:5]:
@@ -143,7 +143,7 @@ def with_faiss(seed: int, *, partitions: bool) -> dict[str, float]:
 
 
 def rows_of(number: int, vectors: np.ndarray) -> tuple[Part, pa.Table]:
-    """A drive as an index has it."""
+    """Return a drive as rows of an index."""
     log, count = f"made_train/{number:06d}", len(vectors)
     frame = np.arange(count) // 7
     known = {
@@ -210,9 +210,9 @@ def with_lancedb(seed: int) -> dict[str, float]:
 
 
 def lidar_tower(seed: int) -> dict[str, float]:
-    """Whole sweeps, cut into the sectors of six cameras, by an untrained tower: weights change no speed.
+    """Measure an untrained tower on whole sweeps, cut into six sectors; weights do not change the speed.
 
-    As an index does it, side by side on every core, each with one thread.
+    It runs as in an index: in parallel on every core, with one thread each.
     """
     with tempfile.TemporaryDirectory() as folder:
         plan = DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0)

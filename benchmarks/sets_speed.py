@@ -1,7 +1,7 @@
-"""How long set likelihoods take, beside a Murty on SciPy's assignments and the best assignment alone.
+"""Speed of set likelihoods, compared with Murty's algorithm on SciPy and with the best assignment alone.
 
-Times are of the processor, on one thread, so that others on the machine count for less, and the least of
-several runs: `foredrive bench sets-speed`.
+Times are CPU times of one thread, so that other programs matter less, and the minimum of several runs:
+`foredrive bench sets-speed`.
 """
 
 import functools
@@ -34,17 +34,17 @@ SIZES = {
     "900x200_dense": (900, 200, 25.0),
     "900x200_densest": (900, 200, 10.0),
 }
-"""Detections, objects, side of the square they are in, m."""
+"""Number of detections, number of objects, and side of their square, m."""
 K, CLASSES = 25, 10
 STD = np.array([0.4, 0.4, 0.2, 0.15, 0.15, 0.15])
 FRAMES, DETECTIONS = 6019, 200
-"""Of nuScenes' validation set."""
+"""Number of frames of nuScenes' validation set, and detections per frame."""
 
 Costs = tuple[np.ndarray, np.ndarray]
 
 
 def scene(m: int, n: int, side_m: float, rng: np.random.Generator) -> tuple[MultiBernoulli, LabelledBoxes]:
-    """Objects of which 90 % are detected, half of those twice; all other detections are of nothing."""
+    """Draw objects, of which 90 % are detected, half of those twice; all other detections are false."""
     half = side_m / 2
 
     def places(count: int) -> np.ndarray:
@@ -75,13 +75,13 @@ def scene(m: int, n: int, side_m: float, rng: np.random.Generator) -> tuple[Mult
 
 
 def region(side_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where objects may be that are not detected."""
+    """Return the bounds of undetected objects."""
     upper = np.array([side_m, side_m, 10.0, 4.0, 4.0, 4.0])
     return -upper, upper
 
 
 def predicted(size: str, seed: int) -> tuple[PoissonMultiBernoulli, LabelledBoxes]:
-    """All detections as Bernoullis, the dearest case, beside a uniform background."""
+    """Return all detections as Bernoullis, the most expensive case, with a uniform background."""
     m, n, side_m = SIZES[size]
     detected, objects = scene(m, n, side_m, np.random.default_rng(seed))
     lower, upper = (torch.as_tensor(bound) for bound in region(side_m))
@@ -90,7 +90,7 @@ def predicted(size: str, seed: int) -> tuple[PoissonMultiBernoulli, LabelledBoxe
 
 
 def costs(size: str, seed: int) -> Costs:
-    """Costs of pairs, objects as rows, and of leaving an object to the background."""
+    """Return the costs of pairs, with objects as rows, and of assigning an object to the background."""
     pmb, objects = predicted(size, seed)
     found = pmb.detected
     log_pair = found.boxes.log_prob(objects) + found.log_label(objects) - found.log_absence[:, None]
@@ -99,7 +99,7 @@ def costs(size: str, seed: int) -> Costs:
 
 
 def least_ms(run: Callable[[], object], runs: int = 9) -> float:
-    """Processor time of the fastest run, after one that is not counted."""
+    """Return the CPU time of the fastest run, ms, after one run that is not counted."""
     run()
     taken = []
     for _ in range(runs):
@@ -110,7 +110,9 @@ def least_ms(run: Callable[[], object], runs: int = 9) -> float:
 
 
 def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
-    """The whole PMB-NLL with its parts, or MB-NLL without a background; how wide an interval it leaves."""
+    """Measure the PMB-NLL with its parts, or the MB-NLL without a background; also the width of the
+    interval.
+    """
     torch.set_num_threads(1)
     figures = {}
     for size in SIZES:
@@ -124,7 +126,7 @@ def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
 
 
 def k_best(seed: int) -> dict[str, float]:
-    """The K best assignments, ungated, by our kernel, and by Murty on SciPy, which must agree."""
+    """Measure the K best assignments, ungated, by our kernel and by Murty on SciPy; they must agree."""
     figures = {}
     for size in ("100x50", "900x200"):
         cost, free = costs(size, seed)
@@ -139,7 +141,7 @@ def k_best(seed: int) -> dict[str, float]:
 
 
 def best_only(seed: int) -> dict[str, float]:
-    """One assignment by SciPy: what a score by Hungarian matching takes, densities not counted."""
+    """Measure one assignment by SciPy: the time of a score by Hungarian matching, without densities."""
     figures = {}
     for size in SIZES:
         padded = with_background(*costs(size, seed))
@@ -148,14 +150,14 @@ def best_only(seed: int) -> dict[str, float]:
 
 
 def with_background(cost: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Each row has a column of its own for none; what is forbidden is dear."""
+    """Add one column for each row, its background; forbidden pairs have a high cost."""
     own = np.full((len(free), len(free)), 1e9)
     np.fill_diagonal(own, free)
     return np.concatenate([cost, own], axis=1)
 
 
 def murty_on_scipy(cost: np.ndarray, free: np.ndarray, k: int) -> np.ndarray:
-    """Costs of the k best assignments: Murty's partition, each subproblem solved from the start."""
+    """Return the costs of the k best assignments by Murty's partition; solve each subproblem from scratch."""
     whole = with_background(cost, free)
     count = itertools.count()
 
@@ -181,7 +183,7 @@ def murty_on_scipy(cost: np.ndarray, free: np.ndarray, k: int) -> np.ndarray:
 
 
 def as_boxes(state: np.ndarray, yaw: np.ndarray, label: np.ndarray) -> list[dict]:
-    """In nuScenes' format."""
+    """Return boxes in nuScenes' format."""
     size = np.exp(state[:, [4, 3, 5]])
     rotation = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
     return [
@@ -193,7 +195,7 @@ def as_boxes(state: np.ndarray, yaw: np.ndarray, label: np.ndarray) -> list[dict
 
 
 def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
-    """Results with variances, and truth, as files."""
+    """Write results with variances, and the ground truth, as files."""
     rng = np.random.default_rng(seed)
     results, truth = folder / "results.json", folder / "truth.json"
     with results.open("w") as said, truth.open("w") as true:
@@ -218,7 +220,7 @@ def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
 
 
 def validation(seed: int) -> dict[str, float]:
-    """`foredrive score` on as many frames as nuScenes' validation set has, on one thread, from its files."""
+    """Measure `foredrive score` on files with as many frames as nuScenes' validation set, on one thread."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         results, truth = write_validation(Path(folder), seed)

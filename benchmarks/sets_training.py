@@ -1,8 +1,8 @@
-"""What the likelihood of sets does to a detector: trained by matching, then by it, then calibrated.
+"""Effect of the set likelihood on a detector: trained by matching, then by the likelihood, then calibrated.
 
-A detection head on a volume of lidar hits learns from drives in towns and is judged in Town05, which it has
-not seen. Both arms that are trained go on from the same head for equally many steps:
-`foredrive bench sets-training`.
+A detection head on a volume of lidar hits is trained on drives in towns and evaluated in Town05, which it has
+not seen. Both trained arms start from the same head and train for equally many steps: `foredrive bench
+sets-training`.
 """
 
 import functools
@@ -22,12 +22,12 @@ TRAIN_SEEDS, CALIBRATE_SEEDS, TEST_SEEDS = (0, 1), (0, 1), (0, 1, 2, 3)
 SECONDS, RATE_HZ = 30.0, 2.0
 STEPS = {"first_steps": 500, "more_steps": 250}
 IMAGE_HW = (16, 28)
-"""Nothing looks at the images."""
+"""Size of the images, which are not used."""
 
 
 @functools.cache
 def split() -> DetectionSplit:
-    """The drives of each town, one for each seed."""
+    """Return the samples of the drives of each town, one drive for each seed."""
     return DetectionSplit(
         samples(TRAIN, TRAIN_SEEDS), samples(CALIBRATE, CALIBRATE_SEEDS), samples(TEST, TEST_SEEDS)
     )

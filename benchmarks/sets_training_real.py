@@ -1,8 +1,8 @@
-"""The same as sets-training on a real log: PandaSet 002, whose first frames teach and whose last ones judge.
+"""The same as sets-training on a real log, PandaSet 002: the first frames train, the last ones test.
 
-One log of 5.5 s: the same street and mostly the same objects in training and judgement. It says whether the
-head and its losses work on a real Pandar64 and real boxes, not how they generalise.
-`foredrive bench sets-training-real`, with the raw log in FOREDRIVE_REAL_DATA/pandaset.
+The log lasts 5.5 s: training and testing have the same street and mostly the same objects. It shows whether
+the head and its losses work on a real Pandar64 and real boxes, not how they generalise. `foredrive bench
+sets-training-real`, with the raw log in FOREDRIVE_REAL_DATA/pandaset.
 """
 
 import functools
@@ -21,7 +21,7 @@ STEPS = {"first_steps": 250, "more_steps": 125}
 
 @functools.cache
 def split() -> DetectionSplit:
-    """One after the other in time."""
+    """Split the samples of the log by time."""
     with tempfile.TemporaryDirectory() as folder:
         log = pandaset_log(Path(folder) / "pandaset")
         found = detection_samples(log, SPEC, stride_s=STRIDE_S)

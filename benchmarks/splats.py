@@ -1,15 +1,16 @@
-"""How fast cameras and lidars see a street of Gaussians: `foredrive bench splats`.
+"""Speed of rendering cameras and lidars from a street of Gaussians: `foredrive bench splats`.
 
-The street: ground, façades, parked cars and trees under flat Gaussians, spread evenly over the surfaces, so
-that near ones are large in the image and far ones small: 0.6 of their spacing wide (log-normal, by e^0.5), an
-eighth as thick, from clear to opaque (logit 0.5 ± 2); 1 % large ones 200 m away for the far field. The camera
-stands at its end and sees 0.9 of 200 k, the lidar (a Pandar64, 64 × 1800 beams) in its middle. Both drive and
-turn, with rolling shutter. Projection, lists, compositing and, for training, the gradients of all parameters
-are timed together; each path runs in a process of its own.
+The street has ground, façades, parked cars and trees under flat Gaussians. They are spread evenly over the
+surfaces, so that near ones are large in the image and far ones small. They are 0.6 of their spacing wide
+(log-normal, by e^0.5), an eighth as thick, and from clear to opaque (logit 0.5 ± 2); 1 % are large ones 200 m
+away for the far field. The camera stands at the end of the street and sees 0.9 of 200 k. The lidar (a
+Pandar64, 64 × 1800 beams) stands in its middle. Both drive and turn, with rolling shutter. Projection, lists,
+compositing and, for training, the gradients of all parameters are timed together; each path runs in its own
+process.
 
-Beside it: plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the textbook's loop in
-numba, pixel by pixel over its tile's list (compositing alone, forward, on the same lists). Rasterisers on
-PyPI that may run on a CPU (splax in JAX, gausscam) are not measured here.
+The comparisons are plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the
+textbook's loop in numba, pixel by pixel over its tile's list (only compositing, forward, on the same lists).
+Rasterisers on PyPI that may run on a CPU (splax in JAX, gausscam) are not measured here.
 """
 
 import json
@@ -41,12 +42,12 @@ from foredrive.sensors import pandar64
 RUNS = 7
 READOUT_S = 0.03
 CAM_SCENE = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 1.6], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""scene (x forward, z up) -> a camera 1.6 m above the ground."""
+"""Transform from the scene (x forward, z up) to a camera 1.6 m above the ground."""
 WIDTH_M, HEIGHT_M, CARS, TREES = 24.0, 10.0, 24, 20
 
 
 class View(NamedTuple):
-    """What is timed: a sensor, and what it sees."""
+    """A timed sensor and its Gaussians."""
 
     project: Callable[[Gaussians], Splats]
     points: TiledPoints
@@ -54,7 +55,7 @@ class View(NamedTuple):
 
 
 def street(count: int, begin_m: float, end_m: float) -> Gaussians:
-    """See this file's docstring; the street runs along x."""
+    """Return the street of this file's docstring; it runs along x."""
     rng = torch.Generator().manual_seed(0)
     shares = ((_ground, 0.41), (_fronts, 0.36), (_cars, 0.1), (_trees, 0.12))
     parts = [surface(int(share * count), rng) for surface, share in shares]
@@ -65,7 +66,7 @@ def street(count: int, begin_m: float, end_m: float) -> Gaussians:
     log_scale = math.log(width_m) + 0.5 * torch.randn(len(mean), 3, generator=rng)
     log_scale[:, 2] -= 2.0
     nx, ny, nz = normal.unbind(-1)
-    from_z = torch.stack([1.001 + nz, -ny, nx, torch.zeros_like(nx)], -1)  # turns z to the normal
+    from_z = torch.stack([1.001 + nz, -ny, nx, torch.zeros_like(nx)], -1)  # rotates z to the normal
     far = count - len(mean)
     around = 2 * math.pi * torch.rand(far, generator=rng)
     sky = torch.stack([200 * around.cos(), 200 * around.sin(), 100 * torch.rand(far, generator=rng)], -1)
@@ -79,7 +80,7 @@ def street(count: int, begin_m: float, end_m: float) -> Gaussians:
 
 
 def _ground(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Points and normals; x from 0 to 1 along the street, y and z in m, here and in what follows."""
+    """Return points and normals; here and below, x runs from 0 to 1 along the street, y and z are in m."""
     place = (torch.rand(n, 3, generator=rng) - torch.tensor([0, 0.5, 0])) * torch.tensor([1, WIDTH_M, 0])
     return place, torch.tensor([0.0, 0, 1]).expand(n, 3)
 
@@ -104,14 +105,14 @@ def _trees(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def _stands(n: int, many: int, aside_m: float, up_m: float, rng: torch.Generator) -> Tensor:
-    """For each point the middle of one of many things that stand on either side."""
+    """Return for each point the centre of one of many objects on both sides of the street."""
     k = torch.randint(0, many, (n,), generator=rng)
     y = torch.where(k % 2 == 0, -aside_m, aside_m)
     return torch.stack([k / many, y, torch.full((n,), up_m)], -1)
 
 
 def camera(count: int, size_hw: tuple[int, int], device: str) -> View:
-    """RGB and range, 60° wide; 10 m/s, 0.1 rad/s."""
+    """Return a camera with RGB and range, 60° wide, at 10 m/s and 0.1 rad/s."""
     height, width = size_hw
     focal = 830.0 * width / 960
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], device=device)
@@ -127,7 +128,7 @@ def camera(count: int, size_hw: tuple[int, int], device: str) -> View:
 
 
 def lidar(count: int, device: str) -> View:
-    """64 × 1800 beams of a Pandar64, three features, range and median."""
+    """Return 64 × 1800 beams of a Pandar64 with three features, range and median."""
     T_ego_lidar = exp_se3(torch.tensor([0.0, 0, 1.8, 0, 0, 0]))
     twist = torch.tensor([10.0, 0, 0, 0, 0, 0.1])
     points = lidar_points(pandar64(T_ego_lidar).beams(twist), T_ego_lidar, twist).to(device)
@@ -144,7 +145,7 @@ def _learnable(gaussians: Gaussians, device: str) -> Gaussians:
 
 
 def _times(view: View, device: str, composite: Callable[..., Composited], runs: int) -> dict[str, float]:
-    """Seconds by the clock and of computing (all threads), forward and for a training step."""
+    """Measure wall time and CPU time (all threads), s, forward and for a training step."""
     project, points, gaussians = view
     leaves = [getattr(gaussians, name) for name in vars(gaussians)]
 
@@ -166,7 +167,7 @@ def _times(view: View, device: str, composite: Callable[..., Composited], runs: 
 
 @numba.njit(error_model="numpy", fastmath=True, nogil=True)
 def textbook(packed: Any, feature: Any, splat: Any, first: Any, place: Any, index: Any, out: Any) -> None:
-    """Kerbl et al.'s loop: every pixel walks along its tile's list; libm's exp, `out` [P D + 2]."""
+    """Run the loop of Kerbl et al.: every pixel walks along its tile's list; libm's exp, `out` [P D + 2]."""
     for tile in range(index.shape[0]):
         for s in range(index.shape[1]):
             if index[tile, s] < 0:
@@ -191,7 +192,7 @@ def textbook(packed: Any, feature: Any, splat: Any, first: Any, place: Any, inde
 
 
 def _textbook(view: View) -> dict[str, float]:
-    """Compositing alone, one thread, on lists that ours made; and ours on one thread, lists included."""
+    """Measure compositing alone on one thread, on our lists; and our path on one thread, with the lists."""
     with torch.no_grad():
         splats, points = view.project(view.gaussians), view.points
         seen = composite_splats(splats, points, median=False)
@@ -233,7 +234,7 @@ def _measure_here(device: str, path: str) -> dict[str, float]:
 
 
 def measure(device: str) -> dict[str, float]:
-    """All figures of a device; those per CPU second are of computing, whatever else the machine does."""
+    """Return all metrics of a device; those per CPU second do not depend on other programs."""
     paths = ("camera", "lidar", "small", "reference", *(("textbook",) if device == "cpu" else ()))
     found = {path: in_a_process(__file__, device, path) for path in paths}
     figures: dict[str, float] = {"threads": float(torch.get_num_threads())}

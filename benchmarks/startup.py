@@ -1,10 +1,10 @@
-"""How much CPU the program takes before it helps: help, a wrong argument, a verb's own work.
+"""CPU time of the program before its own work: help, a wrong argument, a verb.
 
-Each command is a process of its own, started several times; its CPU seconds (user and system, all of its
-threads) are counted, the least of them: `foredrive bench startup`.
+Each command is its own process, started several times; the minimum of its CPU seconds (user and system, all
+threads) is reported: `foredrive bench startup`.
 
-A verb's own work begins when its modules are imported, which the arms called "begin" do. Nothing is below
-"import torch", which most verbs need.
+A verb's own work begins when its modules are imported; the arms called "begin" measure these imports. "import
+torch" is the lower bound for most verbs.
 """
 
 import resource
@@ -42,7 +42,7 @@ IMPORTS = {
 
 def _cpu_s(command: list[str]) -> dict[str, float]:
     taken = []
-    for _ in range(REPETITIONS + 1):  # the first writes bytecode
+    for _ in range(REPETITIONS + 1):  # the first run writes bytecode
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(command, check=False, capture_output=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)

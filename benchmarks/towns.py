@@ -1,6 +1,6 @@
-"""How fast towns are sensed and recorded, whether memory stays flat, and where the time goes.
+"""Speed of sensing and recording towns, growth of memory, and profile: `foredrive bench towns`.
 
-Six cameras of 144×256 px and 32×720 beams among 60 road users: `foredrive bench towns`.
+It uses six cameras of 144×256 px and 32×720 beams among 60 actors.
 """
 
 import sys
@@ -28,9 +28,9 @@ from foredrive.towns.world import World
 TOWN, VEHICLES, PEOPLE, RATE_HZ = "Town05", 40, 20, 2.0
 FRAMES = 60
 LONG_RUN_S = 3600.0
-"""Length of the drive that memory is watched over."""
+"""Length of the drive in the memory test, s."""
 SETTLED_FROM, ENDS_FROM = 0.1, 0.9
-"""Memory at the end of a run is compared with that after this share of it; before, caches fill."""
+"""Shares of a run between which memory is compared; before the first, caches fill."""
 SAMPLE_S = 0.005
 
 PARTS = (
@@ -45,11 +45,11 @@ PARTS = (
     ("casting", "raycast.py", None),
     ("shading", "capture.py", None),
 )
-"""Name of a part, file and function that stand for it; the first that a stack holds takes the sample."""
+"""Name of a part, with its file and function. A sample counts for the first entry that its stack contains."""
 
 
 def sensors(seed: int) -> dict[str, float]:
-    """Key frames per second without labels and disk."""
+    """Measure key frames per second without labels and disk."""
     town = load_town_map(TOWN)
     world, traffic = World(town, seed), Traffic(town, seed, VEHICLES + 1, PEOPLE)
     moments = list(Drive(traffic, FRAMES / RATE_HZ).moments(FRAMES + 1, 1 / RATE_HZ))
@@ -70,7 +70,7 @@ def sensors(seed: int) -> dict[str, float]:
 
 
 def disk(seed: int) -> dict[str, float]:
-    """Key frames per second into a log with all that `foredrive record` writes, and the start before them."""
+    """Measure key frames per second into a log with all labels of `foredrive record`, and the start time."""
     _record(seed, 1)  # compiles
     took_s = {frames: _record(seed, frames) for frames in (FRAMES // 4, FRAMES)}
     write_hz = (FRAMES - FRAMES // 4) / (took_s[FRAMES] - took_s[FRAMES // 4])
@@ -78,7 +78,7 @@ def disk(seed: int) -> dict[str, float]:
 
 
 def memory(seed: int) -> dict[str, float]:
-    """Memory over one long drive, swapped out or not, files' pages aside."""
+    """Measure memory over one long drive, swapped out or not, without pages of files, MiB."""
     with _sampled(1.0, _resident_mib) as samples:
         _record(seed, round(LONG_RUN_S * RATE_HZ))
     settled = samples[int(SETTLED_FROM * len(samples)) : int(2 * SETTLED_FROM * len(samples)) + 1]
@@ -87,7 +87,7 @@ def memory(seed: int) -> dict[str, float]:
 
 
 def profile(seed: int) -> dict[str, float]:
-    """Share of the time that recording spends on each part, on one thread."""
+    """Return the share of recording time of each part, on one thread."""
     _record(seed, 1)  # compiles
     threads, main = torch.get_num_threads(), threading.main_thread().ident
     torch.set_num_threads(1)
@@ -104,7 +104,7 @@ def profile(seed: int) -> dict[str, float]:
 
 
 def _record(seed: int, frames: int) -> float:
-    """Seconds that a recording takes."""
+    """Return the time of a recording, s."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         record(TOWN, frames / RATE_HZ, seed, Path(folder), RATE_HZ, _suite(), Crowd(VEHICLES, PEOPLE))
@@ -117,7 +117,7 @@ def _suite() -> SensorSuite:
 
 @contextmanager
 def _sampled(every_s, take) -> Iterator[list]:
-    """What `take` finds while the block runs."""
+    """Collect the results of `take` every `every_s` while the block runs."""
     samples, over = [], threading.Event()
 
     def watch() -> None:
@@ -134,7 +134,7 @@ def _sampled(every_s, take) -> Iterator[list]:
 
 
 def _part(frame: FrameType | None) -> str:
-    """What a stack works on."""
+    """Return the part that a stack works on."""
     stack = []
     while frame is not None:
         stack.append((Path(frame.f_code.co_filename).name, frame.f_code.co_name))

@@ -1,5 +1,6 @@
-"""What goes wrong in hours of simulated traffic in every town, and how long a step takes: 60 road users
-around the expert, some of them on foot, its steering disturbed now and then: `foredrive bench traffic`.
+"""Errors in hours of simulated traffic in every town, and the time of a step: `foredrive bench traffic`.
+
+There are 60 actors around the expert, some of them pedestrians; its steering is disturbed now and then.
 """
 
 import functools
@@ -20,11 +21,11 @@ HOURS = 1.0
 DT_S = 0.1
 STEERING_NOISE_RAD = 0.02
 CHUNK_S = 900.0
-"""A drive this long follows one route; then the next begins."""
+"""Length of a drive along one route, s; then the next route begins."""
 
 
 def measure(seed: int, town: str, hours: float = HOURS) -> Mapping[str, float]:
-    """Violations, lane changes and kilometres of the expert per simulated hour; milliseconds of a step."""
+    """Return violations, lane changes and kilometres of the expert per simulated hour, and ms per step."""
     town_map = load_town_map(town)
     found: dict[str, float] = {}
     seconds, changes, driven_m, speeds, took_s = 0.0, 0, 0.0, [], []

@@ -1,6 +1,6 @@
-"""The detection task: samples from any log, a head's figures on them, losses compared.
+"""The detection task: samples from any log, metrics of a head on them, and a comparison of losses.
 
-A head (`models.detection`) learns from samples by `training.detection.fit_head`; docs/sets.md shows how.
+`training.detection.fit_head` trains a head (`models.detection`) on samples; docs/sets.md shows how.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ _CLASS_OF = {
     Category.PEDESTRIAN: 2,
 }
 LEAST_HITS = 3
-"""Objects that fewer beams met are left out."""
+"""Minimum number of lidar hits of an object; objects with fewer are left out."""
 _IMAGE_HW = (16, 28)
-"""Nothing looks at the images."""
+"""Size of the images, which are not used."""
 HALF_HEIGHT_M, LARGEST_LOG_SIZE = 5.0, 4.0
-"""Of the region in which objects may be that no detection explains."""
+"""Bounds of the region of undetected objects: half height (m) and size (logarithm)."""
 
 
 class DetectionSample(NamedTuple):
@@ -44,7 +44,7 @@ class DetectionSample(NamedTuple):
 
 
 class DetectionSplit(NamedTuple):
-    """Samples for what they are used for."""
+    """Samples for training, calibration and testing."""
 
     train: Sequence[DetectionSample]
     calibrate: Sequence[DetectionSample]
@@ -52,7 +52,7 @@ class DetectionSplit(NamedTuple):
 
 
 def detection_samples(log: LogPath, spec: VoxelSpec, *, stride_s: float = 0.5) -> list[DetectionSample]:
-    """Hits and objects every `stride_s` of a log that has lidar and boxes."""
+    """Return lidar hits and objects every `stride_s` of a log with lidar and boxes."""
 
     def volume_of(clip: Clip) -> Float[Tensor, "1 Z Y X"]:
         return hits_volume(clip.sweeps[clip.now], spec)
@@ -67,7 +67,7 @@ def detection_samples(log: LogPath, spec: VoxelSpec, *, stride_s: float = 0.5) -
 def observed_samples(
     log: LogPath, world_model: WorldModel, clips: ClipConfig, *, stride_s: float = 0.5
 ) -> list[DetectionSample]:
-    """What a world model makes of a log's images, and the objects that its lidar meets, every `stride_s`.
+    """Return a world model's volumes of a log's images, and the objects hit by its lidar, every `stride_s`.
 
     `clips` are those of the model's recipe; the model is not trained.
     """
@@ -89,7 +89,7 @@ def _samples(
 
 
 def hits_volume(sweep: LidarSweep, spec: VoxelSpec) -> Float[Tensor, "1 Z Y X"]:
-    """Logarithm of 1 + the hits in each voxel."""
+    """Return log(1 + number of hits) of each voxel."""
     points = sweep.points_ego[sweep.returned & sweep.valid]
     index = ((points - torch.tensor(spec.lower_m)) / spec.voxel_m).floor().long()
     depth, height, breadth = spec.shape_zyx
@@ -100,7 +100,9 @@ def hits_volume(sweep: LidarSweep, spec: VoxelSpec) -> Float[Tensor, "1 Z Y X"]:
 
 
 def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
-    """Objects of one clip at now, of the classes that are told apart, over the volume's ground and seen."""
+    """Return the objects of one clip at now: of a known class, over the volume's ground area, hit by
+    lidar.
+    """
     sweep, boxes = clip.sweeps[clip.now], clip.boxes[clip.now]
     points = sweep.points_ego[sweep.returned & sweep.valid]
     hits = points_in_boxes(points, boxes.centre, boxes.size_lwh, boxes.yaw).sum(0)
@@ -113,7 +115,7 @@ def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
 
 
 def unexplained(spec: VoxelSpec) -> UniformPoisson:
-    """One object a frame that no detection explains, evenly over classes and the volume's ground."""
+    """Return a prior of one undetected object per frame, uniform over classes and the ground area."""
     lower, upper = _ground(spec)
     rest = torch.tensor([HALF_HEIGHT_M, *[LARGEST_LOG_SIZE] * 3])
     rate = torch.full((len(CLASSES),), 1 / len(CLASSES))
@@ -124,7 +126,7 @@ def unexplained(spec: VoxelSpec) -> UniformPoisson:
 def judge(
     detected: Sequence[MultiBernoulli], samples: Sequence[DetectionSample], spec: VoxelSpec
 ) -> dict[str, float]:
-    """What `foredrive score` says of detections: likelihood, its parts, mAP, calibration; NaN for none."""
+    """Return the metrics of `foredrive score`: likelihood, its parts, mAP, calibration; NaN for none."""
     region = unexplained(spec)
     frames = [
         Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
@@ -147,10 +149,10 @@ def judge(
 def compare_losses(
     split: Callable[[], DetectionSplit], spec: VoxelSpec, *, first_steps: int, more_steps: int
 ) -> dict[str, Callable[[int], dict[str, float]]]:
-    """Arms of a benchmark, seed → figures: trained by matching or by set likelihood, each also calibrated.
+    """Return the arms of a benchmark as functions from seed to metrics.
 
-    All heads of a seed go on from the same one, for equally many steps; `split` is asked whenever samples
-    are needed.
+    The arms train by matching or by set likelihood, each with and without calibration. All heads of a seed
+    start from the same head and train for equally many steps; `split` is called whenever samples are needed.
     """
 
     @functools.cache

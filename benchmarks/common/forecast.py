@@ -1,4 +1,4 @@
-"""Forecasts of occupancy: what a run predicts for parts of logs, without looking at plans."""
+"""Forecasts of occupancy: the predictions of a run for parts of logs; plans are not evaluated."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,12 +20,12 @@ BATCH = 4
 def forecasting(
     recipe: Recipe, part_s: tuple[float, float], stride_s: float, future_frames: int | None = None
 ) -> Recipe:
-    """Fine-tuning of the world model alone, by what pre-training learns from, on a part of each log.
+    """Return a recipe that trains only the world model, with the losses of pre-training, on parts of logs.
 
     Args:
         part_s: see `ClipConfig`.
-        stride_s: time between the clips' nows.
-        future_frames: how far is imagined, and judged; None: as far as the recipe imagines.
+        stride_s: time between the clips' nows, s.
+        future_frames: number of imagined and evaluated frames; None: as in the recipe.
     """
     assert recipe.pretrain is not None
     stage = replace(recipe.pretrain, schedule=recipe.finetune.schedule)
@@ -40,10 +40,10 @@ def forecasting(
 
 
 def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float]) -> dict[str, float]:
-    """Occupancy and flow of another part of logs, now and at each imagined frame, beside copies of now.
+    """Evaluate occupancy and flow of another part of logs, now and later, beside persistence.
 
     Raises:
-        InputError: if there is nothing to judge.
+        InputError: there is nothing to evaluate.
     """
     clips = run.recipe.clips
     dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)

@@ -1,4 +1,4 @@
-"""Time and memory of a piece of code, on the CPU or a GPU; each measurement in a process of its own."""
+"""Measure time and memory of code on the CPU or a GPU, each measurement in its own process."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 def in_a_process(program: str, *arguments: str) -> dict[str, float]:
-    """Figures that `program`, a Python file, prints as JSON. Numba compiles anew there."""
+    """Run `program`, a Python file that prints metrics as JSON; return them. Numba compiles again there."""
     with tempfile.TemporaryDirectory() as empty_cache:
         done = subprocess.run(
             [sys.executable, program, *arguments],
@@ -30,15 +30,15 @@ def in_a_process(program: str, *arguments: str) -> dict[str, float]:
 
 
 class Took(NamedTuple):
-    """Medians over calls."""
+    """Median times over several calls."""
 
     wall_s: float
     cpu_s: float
-    """Of all threads of this process: what other programs do beside it shows less here."""
+    """CPU time of all threads of this process, s; other programs on the machine affect it less."""
 
 
 def measure(call: Callable[[], object], times: int, device: str) -> Took:
-    """How long a call takes, each until a GPU has done what it was told."""
+    """Measure the time of a call; each call ends when the GPU has finished."""
     took = [_measure_one(call, device) for _ in range(times)]
     return Took(median(one.wall_s for one in took), median(one.cpu_s for one in took))
 
@@ -54,7 +54,7 @@ def _measure_one(call: Callable[[], object], device: str) -> Took:
 def measure_op(
     op: Callable[..., Tensor], inputs: Sequence[Tensor], times: int, device: str
 ) -> dict[str, float]:
-    """Milliseconds (medians) of an op and its gradients, and what they hold at most above the inputs, MiB."""
+    """Return median times of an op and its gradients, ms, and their peak memory above the inputs, MiB."""
     inputs = [x.requires_grad_() for x in inputs]
     forget_peak(device)
     before_mib = held_mib(device)
@@ -76,7 +76,7 @@ def measure_op(
 
 
 def compare(fast: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
-    """Figures of `measure_op` of two paths side by side, with their ratios."""
+    """Return the metrics of `measure_op` of two paths side by side, with their ratios."""
     figures = {f"fast.{key}": value for key, value in fast.items()}
     figures |= {f"reference.{key}": value for key, value in reference.items()}
     for name, unit in (("speedup", "ms"), ("speedup_cpu", "cpu_ms")):
@@ -87,7 +87,7 @@ def compare(fast: Mapping[str, float], reference: Mapping[str, float]) -> dict[s
 
 
 def forget_peak(device: str) -> None:
-    """From now on `peak_mib` tells of what comes."""
+    """Reset the peak that `peak_mib` returns."""
     if device == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -96,12 +96,12 @@ def forget_peak(device: str) -> None:
 
 
 def held_mib(device: str) -> float:
-    """Memory that torch holds on the GPU, or that this process has resident, MiB."""
+    """Return the memory that torch holds on the GPU, or the resident memory of this process, MiB."""
     return torch.cuda.memory_reserved() / 2**20 if device == "cuda" else _status_mib("VmRSS")
 
 
 def peak_mib(device: str) -> float:
-    """The most that was held since `forget_peak`, MiB."""
+    """Return the peak memory since `forget_peak`, MiB."""
     return torch.cuda.max_memory_reserved() / 2**20 if device == "cuda" else _status_mib("VmHWM")
 
 

@@ -1,4 +1,4 @@
-"""Drives of towns to be rebuilt, and what their sensors would really see of the scene after edits."""
+"""Drives of towns for reconstruction, and the true sensor views of the scene after edits."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from foredrive.towns.world import World
 
 @dataclass(frozen=True)
 class TownDrive:
-    """A drive that comes out the same each time: as a log, and as the town it was recorded in."""
+    """A reproducible drive: as a log, and as the town in which it was recorded."""
 
     town: str
     seed: int
@@ -44,18 +44,18 @@ class TownDrive:
 
     @cached_property
     def sensors(self) -> SensorSuite:
-        """What the vehicle carries."""
+        """Return the sensors of the vehicle."""
         rig = camera_rig(self.image_hw, self.readout_s)
         rows = [rig.names.index(name) for name in self.cameras]
         return SensorSuite(dataclasses.replace(rig[rows], names=self.cameras), find_lidar(self.lidar))
 
     @property
     def frames(self) -> int:
-        """Length of the log."""
+        """Return the number of frames of the log."""
         return max(1, round(self.seconds * self.rate_hz))
 
     def recorded(self, out: Path) -> LogPath:
-        """The log in a 123D data root, recorded if it is not there yet: without labels but boxes."""
+        """Return the log in a 123D data root; record it if it is missing. Boxes are its only labels."""
         name = f"{self.town}_seed{self.seed}"
         path = LogPath(out / "logs" / split_of(self.town) / name, out / "maps")
         if path.folder.is_dir():
@@ -76,15 +76,15 @@ class TownDrive:
 
 @dataclass(frozen=True)
 class TrueViews:
-    """What all sensors see at one time."""
+    """The true views of all sensors at one time."""
 
     cameras: list[CameraView]
-    """With images."""
+    """Camera views with images."""
     sweep: SweepView
 
 
 class TownTruth:
-    """The town of a drive, as its sensors see it from anywhere, with road users moved or not there."""
+    """The town of a drive, seen by its sensors from any pose, with actors moved or removed."""
 
     def __init__(self, drive: TownDrive) -> None:
         self.drive = drive
@@ -95,14 +95,14 @@ class TownTruth:
         self.moments: list[Moment] = list(moments)
 
     def seen(self, frame: int, edits: Sequence[Edit] = ()) -> TrueViews:
-        """What the sensors see at a frame's time after edits, in the frame of the first ego pose.
+        """Return the true sensor views at a frame's time after edits, in the frame of the first ego pose.
 
         Args:
-            frame: of the log.
-            edits: `Move` and `Remove` of road users that are not parked, and `ShiftEgo`.
+            frame: index of a frame of the log.
+            edits: `Move` and `Remove` of actors that are not parked, and `ShiftEgo`.
 
         Raises:
-            InputError: on another kind of edit.
+            InputError: there is another kind of edit.
         """
         moment, sensors = self.moments[frame], self.drive.sensors
         actors, T_ego_shifted = _edited(moment.actors, edits)
@@ -127,7 +127,7 @@ class TownTruth:
 def _edited(
     actors: list[ActorState], edits: Sequence[Edit]
 ) -> tuple[list[ActorState], Float64[Tensor, "4 4"]]:
-    """Road users after edits, and where the ego vehicle is in the frame it was driven in."""
+    """Return the actors after edits, and the pose of the ego vehicle in its original frame."""
     T_ego_shifted = torch.eye(4, dtype=torch.float64)
     for edit in edits:
         if isinstance(edit, Remove):
@@ -143,7 +143,7 @@ def _edited(
 
 
 def _moved(actor: ActorState, edit: Move) -> ActorState:
-    """An actor elsewhere, by an offset and a turn in its own frame; over ground it moves as it did."""
+    """Move an actor by an offset and a rotation in its own frame; its velocity over the ground stays."""
     cos, sin = np.cos(actor.yaw), np.sin(actor.yaw)
     forward_m, left_m, up_m = edit.offset_m
     shift = np.array([cos * forward_m - sin * left_m, sin * forward_m + cos * left_m, up_m])

@@ -1,4 +1,4 @@
-"""What towers find of what is asked for, by kind of question and weather, with intervals over drives."""
+"""Retrieval quality of towers by kind of query and by weather, with confidence intervals over drives."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -21,44 +21,46 @@ from foredrive.search.zero_shot import class_vectors, classify
 
 RANKS = (1, 10, 100)
 GAP_S = 5.0
-"""Moments of one drive that are closer than this are one hit."""
+"""Moments of one drive that are closer than this count as one hit, s."""
 DRAWS = 1000
 LEAST_ANSWERS = 3
-"""A question that fewer hits could answer is not asked."""
+"""Minimum number of possible hits of a query; a query with fewer is not used."""
 WEATHERS = {
     "clear": ("by day in clear weather", "on a sunny day"),
     **{name: SETTINGS[name] for name in ("night", "rain", "fog")},
 }
-"""Of whole drives, and what they are called: clear is by day, night has dry roads and clear air."""
+"""Weather of whole drives, with its names in texts: clear is by day, night has dry roads and clear air."""
 THINGS = ("car", "truck", "cyclist", "pedestrian", "crossing pedestrian")
-"""What is asked for under one of the other weathers too."""
+"""Objects that are also queried under one of the other weathers."""
 MODALITIES = ("image", "lidar", "joint", "joint_logits", "chance")
-"""Joint by the sum of features, and by the sum of logits with a text for each modality (LidarCLIP, 4.2)."""
+"""Modalities. Joint uses the sum of features; joint_logits uses the sum of logits with a text for each
+modality (LidarCLIP, 4.2).
+"""
 ALL, EVERY = "all", "every"
 
 
 class Question(NamedTuple):
-    """A text, and the facts of the views that answer it."""
+    """A text, and the facts of the views that match it."""
 
     kind: str
-    """thing, manner, number, place, conditions, or composed: a thing under conditions."""
+    """Kind of query: thing, manner, number, place, conditions, or composed (a thing under conditions)."""
     text: str
     lidar_text: str
-    """What is left of it for sweeps, which show no light, where both modalities have texts of their own."""
+    """The text for sweeps, which show no light, if each modality has its own text."""
     facts: frozenset[str]
 
 
 class Judged(NamedTuple):
-    """Views with what is known of them, and their unit vectors."""
+    """Views with their known facts and their unit vectors."""
 
     rows: list[Row]
     t_us: Int[np.ndarray, "n"]
     vectors: Mapping[str, Float[np.ndarray, "n D"]]
-    """By modality: image, lidar, joint."""
+    """Unit vectors by modality: image, lidar, joint."""
 
     @classmethod
     def of_logs(cls, logs: Sequence[LogPath], views: Sequence[LogViews], towers: Towers) -> "Judged":
-        """All views of some logs, `views` being what `gather_views` made of them."""
+        """Return all views of some logs; `views` is the result of `gather_views` for them."""
         t_us = [
             Log(path).t_us[[row.frame for row in mine.rows]] for path, mine in zip(logs, views, strict=True)
         ]
@@ -66,7 +68,7 @@ class Judged(NamedTuple):
 
 
 def questions() -> list[Question]:
-    """Single facts, and things under conditions."""
+    """Return queries for single facts, and for things under conditions."""
     single = [Question(_kind_of(fact), text, text, frozenset({fact})) for fact, text in QUERIES.items()]
     return single + [
         Question(
@@ -81,10 +83,11 @@ def questions() -> list[Question]:
 
 
 def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
-    """P@K by modality, then by "pool.kind.p_at_K"; the bounds of its 95 % interval end in "_low" and "_high".
+    """Return P@K by modality under "pool.kind.p_at_K", and its 95 % interval under "..._low" and "..._high".
 
-    Pools are the drives of one weather, and all; kinds those of `Question`, and every question. Sequences are
-    drives. "_above_image" is the difference to the image tower's, over the same draws of drives.
+    Pools are the drives of one weather, and all drives. Kinds are those of `Question`, and all queries. The
+    interval resamples drives. "_above_image" is the difference to the image tower, over the same resampled
+    drives.
     """
     logs = [row.log for row in judged.rows]
     drives = sorted(set(logs))
@@ -105,9 +108,10 @@ def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float
 
 
 def judge_naming(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
-    """By modality "zero_shot_accuracy" with its interval, and by weather.
+    """Return by modality "zero_shot_accuracy" with its interval, and by weather.
 
-    It is the mean over drives of the share of views whose weather is named right (`search.zero_shot`).
+    It is the mean over drives of the share of views whose weather is classified correctly
+    (`search.zero_shot`).
     """
     classes, names = class_vectors(towers, WEATHERS), list(WEATHERS)
     logs = np.array([row.log for row in judged.rows])
@@ -127,7 +131,7 @@ def judge_naming(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
 
 
 def weather_of(row: Row) -> str:
-    """One of `WEATHERS`."""
+    """Return the weather of a row, a key of `WEATHERS`."""
     if row.facts.weather in ("rain", "fog"):
         return row.facts.weather
     return "night" if row.facts.time_of_day == "night" else "clear"
@@ -144,7 +148,7 @@ def _kind_of(fact: str) -> str:
 def _rankings(
     question: Question, judged: Judged, drive: Int[np.ndarray, "n"], towers: Towers
 ) -> dict[str, Ranking]:
-    """A question's hits by modality."""
+    """Return a query's ranking for each modality."""
     text, lidar_text = (embed_prompt(towers, words).numpy() for words in (question.text, question.lidar_text))
     scores = {modality: vectors @ text for modality, vectors in judged.vectors.items()}
     scores["joint_logits"] = scores["image"] + judged.vectors["lidar"] @ lidar_text
@@ -175,7 +179,7 @@ def _ranking(
 def _kept(
     score: Float[np.ndarray, "n"], drive: Int[np.ndarray, "n"], t_us: Int[np.ndarray, "n"]
 ) -> list[int]:
-    """Rows that no better one of their drive is close to."""
+    """Return the rows that have no better row of their drive within `GAP_S`."""
     return collapse(score, [str(number) for number in drive], t_us, GAP_S, len(score))
 
 
@@ -191,7 +195,7 @@ def _fits(
     inside: Bool[np.ndarray, "n"],
     chosen: Int[np.ndarray, "s"],
 ) -> bool:
-    """Whether a question is worth asking of a pool."""
+    """Return whether a query can be evaluated on a pool."""
     if pool != ALL and question.kind in ("conditions", "composed"):
         return False
     share = _true_of(question, judged)[inside].mean()
@@ -201,7 +205,7 @@ def _fits(
 def _pooled(
     kept: Sequence[tuple[Question, Mapping[str, Ranking]]], drawn: Int[np.ndarray, "B s"]
 ) -> dict[str, dict[str, float]]:
-    """The figures of one pool, by modality."""
+    """Return the metrics of one pool by modality."""
     kinds = np.array([question.kind for question, _ in kept])
     found = {
         modality: np.stack([precision_at(rankings[modality], drawn, RANKS) for _, rankings in kept])
@@ -223,7 +227,7 @@ def _pooled(
 
 
 def _mean(values: Float[np.ndarray, "Q B K"]) -> Float[np.ndarray, "B K"]:
-    """Over the questions that something in a draw answers; NaN where there are none."""
+    """Return the mean over the queries with an answer in a resample; NaN if there are none."""
     there = ~np.isnan(values)
     count = there.sum(axis=0)
     return np.where(count > 0, np.where(there, values, 0).sum(axis=0) / count.clip(min=1), np.nan)

@@ -1,4 +1,4 @@
-"""Studies: arms that differ in one thing, trained on the same recorded towns and judged in one held out."""
+"""Studies: arms that differ in one thing, trained on the same towns and evaluated in a held-out town."""
 
 import dataclasses
 import os
@@ -24,13 +24,13 @@ from foredrive.training import PathFit, read_metrics
 HEADLINE = "uniad"
 """The protocol of NeMo's own tables."""
 JUDGED_EVERY_S = 1.0
-"""Neighbouring key frames say nearly the same."""
+"""Time between evaluated key frames, s; neighbouring key frames give nearly the same result."""
 PLANNERS = ("stand_still", "constant_velocity", "ego_mlp")
 
 
 @dataclass(frozen=True)
 class StudyTowns:
-    """What is driven for a study, in bright daylight, key frames alone."""
+    """The drives of a study, in bright daylight, with key frames only."""
 
     train: tuple[str, ...] = ("Town01", "Town02", "Town03", "Town04", "Town06", "Town07", "Town10HD")
     test: tuple[str, ...] = ("Town05",)
@@ -43,22 +43,22 @@ class StudyTowns:
 
 @dataclass(frozen=True)
 class StudyLogs:
-    """The drives, by seed and then by town, so that any first part of them has all towns in it."""
+    """The drives, ordered by seed and then by town, so that each first part contains all towns."""
 
     train: tuple[LogPath, ...]
     test: tuple[LogPath, ...]
 
 
 def work_folder(root: Path) -> Path:
-    """Where a study of this very code keeps its drives, labels and runs, to go on where it stopped."""
+    """Return the folder of a study with the present commit, where it also continues after an interruption."""
     return root / str(collect_provenance()["commit"] or "no_commit")
 
 
 def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
-    """Record what does not lie in `out` yet.
+    """Record the drives that are not in `out` yet.
 
     Raises:
-        InputError: if a drive failed: arms must not differ in what they are trained on.
+        InputError: a drive failed: all arms must have the same training data.
     """
     found = []
     for names, seeds in ((towns.train, towns.train_seeds), (towns.test, towns.test_seeds)):
@@ -73,7 +73,7 @@ def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
 
 
 def pandaset_log(root: Path) -> LogPath:
-    """The first log of the raw PandaSet in FOREDRIVE_REAL_DATA, converted into `root` if it is not there yet.
+    """Return the first log of the raw PandaSet in FOREDRIVE_REAL_DATA; convert it into `root` if necessary.
 
     Raises:
         InputError: there is no raw PandaSet here.
@@ -92,12 +92,12 @@ def _raw_pandaset() -> Path:
 
 
 def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:
-    """The first logs, whole ones, at least one."""
+    """Return the first part of the logs: whole logs, at least one."""
     return tuple(logs[: max(1, round(share * len(logs)))])
 
 
 def seeded(recipe: Recipe, seed: int) -> Recipe:
-    """The recipe with another seed for weights, order of data and rays."""
+    """Return the recipe with another seed for weights, order of data and rays."""
 
     return dataclasses.replace(
         recipe,
@@ -107,8 +107,11 @@ def seeded(recipe: Recipe, seed: int) -> Recipe:
 
 
 def shortened(recipe: Recipe) -> Recipe:
-    """What is trained of a recipe that plans where many are compared: fewer steps, in bfloat16, and the head
-    along the path on fewer clips, so that a run takes a quarter of an hour on one core."""
+    """Return a shorter training of a planning recipe, for comparisons of many runs.
+
+    It has fewer steps, uses bfloat16, and fits the path features on fewer clips, so that a run takes a
+    quarter of an hour on one core.
+    """
     pretrain = recipe.pretrain
     if pretrain is not None:
         pretrain = rescheduled(pretrain, steps=300, warmup_steps=20)
@@ -122,7 +125,7 @@ def shortened(recipe: Recipe) -> Recipe:
 
 
 def occupancy_alone(recipe: NemoRecipe) -> NemoRecipe:
-    """One stage that learns the occupancy of the present and nothing else, as long as pre-training takes."""
+    """Return a recipe of one stage that learns only the present occupancy, as long as pre-training."""
     stage = recipe.pretrain
     assert stage is not None
     weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
@@ -133,13 +136,13 @@ def occupancy_alone(recipe: NemoRecipe) -> NemoRecipe:
 def run_arm(
     recipe: Recipe, logs: StudyLogs, folder: Path, cache_dir: Path, start: Path | None = None
 ) -> dict[str, float]:
-    """Train one arm, judge it on the test drives, and return its figures; goes on where it stopped.
+    """Train one arm, evaluate it on the test drives, and return its metrics; continue where it stopped.
 
-    An arm that was judged is not judged again: `folder` belongs to one code and one set of test drives.
+    An evaluated arm is not evaluated again: `folder` belongs to one commit and one set of test drives.
 
-    `occupancy_iou` is that of voxels above the ground, now; `l2_avg_m` and `collision_avg_pct` are those of
-    UniAD's protocol, which NeMo's tables follow. Those of the other protocols, of later frames and of what
-    has to be beaten stand under longer names. `train_s` is what the steps of this run took.
+    `occupancy_iou` is the present IoU of voxels above the ground. `l2_avg_m` and `collision_avg_pct` follow
+    UniAD's protocol, as NeMo's tables do. Metrics of other protocols, later frames and baselines have longer
+    names. `train_s` is the time of the training steps of this run.
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
     if not (folder / SUMMARY).is_file():
@@ -155,7 +158,7 @@ def run_arm(
 
 
 def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What a study keeps of a summary: figures by name; those of a recipe that does not plan mean nothing."""
+    """Return the metrics that a study keeps; planning metrics mean nothing for a recipe without planning."""
     headline = f"planning.{HEADLINE}"
     kept = {
         "occupancy_iou": "occupancy.above_ground.iou_now",

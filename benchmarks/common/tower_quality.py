@@ -1,4 +1,4 @@
-"""How well towers find what is true of views that they were not trained on."""
+"""Retrieval quality of towers on views that they were not trained on."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,7 +17,7 @@ from foredrive.search.towers import Towers, embed_prompt, unit
 from foredrive.search.zero_shot import class_vectors, classify
 
 LEAST_SHARE, MOST_SHARE = 0.01, 0.6
-"""Facts of fewer or of more of the views are not asked for: chance alone would decide."""
+"""Minimum and maximum share of views with a fact; outside, chance alone would decide the result."""
 QUERIES = {
     **{noun: f"a {noun}" for noun in NOUNS.values()},
     **{f"near {noun}": f"a {noun} close by" for noun in NOUNS.values()},
@@ -27,18 +27,18 @@ QUERIES = {
     **{fact: texts[0] for fact, texts in SETTINGS.items()},
     EMPTY: "nobody around",
 }
-"""What is asked for each fact."""
+"""The query of each fact."""
 KINDS = ("time_of_day", "weather", "place")
-"""What is named without training, where the views have two of its classes at least."""
+"""Facts for zero-shot classification, if the views have at least two of the classes."""
 
 
 def judge_towers(views: Sequence[LogViews], towers: Towers) -> dict[str, float]:
-    """Mean average precision of all queries and the accuracy of naming, by modality.
+    """Return the mean average precision of all queries and the zero-shot accuracy, by modality.
 
-    "map_chance" is what random ranks have, "map_image" and so on what the towers have.
+    "map_chance" is the value of random ranks; "map_image" and the others are those of the towers.
 
     Raises:
-        InputError: no fact is true of some of the views and not of others.
+        InputError: no fact separates the views.
     """
     rows = [row for log in views for row in log.rows]
     vectors = embed_all(views, towers)
@@ -58,13 +58,13 @@ def judge_towers(views: Sequence[LogViews], towers: Towers) -> dict[str, float]:
 
 
 def average_precision(scores: Float[np.ndarray, "n"], true: Bool[np.ndarray, "n"]) -> float:
-    """The mean, over the true ones, of the share that is true down to each of them."""
+    """Return the average precision: the mean precision at the ranks of the true items."""
     ranked = true[np.argsort(-scores, kind="stable")]
     return float((np.cumsum(ranked) / np.arange(1, len(ranked) + 1))[ranked].mean())
 
 
 def _named(rows: Sequence[Row], found: Float[np.ndarray, "n D"], towers: Towers) -> Mapping[str, float]:
-    """The mean over classes of the share that is named right."""
+    """Return the mean over classes of the share that is classified correctly."""
     out = {}
     for kind in KINDS:
         told = [getattr(row.facts, kind) for row in rows]
@@ -78,7 +78,7 @@ def _named(rows: Sequence[Row], found: Float[np.ndarray, "n D"], towers: Towers)
 
 
 def embed_all(views: Sequence[LogViews], towers: Towers) -> dict[str, Float[np.ndarray, "n D"]]:
-    """Unit vectors by modality."""
+    """Return the unit vectors of all views by modality."""
     images = []
     for log in views:
         found = torch.zeros(len(log), towers.dim)
@@ -94,7 +94,7 @@ def embed_all(views: Sequence[LogViews], towers: Towers) -> dict[str, Float[np.n
 
 
 def _sweep(points: Float[Tensor, "P 4"]) -> LidarSweep:
-    """Returns as one sweep of beams from the origin."""
+    """Return the returns as one sweep of beams from the origin."""
     range_m = points[:, :3].norm(dim=-1)
     count = len(points)
     return LidarSweep(

@@ -1,4 +1,4 @@
-"""What must never happen in traffic, counted: overlaps, leaving the road, red lights, standing for ever."""
+"""Count errors of the traffic simulation: overlaps, leaving the road, red lights, standing for ever."""
 
 import numpy as np
 import shapely
@@ -10,10 +10,10 @@ from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Poses
 
 LEVEL_M = 2.0
-"""What is further apart in height passes over or under."""
+"""Minimum height difference at which actors pass over or under each other, m."""
 ROAD_MARGIN_M = 0.5
 WALK_MARGIN_M = 1.0
-"""People cut corners where walks meet."""
+"""Margin of the walkable area, m: pedestrians cut corners where walks meet."""
 CROSSING_REACH_M = 1.5
 SPEEDING = 1.1
 HARD_BRAKING_MPS2 = 6.0
@@ -23,7 +23,7 @@ JUMP_M = 0.15
 MOVES_M = 1.0
 STUCK_S = 240.0
 LOOK_EVERY = 3
-"""Outlines are compared at every third step only."""
+"""Outlines are compared only at every third step."""
 DRIVABLE = (
     StripKind.DRIVING,
     StripKind.SHOULDER,
@@ -46,7 +46,7 @@ VIOLATIONS = (
 
 
 class Audit:
-    """Watches steps of traffic; each violation counts once for every road user or pair of them."""
+    """Watches steps of traffic; each violation counts once for each actor or pair of actors."""
 
     def __init__(self, town: TownMap, traffic: Traffic) -> None:
         self._traffic = traffic
@@ -62,19 +62,19 @@ class Audit:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often each of `VIOLATIONS` was found."""
+        """Return the number of each of `VIOLATIONS`."""
         return {name: len(found) for name, found in self._found.items()}
 
     @property
     def examples(self) -> dict[str, list[tuple[int, ...]]]:
-        """The track ids involved."""
+        """Return the track ids of each violation."""
         return {name: sorted(found) for name, found in self._found.items()}
 
     def watch(self, before: TrafficState, after: TrafficState, poses: Poses | None = None) -> None:
-        """Look at one step.
+        """Check one step.
 
         Args:
-            poses: where the vehicles are after it, if one of them is not on its path.
+            poses: poses of the vehicles after the step, if one of them is not on its path.
         """
         then = self._poses_of(before)
         now = poses or self._traffic.poses(after)
@@ -150,7 +150,7 @@ class Audit:
 
 
 def _walkable(town: TownMap, traffic: Traffic) -> shapely.Geometry:
-    """Where people may be: walkways, which are never built over, and crossings."""
+    """Return the area in which pedestrians may be: walkways, which are never built over, and crossings."""
     walks = traffic.walks
     crossings = [
         shapely.LineString(walks.xyz[walks.first[i] : walks.first[i + 1], :2]).buffer(CROSSING_REACH_M)
@@ -161,7 +161,7 @@ def _walkable(town: TownMap, traffic: Traffic) -> shapely.Geometry:
 
 
 def _outlines(poses: Poses, state: TrafficState, live: Int[np.ndarray, "K"]) -> np.ndarray:
-    """Oriented boxes seen from above."""
+    """Return oriented boxes from above."""
     yaw, size = poses.yaw[live], 0.5 * state.vehicles.size_lwh[live]
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * size[:, :1]
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * size[:, 1:2]

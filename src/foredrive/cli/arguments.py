@@ -1,4 +1,4 @@
-"""Kinds of arguments that several verbs take, and checks that need nothing heavy imported."""
+"""Argument types that several verbs share, and checks without expensive imports."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ ImageSize = Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")]
 Number = float | int
 
 RUN_CONFIG = "config.yaml"
-"""What folders of runs have, and those of logs do not."""
+"""A file that folders of runs contain, and folders of logs do not."""
 LARGEST_IMAGE_PX = 16_384
 
 
@@ -28,17 +28,17 @@ def check_number(
     low: Number | None = None,
     high: Number = math.inf,
 ) -> None:
-    """Check a flag's number; None, where it was left out, is in order.
+    """Check the number of a flag; None (the flag is not given) is valid.
 
     Args:
-        flag: as the command line has it.
-        value: what was given.
-        above: the number is larger than this.
-        low: the number is at least this.
-        high: the number is at most this.
+        flag: name of the flag on the command line.
+        value: the given number.
+        above: the number must be larger than this.
+        low: minimum.
+        high: maximum.
 
     Raises:
-        InputError: it is outside of the range, infinite or not a number.
+        InputError: the number is outside the range, infinite or not a number.
     """
     if value is None:
         return
@@ -55,30 +55,30 @@ def check_number(
 
 
 def check_image_size(size: tuple[int, int] | None) -> None:
-    """Check --image-size. Raises `InputError` where there can be no such image."""
+    """Check --image-size. Raise `InputError` if the size is impossible."""
     if size is not None and not all(0 < side <= LARGEST_IMAGE_PX for side in size):
         raise InputError(f"--image-size is {size[0]} {size[1]}: sides are 1 to {LARGEST_IMAGE_PX} px")
 
 
 def check_out_folder(folder: Path | None) -> None:
-    """Check that --out can be a folder. Raises `InputError` where it is a file."""
+    """Check that --out can be a folder. Raise `InputError` if it is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: there is a file of that name; a folder is needed")
 
 
 def check_run(folder: Path) -> None:
-    """Check that a folder holds a run. Raises `InputError` where it does not."""
+    """Check that a folder holds a run. Raise `InputError` if it does not."""
     if not (folder / RUN_CONFIG).is_file():
         raise InputError(f"{folder}: not a run folder (no {RUN_CONFIG})")
 
 
 def check_rebuilt(folder: Path) -> None:
-    """Check that a folder holds a reconstruction. Raises `InputError` where it does not."""
+    """Check that a folder holds a reconstruction. Raise `InputError` if it does not."""
     if not (folder / RUN_CONFIG).is_file():
         raise InputError(f"{folder}: not the folder of a reconstruction (no {RUN_CONFIG})")
 
 
 def check_file(path: Path | None) -> None:
-    """Check that there is a file to be read. Raises `InputError` where there is none."""
+    """Check that a file exists. Raise `InputError` if it does not."""
     if path is not None and not path.is_file():
         raise InputError(f"{path}: no such file")

@@ -21,9 +21,11 @@ def bench(
     """List the benchmarks, or run one and write FOLDER/results/NAME.json.
 
     Args:
-        name: Benchmark to run; an interrupted one goes on where it stopped. Without a name they are listed.
-        arms: Run these arms only.
-        folder: Where the benchmarks lie: each is a Python file (_ for - in its name) that defines BENCHMARK.
+        name: Benchmark to run. An interrupted benchmark continues where it stopped. Without a name, all
+            benchmarks are listed.
+        arms: Run only these arms.
+        folder: Folder of the benchmarks. Each benchmark is a Python file that defines BENCHMARK; its file
+            name has _ in place of -.
     """
     from foredrive.evaluation import run_benchmark
 
@@ -50,7 +52,7 @@ def bench(
 
 
 def _load(path: Path) -> "Benchmark | None":
-    """The BENCHMARK that a file defines; None if it defines none."""
+    """Load the BENCHMARK of a file; return None if the file defines none."""
     from foredrive.evaluation import Benchmark
 
     module_name = f"benchmarks.{path.stem}"
@@ -58,7 +60,7 @@ def _load(path: Path) -> "Benchmark | None":
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # before it runs: its dataclasses look themselves up there
+    sys.modules[module_name] = module  # before it runs: its dataclasses look up their module there
     sys.path.insert(0, str(path.absolute().parent.parent))  # `benchmarks.common`
     spec.loader.exec_module(module)
     benchmark = getattr(module, "BENCHMARK", None)

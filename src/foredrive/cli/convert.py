@@ -17,8 +17,8 @@ def convert(
     """Convert a raw data set into 123D logs.
 
     Args:
-        dataset: pandaset, av2, nuscenes-keyframe or kitti-object; for others use py123d's own
-            py123d-conversion.
+        dataset: pandaset, av2, nuscenes-keyframe or kitti-object; for other data sets use py123d-conversion
+            of py123d.
         source: Folder of one raw log, or of many.
         out: 123D data root to write to.
     """

@@ -9,12 +9,12 @@ EXAMPLES, QUICK_EXAMPLES = 4, 1
 
 
 def demo(out: OptionalPath = None, quick: bool = False) -> None:
-    """Go once around the loop: record towns, train NeMo on them, judge it in a town it has not seen.
+    """Run the whole loop: record towns, train NeMo on them, evaluate it in a town that it has not seen.
 
     Args:
-        out: Folder for logs, run and report, by default runs/demo or runs/demo-quick. What an interrupted
-            demo has finished is not done again.
-        quick: Hardly any data or training: shows in about a minute that everything works.
+        out: Folder for logs, run and report; by default runs/demo or runs/demo-quick. An interrupted demo
+            continues where it stopped.
+        quick: Use very little data and training. This shows in about a minute that everything works.
     """
     check_out_folder(out)
 

@@ -24,17 +24,18 @@ def drive(
     towns: tyro.conf.OmitArgPrefixes[InTowns],
     rebuilt: tyro.conf.OmitArgPrefixes[InRebuilt],
 ) -> None:
-    """Drive routes in closed loop and score them as CARLA's leaderboards 1.0 and 2.1 do.
+    """Drive routes in closed loop and score them like CARLA's leaderboards 1.0 and 2.1.
 
-    Every drive is kept as it ends, with a 123D log of what was sensed; what lies there is not driven again.
-    With --in a rebuilt log is driven in instead of towns, along the way it drove itself; with --carla
-    the towns are those of a CARLA server.
+    Every drive is saved when it ends, with a 123D log of the sensor data. A saved drive is not driven again.
+    With --in the agent drives in a reconstructed log instead of towns, along the path of the log. With
+    --carla it drives in the towns of a CARLA server.
 
     Args:
-        agent: A run folder, the privileged expert, straight on at 5 m/s, standing still, or ego-mlp:RUN, the
-            MLP that sees ego status alone, fitted to what a run was trained on. Lessons, whose logs tell what
-            the expert would do at each key frame: disturbed, the expert steered aside and slowed, or
-            pupil:RUN, a run and the expert by turns.
+        agent: A run folder; expert (it has privileged information); constant-velocity (straight on at 5 m/s);
+            stop (stands still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the training
+            data of a run. Two more record DAgger demonstrations, with the expert's plan at each key frame in
+            the logs. disturbed is the expert while it is steered aside and slowed. pupil:RUN is a run and the
+            expert in alternation.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)
@@ -54,10 +55,10 @@ def drive(
 
 
 def _tell(driven: "Driven") -> None:
-    """The scores.
+    """Print the scores.
 
     Raises:
-        InputError: some drives could not be driven.
+        InputError: some drives broke off.
     """
     from rich.console import Console
 
@@ -81,7 +82,7 @@ def _tell(driven: "Driven") -> None:
 
 
 class _Progress:
-    """A bar over all drives, with the mean driving score so far."""
+    """A progress bar over all drives, with the mean driving score so far."""
 
     def __init__(self, total: int) -> None:
         from rich.progress import (
@@ -106,7 +107,7 @@ class _Progress:
         self._progress.stop()
 
     def tick(self, job: "DriveJob", drive: "DriveRecord | None") -> None:
-        """One drive is done with."""
+        """Count one more finished drive."""
         if drive is not None:
             self._scores.append(drive.driving_score_1_0)
         mean = f"score {sum(self._scores) / len(self._scores):.1f}" if self._scores else ""

@@ -1,4 +1,4 @@
-"""What `foredrive drive` drives on, in groups of options: routes through towns, or a rebuilt log."""
+"""Options of `foredrive drive`, in groups: planning, routes through towns, a reconstructed log."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,12 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Planning:
-    """How the agent plans.
+    """Planning of the agent.
 
     Args:
-        sensors: Log cameras and lidar of agents that need none, too; without, drives are much faster.
-        period: Time between plans.
-        latency: How much later than what it saw a plan takes effect.
+        sensors: Log cameras and lidar even if the agent does not need them; without them, drives are much
+            faster.
+        period: Time between two plans, s.
+        latency: Time from an observation until the plan made from it takes effect, s.
     """
 
     sensors: bool = True
@@ -37,7 +38,7 @@ class Planning:
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1
 
     def check(self) -> None:
-        """Raises `InputError` for times that there cannot be."""
+        """Raise `InputError` if a time is impossible."""
         check_number("--period", self.period, above=0)
         check_number("--latency", self.latency, low=0)
 
@@ -47,19 +48,20 @@ class InTowns:
     """Routes through towns.
 
     Args:
-        carla: Drive on a CARLA server instead of the embedded towns, one drive at a time, without scenarios.
-        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for lessons in
-            the other towns training-short and training-long.
-        repetitions: How often each route is driven, every time among other traffic.
-        seed: Decides the place, the traffic and all noise of the first repetition; the next has the next.
-        conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog;
-            any: drawn for each drive; a bright day if left out.
-        image_size: Size of the six cameras' images, px.
-        vehicles: How many vehicles share the road near the ego vehicle.
-        people: How many pedestrians do.
-        scenarios: Let others brake, cut in, run lights and step out on the way, in CARLA's manner.
-        workers: How many drives run at a time; 0 is one for each core.
-        ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on one started here.
+        carla: Drive on a CARLA server instead of in the embedded towns: one drive at a time, without
+            scenarios.
+        routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for DAgger
+            demonstrations in the other towns training-short and training-long.
+        repetitions: Number of drives of each route, each with other traffic.
+        seed: Seed of the town, the traffic and all noise in the first repetition; each repetition adds one.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog; any: drawn for
+            each drive; by default a bright day.
+        image_size: Size of the six cameras' images (height, width), px.
+        vehicles: Number of vehicles on the road near the ego vehicle.
+        people: Number of pedestrians near the ego vehicle.
+        scenarios: Include scenarios like CARLA's: actors brake, cut in, run lights and step out.
+        workers: Number of drives at a time; 0: one for each core.
+        ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
 
     routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short"
@@ -75,7 +77,7 @@ class InTowns:
     ray: bool = False
 
     def check(self) -> None:
-        """Raises `InputError` for numbers that there cannot be."""
+        """Raise `InputError` if a number is impossible."""
         check_number("--repetitions", self.repetitions, low=1)
         check_number("--seed", self.seed, low=0)
         check_image_size(self.image_size)
@@ -84,7 +86,7 @@ class InTowns:
         check_number("--workers", self.workers, low=0)
 
     def source(self) -> "TownRoutes | CarlaRoutes":
-        """What is to be driven."""
+        """Return the source of the drives."""
         from foredrive.runs.drive.in_towns import TownRoutes
 
         routes = TownRoutes(
@@ -106,14 +108,14 @@ class InTowns:
 
 @dataclass(frozen=True)
 class InRebuilt:
-    """A log that was rebuilt; then the options for towns do not count.
+    """A reconstructed log; it replaces the options for towns.
 
     Args:
-        rebuilt: Folder of a reconstruction to drive in. Its actors replay; agent "log" goes on as the log was
-            driven.
-        start: Times of the log at which drives begin; as early as possible if left out.
-        threat: Put a car in the way: one that stands, comes head-on or crosses.
-        edits: File of edits to the rebuilt scene.
+        rebuilt: Folder of a reconstruction to drive in. Its actors replay the log. The agent "log" replays
+            the logged ego drive.
+        start: Times of the log at which drives begin, s; by default as early as possible.
+        threat: Put a car in the way: it stands, comes head-on or crosses.
+        edits: File of edits to the reconstructed scene.
     """
 
     rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None
@@ -122,7 +124,7 @@ class InRebuilt:
     edits: OptionalPath = None
 
     def check(self) -> None:
-        """Raises `InputError` for files that are not there, and times that there cannot be."""
+        """Raise `InputError` if a file does not exist or a time is impossible."""
         if self.rebuilt is not None:
             check_rebuilt(self.rebuilt)
         for start in self.start:
@@ -130,10 +132,10 @@ class InRebuilt:
         check_file(self.edits)
 
     def source(self) -> "RebuiltRoutes | None":
-        """What is to be driven, if it is in a rebuilt log.
+        """Return the source of drives in a reconstructed log; None without --in.
 
         Raises:
-            InputError: what is for rebuilt logs is asked for without one.
+            InputError: options for reconstructed logs are given without --in.
         """
         if self.rebuilt is None:
             if self.start or self.threat or self.edits is not None:

@@ -24,19 +24,19 @@ def evaluate(
     batch_size: int = 4,
     rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="REBUILT")] = None,
 ) -> None:
-    """Judge a trained run against its baselines; write summary.json and report.html.
+    """Evaluate a trained run and its baselines; write summary.json and report.html.
 
-    With --in the gap between real and rendered images is measured instead, at the moments that a rebuilt log
-    has held out: how far the run's occupancy and plans agree, beside how well each fits the truth.
+    With --in it measures the gap between real and rendered images instead, at the held-out times of a
+    reconstructed log: how far the run's occupancy and plans agree on both, and how well each fits the labels.
 
     Args:
         run: Folder of a trained run.
-        logs: 123D logs, splits or data roots to judge it on; by default those it was trained on, which the
-            report then says.
-        out: Folder for summary.json and report.html; the run's own by default.
-        examples: How many examples the report shows in pictures.
-        batch_size: Clips judged at once.
-        rebuilt: Folder of a reconstruction whose log is still there; writes gap.json.
+        logs: 123D logs, splits or data roots for the evaluation; by default the training logs, and the report
+            then says so.
+        out: Folder for summary.json and report.html; by default the folder of the run.
+        examples: Number of examples that the report shows in pictures.
+        batch_size: Number of clips in a batch.
+        rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
     """
     check_run(run)
     check_number("--examples", examples, low=0)

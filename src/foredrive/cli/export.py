@@ -19,10 +19,10 @@ def export(
 
     Args:
         run: Folder of a trained run.
-        out: Folder for the models and export.json, which tells inputs, outputs, differences and latencies;
-            "export" in the run's folder by default.
-        logs: 123D logs, splits or data roots to compare on; by default those it was trained on.
-        clips: How many clips are compared.
+        out: Folder for the models and export.json, which describes inputs, outputs, differences and
+            latencies; by default "export" in the run's folder.
+        logs: 123D logs, splits or data roots for the comparison; by default the training logs.
+        clips: Number of clips to compare.
     """
     check_run(run)
     check_number("--clips", clips, low=1)

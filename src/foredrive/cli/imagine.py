@@ -17,17 +17,17 @@ def imagine(
     samples: int = 5,
     moments: int = 4,
 ) -> None:
-    """Film the futures that a trained model imagines, beside what happened.
+    """Write a video of the futures that a trained model imagines, beside the recorded future.
 
-    From above, against what lidar saw then, and through the cameras where the model renders.
+    It shows the scene from above, compared with the lidar, and the camera images if the model renders.
 
     Args:
         run: Folder of a trained run.
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: The video: .mp4, or .webp, which browsers play as a picture.
-        seconds: How far is imagined.
-        samples: How many futures are drawn from a model that knows chance; one that does not has one.
-        moments: From how many times of the log.
+        seconds: Length of each future, s.
+        samples: Number of futures drawn from a stochastic model; a deterministic model gives one.
+        moments: Number of times of the log from which the model imagines.
     """
     from foredrive.view.video import check_video
 

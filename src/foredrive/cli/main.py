@@ -1,4 +1,4 @@
-"""The program `foredrive`: its verbs, and what a user sees when one of them cannot go on."""
+"""The program `foredrive`: its verbs, and the messages when a verb cannot continue."""
 
 import errno
 import os
@@ -57,7 +57,7 @@ DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly. "
     "--version says which version this is."
 )
-# OpenMP threads that spin while they wait would take the cores from kernels and data workers.
+# OpenMP threads spin while they wait, which would take the cores from kernels and data workers.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
@@ -73,15 +73,15 @@ DISK_ERRORS = {
     errno.EISDIR: "there is a folder of that name",
 }
 ERROR_NUMBER = re.compile(r"\[Errno (\d+)\]|\(os error (\d+)\)")
-"""How Python and Rust write an operating system's error in a text."""
+"""Matches the number of an operating system's error in a message of Python or Rust."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit code.
+    """Run one verb; return the exit code.
 
-    Bad input and full disks are one line on stderr and 2, Ctrl-C one line and 130; on any other error the
-    traceback is shown, because it is a mistake in the program. What the command line itself gets wrong ends
-    in SystemExit(2), `--help` in SystemExit(0).
+    Bad input and full disks print one line on stderr and return 2; Ctrl-C prints one line and returns 130.
+    Any other error is a mistake in the program, and its traceback is shown. Errors of the command line itself
+    end in SystemExit(2), `--help` ends in SystemExit(0).
     """
     args = sys.argv[1:] if args is None else list(args)
     if args == ["--version"]:
@@ -95,13 +95,13 @@ def main(args: Sequence[str] | None = None) -> int:
             tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
         return _give_up(_last_words(error))
-    except BrokenPipeError:  # whoever reads our output has seen enough, such as `head`
+    except BrokenPipeError:  # the reader of our output, such as `head`, has stopped
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE
     except KeyboardInterrupt:
         return _end_interrupted()
     except Exception as error:
-        if interrupt.pressed:  # code that it hit has made another error of it
+        if interrupt.pressed:  # the interrupted code raised another error
             return _end_interrupted()
         reason = _disk_reason(error)
         if reason is None:
@@ -121,7 +121,7 @@ def _give_up(reason: str) -> int:
 
 
 def _last_words(error: BaseException) -> str:
-    """An error's message; of one from a worker process, which carries a traceback as text, the last line."""
+    """Return an error's message; if it contains the traceback of a worker process, only the last line."""
     lines = str(error).strip().splitlines()
     if lines and lines[0].startswith("Caught "):
         return lines[-1].partition(": ")[2]
@@ -129,9 +129,9 @@ def _last_words(error: BaseException) -> str:
 
 
 def _disk_reason(error: BaseException) -> str | None:
-    """What the disk refused and where; None if the disk is not to blame.
+    """Return the disk error and its path; None if the disk is not the cause.
 
-    Libraries wrap the operating system's error in their own, some keep only its text.
+    Libraries wrap the operating system's error in their own, and some keep only its text.
     """
     for cause in _causes(error):
         number, where = None, None
@@ -146,7 +146,10 @@ def _disk_reason(error: BaseException) -> str | None:
 
 
 def _written(error: BaseException) -> str | None:
-    """The final path of what was being written: noted by `files.naming`; of a worker's error in its text."""
+    """Return the final path of the file that was being written; None if it is unknown.
+
+    `files.naming` adds the path as a note; the error of a worker has it in its text.
+    """
     for cause in _causes(error):
         for line in (*getattr(cause, "__notes__", ()), *str(cause).splitlines()):
             if line.startswith(WHILE_WRITING):

@@ -8,10 +8,10 @@ import tyro
 def recipes(
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECIPE")] = None,
 ) -> None:
-    """List the recipes, or print one as YAML, to be changed and given to `train` or `reconstruct`.
+    """List the recipes, or print one as YAML, to edit it and pass it to `train` or `reconstruct`.
 
     Args:
-        name: Print this recipe; without a name all are listed.
+        name: Print this recipe; without a name, all recipes are listed.
     """
     from foredrive.recipes.config import recipe_yaml
     from foredrive.recipes.gaussians import REBUILD_RECIPES, find_rebuild_recipe

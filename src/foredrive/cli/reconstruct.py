@@ -20,23 +20,25 @@ def reconstruct(
     cache: OptionalPath = None,
     set: Settings = (),  # noqa: A002: the flag's name
 ) -> None:
-    """Rebuild a log as a scene to render cameras and lidars from, or go on with an interrupted run.
+    """Reconstruct a log as a scene that renders cameras and lidars, or continue an interrupted run.
 
-    Every second frame is held out, and the scene is judged on those. The run's folder holds the scene, its
-    figures (summary.json), pictures of frames that were held out (held_out.png) and what stands as a PLY file
-    that viewers of 3-D Gaussians read (static.ply).
+    Every second frame is held out, and the scene is evaluated on the held-out frames. The run's folder holds
+    the scene, its metrics (summary.json), pictures of held-out frames (held_out.png) and the static part as a
+    PLY file for viewers of 3-D Gaussians (static.ply).
 
     Args:
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
-        out: Folder of the run. Where it holds this run already, it goes on from the last checkpoint.
-        method: What the scene is made of.
+        out: Folder of the run. If it holds this run already, the run continues from the last checkpoint.
+        method: Representation of the scene.
         recipe: Name of the recipe, gaussians_tiny (minutes on two cores) or gaussians_base (a GPU), or a YAML
             file.
-        cameras: Only these, by their own names or 123D's, such as pcam_f0; by default the recipe's.
-        image_size: Images are shrunk to this, px; by default the recipe's, 270 480 or 1080 1920.
+        cameras: Use only these cameras, by their own names or 123D's, such as pcam_f0; by default the
+            recipe's.
+        image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or
+            1080 1920.
         cache: Folder for shrunk images; by default "cache" in the run's folder.
         set: Entries of the recipe to replace, such as schedule.steps=2000; `foredrive recipes RECIPE` prints
-            them all.
+            all entries.
     """
     check_image_size(image_size)
     check_out_folder(out)

@@ -41,24 +41,24 @@ def record(
 ) -> None:
     """Record drives through towns as 123D logs with exact labels.
 
-    One drive is recorded here and now. Several, of several towns, conditions or seeds, are recorded side by
-    side; logs that lie there whole are skipped, and a contact sheet shows what there is at the end.
+    A single drive is recorded in this process. Several drives (towns, conditions or seeds) are recorded in
+    parallel. Complete logs are skipped, and a contact sheet shows all drives at the end.
 
     Args:
         town: Town01 to Town07 or Town10HD; Town05 is held out for testing.
         out: 123D data root; logs and the towns' maps are written into it.
         seconds: Length of each drive, s.
-        seed: Decides the buildings, the route, the traffic and all noise; the same seed gives the same bytes.
-        seeds: Instead of one seed FIRST..LAST, or how many drives in each town under each of the conditions:
-            then seeds are chosen whose routes turn left, turn right and go straight equally often.
+        seed: Seed of the buildings, the route, the traffic and all noise; the same seed gives the same bytes.
+        seeds: Instead of one seed: a range FIRST..LAST, or the number of drives in each town and condition.
+            For a number, seeds are chosen whose routes turn left, turn right and go straight equally often.
         rate: Frames per second.
-        image_size: Size of the six cameras' images, px.
-        vehicles: How many vehicles share the road near the ego vehicle; drawn from a range for each drive.
-        people: How many pedestrians do, where the town has walkways.
-        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog, every drive under each;
+        image_size: Size of the six cameras' images (height, width), px.
+        vehicles: Number of vehicles on the road near the ego vehicle; from a range, drawn for each drive.
+        people: Number of pedestrians, where the town has walkways; from a range, drawn for each drive.
+        conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog: every drive under each;
             any: one for each drive, evenly; none: a bright day.
-        workers: How many drives are recorded at a time; 0 is one for each core.
-        ray: Record on Ray: on the cluster at RAY_ADDRESS, or on one started here.
+        workers: Number of drives recorded at a time; 0: one for each core.
+        ray: Record on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
     check_number("--seconds", seconds, above=0)
     check_number("--seed", seed, low=0)
@@ -97,7 +97,7 @@ def record(
 
 
 def _tell(done: "Recorded", plans: "list[DrivePlan]", out: Path) -> None:
-    """What was recorded, with pictures; at last what was not.
+    """Print the recorded drives, write the contact sheet, and report the failed drives last.
 
     Raises:
         InputError: some drives failed.
@@ -121,7 +121,7 @@ def _caption(plan: "DrivePlan") -> str:
 
 @contextmanager
 def _progress(total: int) -> "Iterator[Callable[[], None]]":
-    """A bar over all drives; yields what moves it on by one."""
+    """Show a progress bar over all drives; yield the function that advances it by one."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
@@ -131,13 +131,13 @@ def _progress(total: int) -> "Iterator[Callable[[], None]]":
 
 
 def _seeds(text: str) -> tuple[int, ...] | int:
-    """A range of seeds, or how many."""
+    """Return the seeds of a range, or the number of seeds."""
     first, last = _range("seeds", text)
     return tuple(range(first, last + 1)) if ".." in text else first
 
 
 def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names of conditions, checked; "none" stands for none at all."""
+    """Check the names of conditions and return them; "none" alone gives no names."""
     from foredrive.towns.conditions import ANY_CONDITIONS, find_conditions
 
     if names in ((NO_CONDITIONS,), (ANY_CONDITIONS,)):

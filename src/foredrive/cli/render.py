@@ -25,24 +25,27 @@ def render(
     seconds: float | None = None,
     rate_hz: float | None = None,
 ) -> None:
-    """Film a rebuilt log: its cameras and its lidar from above, edited beside unedited where there are edits.
+    """Write a video of a reconstructed log: its cameras, and its lidar from above.
 
-    The log itself is not needed any more. Numbers in the view from above are the actors' ids.
+    If there are edits, the edited scene is shown beside the unedited one. The log itself is not needed.
+    Numbers in the view from above are the actors' ids.
 
     Args:
         run: Folder of a reconstruction.
         out: The video: .mp4, or .webp, which browsers play as a picture.
-        shift_left: Let the ego vehicle drive so far to the left of where it drove; negative is to the right.
-        remove: Ids of actors that are not there.
-        insert: Actors of other runs, each on the way of an actor of this one, which --remove makes room for.
+        shift_left: Shift the ego vehicle's path to the left by this distance, m; negative: to the right.
+        remove: Ids of actors to remove.
+        insert: Actors of other runs, each on the path of an actor of this run; remove that actor with
+            --remove.
         edits: File of edits, applied before those of the other flags.
-        save_edits: Write all edits to this file, so that --edits applies them again.
-        cameras: Only these, in this order; by default all that were rebuilt.
-        lidar: Put this one where the log's lidar was; by default the log's own, where its pattern is known.
-        colour: What the lidar's points are coloured by.
-        start: Time since the log's start at which the film begins, s.
-        seconds: Length of the film, s; by default until the log's end.
-        rate_hz: Frames a second, shown in real time; by default as many as the log has.
+        save_edits: Write all edits to this file, so that --edits can apply them again.
+        cameras: Show only these cameras, in this order; by default all reconstructed cameras.
+        lidar: Mount this lidar in place of the log's lidar; by default the log's own, if its beam pattern is
+            known.
+        colour: Quantity that colours the lidar's points.
+        start: Start of the film, s since the start of the log.
+        seconds: Length of the film, s; by default until the end of the log.
+        rate_hz: Frames per second, shown in real time; by default the rate of the log.
     """
     from foredrive.view.video import check_video
 

@@ -27,15 +27,15 @@ def score(
     """Score detections as a random finite set; write summary.json, report.html and frames.jsonl.
 
     Args:
-        results: nuScenes or COCO results (JSON), or a folder of KITTI's text; docs/sets.md says how such
-            files state their uncertainty.
-        truth: The truth in the same format; for COCO its instances.
+        results: nuScenes or COCO results (JSON), or a folder of KITTI's text files; docs/sets.md describes
+            how such files state their uncertainty.
+        truth: The ground truth in the same format; for COCO its instances.
         against: Other results on the same frames, to compare with.
-        out: Folder for summary.json, report.html and frames.jsonl: every frame's scores, which
-            `foredrive search index --scores` takes.
-        family: What box densities are taken to be.
-        k: Best associations that are listed where there are too many to be summed.
-        worst: How many of the frames that lost most likelihood the report draws.
+        out: Folder for summary.json, report.html and frames.jsonl, which has the scores of every frame for
+            `foredrive search index --scores`.
+        family: Family of the box densities.
+        k: Number of best associations to sum if there are too many to sum all.
+        worst: Number of frames to draw in the report: those that lost most likelihood.
     """
     for path in (results, truth, *(() if against is None else (against,))):
         if not path.exists():
@@ -73,7 +73,7 @@ def score(
 def _compared(
     scores: "list[FrameScore]", against: Path, truth: Path, family: Family, k: int
 ) -> dict[str, Any]:
-    """The others' figures, and the difference to them."""
+    """Return the metrics of the other results, and the difference to them."""
     from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
 
     other = read_detections(against, truth, family)

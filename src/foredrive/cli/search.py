@@ -28,13 +28,13 @@ def search(
 ) -> None:
     """Find moments of indexed logs by a text, an example, their facts or their scores.
 
-    `foredrive search index LOGS` makes the index; `foredrive search page` asks it in the browser.
+    `foredrive search index LOGS` makes the index; `foredrive search page` queries it in the browser.
 
     Args:
-        index: The index: a folder, or a place on object storage.
-        towers: Where the towers that made the index lie now, if they have moved.
-        saved: Ask the query that was kept under this name, whatever else says what to look for.
-        untag: Take this tag away from whatever has it; nothing is looked for.
+        index: The index: a folder, or a location in object storage.
+        towers: Current folder of the towers that made the index, if they have moved.
+        saved: Run the query that was saved under this name; the other options of the query are ignored.
+        untag: Remove this tag from all moments that have it; no search is done.
     """
     hits.check()
     check_index(index)
@@ -58,12 +58,12 @@ def search(
 
 
 def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhost", port: int = 8090) -> None:
-    """Search in the browser: a grid of hits, conditions, a map of all scenes to draw around some.
+    """Search in the browser: a grid of hits, conditions, and a map of all scenes with a lasso.
 
     Args:
-        index: The index: a folder, or a place on object storage.
-        towers: Where the towers that made the index lie now, if they have moved.
-        host: Where the page is served; other machines see it at 0.0.0.0.
+        index: The index: a folder, or a location in object storage.
+        towers: Current folder of the towers that made the index, if they have moved.
+        host: Address at which the page is served; use 0.0.0.0 to make it visible to other machines.
         port: The page's port.
     """
     check_number("--port", port, low=1, high=65535)

@@ -16,13 +16,13 @@ def search_caption(
     index: Place = INDEX,
     towers: Name = None,
 ) -> None:
-    """Say what the views of a moment show: by their images, and by lidar alone.
+    """Describe what the views of a moment show: from their images, and from lidar alone.
 
     Args:
-        moment: A moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part of that
+        moment: A moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part of a view
             (LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM in px); LOG is the name of an indexed log or a log's folder.
-        index: The index that knows the log by name, and by default the towers.
-        towers: The folder of other towers, for which captions were trained; LOG is a folder then.
+        index: The index that contains the log's name; by default its towers are used.
+        towers: The folder of other towers with a trained caption decoder; LOG must be a folder then.
     """
     if towers is None:
         check_index(index)
@@ -50,18 +50,19 @@ def search_caption(
 def search_train_captions(
     logs: SomePaths, towers: Path, out: Path, stride: float = 0.5, epochs: int = 20, seed: int = 0
 ) -> None:
-    """Teach towers to say what they see, or go on with a run that was interrupted.
+    """Train a caption decoder for towers, or continue an interrupted run.
 
-    A small decoder learns from embeddings of images to say what is known of their views; sweeps, whose
-    embeddings lie in the same space, are then read by it too. It is put into the towers' folder.
+    A small decoder learns captions of the known facts of views from the views' image embeddings. The
+    embeddings of sweeps lie in the same space, so that the decoder reads them too. It is saved in the towers'
+    folder.
 
     Args:
         logs: 123D logs, splits or data roots with cameras, and with boxes or captions.
         towers: A folder of towers that `foredrive search train` made.
         out: Folder of the run.
-        stride: Time between the moments that are looked at, s.
-        epochs: How often it looks at each.
-        seed: Of weights and of the order of data.
+        stride: Time between the moments that are used, s.
+        epochs: Number of passes over the data.
+        seed: Seed of the weights and of the order of the data.
     """
     check_number("--stride", stride, above=0)
     check_number("--epochs", epochs, low=1)

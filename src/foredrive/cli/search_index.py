@@ -31,18 +31,18 @@ def search_index(
     ray: bool = False,
     scores: OptionalPath = None,
 ) -> None:
-    """Index logs for search, or go on with it: what is in stays, what has changed is put in anew.
+    """Index logs for search, or continue: indexed logs stay, changed logs are indexed again.
 
     Args:
         logs: 123D logs, splits, data roots or lists of clips.
-        index: Where the index lies: a folder, or a place on object storage such as s3://bucket/index.
-        towers: Those that come along ("embedded"); or a CLIP or SigLIP model: its name on Hugging Face's hub,
-            or its folder; or a folder that `foredrive search train` made.
-        stride: Time between the moments of a log that are indexed.
-        workers: How many parts of logs are embedded at a time; 0 is one for each core.
-        ray: Embed on Ray: on the cluster at RAY_ADDRESS, or on one started here.
-        scores: Per-frame scores of detections, one JSON object a line (docs/search.md); moments that are in
-            the index are given them too.
+        index: Location of the index: a folder, or object storage such as s3://bucket/index.
+        towers: "embedded", the towers of this package; or a CLIP or SigLIP model: its name on the Hugging
+            Face hub, or its folder; or a folder that `foredrive search train` made.
+        stride: Time between the moments of a log that are indexed, s.
+        workers: Number of parts of logs embedded at a time; 0: one for each core.
+        ray: Embed on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
+        scores: Per-frame scores of detections, one JSON object per line (docs/search.md); moments that are
+            already in the index receive them too.
     """
     check_number("--stride", stride, above=0)
     check_number("--workers", workers, low=0)
@@ -69,20 +69,21 @@ def search_train(
     lidar_steps: int | None = None,
     seed: int = 0,
 ) -> None:
-    """Train towers for search, or go on with a run that was interrupted.
+    """Train towers for search, or continue an interrupted run.
 
-    An image tower learns beside a sentence encoder from what is known of each camera's view, then a lidar
-    tower from the image tower. Beside other towers only a lidar tower is trained, from images alone.
+    An image tower is trained with a sentence encoder on the known facts of each camera's view, then a lidar
+    tower on the image tower. With --beside only a lidar tower is trained, on the images alone.
 
     Args:
         logs: 123D logs, splits or data roots with cameras and lidar; image towers need boxes or captions.
-        out: Folder of the run; the towers lie in its folder "towers".
+        out: Folder of the run; the towers are in its folder "towers".
         cache: Folder for views; by default "cache" in the run's folder.
-        beside: Towers whose images teach the lidar tower: embedded, a folder, or a CLIP or SigLIP model.
-        loss: What the lidar tower is trained by: mean squared error, or 1 - cosine.
-        image_steps: Steps of the image tower; by default 20 epochs.
-        lidar_steps: Steps of the lidar tower; by default 10 epochs.
-        seed: Of weights and of the order of data.
+        beside: Towers whose image embeddings train the lidar tower: embedded, a folder, or a CLIP or SigLIP
+            model.
+        loss: Loss of the lidar tower: mean squared error, or 1 - cosine.
+        image_steps: Training steps of the image tower; by default 20 epochs.
+        lidar_steps: Training steps of the lidar tower; by default 10 epochs.
+        seed: Seed of the weights and of the order of the data.
     """
     check_number("--image-steps", image_steps, low=1)
     check_number("--lidar-steps", lidar_steps, low=1)
@@ -112,7 +113,7 @@ def _tell_indexed(done: "Indexed", index: str) -> None:
 
 @contextmanager
 def _progress() -> "Iterator[Callable[[int, int], None]]":
-    """A bar over all moments; yields what moves it."""
+    """Show a progress bar over all moments; yield the function that updates it."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())

@@ -1,4 +1,4 @@
-"""What `foredrive search` is asked for, and what comes of its hits, in groups of options."""
+"""Options of `foredrive search`, in groups: the query, the moments, the ranking, and the use of the hits."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ Seconds = Annotated[float, tyro.conf.arg(metavar="SECONDS")]
 
 
 def check_index(place: str) -> None:
-    """Check that there may be an index. Raises `InputError` where a local folder is not there."""
+    """Check that an index can exist. Raise `InputError` if a local folder does not exist."""
     if "://" not in place and not Path(place).is_dir():
         raise InputError(f"{place}: no index here; foredrive search index LOGS --index {place} makes one")
 
@@ -30,16 +30,16 @@ class LookFor:
     """What to look for.
 
     Args:
-        text: What to look for, such as "pedestrian crossing at night".
-        like: Look for what is like a moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part
-            of that (LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM in px); LOG is the name of an indexed log
-            or a log's folder.
+        text: Text to look for, such as "pedestrian crossing at night".
+        like: Find moments that are similar to a moment (LOG@12.5s), one view of it (LOG@12.5s/VIEW) or a part
+            of a view (LOG@12.5s/VIEW:LEFT,TOP,RIGHT,BOTTOM in px); LOG is the name of an indexed log or a
+            log's folder.
         modality: Compare with images, with sweeps, or with both.
-        rule: How both are joined: the sum of features, the sum of logits, or the best by image
+        rule: How images and sweeps are combined: the sum of features, the sum of logits, or the best by image
             ranked again by lidar.
         image_text: Compare images with this text instead.
         lidar_text: Compare sweeps with this text instead.
-        plain: Take texts as they are; else they are worded in several ways.
+        plain: Use texts as they are; by default each text is worded in several ways.
     """
 
     text: tyro.conf.Positional[Text] = None
@@ -53,12 +53,12 @@ class LookFor:
 
 @dataclass(frozen=True)
 class Among:
-    """Among which moments.
+    """Which moments to search.
 
     Args:
-        where: A condition on the index' columns, such as "ego_speed > 5 AND weather = 'rain'";
-            docs/search.md names them.
-        tagged: Only moments that have this tag.
+        where: A condition on the columns of the index, such as "ego_speed > 5 AND weather = 'rain'";
+            docs/search.md lists the columns.
+        tagged: Search only moments that have this tag.
         view: any, sectors, all (whole scenes) or the name of a camera.
     """
 
@@ -69,15 +69,15 @@ class Among:
 
 @dataclass(frozen=True)
 class Choose:
-    """Which hits, and in what order.
+    """Which hits to return, and in what order.
 
     Args:
-        top: How many hits.
-        gap: Moments of one log that are closer than this are one hit.
-        diverse: Of the best ten times as many take those that differ most (k-centre), or that stand
-            for most.
-        by: Rank by a column of numbers as well, such as score_missed; without a text by it alone.
-        mix: What that column weighs beside likeness, 0 to 1.
+        top: Number of hits.
+        gap: Moments of one log that are closer than this count as one hit, s.
+        diverse: From the best ten times as many hits, choose those that differ most (k-centre), or those that
+            represent most of the others.
+        by: Rank also by a column of numbers, such as score_missed; without a text, rank by this column alone.
+        mix: Weight of that column relative to similarity, 0 to 1.
     """
 
     top: int = 20
@@ -93,12 +93,12 @@ class Then:
 
     Args:
         out: Write a contact sheet: PNG or HTML.
-        clips: Write the hits as a list of clips, which `foredrive train --logs` and other verbs
-            take as logs.
-        before: How much of such a clip lies before its hit.
-        after: How much of it lies after.
+        clips: Write the hits as a list of clips, which `foredrive train --logs` and other verbs accept as
+            logs.
+        before: Length of such a clip before its hit, s.
+        after: Length of such a clip after its hit, s.
         tag: Give all hits this tag.
-        save: Keep this query under a name.
+        save: Save this query under a name.
     """
 
     out: OptionalPath = None
@@ -109,7 +109,7 @@ class Then:
     save: Name = None
 
     def check(self) -> None:
-        """Raises `InputError` for what cannot be written, before anything is looked for."""
+        """Raise `InputError` for output that cannot be written, before the search begins."""
         check_number("--before", self.before, low=0)
         check_number("--after", self.after, low=0)
         if not self.before + self.after > 0:
@@ -118,7 +118,7 @@ class Then:
             raise InputError(f"{self.out}: a contact sheet ends on .png or .html")
 
     def do(self, index: str, query: "Query", found: "Found") -> None:
-        """Keep, tag and write."""
+        """Save the query, tag the hits, and write the files."""
         from foredrive.data.clip_list import write_clip_list
         from foredrive.runs.search.searching import listed_clips
         from foredrive.search.kept import add_tag, save_query
@@ -139,7 +139,7 @@ class Then:
 
 
 def as_query(look_for: LookFor, among: Among, choose: Choose) -> "Query":
-    """The question that options ask. Raises `InputError` as `Query` does."""
+    """Return the query of the options. Raise `InputError` as `Query` does."""
     from foredrive.search.query import Query
 
     return Query(

@@ -18,18 +18,18 @@ def train(
     start: OptionalPath = None,
     set: Settings = (),  # noqa: A002: the flag's name
 ) -> None:
-    """Train a recipe on logs, or go on with a run that was interrupted.
+    """Train a recipe on logs, or continue an interrupted run.
 
     Args:
         recipe: Name of the recipe, such as nemo_tiny (`foredrive recipes` lists all), or a YAML file.
         logs: 123D logs, splits or data roots to train on.
-        out: Folder of the run. Where it holds this run already, training goes on from the last checkpoint.
+        out: Folder of the run. If it holds this run already, training continues from the last checkpoint.
         cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
-        occupancy: What voxel labels are made from: what lidar beams met and passed through, or the exact
-            occupancy that towns record, seen or not. The run is evaluated by the same.
-        start: Another run's folder: take its pre-trained weights and go straight on to fine-tuning.
+        occupancy: Source of the voxel labels: the voxels that lidar beams hit and passed through, or the
+            exact occupancy that towns record, visible or not. The run is evaluated with the same labels.
+        start: Another run's folder: use its pre-trained weights and begin with fine-tuning.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
-            prints them all.
+            prints all entries.
     """
     check_out_folder(out)
     if start is not None:

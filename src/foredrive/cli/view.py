@@ -25,21 +25,23 @@ def view(
     host: str = "localhost",
     port: int = 8080,
 ) -> None:
-    """Look at a log, or at one that was rebuilt: in 3-D and over time on a page in the browser. Of a log one
-    time can be had as a picture, too; in a rebuilt one actors can be dragged, removed and added.
+    """Show a log or a reconstruction in 3-D and over time, on a page in the browser.
+
+    With --save one time of a log is written as a picture instead. In a reconstruction, actors can be dragged,
+    removed and added.
 
     Args:
-        log: Folder of a 123D log, or of a split or data root with exactly one log in it; or that of a
+        log: Folder of a 123D log, or of a split or data root with exactly one log in it; or the folder of a
             reconstruction.
-        run: Folder of a trained run: the page shows what its model sees, imagines and plans, too.
-        edits: Of a reconstruction: file of edits to begin with, where the page saves them, too; by default it
-            saves them as "edits.json" in the run's folder, and begins without any.
+        run: Folder of a trained run: the page also shows what its model predicts, imagines and plans.
+        edits: For a reconstruction: file of edits that the page loads and saves. By default the page starts
+            without edits and saves them as "edits.json" in the folder of the reconstruction.
         save: Write a picture (PNG) and serve no page: every camera with lidar and boxes, and the scene from
             above with the map.
-        t: Time since the log's start, s; by default the middle of the log, of a reconstruction the start.
-        reach: How far the picture's view from above looks in each direction, m.
-        host: Where the page is served; other machines see it at 0.0.0.0.
-        port: The page's port; the next free one if it is taken.
+        t: Time since the start of the log, s; by default the middle of a log, the start of a reconstruction.
+        reach: Distance that the picture's view from above shows in each direction, m.
+        host: Address at which the page is served; use 0.0.0.0 to make it visible to other machines.
+        port: The page's port; if it is taken, the next free port.
     """
     check_number("--t", t)
     check_number("--reach", reach, above=0)
@@ -80,7 +82,7 @@ def view(
 
 
 def _opened(run: Path) -> "Run":
-    from foredrive.runs import open_run  # only now: a log alone needs none of it
+    from foredrive.runs import open_run  # only now: a log alone does not need it
 
     return open_run(run)
 

@@ -14,8 +14,8 @@ def build_agent(recipe: Recipe[Any, Any], *, fetch: bool = True) -> PlanningAgen
     """Build the world model and the planner with fresh weights.
 
     Args:
-        fetch: whether to fetch what the recipe names, weights of a backbone and encodings of texts; not
-            needed where trained weights will replace them.
+        fetch: whether to download what the recipe names: weights of a backbone and encodings of texts. It is
+            not needed where trained weights replace them.
     """
     clips = recipe.clips
     world_model = WORLD_MODELS[recipe.model.kind].build(recipe.model, clips, fetch)

@@ -1,4 +1,4 @@
-"""The demo's part below pictures: record towns, train, evaluate on the one held out."""
+"""The demo without its pictures: record towns, train, evaluate on the held-out town."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,23 +15,23 @@ from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 RATE_HZ = 2.0
-"""Key frames alone: one every 0.5 s."""
+"""Recording rate: one key frame every 0.5 s."""
 
 
 @dataclass(frozen=True)
 class DemoSize:
-    """How much is recorded and how long is trained."""
+    """The amount of recorded data and of training."""
 
     recipe: Recipe
     train_drives: tuple[tuple[str, int], ...]
-    """Town and seed of each."""
+    """Town and seed of each drive."""
     test_drives: tuple[tuple[str, int], ...]
     train_s: float
     test_s: float
 
 
 def full_demo() -> DemoSize:
-    """Minutes on two cores: two training towns, Town05 held out."""
+    """Return the full size, minutes on two cores: two training towns, Town05 held out."""
     return DemoSize(
         recipe=nemo_tiny(),
         train_drives=(("Town01", 1), ("Town03", 1), ("Town01", 2), ("Town03", 2)),
@@ -42,7 +42,7 @@ def full_demo() -> DemoSize:
 
 
 def quick_demo() -> DemoSize:
-    """The same steps in a minute or so: they run, but nothing is learned worth looking at."""
+    """Return a size with the same steps that takes about a minute. The model learns nothing useful."""
     recipe, few = nemo_tiny(), {"batch_size": 2, "warmup_steps": 2}
     return DemoSize(
         recipe=dataclasses.replace(
@@ -59,7 +59,7 @@ def quick_demo() -> DemoSize:
 
 
 def run_demo(size: DemoSize, out: Path, say: Callable[[str], None]) -> tuple[Run, list[LogPath]]:
-    """Record, pre-train, fine-tune, evaluate; goes on where an earlier call stopped.
+    """Record, pre-train, fine-tune and evaluate; continue where an earlier call stopped.
 
     Returns:
         the run, whose folder is `out/run`, and the held-out logs.
@@ -77,7 +77,7 @@ def run_demo(size: DemoSize, out: Path, say: Callable[[str], None]) -> tuple[Run
 def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
     folder = out / "towns"
     there = folder / "logs" / split_of(town) / f"{town}_seed{seed}"
-    if there.is_dir():  # logs are whole or not there
+    if there.is_dir():  # a log is either complete or absent
         return LogPath(there, folder / "maps")
     sensors = SensorSuite(camera_rig(nemo_tiny().clips.image_hw), roof_lidar())
     return record(

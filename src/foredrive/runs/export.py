@@ -1,4 +1,4 @@
-"""A trained run as files for other runtimes, compared with the run itself on clips of real logs."""
+"""Export a trained run to files for other runtimes, and compare them with the run on clips of logs."""
 
 import dataclasses
 import json
@@ -27,13 +27,13 @@ from foredrive.scene import Clip
 PROGRAM, MODEL, FACTS = "model.pt2", "model.onnx", "export.json"
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 ROUNDS = 3
-"""How often each clip is run when time is taken."""
+"""Number of timed runs of each clip."""
 
 Infer = Callable[[GraphInputs], GraphOutputs]
 
 
 class _Sample(NamedTuple):
-    """One observed clip, a batch of one, in both forms."""
+    """One observed clip (batch size 1), as a clip and as inputs of the graph."""
 
     observed: Clip
     inputs: GraphInputs
@@ -43,17 +43,19 @@ class _Sample(NamedTuple):
 def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> dict[str, Any]:
     """Write model.pt2 (torch.export), model.onnx (opset 20) and export.json.
 
-    Both models take a batch of one and as many cameras as `logs` have. They are read back and compared, in
-    what they say and how long they take, with the agent as it runs here; export.json has it all, as returned.
+    Both models take a batch of one and the cameras of `logs`. The function reads them back and compares their
+    outputs and their latency with those of the PyTorch agent. The returned dict is the content of
+    export.json.
 
     Args:
-        run: one that has finished a stage.
-        logs: what is compared on.
+        run: a run that has finished a stage.
+        logs: logs for the comparison.
         out: folder for the files.
-        clips: how many, spread evenly over the logs.
+        clips: number of clips, spread evenly over the logs.
 
     Raises:
-        InputError: without the packages of the extra `export`; if there is nothing to export or to compare.
+        InputError: the packages of the extra `export` are missing, or there is nothing to export or to
+            compare.
     """
     if clips < 1:
         raise InputError(f"parity needs at least one clip, got {clips}")
@@ -99,7 +101,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
 
 
 def _samples(dataset: ClipDataset, agent: PlanningAgent[Any], count: int) -> list[_Sample]:
-    """Clips spread evenly over the logs."""
+    """Return clips spread evenly over the logs."""
     every = len(dataset) / count if count else 0.0
     clips = [collate([dataset[int((k + 0.5) * every)]]).clip.observed() for k in range(count)]
     return [_Sample(observed, GraphInputs.of(observed, agent)) for observed in clips]
@@ -126,20 +128,20 @@ def _as_it_runs_here(agent: PlanningAgent[Any], observed: Clip, steps: int) -> G
 
 
 def _program(path: Path) -> Infer:
-    """A torch.export program, read back."""
+    """Read back a torch.export program."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # PyTorch's own
+        warnings.simplefilter("ignore", FutureWarning)  # from PyTorch itself
         module = torch.export.load(path).module()
     return lambda inputs: GraphOutputs(**module(*inputs))
 
 
 def _session(path: Path) -> Infer:
-    """An ONNX model in onnxruntime, on the CPU with as many threads as PyTorch has."""
+    """Open an ONNX model in onnxruntime, on the CPU, with as many threads as PyTorch."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 3  # it tells of every constant that it cannot fold
+    options.log_severity_level = 3  # it would report every constant that it cannot fold
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [entry.name for entry in session.get_inputs()]
 
@@ -151,7 +153,9 @@ def _session(path: Path) -> Infer:
 
 
 def _largest_difference(truth: Sequence[GraphOutputs], said: Sequence[GraphOutputs]) -> dict[str, float]:
-    """Of every output over all clips, in its own unit; and the share of voxels on the other side of 0."""
+    """Return the largest difference of each output over all clips, in the output's unit, and the share of
+    voxels whose logit changes its sign.
+    """
     found = {}
     for name in GraphOutputs._fields:
         pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(truth, said, strict=True)]
@@ -161,14 +165,17 @@ def _largest_difference(truth: Sequence[GraphOutputs], said: Sequence[GraphOutpu
 
 
 def _difference(name: str, a: Tensor, b: Tensor) -> Float[Tensor, "..."]:
-    """Of angles, the way round that is shorter."""
+    """Return a - b; for angles, wrapped to [-pi, pi)."""
     return torch.remainder(a - b + torch.pi, 2 * torch.pi) - torch.pi if name == "waypoints_yaw" else a - b
 
 
 def _latency_ms(
     agent: PlanningAgent[Any], runtimes: dict[str, Infer], samples: Sequence[_Sample], steps: int
 ) -> dict[str, dict[str, float]]:
-    """Median and 90th percentile of one clip, in turns, so that a busy machine slows all of them alike."""
+    """Return median and 90th percentile of the latency of one clip, ms.
+
+    The runtimes take turns, so that a busy machine slows all of them alike.
+    """
     times: dict[str, list[float]] = {"eager": [], **{name: [] for name in runtimes}}
     for _ in range(ROUNDS):
         for sample in samples:

@@ -1,10 +1,10 @@
-"""Many jobs at once, over processes or over Ray; what one of them fails of takes none of the others with it.
+"""Run many jobs at once, in processes or on Ray; a job that fails does not stop the others.
 
-An interruption reaches every worker, and what they have half written is cleared away before it is raised.
+An interruption reaches every worker. Each worker removes its unfinished files before the interruption is
+raised.
 
-Local work runs on the standard library's process pool: Ray would start a cluster of processes for two
-workers, and loky ends its workers by killing them, so that half-written files would stay. Ray serves
-clusters.
+Local work runs on the standard library's process pool. Ray would start a cluster of processes for two
+workers. loky kills its workers, so that unfinished files would stay. Ray serves clusters.
 """
 
 import _thread
@@ -28,7 +28,7 @@ from foredrive.interrupts import LastingInterrupt
 from foredrive.training.interrupts import start_fork_server
 
 LAST_WORDS_S = 60.0
-"""How long Ray's tasks may take to clear away what they have half written."""
+"""Maximum time for Ray's tasks to remove their unfinished files, s."""
 
 _log = logging.getLogger(__name__)
 J = TypeVar("J")
@@ -38,13 +38,13 @@ R = TypeVar("R")
 def fan_out(
     jobs: Sequence[J], work: Callable[[J], R], workers: int, *, on_ray: bool = False
 ) -> Generator[tuple[J, R | BaseException], None, None]:
-    """Jobs as they end, with what came of them or what they failed of; no more under way than are worked on.
+    """Yield each job when it ends, with its result or its error; submit only as many jobs as run at a time.
 
     Close the generator to stop early (`contextlib.closing`).
 
     Args:
-        work: can be pickled, as jobs and results can.
-        workers: jobs at a time. On Ray that is the size of a cluster which is started here; one that
+        work: must be picklable, as must the jobs and the results.
+        workers: jobs at a time. On Ray it is the size of a cluster that is started here; a cluster that
             RAY_ADDRESS names is used as it is.
     """
     waiting, running = deque(jobs), dict[Future[R], J]()
@@ -60,12 +60,12 @@ def fan_out(
 
 
 def reason(name: str, error: BaseException) -> str:
-    """Why a job failed, in one line.
+    """Return in one line why a job failed.
 
     Raises:
-        BaseException: the error itself, if it is no job's own fault: a full disk, an interruption.
+        BaseException: the error itself, if the job did not cause it: a full disk, an interruption.
     """
-    error = getattr(error, "cause", None) or error  # Ray wraps it, with its traceback as text
+    error = getattr(error, "cause", None) or error  # Ray wraps the error, with its traceback as text
     if isinstance(error, OSError) or not isinstance(error, Exception):
         raise error
     if isinstance(error, InputError):
@@ -78,10 +78,10 @@ def reason(name: str, error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
-    """Worker processes, anew after one has died; at the end they have cleared away what is half-written."""
+    """Run jobs in worker processes, which remove their unfinished files at the end; replace a dead worker."""
     start_fork_server(preload=_module_of(work))
     context = multiprocessing.get_context("forkserver")
-    stop, alive = context.Pipe(duplex=False)  # an event would wait for ever for a process that has died
+    stop, alive = context.Pipe(duplex=False)  # an event would wait for ever for a dead process
     pool: ProcessPoolExecutor | None = None
 
     def submit(job: J) -> Future[R]:
@@ -103,15 +103,18 @@ def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callab
 
 
 class _Worker:
-    """What a worker process knows of itself."""
+    """The state of a worker process."""
 
     is_busy = False
     interrupt = LastingInterrupt(lambda: _Worker.is_busy)
 
 
 def _start_worker(stop: Connection) -> None:
-    """Stop when the parent closes its end of a pipe, not by Ctrl-C; clear away what is half-written."""
-    rich.get_console().quiet = True  # the parent shows how far it is
+    """Set up a worker: stop when the parent closes its end of the pipe, not by Ctrl-C.
+
+    The worker removes its unfinished files when it stops.
+    """
+    rich.get_console().quiet = True  # the parent shows the progress
 
     def watch() -> None:
         stop.poll(None)
@@ -133,8 +136,8 @@ def _unless_stopped(work: Callable[[J], R], job: J) -> R:
 
 @contextlib.contextmanager
 def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
-    """Ray's tasks of one core each; at the end they have cleared away what is half-written."""
-    import ray  # takes a second
+    """Run jobs as Ray tasks of one core each. At the end the tasks have removed their unfinished files."""
+    import ray  # the import takes a second
 
     started_here = not ray.is_initialized()
     if started_here:
@@ -167,5 +170,5 @@ def _quietly(work: Callable[[J], R], job: J) -> R:
 
 
 def _module_of(work: Any) -> str:
-    """Where a function or a partial of one is defined: what the workers import before they are forked."""
+    """Return the module that defines a function or a partial; the fork server imports it before it forks."""
     return str(getattr(work, "func", work).__module__)

@@ -1,4 +1,4 @@
-"""Folders that runs are made in: one process at a time, gone on with by who asks for the same, and marked."""
+"""Run folders: one process writes at a time, an interrupted run continues, and the commit is noted."""
 
 import contextlib
 import json
@@ -21,36 +21,38 @@ CONFIG, LOGS, LOG, WEIGHTS, SUMMARY = (
     "model.safetensors",
     "summary.json",
 )
-"""Of training runs and reconstructions: the recipe, the log or logs, what was learned, how good it is."""
+"""Files of training runs and reconstructions: the recipe, the logs, the log, the weights, the metrics."""
 RECIPE = "recipe.json"
-"""Of towers: the recipe and the logs."""
+"""File of retrieval towers: the recipe and the logs."""
 SUITE, DRIVES = "suite.json", "drives"
-"""Of drives: who drives what, and a file for each drive."""
+"""Files of a suite of drives: the suite's file, and the folder with a file for each drive."""
 MADE_BY = "made_by.json"
-"""The code that a run was begun with."""
+"""File that notes the commit with which a run began."""
 LOCK = ".lock"
-"""Held by the operating system for as long as its process lives: a killed one leaves the folder free."""
+"""Lock file. The operating system holds the lock as long as its process lives, so that a killed process
+leaves the folder free.
+"""
 _RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")
-"""How processes that train together are told apart; the first of them holds the lock for all."""
+"""Variables that number processes that train together; the first process holds the lock for all."""
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that something is made in step by step, and gone on with after an interruption."""
+    """A folder that is filled step by step and can be continued after an interruption."""
 
     path: Path
     wanted: Mapping[str, object]
-    """What is asked for; the keys complete "PATH: holds ..." where a folder holds something else."""
+    """The request. The keys complete the message "PATH: holds ..." if the folder holds something else."""
     read: Callable[[], Mapping[str, object] | None]
-    """What was asked for when the folder was begun, by the same keys; None: nothing was."""
+    """Returns the request with which the folder began, with the same keys; None: the folder is new."""
     write: Callable[[], None]
-    """Note what is asked for."""
+    """Writes the request to the folder."""
     grows: bool = False
-    """Whether more may be asked for later: it is noted each time."""
+    """Whether the request may grow later; it is then written each time."""
 
     def check(self) -> bool:
-        """Whether the folder has been begun, with the same.
+        """Return whether the folder was begun with the same request.
 
         Raises:
             InputError: it holds something else.
@@ -63,7 +65,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def claimed(self) -> Iterator[None]:
-        """Begin the folder or go on with it, and keep other processes from writing to it meanwhile.
+        """Begin or continue the folder, and keep other processes from writing to it meanwhile.
 
         Raises:
             InputError: it holds something else, or another process writes to it.
@@ -75,13 +77,13 @@ class RunFolder:
             yield
 
     def _mark(self, begun: bool) -> None:
-        """Keep the commit that a run was begun with; say so if it goes on under another."""
+        """Note the commit with which a run begins; warn if the run continues with another commit."""
         file = self.path / MADE_BY
         if not begun:
             with atomic_path(file) as temporary:
                 temporary.write_text(json.dumps({"commit": COMMIT}) + "\n")
             return
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # older runs have no mark
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # older runs have no such file
             commit = json.loads(file.read_text())["commit"]
             if commit != COMMIT:
                 _log.warning(
@@ -91,7 +93,7 @@ class RunFolder:
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing to a folder, which is made if need be.
+    """Keep other processes from writing to a folder; create it if it does not exist.
 
     Raises:
         InputError: another process writes to it.

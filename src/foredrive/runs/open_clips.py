@@ -1,4 +1,4 @@
-"""Opening clips for a model that sees by cameras."""
+"""Open clips for a model with camera input."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,10 +8,10 @@ from foredrive.errors import InputError
 
 
 def open_clips(logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path) -> ClipDataset:
-    """Clips that a model can see something in; cameras that some of the logs lack are masked.
+    """Open clips that have at least one camera; cameras that some of the logs lack are masked.
 
     Raises:
-        InputError: if none of the logs has a camera.
+        InputError: none of the logs has a camera.
     """
     dataset = ClipDataset(logs, config, cache_dir)
     if not dataset.camera_names:

@@ -1,4 +1,4 @@
-"""Slow work of a page in a thread of its own; a newer job replaces an older one of its name."""
+"""Slow work of a page in its own thread; a newer job replaces an older one with the same name."""
 
 import logging
 import threading
@@ -10,10 +10,10 @@ _log = logging.getLogger(__name__)
 
 
 class Background:
-    """One thread that does named jobs. A job that has not begun is replaced by a newer one of its name.
+    """One thread that runs named jobs. A waiting job is replaced by a newer job with the same name.
 
-    The name that has waited longest for its turn comes first, so that none starves while jobs come faster
-    than they are done. A failure is reported, and the next job is done.
+    The name that has waited longest runs first, so that no name starves when jobs arrive faster than they
+    run. A failure is reported, and the next job runs.
 
     Args:
         tell: called with the message of a job that failed.
@@ -35,12 +35,12 @@ class Background:
             self._changed.notify_all()
 
     def wait(self) -> None:
-        """Return once nothing is left to do."""
+        """Wait until no job is left."""
         with self._changed:
             self._changed.wait_for(lambda: not self._wanted and not self._busy)
 
     def close(self) -> None:
-        """Drop queued jobs, and return once the running one is done."""
+        """Drop queued jobs, and wait for the running one."""
         with self._changed:
             self._wanted.clear()
             self._closed = True
@@ -53,7 +53,7 @@ class Background:
                 job()
             except InputError as error:
                 self._tell(str(error))
-            except Exception as error:  # a mistake in the program, but the page lives on
+            except Exception as error:  # a mistake in the program, but the page continues
                 _log.exception("while drawing")
                 self._tell(f"{type(error).__name__}: {error}")
 

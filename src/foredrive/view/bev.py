@@ -23,10 +23,10 @@ MOVING_MPS = 0.5  # slower boxes get no arrow
 
 
 def draw_bev(ax: Axes, clip: Clip, reach_m: float, plan: Trajectory | None = None) -> None:
-    """Draw everything a clip knows about now: map, lidar, boxes, the driven future and, if given, a plan.
+    """Draw a clip's present frame: map, lidar, boxes, the driven future and, if given, a plan.
 
     Args:
-        ax: where to draw; its limits, ticks and colours are set.
+        ax: axes to draw in; the function sets their limits, ticks and colours.
         clip: without leading dimensions.
         reach_m: half the side of the square that is shown, centred on the rear axle.
         plan: without leading dimensions.
@@ -90,7 +90,7 @@ def draw_map(ax: Axes, patch: MapPatch) -> None:
 
 
 def draw_sweep(ax: Axes, sweep: LidarSweep, reach_m: float) -> None:
-    """Returns as dots, coloured by range as in the images."""
+    """Draw returns as dots, coloured by range as in the images."""
     returned = sweep.returned & sweep.valid
     points, range_m = sweep.points_ego[returned], sweep.range_m[returned]
     shown = (points[:, :2].abs() < reach_m).all(-1)

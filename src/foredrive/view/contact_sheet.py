@@ -1,4 +1,4 @@
-"""Many drives on one sheet: a few images of the front camera, and the path through the town, of each."""
+"""A sheet of many drives: a few images of the front camera and the path through the town for each."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -23,25 +23,27 @@ THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
 LARGEST_PT, PT_OF_PX = 12.0, 0.86
-"""Names share one size, at which the longest fits: points for each pixel that a letter may be wide."""
+"""All names share one font size, at which the longest name fits: the maximum size, and points per pixel of
+letter width.
+"""
 MAX_ROWS = 60
-"""More drives are thinned out evenly to this many."""
+"""Maximum number of drives; more drives are thinned out evenly."""
 AROUND_M = 30.0
 SMALLEST_M = 50.0
-"""Margin of the view from above around the path, and its least half width."""
+"""Margin of the view from above around the path, and its minimum half width, m."""
 MAP_LINES = {MapKind.LANE_BOUNDARY: 0.5, MapKind.ROAD_EDGE: 0.9}
 HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
 
 
 def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> None:
-    """Write a PNG: a row for each drive, in the order given.
+    """Write a PNG with one row for each drive, in the given order.
 
     Args:
-        path: the picture; it appears whole or not at all.
-        drives: logs, and a caption for each.
+        path: path of the picture; it is written completely or not at all.
+        drives: logs, each with a caption.
 
     Raises:
-        InputError: on a log that cannot be read.
+        InputError: a log cannot be read.
     """
     chosen = np.linspace(0, len(drives) - 1, min(len(drives), MAX_ROWS)).round().astype(int).tolist()
     (cell_h, cell_w), row_h = THUMBNAIL_HW, THUMBNAIL_HW[0] + GAP_PX
@@ -111,7 +113,7 @@ def _show_front(ax: Axes, log: Log, frame: int) -> None:
 
 
 def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Read the image of the camera that looks ahead; return a bare panel if the log has none."""
+    """Read the image of the first camera; return an empty panel if the log has none."""
     cameras = pinhole_cameras(log)
     if cameras:
         image = read_camera(log, frame, next(iter(cameras.values())), THUMBNAIL_HW, with_image=True).image

@@ -1,4 +1,4 @@
-"""Figures of one closed-loop drive: where it went, and how fast."""
+"""Figures of one closed-loop drive: its path and its speed."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,7 +22,9 @@ from foredrive.view.html import INK_MARK
 AROUND_M, SMALLEST_M = 25.0, 45.0
 FASTEST_MPS = 14.0
 SPEED_MAP, DARKEST = "plasma", -0.35
-"""Who stands is so far, in parts of the fastest, from the colours that cannot be told from the road."""
+"""Lower end of the speed colours, as a part of `FASTEST_MPS`. It keeps a standing vehicle away from the
+darkest colours, which look like the road.
+"""
 ROAD = "#333d4b"
 LETTERS = {
     InfractionKind.COLLISION_PEDESTRIAN: "P",
@@ -34,12 +36,14 @@ LETTERS = {
     InfractionKind.YIELD_TO_EMERGENCY: "Y",
     InfractionKind.MIN_SPEED: "M",
 }
-"""By which infractions are marked in the figures."""
+"""The letter that marks each kind of infraction in the figures."""
 
 
 def draw_way(drive: DriveRecord) -> Figure:
-    """The route over the town's lanes, if there is a town, the way driven coloured by speed; north is up.
-    Infractions and scenarios are marked."""
+    """Draw the route over the town's lanes, and the driven path coloured by speed.
+
+    North is up. Infractions and scenarios are marked. Without a town there are no lanes.
+    """
     figure = Figure(figsize=(4.6, 4.6))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     route, track = np.array(drive.route_xy), np.array(drive.track.xy)
@@ -77,7 +81,7 @@ def draw_way(drive: DriveRecord) -> Figure:
 
 
 def draw_timeline(drive: DriveRecord) -> Figure:
-    """Speed over time, with what happened and what went wrong, and where others came near."""
+    """Draw speed over time, with marks for scenarios and infractions and shaded times of near collisions."""
     figure = Figure(figsize=(7.6, 2.3))
     ax = figure.add_axes((0.07, 0.22, 0.92, 0.70))
     t_s, speed = drive.track.t_s, drive.track.speed_mps
@@ -113,7 +117,7 @@ def _draw_lanes(ax: Axes, town: str, centre: Float[np.ndarray, "2"], half: float
 
 
 def _marks(drive: DriveRecord) -> list[tuple[float, Sequence[float], str, dict[str, Any]]]:
-    """When, where, what to write and how for all that is marked; infractions come last, on top."""
+    """Return time (s), world position, text and text style of each mark; infractions come last, on top."""
     marks = [
         (event.t_s, event.xy_world, str(number), _style("square", palette.SCENARIO))
         for number, event in enumerate(drive.scenario_events, start=1)
@@ -130,7 +134,7 @@ def _style(shape: str, colour: str) -> dict[str, Any]:
 
 
 def _near(nearest_s: Sequence[float | None]) -> list[tuple[float, float]]:
-    """Spans of time in which somebody was less than nuPlan's bound from being touched."""
+    """Return the spans of time, s, in which the time to collision was below nuPlan's bound."""
     return [
         (FRAME_DT_S * (k - 0.5), FRAME_DT_S * (k + 0.5))
         for k, seconds in enumerate(nearest_s)

@@ -1,4 +1,4 @@
-"""The report on a suite of closed-loop drives: scores, and each drive with its way, its speed and a film."""
+"""The report on a suite of closed-loop drives: scores, and path, speed and film of each drive."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -45,17 +45,17 @@ SCORES = {
 
 @dataclass(frozen=True)
 class Happening:
-    """Something that happened on a drive."""
+    """An infraction, a scenario or a threat in a drive."""
 
     t_s: float | None
-    """None: of the whole drive."""
+    """Time of the drive, s; None: it concerns the whole drive."""
     kind: str
     text: str
 
 
 @dataclass(frozen=True)
 class ShownDrive:
-    """A drive as the template lays it out."""
+    """The values of one drive that the page template shows."""
 
     name: str
     score: str
@@ -65,11 +65,11 @@ class ShownDrive:
     timeline: Markup
     happenings: list[Happening]
     film: str
-    """Where its film lies, from the page."""
+    """URL of the film, relative to the page."""
 
 
 def score_table(summary: Summary) -> Table:
-    """List the figures that a reader looks for first."""
+    """Return a table of the main metrics."""
     again = _repeated(summary)
     scores = []
     for key, name in SCORES.items():
@@ -93,10 +93,12 @@ def score_table(summary: Summary) -> Table:
 
 
 def write_drive_report(out: Path) -> Path:
-    """Write the page about a suite's folder, and a film of each drive beside it; films that are there stay.
+    """Write the report page into a suite's folder, and a film of each drive.
+
+    Films that exist already are kept.
 
     Raises:
-        InputError: the folder holds no suite that has been driven to its end.
+        InputError: the folder holds no suite whose drives are all complete.
     """
     if not (out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
@@ -151,7 +153,7 @@ def _percent(share: Value) -> str:
 
 
 def _infractions(summary: Summary) -> list[tuple[InfractionKind, Value, Value]]:
-    """Kinds of infractions that happened, with their number and how many a kilometre."""
+    """Return the kinds of infractions that occurred, with their number and their number per kilometre."""
     return [
         (kind, count, summary[f"infractions_per_km.{kind}"])
         for kind in InfractionKind
@@ -166,7 +168,7 @@ def _infraction_table(summary: Summary) -> Table | None:
 
 
 def _counted(summary: Summary, what: str, kinds: Iterable[str]) -> str:
-    """List how many there were of each kind."""
+    """Return one line with the number of each kind, such as "3 completed, 1 timeout"."""
     counts = {kind: summary[f"{what}.{kind}"] for kind in kinds}
     return ", ".join(f"{number(count)} {words(kind)}" for kind, count in counts.items() if count)
 
@@ -202,7 +204,7 @@ def _drive_row(name: str, drive: DriveRecord) -> list[Value | Cell]:
 
 
 def _told(infraction: Infraction) -> str:
-    """Tell what was met, and how; some details begin with what it was."""
+    """Return the object of an infraction and its detail; some details already begin with the object."""
     what, detail = infraction.what, infraction.detail
     return detail if detail.startswith(what) else f"{what} {detail}"
 
@@ -230,7 +232,7 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
 
 
 def _threat(met: ThreatMet) -> Happening:
-    """Tell what came of a threat."""
+    """Return the outcome of a threat as one entry of the list."""
     hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
     by_the_log = f"{met.reference_mps:.1f} m/s by who goes on as the log did"
     text = f"{hit} ({by_the_log}), score {met.score:.1f} of 5"
@@ -238,6 +240,6 @@ def _threat(met: ThreatMet) -> Happening:
 
 
 def _order(path: Path) -> tuple[list[int], str]:
-    """Numbers in names as numbers."""
+    """Return a sort key that compares the numbers in a name as numbers."""
     parts = path.stem.replace("route", "").split("_rep")
     return [int(part) if part.isdigit() else 0 for part in parts], path.stem

@@ -1,4 +1,4 @@
-"""A closed-loop drive as an animated picture: what the front cameras saw, and the scene from above."""
+"""An animated picture of a closed-loop drive: the front cameras, and the scene from above."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -21,25 +21,27 @@ from foredrive.view.bev import EGO_OUTLINE_XY
 from foredrive.view.video import write_video
 
 FASTER = 2.0
-"""Than life."""
+"""Speed of the video relative to real time."""
 FRONT = ("pcam_l0", "pcam_f0", "pcam_r0")
 CAMERA_WH = (256, 144)
 ABOVE_WH = (768, 288)
 PX_PER_M, EGO_AT_X = 5.0, 0.3
-"""From above, driving to the right; the vehicle stands at this part of the width."""
+"""Scale of the view from above, px per metre, and the ego's place as a part of the width. The ego faces
+right.
+"""
 LEAST_PX = 3.5
-"""Nobody is smaller than this radius: people would hardly be seen."""
+"""Minimum radius of an actor, px; pedestrians would otherwise be too small to see."""
 TOLD_S = 6.0
-"""For how long a caption says that a scenario has begun."""
+"""Time for which a caption shows a scenario after its start, s."""
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
 
 
 def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
-    """Write an animated WebP, which browsers play: a frame for each key frame, twice as fast as life.
+    """Write an animated WebP for browsers: one frame for each key frame, at twice real time.
 
     Args:
-        log: of the drive.
-        drive: what was kept of it.
+        log: log of the drive.
+        drive: record of the drive.
     """
     opened = Log(log)
     frames = (_frame(opened, index, drive) for index in range(len(opened)))
@@ -68,13 +70,13 @@ def from_above(
     T_world_ego: Float[np.ndarray, "4 4"],
     boxes: Boxes | None,
 ) -> Image.Image:
-    """The scene around the vehicle, which drives to the right.
+    """Draw the scene around the ego vehicle from above; the ego faces right.
 
     Args:
-        town: whose lanes are drawn; None: there is no map.
-        boxes: of the others, in the ego frame.
+        town: town whose lanes are drawn; None: there is no map.
+        boxes: boxes of the other actors, in the ego frame.
     """
-    twice = 2  # drawn larger and shrunk: PIL's polygons have no smooth edges
+    twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of polygons
     image = Image.new("RGB", (twice * ABOVE_WH[0], twice * ABOVE_WH[1]), palette.GROUND)
     pen = ImageDraw.Draw(image)
     T_ego_world = np.linalg.inv(T_world_ego)

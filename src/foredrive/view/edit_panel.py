@@ -1,4 +1,4 @@
-"""The part of the page that edits a rebuilt scene: edits are made, undone and saved."""
+"""The part of the page that edits a reconstructed scene: make, undo and save edits."""
 
 import functools
 import threading
@@ -32,7 +32,7 @@ from foredrive.view.rebuilt_video import words_of
 
 NOBODY = "none"
 BESIDE_M = (0.0, 3.0, 0.0)
-"""A copy's offset from its original: a lane to the left."""
+"""Offset of a copy from its original, m: one lane to the left."""
 GIZMO_M = 5.0
 RUNS_KEPT = 4
 
@@ -40,15 +40,15 @@ RUNS_KEPT = 4
 class EditPanel:
     """Controls of edits, and the gizmo that drags an actor.
 
-    An edit that cannot be made is told, and leaves everything as it was.
+    An edit that cannot be made shows a message and changes nothing.
 
     Args:
-        server: of the page.
-        graph: the scene as it was learned; it is never changed.
-        nodes: of the scene; the chosen actor stands out, and goes along with the gizmo.
-        file: where edits are saved, unless the page says otherwise.
-        tell: is given what went wrong, or well.
-        on_change: is called after the scene has changed.
+        server: server of the page.
+        graph: the scene without edits; it is never changed.
+        nodes: nodes of the scene; the chosen actor is highlighted and moves with the gizmo.
+        file: default file for saved edits; the page can change it.
+        tell: called with the message of a success or a failure.
+        on_change: called after the scene has changed.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class EditPanel:
 
     @property
     def chosen(self) -> int | None:
-        """Id of the actor that is edited."""
+        """Return the id of the edited actor; None: no actor is chosen."""
         return None if self.actor.value == NOBODY else int(self.actor.value)
 
     def choose(self, track_id: int | None) -> None:
@@ -116,7 +116,7 @@ class EditPanel:
             return self.replace([*self.edits, edit])
 
     def drop(self) -> None:
-        """Leave the chosen actor where the gizmo is."""
+        """Leave the chosen actor at the pose of the gizmo."""
         with self._changing:
             if self.chosen is None:
                 return
@@ -140,7 +140,7 @@ class EditPanel:
             self._tell(f"{len(self.edits)} edits saved to {path}")
 
     def load(self) -> None:
-        """Read edits instead of those there are."""
+        """Read edits from the file; they replace the present edits."""
         try:
             edits = load_edits(Path(self.file.value))
         except InputError as error:

@@ -1,4 +1,4 @@
-"""One example of a report: what was seen, what was rendered, predicted and planned."""
+"""One example of a report: recorded images, rendered images, predictions and the plan."""
 
 import io
 from dataclasses import dataclass
@@ -47,13 +47,13 @@ class ExamplePanel:
 
     @property
     def spec(self) -> VoxelSpec:
-        """The grids' place and size."""
+        """Return the position and size of the voxel grids."""
         return self.example.occupancy.spec
 
 
 @dataclass(frozen=True)
 class ShownPanel:
-    """An example's pictures, as the template lays them out."""
+    """An example's pictures for the page template."""
 
     title: str
     command: str
@@ -61,10 +61,10 @@ class ShownPanel:
     plan: list[Picture]
     """The driven future and the plan: in the front camera, and from above."""
     cameras: dict[str, list[Picture]]
-    """Images, and in the same order what the model renders; empty if the log has none."""
+    """Recorded images and, in the same order, rendered images; empty if the log has no camera."""
     camera_columns: Literal["two", "three"]
     occupancy: list[Picture]
-    """Occupancy at now in perspective, predicted and seen."""
+    """Occupancy at now in perspective: predicted, and seen by lidar."""
     above: list[Picture]
     later: list[Picture]
     """The imagined key frames, each in its own ego frame: in perspective, and compared from above."""
@@ -94,7 +94,7 @@ def show_panel(panel: ExamplePanel) -> ShownPanel:
 
 
 def front_camera(clip: Clip) -> int | None:
-    """Return the camera with an image at now that looks ahead most straightly; None if there is none."""
+    """Return the camera with an image at now that points most straight ahead; None: there is none."""
     ahead = clip.rig.T_ego_cam[clip.now, :, 0, 2].masked_fill(~clip.image_valid[clip.now], -torch.inf)
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
@@ -199,7 +199,7 @@ def _above(panel: ExamplePanel) -> list[Picture]:
 
 
 def _how_much(panel: ExamplePanel, step: int) -> str:
-    """Tell what there is to see in a picture of predicted voxels: without any it is black."""
+    """Return the end of a caption, which says whether any voxel is occupied; the picture is black without."""
     return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
 
 

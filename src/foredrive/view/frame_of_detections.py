@@ -1,4 +1,4 @@
-"""Detections with their uncertainty and objects of one frame: from above in m, or in the image in pixels."""
+"""Objects and uncertain detections of one frame: from above in metres, or in the image in pixels."""
 
 import numpy as np
 from jaxtyping import Float
@@ -12,16 +12,16 @@ from foredrive.view.html import INK_MARK
 
 OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
 FAINTEST = 0.02
-"""Detections of a lower probability of existence are not drawn."""
+"""Minimum probability of existence of a drawn detection."""
 MAX_DRAWN = 1000
-"""Of more detections only those most likely to exist are drawn."""
+"""Maximum number of drawn detections; those most likely to exist are drawn."""
 SIGMAS = 2.0
 
 
 def draw_frame(frame: Frame, score: FrameScore, upright: bool) -> Figure:
-    """Draw objects, detections with ellipses of two σ of their centres, and likeliest pairs.
+    """Draw objects, detections with ellipses of two σ of their centres, and the likeliest pairs.
 
-    A detection is as opaque as it is likely to exist.
+    The opacity of a detection is its probability of existence.
     """
     figure = Figure(figsize=(5.4, 5.0), layout="constrained")
     axes = figure.subplots()

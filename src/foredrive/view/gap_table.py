@@ -11,7 +11,7 @@ SCOPES = {"": "IoU", "above_ground.": f"IoU above {ABOVE_GROUND_M:g} m"}
 
 
 def gap_table(figures: Summary) -> Table:
-    """Compare what a model makes of real and of rendered images with the truth, and with each other.
+    """Compare a model's predictions on real and on rendered images with the labels, and with each other.
 
     Plans are scored by UniAD's protocol.
     """

@@ -1,4 +1,4 @@
-"""One wide picture of what Foredrive does: cameras and lidar in, occupancy and a plan out."""
+"""One wide picture of Foredrive: cameras and lidar as input, occupancy and a plan as output."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def write_hero(path: Path, panel: ExamplePanel) -> None:
     """Write the picture as a PNG, about 1,900 px wide.
 
     Raises:
-        InputError: if the example has no camera images.
+        InputError: the example has no camera images.
     """
     clip = panel.example.clip
     rows = camera_rows(clip.rig[clip.now])

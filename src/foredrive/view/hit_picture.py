@@ -1,4 +1,4 @@
-"""A hit of a search in a picture (camera beside lidar from above) and in words."""
+"""Pictures and descriptions of search hits: camera beside lidar from above, and words."""
 
 import functools
 from pathlib import Path
@@ -18,16 +18,16 @@ from foredrive.search.rows import COUNTS
 from foredrive.view import palette
 
 HEIGHT_PX, WIDTH_PX = 198, 352
-"""Size of the camera's picture; the lidar's is as high, and square."""
+"""Size of the camera's picture, px; the lidar's picture is square and has the same height."""
 GAP_PX = 4
 REACH_M = 40.0
-"""Half width of the lidar's picture."""
+"""Half width of the lidar's picture, m."""
 
 
 def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw camera and lidar side by side, the same size for every hit; a missing sensor stays dark.
+    """Draw camera and lidar side by side, in the same size for every hit; a missing sensor stays dark.
 
-    A whole scene is shown by its front camera. A mark at the lidar's edge shows where any other view looks.
+    A whole scene shows its front camera. For any other view, a mark at the lidar's edge shows its direction.
     """
     canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
     canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
@@ -68,17 +68,17 @@ def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 
 
 
 def hit_name(hit: Hit) -> str:
-    """Name the hit as `--like` takes it: LOG@12.5s/VIEW."""
+    """Return the name of the hit in the format of `--like`: LOG@12.5s/VIEW."""
     return f"{hit.facts['log']}@{float(str(hit.facts['t_s'])):.2f}s/{hit.facts['view']}"
 
 
 def why_matched(hit: Hit) -> str:
-    """Write the scores that the hit was ranked by."""
+    """Return the scores that ranked the hit, as text."""
     return "   ".join(f"{name} {score:.3f}" for name, score in hit.scores.items()) or f"{hit.score:.3f}"
 
 
 def what_is_there(hit: Hit) -> str:
-    """List place, weather, speed and objects, as far as they are known."""
+    """Return place, weather, speed and objects as text, as far as they are known."""
     facts = hit.facts
     told = [str(facts[name]) for name in ("place", "time_of_day", "weather") if facts[name] is not None]
     if facts["ego_speed"] is not None:
@@ -92,7 +92,7 @@ def what_is_there(hit: Hit) -> str:
 
 
 def _point(above: Image.Image, azimuth_deg: float) -> None:
-    """Mark the direction of the sector's middle."""
+    """Mark the direction of the sector's centre."""
     middle, along = (
         HEIGHT_PX / 2,
         np.array([-np.sin(np.deg2rad(azimuth_deg)), -np.cos(np.deg2rad(azimuth_deg))]),

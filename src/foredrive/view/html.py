@@ -1,4 +1,4 @@
-"""Self-contained pages from the templates beside this file; whatever is put into them is escaped."""
+"""Self-contained pages from the templates beside this file; all inserted values are escaped."""
 
 import base64
 import functools
@@ -20,7 +20,7 @@ from foredrive.files import atomic_path
 from foredrive.view.table import Cell, Value, number, words
 
 INK_MARK = "#010203"
-"""Drawn wherever the page's own text colour shall be."""
+"""Colour that stands for the page's text colour."""
 NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
@@ -37,7 +37,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Tile:
-    """A figure that a reader looks for first."""
+    """One of the main metrics of a page."""
 
     name: str
     value: str
@@ -46,14 +46,14 @@ class Tile:
 
 
 def write_page(path: Path, template: str, **content: object) -> None:
-    """Write one HTML file that loads nothing from anywhere; it appears whole or not at all."""
+    """Write one HTML file that loads no other file; it is written completely or not at all."""
     page = render_page(template, **content)
     with atomic_path(path) as scratch:
         scratch.write_text(page, encoding="utf-8")
 
 
 def render_page(template: str, **content: object) -> str:
-    """Render a template of this folder, escaping all that is no `Markup`."""
+    """Render a template of this folder; escape every value that is not `Markup`."""
     return _environment().get_template(template).render(**content)
 
 
@@ -69,7 +69,7 @@ def picture(
 
 
 def inline_svg(figure: Figure) -> Markup:
-    """Draw a figure as SVG of the page's width, in its font and text colour; matplotlib escapes its texts."""
+    """Draw a figure as SVG with the page's width, font and text colour; matplotlib escapes its texts."""
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)

@@ -26,7 +26,7 @@ class Camera:
     """One camera at one time."""
 
     K: Float[Tensor, "3 3"]
-    """px, for images of `size_hw`."""
+    """Intrinsic matrix, px, for images of `size_hw`."""
     T_ego_cam: Float[Tensor, "4 4"]
     dist: Float[Tensor, "5"]
     size_hw: tuple[int, int]
@@ -47,7 +47,7 @@ class Camera:
 
 
 def resize(image: UInt8[np.ndarray, "H W 3"], size_hw: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-    """Resample an image; small ones are enlarged smoothly."""
+    """Resample an image; small images are enlarged smoothly."""
     return np.asarray(Image.fromarray(image).resize(size_hw[::-1], Image.Resampling.LANCZOS))
 
 
@@ -59,9 +59,10 @@ def draw_points_on_image(
     radius_px: float = 0.8,
     alpha: float = 0.6,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw a round dot at every point the camera sees, near dots over far ones.
+    """Draw a round dot at every point in the camera's view, near dots over far ones.
 
-    Hidden points are drawn too: a lidar sees past what a camera sees, and a wrong calibration shows there.
+    Hidden points are drawn too: a lidar sees past surfaces that hide points from a camera, and a wrong
+    calibration shows there.
     """
     uv, depth, visible = project(camera.from_ego(points_ego), camera.K, camera.dist, camera.size_hw)
     shown = visible.numpy()
@@ -88,7 +89,7 @@ def draw_boxes_on_image(
     Args:
         image: RGB of the camera's size.
         boxes: without leading dimensions, in the ego frame.
-        camera: where the image was taken.
+        camera: the camera that took the image.
         width_px: width of the lines.
     """
     kept = boxes[boxes.valid]
@@ -155,17 +156,17 @@ def _projected_lines(segments_cam: Float[Tensor, "S 2 3"], camera: Camera) -> li
     uv, _, inside = project(points.flatten(0, 1), camera.K, camera.dist, camera.size_hw)
     uv, inside = uv.unflatten(0, points.shape[:2]), inside.unflatten(0, points.shape[:2])
     pieces = torch.stack([uv[:, :-1], uv[:, 1:]], dim=2)  # [S, K-1, 2, 2]
-    # Distortion is defined inside the image alone; an ideal pinhole may draw up to the cut and beyond.
+    # Distortion is defined only inside the image; an ideal pinhole camera may draw beyond the image.
     return list(pieces[inside[:, :-1] & inside[:, 1:]] if bent else pieces.flatten(0, 1))
 
 
 def _clip_to_view(
     segments_cam: Float[Tensor, "S 2 3"], camera: Camera
 ) -> tuple[Float[Tensor, "S 2 3"], Tensor]:
-    """Cut segments at the near plane and at the sides of the viewing frustum; return those left, too.
+    """Cut segments at the near plane and the sides of the viewing frustum; also return which are left.
 
-    Cutting in 3-D, before the division by depth, is what keeps an edge that passes beside or behind the
-    camera from running across the picture.
+    Segments are cut in 3-D, before the division by depth. Otherwise an edge that passes beside or behind the
+    camera would run across the picture.
     """
     height, width = camera.size_hw
     border = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
@@ -190,7 +191,7 @@ def _draw_lines(
     image: UInt8[np.ndarray, "H W 3"],
     lines: list[tuple[Float[Tensor, "2 2"], tuple[int, int, int], float]],
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw anti-aliased lines: larger with coverage, then averaged down."""
+    """Draw anti-aliased lines: enlarge the image, draw, and average it down."""
     if not lines:
         return image
     size = (image.shape[1] * SUPERSAMPLING, image.shape[0] * SUPERSAMPLING)

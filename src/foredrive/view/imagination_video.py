@@ -1,4 +1,4 @@
-"""A video of imagined futures beside the recorded one: from above and through the cameras."""
+"""A video of imagined futures beside the recorded future: from above and through the cameras."""
 
 import datetime
 from collections.abc import Iterable
@@ -21,11 +21,11 @@ from foredrive.view.voxel_drawing import draw_comparison
 PANEL_PX, GAP_PX, TITLE_PX, HEAD_PX, KEY_PX = 320, 10, 26, 40, 34
 COLUMNS = 3
 HOLD = 2
-"""How many times as long now is shown as what follows."""
+"""Number of frames that show now; each later key frame is shown once."""
 
 
 def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: float) -> int:
-    """Write one moment after another, each from now on in real time; returns how many frames there are."""
+    """Write one moment after another, each from now on in real time; return the number of frames."""
     frames = []
     for moment in moments:
         shown = [draw_imagined(moment, step, frame_dt_s) for step in range(moment.futures.shape[1])]
@@ -35,10 +35,10 @@ def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: f
 
 
 def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
-    """Draw the recorded and every imagined future at one key frame: front cameras, and below them occupancy.
+    """Draw the recorded and all imagined futures at one key frame: front cameras above, occupancy below.
 
     Args:
-        step: 0 is now.
+        step: index of the key frame; 0 is now.
     """
     rows = _camera_strips(moment, step)
     label = moment.example.occupancy
@@ -74,7 +74,7 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
 
 
 def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
-    """Draw the three cameras that look ahead most: recorded images, and rendered ones if any."""
+    """Draw the three cameras that point most straight ahead: recorded images, and rendered ones if any."""
     clip = moment.example.clip
     frame = clip.now + step
     order = camera_rows(clip.rig[frame])
@@ -90,7 +90,7 @@ def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarra
 
 
 def _strip(images: Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Put images [C 3 h w] side by side, each as wide as a panel."""
+    """Put images [C 3 h w] side by side, each with the width of a panel."""
     height = PANEL_PX * images.shape[2] // images.shape[3]
     gap = np.full((height, GAP_PX, 3), palette.rgb255(palette.GROUND), dtype=np.uint8)
     parts = []

@@ -25,10 +25,10 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
     """Write the page as a PNG.
 
     Args:
-        path: the picture; it appears whole or not at all.
-        clip: without leading dimensions; what is drawn is its frame at t = 0.
-        title: name and time of what is shown.
-        reach_m: how far the view from above looks in each direction.
+        path: path of the picture; it is written completely or not at all.
+        clip: without leading dimensions; its frame at t = 0 is drawn.
+        title: name of the log, and the time.
+        reach_m: distance that the view from above shows in each direction.
     """
     rig = clip.rig[clip.now]
     rows = camera_rows(rig)
@@ -68,9 +68,9 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
 
 
 def camera_rows(rig: CameraRig) -> list[list[int]]:
-    """Lay out camera indices as around the car: those looking ahead above those looking back.
+    """Return rows of camera indices as around the car: cameras that look ahead above those that look back.
 
-    In both rows what lies to the left of the car is on the left.
+    In both rows the cameras on the left of the car are on the left.
     """
     forward = rig.T_ego_cam[..., :2, 2]  # the optical axis seen from above
     azimuth = torch.atan2(forward[:, 1], forward[:, 0])
@@ -81,14 +81,14 @@ def camera_rows(rig: CameraRig) -> list[list[int]]:
 
 
 def _leftness(azimuth: float) -> float:
-    """Return a number that grows with how far to the left of the car's axis a camera looks."""
+    """Return a number that is larger the farther left of the car's axis a camera looks."""
     return float(np.sin(azimuth)) if abs(azimuth) > 1e-6 else 0.0
 
 
 def camera_picture(
     clip: Clip, index: int, size_hw: tuple[int, int], with_boxes: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw one camera's image at now with lidar and boxes; a bare panel if there is none."""
+    """Draw one camera's image at now with lidar and boxes; an empty panel if there is no image."""
     now = clip.now
     if bool(clip.image_valid[now, index]):
         image = resize(clip.images[now, index].permute(1, 2, 0).numpy(), size_hw)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from foredrive.runs.evaluate.vision import Observer, Vision
 
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
-"""Every clip comes with labels, which are not used here."""
+"""Voxel grid of the labels, which every clip has and this module does not use."""
 KEPT = 16
 
 
@@ -23,17 +23,17 @@ class LogTimes:
     """The frames of a log in the order of time.
 
     Args:
-        path: of the log.
-        image_width_px: width that camera images are read in.
-        run: a trained run, or None to see the log alone.
+        path: path of the log.
+        image_width_px: width to which camera images are read.
+        run: a trained run; None: show only the log.
 
     Raises:
-        InputError: on a log that cannot be read; a run that has no weights yet; a log that the run's model
-            cannot see, because it lacks its cameras or is too short.
+        InputError: the log cannot be read; the run has no weights yet; the log lacks the cameras of the run's
+            model, or is too short for it.
     """
 
     observer: "Observer | None"
-    """None without a run."""
+    """Predicts with the run; None without a run."""
 
     def __init__(self, path: LogPath, image_width_px: int, run: "Run | None" = None) -> None:
         log = Log(path)
@@ -52,13 +52,13 @@ class LogTimes:
         )
         self._clips = ClipDataset([path], config, cache_dir=None)
         self.now_us = [self._clips.now_us(index) for index in range(len(self._clips))]
-        """Time of every frame, in the time of the log."""
+        """Time of every frame on the log's clock, µs."""
         self.t_s = [(t_us - int(log.t_us[0])) * 1e-6 for t_us in self.now_us]
-        """Time since the log's start of every frame, s."""
+        """Time of every frame since the start of the log, s."""
         self.observer = None
         if run is not None:
             from foredrive.runs.evaluate.vision import Observer
-            from foredrive.runs.train.run import load_agent  # a log alone does not wait for models
+            from foredrive.runs.train.run import load_agent  # without a run, models are not imported
 
             size = run.recipe.clips
             self.observer = Observer(load_agent(run), size.future_frames)
@@ -79,10 +79,10 @@ class LogTimes:
         return len(self._clips)
 
     def nearest(self, t_s: float | None) -> int:
-        """Return the frame nearest to a time since the log's start, by default to its middle.
+        """Return the frame nearest to a time since the start of the log; by default the middle of the log.
 
         Raises:
-            InputError: if the log has no such time.
+            InputError: the log has no such time.
         """
         wanted_s = self.duration_s / 2 if t_s is None else t_s
         if not 0 <= wanted_s <= self.duration_s:

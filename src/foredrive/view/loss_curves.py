@@ -1,4 +1,4 @@
-"""Loss curves as an inline SVG that takes on the page's text colour."""
+"""Loss curves as an inline SVG in the page's text colour."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ def draw_loss_curves(stages: Losses) -> Markup | None:
 
 def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]]) -> None:
     names = [key for key in lines[0] if key not in NOT_LOSSES]
-    names.sort(key=lambda key: key != "loss")  # the one that is descended comes first
+    names.sort(key=lambda key: key != "loss")  # the minimised loss comes first
     for key, colour in zip(names, COLOURS, strict=False):
         steps = np.array([line["step"] for line in lines if key in line], dtype=float)
         values = np.array([line[key] for line in lines if key in line], dtype=float)
@@ -67,7 +67,7 @@ def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]])
 
 
 def _running_mean(values: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-    """Average the last few values, of those that are numbers."""
+    """Return the mean of the last few finite values at each step."""
     number = np.isfinite(values)
     total = np.cumsum(np.where(number, values, 0.0))
     count = np.cumsum(number)

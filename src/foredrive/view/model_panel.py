@@ -1,4 +1,4 @@
-"""The part of the page that shows a model's predictions, and renders them from the viewer's eye."""
+"""The part of the page that shows a model's predictions, and renders them from the browser's viewpoint."""
 
 import math
 import threading
@@ -25,8 +25,8 @@ class ModelPanel:
     """Controls and nodes of one run's model.
 
     Args:
-        server: of the page.
-        times: with a run.
+        server: server of the page.
+        times: a log with a run.
     """
 
     def __init__(self, server: viser.ViserServer, times: LogTimes) -> None:
@@ -61,7 +61,7 @@ class ModelPanel:
         render.on_click(self._render_from)
 
     def show(self, index: int) -> None:
-        """Draw what the model holds to be the case at a frame of the log."""
+        """Draw the model's predictions at a frame of the log."""
         with self._drawing:
             self._index = index
             vision, k, scene = self._times.vision(index), self.frame.value, self._server.scene
@@ -83,7 +83,7 @@ class ModelPanel:
         return f"imagined, **{k * self._dt_s:g} s** ahead" if k else "observed **now**"
 
     def _render_from(self, event: viser.GuiEvent) -> None:
-        """Render from the eye of the client that pressed the button, and leave the picture there."""
+        """Render from the viewpoint of the browser that pressed the button, and keep the picture there."""
         if event.client is None:
             return
         with self._drawing:
@@ -112,7 +112,7 @@ class ModelPanel:
 def pinhole(
     T_ego_cam: Float[np.ndarray, "4 4"], fov_y_rad: float, aspect: float, height_px: int
 ) -> CameraRig:
-    """Make an ideal camera without leading dimensions from its vertical field of view."""
+    """Return an ideal pinhole camera with this vertical field of view, without leading dimensions."""
     width_px = max(round(aspect * height_px), 1)
     focal = height_px / 2 / float(np.tan(fov_y_rad / 2))
     return CameraRig(

@@ -1,4 +1,4 @@
-"""Where a summary's figures come from."""
+"""The origin of a summary: command, commit, machine and date."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from foredrive.view.table import Summary
 
 @dataclass(frozen=True)
 class Origin:
-    """What was run, of which commit, on which machine and when."""
+    """The command, commit, machine and date of a summary."""
 
     command: str
     commit: str
@@ -16,7 +16,7 @@ class Origin:
 
     @classmethod
     def of(cls, summary: Summary, date: str = "") -> "Origin":
-        """Read it off a summary's provenance."""
+        """Return the origin that a summary's provenance states."""
         machine = [
             f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
             f"{summary.get('machine.ram_gib')} GiB",

@@ -15,10 +15,10 @@ START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first free port from `port` on; any one if `port` is 0.
+    """Return the first free port from `port` on; any free port if `port` is 0.
 
     Raises:
-        InputError: if there is no such host here, no such port, or none that this user may serve at.
+        InputError: the host or the port does not exist, or this user may not serve there.
     """
     if not 0 <= port < PORTS:
         raise InputError(f"no port {port}: there are 0 to {PORTS - 1}")
@@ -34,20 +34,20 @@ def free_port(host: str, port: int) -> int:
 
 
 def open_page(label: str, host: str, port: int) -> viser.ViserServer:
-    """Serve an empty page, dark, seen from behind and above the ego vehicle; in threads of its own.
+    """Serve an empty dark page, seen from behind and above the ego vehicle; the server has its own threads.
 
     Args:
-        label: of the page.
-        host, port: where it is served; at the next free port if this one is taken.
+        label: title of the page.
+        host, port: address of the page; if the port is taken, the next free one.
 
     Raises:
         InputError: as `free_port`.
     """
     port = free_port(host, port)  # viser would wait for a host that does not exist
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-    server.scene.configure_environment_map(hdri=None)  # lights that nobody has to download
+    server.scene.configure_environment_map(hdri=None)  # lights without a download
     server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
     server.initial_camera.position = START_EYE_M
     server.initial_camera.look_at = START_TARGET_M
@@ -61,5 +61,5 @@ def page_url(server: viser.ViserServer) -> str:
 
 def close_page(server: viser.ViserServer) -> None:
     """Stop serving."""
-    with contextlib.suppress(RuntimeError):  # its thread may be done before it has been told everything
+    with contextlib.suppress(RuntimeError):  # its thread may end before it has received everything
         server.stop()

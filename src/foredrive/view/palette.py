@@ -1,4 +1,4 @@
-"""The colours and type sizes every picture shares. All pictures are drawn on one dark ground."""
+"""The colours and type sizes of all pictures. All pictures have one dark background."""
 
 import matplotlib
 import numpy as np
@@ -55,28 +55,28 @@ KNOWN_FREE = "#2a323e"
 RANGE_MAP = matplotlib.colormaps["plasma"].reversed()
 HEIGHT_MAP = matplotlib.colormaps["viridis"]
 RANGE_SPAN = (0.05, 0.75)
-"""The part of the map that stands out from the ground."""
+"""The part of the colour map that stands out from the background."""
 NEAREST_M, FARTHEST_M = 3.0, 80.0
-"""Ends of the logarithmic range scale."""
+"""Ends of the logarithmic range scale, m."""
 
 
 def label(kind: Category | MapKind | Command) -> str:
-    """A kind's name for a legend: TRAFFIC_CONE -> traffic cone."""
+    """Return a kind's name for a legend: TRAFFIC_CONE becomes "traffic cone"."""
     return kind.name.lower().replace("_", " ")
 
 
 def box_colour(category: int) -> str:
-    """Colour of a `Category`; a number outside it is drawn as OTHER."""
+    """Return the colour of a `Category`; an unknown number has the colour of OTHER."""
     return BOX_COLOURS[Category(category) if category in set(Category) else Category.OTHER]
 
 
 def rgb255(colour: str) -> tuple[int, int, int]:
-    """Red, green, blue in 0..255 of a colour given as #rrggbb."""
+    """Return red, green and blue, 0 to 255, of a colour #rrggbb."""
     red, green, blue = (round(255 * c) for c in to_rgb(colour))
     return red, green, blue
 
 
 def range_colours(range_m: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
-    """Bright and near to dark and far, on a logarithmic scale from 3 to 80 m."""
+    """Return colours of ranges from bright (near) to dark (far), on a logarithmic scale from 3 to 80 m."""
     scale = np.log(np.clip(range_m, NEAREST_M, FARTHEST_M) / NEAREST_M) / np.log(FARTHEST_M / NEAREST_M)
     return (RANGE_MAP(RANGE_SPAN[0] + (RANGE_SPAN[1] - RANGE_SPAN[0]) * scale)[:, :3] * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A rebuilt scene as nodes that the browser draws: the static background, and actors in moving frames."""
+"""A reconstructed scene as nodes in the browser: the static background, and actors in moving frames."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ from foredrive.view import palette
 from foredrive.view.splat_nodes import show_splats, thinned
 
 ROOT = "/scene"
-"""The scene's frame; nodes beside it are in the ego frame at the time shown."""
+"""Name of the scene's frame; nodes beside it are in the ego frame at the time shown."""
 MOST_SPLATS = 400_000
-"""More splats are thinned out: at 32 bytes each, these are 13 MB for a browser to fetch and sort."""
+"""Maximum number of drawn splats; more are thinned out. These are 13 MB at 32 bytes each."""
 AWAY_M = (0.0, 0.0, -1e6)
-"""Where hidden splats are moved to: the browser draws those of invisible nodes all the same."""
+"""Position of hidden splats, m: the browser draws the splats of invisible nodes too."""
 HERE_M = (0.0, 0.0, 0.0)
 FACE_OPACITY, CHOSEN_OPACITY = 0.06, 0.35
 PLACES = 16
-"""Along the vehicle's way, to tell what is near."""
+"""Number of points along the vehicle's path from which the distance to a Gaussian is measured."""
 EDGE_WIDTH, LABEL_SCALE, NUDGE_M = 2.0, 0.8, 1e-3
 
 
@@ -39,17 +39,17 @@ class _ActorNode:
     edges: viser.LineSegmentsHandle
     label: viser.LabelHandle
     own: Gaussians
-    """The Gaussians before they were thinned out."""
+    """The Gaussians before thinning."""
 
 
 class RebuiltNodes:
     """The nodes of a scene.
 
     Args:
-        scene: of the page.
-        graph: to begin with.
-        way_m: where the ego vehicle was, in the scene's frame.
-        on_click: is given the id of an actor that was clicked at.
+        scene: scene of the page.
+        graph: initial scene graph.
+        way_m: positions of the ego vehicle, in the scene's frame.
+        on_click: called with the id of a clicked actor.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class RebuiltNodes:
     ) -> None:
         self._scene, self._on_click = scene, on_click
         self.share = min(1.0, MOST_SPLATS / max(len(graph.actor), 1))
-        """Of all Gaussians, the share that is drawn."""
+        """Share of all Gaussians that is drawn."""
         self.layers = {"splats": True, "boxes": True, "ids": True}
         self._root = scene.add_frame(ROOT, show_axes=False)
         standing = thinned(graph.of_actor(STATIC), self.share, way_m[:: -(-len(way_m) // PLACES)])
@@ -70,7 +70,7 @@ class RebuiltNodes:
         self._chosen: int | None = None
 
     def show(self, graph: SceneGraph, T_scene_ego: Float[Tensor, "4 4"], t_s: float) -> None:
-        """Draw the scene at a time, seen from the ego vehicle; existing nodes only move."""
+        """Draw the scene at a time in the ego frame; nodes that exist only move."""
         _place(self._root, inverse_se3(T_scene_ego))
         ids = graph.tracks.track_id.tolist()
         for gone in self._actors.keys() - set(ids):
@@ -79,7 +79,7 @@ class RebuiltNodes:
         for row, track_id in enumerate(ids):
             there, own = bool(states.present[row]), graph.of_actor(row)
             node = self._actors.get(track_id)
-            if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another one of this id
+            if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another actor, same id
                 self._actors.pop(track_id).frame.remove()
                 node = None
             if node is None and there:
@@ -116,9 +116,9 @@ class RebuiltNodes:
             node.label.visible = self.layers["ids"] or chosen
 
     def nudge(self) -> None:
-        """Make browsers sort splats anew by an invisible movement.
+        """Make browsers sort the splats again by an invisible movement.
 
-        Of several nodes that arrive at once they show only the first until something moves.
+        If several nodes arrive at once, browsers show only the first until something moves.
         """
         self._root.position = self._root.position + np.array([0.0, 0.0, NUDGE_M])
 

@@ -1,4 +1,4 @@
-"""Sensors' pictures of a rebuilt scene, rendered in the background."""
+"""Sensor pictures of a reconstructed scene, rendered in the background."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -22,25 +22,25 @@ from foredrive.view.rebuilt_video import Colour, sweep_colours
 from foredrive.view.scene_nodes import FRUSTUM_M, POINT_M, clear
 
 OWN_HEIGHT_PX = 360
-"""Size of the picture from the reader's eye."""
+"""Height of the picture from the browser's viewpoint, px."""
 LIDAR, CAMERAS = "/lidar", "/cameras"
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A scene after edits, at a time."""
+    """An edited scene at one time."""
 
     edited: Edited
     t_s: float
 
 
 class RebuiltPictures:
-    """Pictures of the rig's cameras, the lidar's points, and what the reader's eye sees.
+    """Pictures of the rig's cameras, the lidar's points, and the view from the browser's viewpoint.
 
     Args:
-        server: of the page.
-        run: that is looked at.
-        background: where everything is rendered.
+        server: server of the page.
+        run: the shown reconstruction.
+        background: thread that renders everything.
     """
 
     def __init__(self, server: viser.ViserServer, run: OpenRun, background: Background) -> None:
@@ -58,7 +58,7 @@ class RebuiltPictures:
         self.colour.on_update(lambda _: self._ask_lidar())
 
     def show(self, edited: Edited, t_s: float) -> None:
-        """Ask for pictures of a moment; queued ones of earlier moments are dropped."""
+        """Request pictures of a moment; queued requests of earlier moments are dropped."""
         self._moment = Moment(edited, t_s)
         self._ask_lidar()
         for camera, name in enumerate(self._run.vehicle.rig.names):
@@ -71,7 +71,7 @@ class RebuiltPictures:
                 node.visible = self.layers[name[1:]]
 
     def ask_own_view(self, client: viser.ClientHandle) -> None:
-        """Render from one reader's eye, as the background of that reader's page."""
+        """Render from the viewpoint of one browser, as the background of its page."""
         self._background.ask(f"client {client.client_id}", partial(self._show_own_view, client))
 
     def _ask_lidar(self) -> None:

@@ -1,4 +1,4 @@
-"""A rebuilt scene beside the recorded images."""
+"""A reconstructed scene beside the recorded images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
 
 ROWS = 4
 WIDTH_IN = 4.0
-"""Width of one picture."""
+"""Width of one picture, inches."""
 
 
 @torch.no_grad()
@@ -29,14 +29,14 @@ def write_rebuilt_sheet(
     title: str,
     graph: SceneGraph | None = None,
 ) -> None:
-    """Write some views as a PNG: as seen, as rendered, the difference, and how far things are.
+    """Write some views as a PNG: recorded, rendered, their difference, and the range.
 
     Args:
-        path: of the picture.
-        scene: that is shown.
-        views: with images; some of them, spread over the drive, are shown.
-        title: of the picture.
-        graph: the scene after edits; None: as it was learned.
+        path: path of the picture.
+        scene: the shown scene.
+        views: views with images; some of them, spread over the drive, are shown.
+        title: title of the picture.
+        graph: the scene after edits; None: the scene without edits.
     """
     chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(ROWS, len(views))).round().astype(int)]
     height = WIDTH_IN * max(view.size_hw[0] / view.size_hw[1] for view in chosen) + 0.3

@@ -1,4 +1,4 @@
-"""A drive through a rebuilt log as a film: the cameras, and below them the lidar from above."""
+"""A video of a drive through a reconstructed log: the cameras, and below them the lidar from above."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,25 +24,27 @@ from foredrive.view.video import check_video, write_video
 
 Colour = Literal["intensity", "height"]
 ONE_CAMERA_PX, CAMERA_PX = 480, 320
-"""Width of a camera's picture where it is alone in its row, and where it is not."""
+"""Width of a camera's picture, px: alone in its row, and beside others."""
 GAP_PX, TITLE_PX = 8, 26
 ABOVE_HW = (0.5, 0.35)
-"""Height of the view from above, and the place of the vehicle (it drives to the right), in its widths."""
+"""Height of the view from above, and the x position of the vehicle, both in widths of the view. The ego faces
+right.
+"""
 ABOVE_M = 100.0
-"""Width of the view from above."""
+"""Width of the view from above, m."""
 LOW_M, HIGH_M = -0.5, 4.0
-"""Ends of the scale of heights over the ground."""
+"""Ends of the colour scale of heights above the ground, m."""
 MOST_EDITS = 3
-"""Actors that a caption names."""
+"""Maximum number of edits that a caption names."""
 
 
 def write_rebuilt_video(
     path: Path, run: OpenRun, edits: list[Edit], shooting: Shooting, colour: Colour
 ) -> None:
-    """Film a run in real time, and beside it the run after edits, if there are any.
+    """Write a video of a run in real time, beside the run after edits if there are any.
 
     Raises:
-        InputError: on edits that cannot be made, or a path that is not one of a video.
+        InputError: the edits cannot be made, or the path is not that of a video.
     """
     check_video(path)
     takes = [("as it was", apply_edits(run.scene.graph, []))]
@@ -67,10 +69,10 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
     """Draw a frame: shots of the same time side by side, each under its caption.
 
     Args:
-        shots: with captions.
-        rig: of the cameras that were shot, [C].
-        name: of the log.
-        colour: what points of the lidar are coloured by.
+        shots: captions and shots.
+        rig: rig of the rendered cameras, [C].
+        name: name of the log.
+        colour: quantity that colours the lidar's points.
     """
     columns = [_column(shot, rig, colour) for _, shot in shots]
     width = sum(column.width for column in columns) + GAP_PX * (len(columns) + 1)
@@ -127,8 +129,8 @@ def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
 
 
 def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
-    """Draw coloured returns, low ones first, and outlines of the actors with their ids."""
-    twice = 2  # drawn larger and shrunk: PIL's lines have no smooth edges
+    """Draw coloured returns, low ones first, and the outlines of the actors with their ids."""
+    twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of lines
     height_px = round(ABOVE_HW[0] * width_px)
     scale = twice * width_px / ABOVE_M
     picture = np.full((twice * height_px, twice * width_px, 3), palette.rgb255(palette.GROUND), np.uint8)
@@ -163,7 +165,7 @@ def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) 
 
 
 def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]:
-    """Colour returns by their height over the ground, or by their intensity."""
+    """Return colours of the returns by height above the ground, or by intensity."""
     if colour == "height":
         share = (sweep.points_ego[:, 2].numpy() - LOW_M) / (HIGH_M - LOW_M)
         mapped = palette.HEIGHT_MAP(share.clip(0, 1))

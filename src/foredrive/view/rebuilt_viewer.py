@@ -1,4 +1,4 @@
-"""A rebuilt log in the browser: over time, from any viewpoint, with edits."""
+"""A page for a reconstructed log: over time, from any viewpoint, with edits."""
 
 import threading
 import time
@@ -17,29 +17,29 @@ from foredrive.view.rebuilt_pictures import RebuiltPictures
 from foredrive.view.scene_nodes import show_ego
 
 STEP_S = 0.1
-"""Step of the slider, and of playing in real time."""
+"""Step of the slider and of playing in real time, s."""
 FAR_M = 5000.0
-"""The browser's far plane: the sky is some two kilometres away."""
+"""The browser's far plane, m: the sky is about two kilometres away."""
 NUDGES_S = (2.0, 6.0)
-"""Delay after the last step until splats are sorted anew for a new client."""
+"""Pauses before each new sorting of the splats for a new browser, s."""
 NOTE_S = 8.0
 
 
 class RebuiltViewer:
     """A page with a slider for time, sensors rendered at that time, and edits.
 
-    The browser draws the Gaussians' albedo by itself; what sensors see is rendered in the background, the
-    newest time first, so that the slider never waits. All is in the ego frame at the time shown. The server
-    runs in threads of its own until `close`.
+    The browser draws the Gaussians' albedo by itself. Sensor images are rendered in the background, the
+    newest time first, so that the slider never waits. All nodes are in the ego frame at the time shown. The
+    server runs in its own threads until `close`.
 
     Args:
-        run: that is looked at.
-        edits: to begin with.
-        file: where edits are saved, unless the page says otherwise.
-        host, port: where the page is served; at the next free port if this one is taken.
+        run: the shown reconstruction.
+        edits: initial edits.
+        file: default file for saved edits; the page can change it.
+        host, port: address of the page; if the port is taken, the next free one.
 
     Raises:
-        InputError: if it cannot be served there.
+        InputError: the page cannot be served there.
     """
 
     def __init__(self, run: OpenRun, edits: Sequence[Edit], file: Path, host: str, port: int) -> None:
@@ -63,12 +63,12 @@ class RebuiltViewer:
 
     @property
     def url(self) -> str:
-        """The page's address."""
+        """Return the page's address."""
         return page_url(self.server)
 
     def show(self, t_s: float) -> None:
-        """Go to a time since the log's start."""
-        self.time_s.value = t_s  # calls `show_now`, unless it is there already
+        """Go to a time since the start of the log, s."""
+        self.time_s.value = t_s  # calls `show_now`, unless the value is the same
 
     def show_now(self) -> None:
         """Draw the scene as it is now; the sensors' pictures follow."""
@@ -81,7 +81,7 @@ class RebuiltViewer:
             self._show_own_views()
 
     def play(self) -> None:
-        """Step through the log in real time while "play" is ticked on the page; does not return."""
+        """Step through the log in real time while "play" is ticked on the page; never return."""
         first_s, last_s = float(self.run.vehicle.t_s[0]), float(self.run.vehicle.t_s[-1])
         while True:
             began_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Confidence beside the share of detections that were right."""
+"""Reliability diagrams: the share of correct detections over their confidence."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,7 +13,7 @@ TITLES = {
 
 
 def draw_reliability(name: str, diagram: Reliability) -> Figure:
-    """Draw outcome over confidence, calibrated on the diagonal; bars show each bin's share."""
+    """Draw outcome over confidence, with the diagonal of perfect calibration; bars show each bin's share."""
     figure = Figure(figsize=(4.6, 4.0), layout="constrained")
     axes = figure.subplots()
     full = diagram.count > 0

@@ -1,4 +1,4 @@
-"""One self-contained page about a run: figures, tables, curves and example panels."""
+"""One self-contained page about a run: metrics, tables, curves and example panels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ AGAINST = "constant_velocity"
 
 @dataclass(frozen=True)
 class ReportData:
-    """What a report shows; a part without content is left out."""
+    """The content of a report; a part without content is left out."""
 
     title: str
     origin: Origin
@@ -38,12 +38,12 @@ class ReportData:
     losses: Losses
     panels: Sequence[ExamplePanel]
     notes: Sequence[str] = ()
-    """What a reader must know to read the figures rightly."""
+    """Facts that a reader needs in order to interpret the metrics correctly."""
 
 
 @dataclass(frozen=True)
 class Alert:
-    """A line that must not be overlooked, some less than others."""
+    """A line that a reader must not overlook; a strong one stands out."""
 
     text: str
     is_strong: bool = False
@@ -70,7 +70,7 @@ def write_report(path: Path, report: ReportData) -> None:
 
 
 def _alerts(report: ReportData) -> list[Alert]:
-    """List what failed, where commands came from, and what else must not be overlooked."""
+    """Return lines about failed items, the sources of the commands, and the notes."""
     alerts = []
     for key, count in report.summary.items():
         if key == "failed" or (key.endswith(".failed") and count):
@@ -83,7 +83,7 @@ def _alerts(report: ReportData) -> list[Alert]:
 
 
 def _tiles(summary: Summary) -> list[Tile]:
-    """Show the few figures that a reader looks for first."""
+    """Return tiles of the main metrics."""
     tiles = []
 
     def add(name: str, value: Value, digits: int, unit: str = "", note: str = "") -> None:

@@ -1,4 +1,4 @@
-"""The report of a run that was evaluated."""
+"""The report of an evaluated run."""
 
 import datetime
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def report_on_run(
 
 
 def inspection_panel(inspection: Inspection) -> ExamplePanel:
-    """Make an example's panel."""
+    """Return the panel of an example."""
     log, _, t_us = inspection.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     return ExamplePanel(
@@ -62,7 +62,7 @@ def _notes(
     failures: Sequence[Failure],
     losses: Losses,
 ) -> list[str]:
-    """List what a reader must know so as not to misread the figures."""
+    """Return the facts that a reader needs in order to interpret the metrics correctly."""
     notes = []
     seen = {log.folder for log in run.logs} & {log.folder for log in logs}
     if seen:

@@ -1,6 +1,7 @@
-"""Nodes of a 3-D scene: points, boxes, map, cameras, paths. All in the ego frame at now.
+"""Nodes of a 3-D scene: points, boxes, map, cameras, paths, all in the ego frame at now.
 
-Every function replaces what it drew before under its own name, and takes it away if there is nothing to draw.
+Every function replaces the nodes that it drew before under the same name, and removes them if there is
+nothing to draw.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ POINT_M = 0.06
 FRUSTUM_M = 1.2
 EGO_HEIGHT_M = 1.5
 PATH_LIFT_M = 0.15
-"""Height of paths, which would be half sunk in the road."""
+"""Height of paths above the ground, m; at 0 the road would hide half of them."""
 
 
 def show_lidar(scene: viser.SceneApi, clip: Clip) -> None:
@@ -130,6 +131,6 @@ def _lines(
 
 
 def clear(scene: viser.SceneApi, name: str) -> None:
-    """Take a node away, if it is there."""
+    """Remove a node, if it exists."""
     if scene.get_handle_by_name(name) is not None:
         scene.remove_by_name(name)

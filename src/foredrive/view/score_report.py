@@ -1,4 +1,4 @@
-"""The report on a file of detections: figures, reliability, and the frames where most likelihood was lost."""
+"""The report on a file of detections: metrics, reliability, and the frames that lost most likelihood."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ COMPARED = {
 
 
 def score_table(figures: Summary) -> Table:
-    """List the figures that a reader looks for first, beside those of the other file if there is one."""
+    """Return a table of the main metrics, beside those of the other file if there is one."""
     other = figures.get("against")
     prefixes = ("",) if other is None else ("", "against.")
     names = ("",) if other is None else ("these", Path(str(other)).name)
@@ -58,7 +58,7 @@ def write_score_report(
     """Write the page about a file of detections.
 
     Args:
-        worst: how many of the frames that lost most likelihood are drawn.
+        worst: number of frames to draw: those that lost most likelihood.
     """
     ranked = sorted(range(len(scores)), key=lambda n: -scores[n].nll)[:worst]
     write_page(

@@ -1,4 +1,4 @@
-"""A page in the browser that searches an index: a grid of hits, conditions, a map of scenes with a lasso."""
+"""A page that searches an index: a grid of hits, conditions, and a map of scenes with a lasso."""
 
 import functools
 import io
@@ -27,14 +27,14 @@ from foredrive.view.html import render_page
 
 JPEG_QUALITY = 85
 MAX_SHOWN = 60
-"""Scenes of a lasso that are shown."""
+"""Maximum number of scenes shown from a lasso."""
 Key = tuple[str, str]
-"""A moment's key and a view: a row."""
+"""A moment's key and a view; together they identify a row."""
 
 
 @dataclass(frozen=True)
 class ShownHit:
-    """A hit as the page shows it."""
+    """The values of a hit that the page shows."""
 
     key: str
     name: str
@@ -44,7 +44,7 @@ class ShownHit:
 
     @classmethod
     def of(cls, hit: Hit) -> "ShownHit":
-        """Describe a hit."""
+        """Return the shown values of a hit."""
         why = why_matched(hit) if hit.scores else ""
         caption = hit.facts["caption"]
         told = None if caption is None else str(caption)
@@ -53,7 +53,7 @@ class ShownHit:
 
 @dataclass(frozen=True)
 class ShownHits:
-    """Hits, and a line on how they were found."""
+    """Hits, and a line about the search."""
 
     hits: list[ShownHit]
     told: str
@@ -61,7 +61,7 @@ class ShownHits:
 
 @dataclass(frozen=True)
 class Point:
-    """A whole scene on the map: where it lies, -1 to 1, and what it can be coloured by."""
+    """A whole scene on the map: its position, -1 to 1, and the facts that can colour it."""
 
     x: float
     y: float
@@ -75,7 +75,7 @@ class Point:
 
     @classmethod
     def of(cls, xy: Sequence[float], row: Mapping[str, Any]) -> "Point":
-        """Place a row of the index."""
+        """Return the point of a row of the index."""
         name = f"{row['log']}@{row['t_s']:.1f}s"
         facts = (row["log"], row["place"], row["weather"], row["time_of_day"])
         return cls(xy[0], xy[1], _key(row), row["key"], name, *facts)
@@ -83,7 +83,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Map:
-    """All scenes on a plane that shows a share of their variance."""
+    """All scenes on a plane, and the share of their variance that the plane shows."""
 
     points: list[Point]
     share: float
@@ -92,7 +92,7 @@ class Map:
 
 @dataclass(frozen=True)
 class Done:
-    """A line on what was done."""
+    """A line about a finished action."""
 
     told: str
 
@@ -101,13 +101,13 @@ class SearchPage:
     """Serves the page until it is closed.
 
     Args:
-        towers: where the towers lie that made the index; by default where they lay then.
-        port: 0 takes any that is free.
+        towers: folder or name of the towers that made the index; by default as noted in the index.
+        port: 0 takes any free port.
     """
 
     def __init__(self, index: FrameIndex, towers: str | None, host: str, port: int) -> None:
         self._index, self._towers = index, towers
-        self._one_at_a_time = threading.Lock()  # one query takes all cores
+        self._one_at_a_time = threading.Lock()  # one query uses all cores
         page = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -119,7 +119,7 @@ class SearchPage:
                 page._answer(self, self.rfile.read(length))
 
             def log_message(self, format: str, *args: object) -> None:
-                """Say nothing."""
+                """Print nothing."""
 
         try:
             self._server = ThreadingHTTPServer((host, port), Handler)
@@ -128,11 +128,11 @@ class SearchPage:
         self.url = f"http://{host}:{self._server.server_address[1]}"
 
     def serve(self) -> None:
-        """Answer until `close`, in this thread."""
+        """Answer requests in this thread until `close`."""
         self._server.serve_forever()
 
     def close(self) -> None:
-        """Stop."""
+        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -201,7 +201,7 @@ class SearchPage:
         return Done(f"kept as {told['name']}")
 
     def _rows(self, keys: Sequence[Key]) -> list[Hit]:
-        """Read rows in the order of their keys, as hits without scores."""
+        """Return the rows of some keys, in their order, as hits without scores."""
         if not keys:
             raise InputError("nothing is chosen")
         where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
@@ -210,10 +210,10 @@ class SearchPage:
 
 
 def query_of(asked: Mapping[str, Any]) -> Query:
-    """Make a query of the page's fields; empty ones are left out.
+    """Return the query of the page's fields; empty fields are left out.
 
     Raises:
-        InputError: they do not make one.
+        InputError: the fields make no valid query.
     """
     kinds: dict[str, Callable[[Any], Any]] = {"top": int, "gap_s": float, "mix": float}
     known = {field.name for field in fields(Query)}
@@ -223,7 +223,7 @@ def query_of(asked: Mapping[str, Any]) -> Query:
 
 @functools.cache
 def page_html() -> str:
-    """Return the page; it loads nothing from anywhere but this server."""
+    """Return the page; it loads files only from this server."""
     return render_page("search_page.html.j2", title="Foredrive search")
 
 

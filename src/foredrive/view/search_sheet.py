@@ -28,13 +28,13 @@ MAX_ON_PICTURE = 60
 
 
 def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
-    """Write the hits in their order, three a row.
+    """Write the hits in their order, three per row.
 
     Args:
-        path: ends on .png (a picture of the first 60) or .html (all, in one file that loads nothing).
+        path: ends in .png (a picture of the first 60) or .html (all hits, in one file that loads no other).
 
     Raises:
-        InputError: it ends otherwise.
+        InputError: the path has another suffix.
     """
     check_sheet(path)
     if path.suffix == ".png":
@@ -51,14 +51,14 @@ def check_sheet(path: Path) -> None:
     """Check that a contact sheet can be written under this name.
 
     Raises:
-        InputError: it ends neither on .png nor on .html.
+        InputError: the name ends neither in .png nor in .html.
     """
     if path.suffix not in (".png", ".html"):
         raise InputError(f"{path}: a contact sheet ends on .png or .html")
 
 
 def query_line(query: Query) -> str:
-    """Write a query in one line."""
+    """Return a query as one line of text."""
     asked = [f"“{text}”" for text in (query.text, query.image_text, query.lidar_text) if text]
     asked += [f"like {query.like}"] if query.like else []
     if asked:
@@ -89,7 +89,7 @@ def _write_picture(path: Path, query: Query, hits: Sequence[Hit]) -> None:
 
 
 def hits_table(hits: Sequence[Hit]) -> Table:
-    """List the hits."""
+    """Return the hits as a table."""
     columns = (
         Column(),
         *(Column(name, align="left") for name in ("moment and view", "why", "what is there")),

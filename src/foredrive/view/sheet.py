@@ -1,4 +1,4 @@
-"""A dark picture laid out in pixels from its upper left corner."""
+"""A dark picture with a layout in pixels from its upper left corner."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from foredrive.view import palette
 
 DPI = 100
 PT_OF_PX = 1.15
-"""A title's size, so that it fits: points for each pixel that a letter may be wide."""
+"""Points of font size per pixel of letter width, at which a title fits."""
 
 
 class Sheet:
-    """A figure of so many pixels.
+    """A figure of a given size.
 
     Args:
-        width, height: in px.
+        width, height: size, px.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -26,25 +26,25 @@ class Sheet:
         self.figure = Figure(figsize=size_in, dpi=DPI, facecolor=palette.GROUND)
 
     def place(self, x: int, y: int, w: int, h: int) -> Axes:
-        """Add axes."""
+        """Add axes at a rectangle, px."""
         box = (x / self.width, 1 - (y + h) / self.height, w / self.width, h / self.height)
         return self.figure.add_axes(box)
 
     def write(
         self, x: int, y: int, text: str, size_pt: float, colour: str = palette.INK, weight: str = "normal"
     ) -> None:
-        """Write lines below a point; dollars in them begin no formula."""
+        """Write lines of text below a point; a dollar sign starts no formula."""
         at = (x / self.width, 1 - y / self.height)
         written = self.figure.text(*at, text, color=colour, fontsize=size_pt, va="top", parse_math=False)
         written.set(linespacing=1.5 if "\n" in text else 1.2, weight=weight)
 
     def head(self, x: int, height: int, text: str, size_pt: float) -> None:
-        """Write a title into the middle of the upper margin; a long one shrinks to fit."""
+        """Write a title into the middle of the upper margin; shrink a long one to fit."""
         size_pt = min(size_pt, PT_OF_PX * self.width / max(len(text), 1))
         at = (x / self.width, 1 - height / 2 / self.height)
         self.figure.text(*at, text, color=palette.INK, fontsize=size_pt, va="center", parse_math=False)
 
     def save(self, path: Path) -> None:
-        """Write the picture as a PNG; it appears whole or not at all."""
+        """Write the picture as a PNG; it is written completely or not at all."""
         with atomic_path(path) as scratch:
             self.figure.savefig(scratch, dpi=DPI, facecolor=palette.GROUND, format="png")

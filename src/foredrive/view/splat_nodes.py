@@ -9,20 +9,20 @@ from torch import Tensor
 from foredrive.rendering.gaussians import Gaussians
 
 LARGEST_M = 200.0
-"""Bound of standard deviations: the browser keeps variances in half precision, which ends at 65504."""
+"""Maximum standard deviation, m: the browser keeps variances in half precision, which ends at 65504."""
 FAINTEST = 1 / 255
-"""Gaussians that are less opaque at their centre are not seen."""
+"""Minimum opacity of a visible Gaussian at its centre."""
 NEAREST_M = 5.0
-"""Gaussians nearer to the viewpoint than this count no more."""
+"""Minimum distance in the estimate of coverage, m; nearer Gaussians count as if at this distance."""
 
 
 def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -> Gaussians:
-    """Choose the visible Gaussians that cover most, by opacity and largest section.
+    """Choose the visible Gaussians that cover most, by opacity, largest section and distance.
 
     Args:
         gaussians: in any frame.
-        share: how much of them is left at most.
-        from_m: places they are looked at from, in their frame: what is as large but farther covers less.
+        share: maximum share of the Gaussians that is kept.
+        from_m: viewpoints, in the frame of the Gaussians; of two equal Gaussians the farther covers less.
     """
     opacity = gaussians.opacity_logit.sigmoid()
     seen = (opacity >= FAINTEST).nonzero()[:, 0]
@@ -37,7 +37,7 @@ def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) ->
 
 @torch.no_grad()
 def show_splats(scene: viser.SceneApi, name: str, gaussians: Gaussians) -> viser.GaussianSplatHandle:
-    """Draw Gaussians in the frame of the node above them."""
+    """Draw Gaussians in the frame of the parent node."""
     factor = gaussians.factor().permute(2, 0, 1)
     held = (LARGEST_M / gaussians.log_scale.exp().amax(-1)).clamp_max(1.0)
     factor = factor * held[:, None, None]

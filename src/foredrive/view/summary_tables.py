@@ -1,4 +1,4 @@
-"""Tables of a summary's figures; a figure that is missing is a dash, a table without figures is None."""
+"""Tables of a summary's metrics. A missing value is shown as a dash; a table without values is None."""
 
 import math
 import re
@@ -49,7 +49,7 @@ _IMAGES = re.compile(r"(\w+(?:\.\w+)*)\.psnr_db")
 
 
 def print_summary(summary: Summary, console: Console, model: str) -> None:
-    """Print what a reader looks for first."""
+    """Print the main metrics."""
     for make in (occupancy_table, planning_table, flow_table, image_table):
         if table := make(summary):
             print_table(table, console)
@@ -63,13 +63,13 @@ def print_summary(summary: Summary, console: Console, model: str) -> None:
 
 
 def when_title(name: str) -> str:
-    """Write a time as a title: `future_500ms` -> +500 ms; `now` stays."""
+    """Return the title of a time: `future_500ms` becomes "+500 ms"; `now` stays."""
     later = re.fullmatch(r"future_(\d+)(ms|s)", name)
     return f"+{later[1]} {later[2]}" if later else name
 
 
 def planning_overview(summary: Summary) -> Table | None:
-    """Compare agents by their averages under all protocols; the best value of a column is marked."""
+    """Compare agents by their average scores under all protocols; mark the best value of each column."""
     agents, protocols = _planned(summary)
     if not protocols:
         return None
@@ -84,7 +84,7 @@ def planning_overview(summary: Summary) -> Table | None:
 
 
 def planning_table(summary: Summary) -> Table | None:
-    """Compare agents at every horizon under each protocol; the best value of a column is marked."""
+    """Compare agents at every horizon under each protocol; mark the best value of each column."""
     agents, protocols = _planned(summary)
     if not protocols:
         return None
@@ -105,7 +105,7 @@ def planning_table(summary: Summary) -> Table | None:
 
 
 def occupancy_table(summary: Summary) -> Table | None:
-    """Compare IoU, precision and recall on known voxels, now and later, with those of baselines."""
+    """Compare IoU, precision and recall on known voxels, now and later, with the baselines."""
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
         return None
@@ -135,7 +135,7 @@ def occupancy_table(summary: Summary) -> Table | None:
 
 
 def flow_table(summary: Summary) -> Table | None:
-    """Compare errors of flow on voxels that move, now and later, with those of predicting none."""
+    """Compare flow errors on moving voxels, now and later, with the errors of predicting no motion."""
     rows = [
         (when_title(found[1]), value, summary.get(f"{key}.no_motion"))
         for key, value in summary.items()
@@ -162,7 +162,7 @@ def full_table(summary: Summary) -> Table:
 
 
 def ratio_to_constant(summary: Summary, key: str) -> float | None:
-    """Return how many times the best constant's value a model's is."""
+    """Return the model's value divided by that of the occupancy prior; None if a value is missing."""
     value, constant = summary.get(key), summary.get(f"{key}.{CONSTANT}")
     if not isinstance(value, float) or not isinstance(constant, float) or not constant > 0:
         return None
@@ -170,14 +170,14 @@ def ratio_to_constant(summary: Summary, key: str) -> float | None:
 
 
 def _planned(summary: Summary) -> tuple[list[str], list[str]]:
-    """Agents, the model first, and protocols that have planning figures."""
+    """Return the agents, the model first, and the protocols that have planning metrics."""
     found = [match for key in summary if (match := _PLANNING.match(key))]
     agents = sorted({match[1] or MODEL for match in found}, key=lambda agent: (agent != MODEL, agent))
     return agents, [name for name in PROTOCOLS if any(match[2] == name for match in found)]
 
 
 def _planning_rows(summary: Summary, agents: Sequence[str], keys: Sequence[str]) -> list[Row]:
-    """One row an agent; the best value of every score's column is marked."""
+    """Return one row for each agent; mark the best value of each score's column."""
     values = {agent: [summary.get(_planning_key(agent, key)) for key in keys] for agent in agents}
     best = [
         None if ".frames" in key else _best(column)
@@ -203,6 +203,6 @@ def _planning_key(agent: str, key: str) -> str:
 
 
 def _best(column: Sequence[Value]) -> float | None:
-    """The least of values that differ."""
+    """Return the smallest value of a column; None if all values are equal or missing."""
     values = {value for value in column if isinstance(value, float) and not math.isnan(value)}
     return min(values) if len(values) > 1 else None

@@ -1,4 +1,4 @@
-"""A table as data, which the terminal and reports show alike."""
+"""A table as data, for the terminal and for reports."""
 
 import itertools
 import math
@@ -15,22 +15,22 @@ from rich.text import Text
 
 Value = float | int | str | None
 Summary = Mapping[str, Value]
-"""A summary's figures under flat dotted keys, as summary.json has them."""
+"""A summary's metrics under flat dotted keys, as in summary.json."""
 
 MISSING = "\N{EN DASH}"
 MIN_TEXT_WIDTH, MAX_WIDTH = 16, 1000
-"""Of a column of words, and of a table in the terminal, in characters."""
+"""Minimum width of a column of words, and maximum width of a table in the terminal, in characters."""
 RICH_STYLES = {"": "", "best": "green", "good": "green", "bad": "bold yellow"}
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its titles, and how its values are written.
+    """A column: its titles and the format of its values.
 
     Args:
-        title: of this column.
+        title: title of this column.
         group: a title shared with the neighbouring columns of the same group.
-        digits: after the point of floats.
+        digits: digits of a float after the decimal point.
         align: left for words, right for numbers.
     """
 
@@ -42,7 +42,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value that stands out, or that leads to an anchor of the page."""
+    """A value that is highlighted, or that links to an anchor of the page."""
 
     value: Value
     mark: Literal["", "best", "good", "bad"] = ""
@@ -59,7 +59,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Section:
-    """Rows under a title of their own, parted from those above."""
+    """Rows under their own title, separated from the rows above."""
 
     rows: Sequence[Row]
     title: str = ""
@@ -76,29 +76,29 @@ class Table:
 
     @property
     def has_head(self) -> bool:
-        """Whether any column has a title."""
+        """Return whether any column has a title."""
         return any(column.title or column.group for column in self.columns)
 
     @property
     def groups(self) -> list[tuple[str, list[Column]]]:
-        """Neighbouring columns by their group."""
+        """Return neighbouring columns by their group."""
         return [(group, list(columns)) for group, columns in itertools.groupby(self.columns, _group)]
 
 
 def simple_table(columns: Sequence[Column], rows: Sequence[Sequence[Value | Cell]], title: str = "") -> Table:
-    """Make a table of one section without notes."""
+    """Return a table of one section without notes."""
     return Table(columns, [Section([Row(cells) for cells in rows])], title)
 
 
 def number(value: Value, digits: int = 3) -> str:
-    """Write a figure: a float with that many digits after the point, a missing one as a dash."""
+    """Return a value as text: a float with `digits` after the decimal point, a missing value as a dash."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return MISSING
     return f"{value:z.{digits}f}" if isinstance(value, float) else str(value)
 
 
 def words(name: str) -> str:
-    """Write an identifier as words."""
+    """Return an identifier as words."""
     return str(name).replace("_", " ")
 
 
@@ -113,7 +113,7 @@ def print_table(table: Table, console: Console) -> None:
 
 
 def _rich(table: Table) -> RichTable:
-    """Make the table for rich; nothing in it is taken for markup."""
+    """Return the table for rich; no text in it is read as markup."""
     shown = RichTable(
         title=Text(table.title) if table.title else None,
         title_justify="left",

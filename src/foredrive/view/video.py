@@ -1,4 +1,4 @@
-"""Moving pictures on disk."""
+"""Write videos."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -20,7 +20,7 @@ def check_video(path: Path) -> None:
     """Check that a video can be written under this name.
 
     Raises:
-        InputError: it ends on anything but .mp4 and .webp, or for MP4 there is no PyAV.
+        InputError: the name ends in neither .mp4 nor .webp, or PyAV is missing for MP4.
     """
     if path.suffix not in (MP4, WEBP):
         raise InputError(f"{path}: videos end on {MP4}, or on {WEBP}, which browsers play as a picture")
@@ -32,7 +32,7 @@ def write_video(path: Path, frames: Iterable[Image.Image], frame_s: float) -> No
     """Write frames of one size, each shown for `frame_s`: MP4 (H.264) or animated WebP, by the path's suffix.
 
     Args:
-        frames: at least one. MP4 keeps none of them in memory, WebP all.
+        frames: at least one. MP4 keeps no frames in memory, WebP keeps all.
 
     Raises:
         InputError: as `check_video`.
@@ -55,10 +55,10 @@ def write_video(path: Path, frames: Iterable[Image.Image], frame_s: float) -> No
 
 
 def _write_mp4(path: Path, frames: Iterator[Image.Image], frame_s: float) -> None:
-    import av  # an extra
+    import av  # an optional package
 
     first = next(frames)
-    width, height = (n - n % 2 for n in first.size)  # as H.264 has it
+    width, height = (n - n % 2 for n in first.size)  # H.264 needs even sizes
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(1 / frame_s).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

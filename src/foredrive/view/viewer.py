@@ -1,4 +1,4 @@
-"""A log in the browser, in 3-D and over time, with a run's predictions."""
+"""A page for a log, in 3-D and over time, with a run's predictions."""
 
 import threading
 import time
@@ -14,17 +14,17 @@ PLAY_PERIOD_S = 0.1
 
 
 class Viewer:
-    """A web page with a slider for time and, with a run, one for how far ahead its model imagines.
+    """A page with a slider for time and, with a run, a slider for the imagined time ahead.
 
-    All is drawn in the ego frame at the time shown, so the view goes along with the vehicle. The server runs
-    in threads of its own until `close`.
+    All nodes are in the ego frame at the time shown, so that the view follows the vehicle. The server runs in
+    its own threads until `close`.
 
     Args:
-        times: what is shown.
-        host, port: where the page is served; at the next free port if this one is taken.
+        times: the shown log, with or without a run.
+        host, port: address of the page; if the port is taken, the next free one.
 
     Raises:
-        InputError: if it cannot be served there.
+        InputError: the page cannot be served there.
     """
 
     def __init__(self, times: LogTimes, host: str, port: int) -> None:
@@ -38,7 +38,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """The page's address."""
+        """Return the page's address."""
         return page_url(self.server)
 
     def show(self, index: int) -> None:
@@ -47,7 +47,7 @@ class Viewer:
         self._draw()
 
     def play(self) -> None:
-        """Step through the log while "play" is ticked on the page; does not return."""
+        """Step through the log while "play" is ticked on the page; never return."""
         while True:
             time.sleep(PLAY_PERIOD_S)
             if self._play.value:
@@ -75,7 +75,7 @@ class Viewer:
         self.show(min(max(self._frame.value + change, 0), len(self.times) - 1))
 
     def _draw(self) -> None:
-        """Draw the newest frame that was asked for; those passed over are dropped."""
+        """Draw the newest requested frame; frames requested in between are dropped."""
         with self._drawing:
             index = min(self._frame.value, len(self.times) - 1)
             if index == self._drawn:

@@ -16,9 +16,9 @@ from foredrive.view.scene_nodes import clear
 from foredrive.view.voxel_drawing import height_colours, pca_colours
 
 FILL = 0.94
-"""Edge of a drawn cube over that of its voxel: neighbours stay apart."""
+"""Edge of a drawn cube relative to its voxel; below 1, so that neighbours stay apart."""
 MOVES_M = 0.25
-"""Shorter arrows are not drawn."""
+"""Minimum length of a drawn arrow, m."""
 ARROW_WIDTH, HEAD_SHARE = 3.0, 0.3
 
 _CUBE = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
@@ -33,10 +33,10 @@ _CUBE_FACES = np.array(
 def shown_voxels(
     vision: Vision, k: int, spec: VoxelSpec, above: float, lowest_m: float
 ) -> Bool[Tensor, "Z Y X"]:
-    """Select voxels of frame k that are occupied with a probability of more than `above`.
+    """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
     Args:
-        lowest_m: height in the ego frame below which voxel centres are left out: the road hides much.
+        lowest_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
     """
     z = spec.centres_m()[..., 2]
     return (vision.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
@@ -78,7 +78,7 @@ def show_occupancy(
 def show_flow(
     scene: viser.SceneApi, vision: Vision, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
 ) -> None:
-    """Draw the movement of shown voxels since frame k - 1 as arrows over ground; none for now."""
+    """Draw the movement of shown voxels since frame k - 1 as arrows over the ground; none for now."""
     movement = None if k == 0 else vision.movement_m(k, spec)
     if movement is None:
         return clear(scene, "/flow")

@@ -31,7 +31,7 @@ class Eye:
 
     @classmethod
     def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Eye":
-        """Place it above and behind the vehicle, so that the grid fills a picture of that shape."""
+        """Return an eye above and behind the vehicle, so that the grid fills a picture of that size."""
         reach = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
         low, high = np.array(spec.lower_m), np.array(spec.upper_m)
         middle = (low + high) / 2
@@ -64,14 +64,14 @@ def draw_voxels(
     eye: Eye | None = None,
     colours: UInt8[np.ndarray, "Z Y X 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw occupied voxels as lit cubes with shadows, cast ray by ray through the grid.
+    """Draw occupied voxels as lit cubes with shadows; rays are cast through the grid.
 
     Args:
-        occupied: what is drawn.
-        spec: where the grid lies.
+        occupied: the voxels to draw.
+        spec: position and size of the grid.
         size_hw: size of the picture, px.
-        eye: where it is seen from; above and behind the vehicle if not given.
-        colours: RGB per voxel; by height if not given.
+        eye: viewpoint; by default above and behind the vehicle.
+        colours: RGB per voxel; by default by height.
     """
     eye = eye or Eye.behind(spec, size_hw)
     tint = height_colours(spec) if colours is None else colours
@@ -83,7 +83,7 @@ def draw_voxels(
 
 
 def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
-    """Colour heights from dark (-0.5 m over the ego ground) to bright (4 m), the same in every picture."""
+    """Return fixed colours of heights, dark (-0.5 m above the ego ground) to bright (4 m)."""
     z = spec.lower_m[2] + (np.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
     rgb = palette.HEIGHT_MAP(0.12 + 0.88 * np.clip((z + 0.5) / 4.5, 0, 1))[:, :3]
     return np.broadcast_to((rgb * 255).astype(np.uint8)[:, None, None], (*spec.shape_zyx, 3))
@@ -96,10 +96,10 @@ def draw_comparison(
     spec: VoxelSpec,
     above_m: float,
 ) -> UInt8[np.ndarray, "X Y 3"]:
-    """Draw hits, false alarms, misses, known free and unknown columns from above, one pixel a column.
+    """Draw hits, false alarms, misses, known free and unknown columns from above, one pixel per column.
 
-    Only known voxels whose centre is higher than `above_m` in the ego frame count: the road would hide
-    everything else. Forward points up, left points left.
+    Only known voxels whose centre is higher than `above_m` in the ego frame count, because the road would
+    hide everything else. Forward points up, left points left.
     """
     z = spec.lower_m[2] + (torch.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
     counts = known & (z > above_m)[:, None, None]
@@ -127,9 +127,9 @@ def draw_volume_pca(volume: Float[Tensor, "D Z Y X"]) -> UInt8[np.ndarray, "X Y 
 def pca_colours(
     volume: Float[Tensor, "D Z Y X"], shown: Bool[Tensor, "Z Y X"]
 ) -> UInt8[np.ndarray, "Z Y X 3"]:
-    """Colour every voxel by its features: PCA over the voxels that are shown, each channel stretched.
+    """Return voxel colours from features: PCA over the shown voxels, with each channel stretched.
 
-    With fewer than three of them there is nothing to tell apart, and all are grey.
+    With fewer than three shown voxels, PCA is not defined and all are grey.
     """
     colours = torch.full((3, *shown.shape), 128, dtype=torch.uint8)
     if int(shown.sum()) >= 3:
@@ -161,12 +161,12 @@ def _from_above(rows: UInt8[Tensor, "Y X 3"]) -> UInt8[np.ndarray, "X Y 3"]:
 
 
 @numba.njit(cache=True, error_model="numpy")
-@no_type_check  # numba infers the types, and wants the bare function
+@no_type_check  # numba infers the types and needs the bare function
 def _march(occupied, origin, direction, cell, step, to_next, per_cell):
-    """Find a ray's first occupied voxel (Amanatides & Woo, 1987); the last four arguments are scratch.
+    """Find a ray's first occupied voxel (Amanatides & Woo, 1987); the last four arguments are scratch memory.
 
-    Returns the distance in voxels (-1: none) and the axis of the face that was entered (-1: the ray starts
-    inside); `cell` is left at the voxel's x, y, z.
+    It returns the distance in voxels (-1: none) and the axis of the entered face (-1: the ray starts inside).
+    `cell` is left at the voxel's x, y, z.
     """
     shape = (occupied.shape[2], occupied.shape[1], occupied.shape[0])
     near, far, axis = 0.0, math.inf, -1
@@ -208,7 +208,7 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
 @numba.njit(cache=True, error_model="numpy")
 @no_type_check
 def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
-    """Paint the pixels [H W 3] behind which there is a voxel; the eye's `origin` is in voxels."""
+    """Paint the pixels [H W 3] whose ray hits a voxel; the eye's `origin` is in voxels."""
     height, width = picture.shape[:2]
     direction, hit, above = np.empty(3), np.empty(3), np.empty(3)
     cell, step = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -226,7 +226,7 @@ def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
             light, rim = AMBIENT, 1.0
             for i in range(3):
                 hit[i] = above[i] = origin[i] + distance * direction[i]
-                if i != axis:  # how far from the face's nearest rim, in voxels
+                if i != axis:  # distance from the nearest rim of the face, in voxels
                     rim = min(rim, hit[i] - math.floor(hit[i]), math.ceil(hit[i]) - hit[i])
             if axis >= 0:
                 facing = -sun[axis] if direction[axis] > 0 else sun[axis]

@@ -1,4 +1,4 @@
-"""Who may drive a town: agents by the names that the command line knows."""
+"""Agents that can drive a town, by the names that the command line accepts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,39 +29,41 @@ DISTURBED, PUPIL = "disturbed", "pupil:"
 
 @dataclass(frozen=True)
 class Needs:
-    """What an agent has to be shown."""
+    """The inputs that an agent requires."""
 
     cameras: bool
     lidar: bool
-    """Learned agents go on from a halt only where lidar sees nobody (`Restarting`)."""
+    """Whether the agent requires lidar. A learned agent starts again after a halt only where lidar shows free
+    space (`Restarting`).
+    """
     past_frames: int
     camera_names: tuple[str, ...] | None = None
-    """Which cameras; None: all there are."""
+    """Names of the required cameras; None: all cameras."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sees:
-    """An agent that was trained on smaller images than the vehicle takes."""
+    """An agent that was trained on smaller images than the vehicle records."""
 
     agent: PlanningAgent[Any]
     image_hw: tuple[int, int]
     device: str
 
     def act(self, observation: Clip) -> Trajectory:
-        """The plan of the agent."""
+        """Shrink the images and return the agent's plan."""
         return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
 
 
 def needs_of(driver: str) -> Needs:
-    """What a driver has to be shown.
+    """Return the inputs that a driver requires.
 
     Args:
-        driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN", the MLP that sees ego
-            status alone, fitted to what the run was trained on; for lessons "disturbed", the expert whom
-            things happen to, or "pupil:RUN", a run and the expert by turns.
+        driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
+            the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
+            the expert under disturbances, or "pupil:RUN", in which a run and the expert drive by turns.
 
     Raises:
-        InputError: there is no such driver.
+        InputError: there is no such driver, or it was trained on another frame interval.
     """
     if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
         return Needs(cameras=False, lidar=False, past_frames=1)
@@ -75,16 +77,16 @@ def needs_of(driver: str) -> Needs:
 def make_driver(
     driver: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
 ) -> Agent:
-    """A driver for one drive.
+    """Create a driver for one drive.
 
     Args:
         driver: as for `needs_of`.
-        clock: time of the drive, s.
-        town: where the expert is to drive; the others drive anywhere.
-        seed: of what happens in a lesson.
+        clock: returns the time of the drive, s.
+        town: the town that the expert drives in; the other drivers do not need it.
+        seed: seed of the random disturbances and turns in a demonstration.
 
     Raises:
-        InputError: there is no such driver, or it is the expert and there is no town.
+        InputError: there is no such driver, or it needs the expert and there is no town.
     """
     if driver == EXPERT:
         return _expert(town)
@@ -114,7 +116,7 @@ def _run_folder(driver: str) -> Path:
     return folder
 
 
-@lru_cache(maxsize=1)  # a worker drives many routes
+@lru_cache(maxsize=1)  # a worker drives many routes with the same agent
 def _seeing(folder: Path) -> _Sees:
     run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
     return _Sees(load_agent(run).to(device), run.recipe.clips.image_hw, device)

@@ -1,4 +1,4 @@
-"""Routes through the towns of a CARLA server."""
+"""Drives over routes in the towns of a CARLA server."""
 
 import contextlib
 import dataclasses
@@ -19,10 +19,10 @@ PORT = 2000
 
 @dataclass(frozen=True)
 class CarlaRoutes:
-    """A `Source`: the routes of towns, driven on a server; it plays none of their scenarios."""
+    """A `Source` of routes that are driven on a CARLA server, without scenarios."""
 
     server: str
-    """HOST or HOST:PORT."""
+    """Address: HOST or HOST:PORT."""
     towns: TownRoutes
     in_turn = True
 
@@ -33,27 +33,27 @@ class CarlaRoutes:
 
     @property
     def grows(self) -> tuple[str, ...]:
-        """As of towns; the same server may be reached elsewhere later."""
+        """Return the fields that towns allow to grow, and the server, whose address may change later."""
         return (*self.towns.grows, "carla")
 
     def address(self) -> tuple[str, int]:
-        """Host and port of the server."""
+        """Return host and port of the server."""
         host, _, port = self.server.partition(":")
         if not host or not (port or str(PORT)).isdecimal():
             raise InputError(f"a CARLA server is named HOST:PORT, got {self.server!r}")
         return host, int(port or PORT)
 
     def noted(self) -> Mapping[str, object]:
-        """The fields of the routes, and the server."""
+        """Return the fields of the routes and the server."""
         return {**dataclasses.asdict(self.towns), "carla": self.server}
 
     def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """Every route, once for each repetition."""
+        """Return one drive for each route and repetition."""
         return self.towns.jobs(driver)
 
     @contextlib.contextmanager
     def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
-        """Set a drive up on the server, which is left as it was found."""
+        """Set up a drive on the server; restore the server's state afterwards."""
         route = self.towns.route_of(job)
         scenario = self.towns.scenario_of(route, job.repetition, suite)
         with CarlaSimulator(connect(*self.address())) as simulator:

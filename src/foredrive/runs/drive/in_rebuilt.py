@@ -1,4 +1,4 @@
-"""Drives in a rebuilt log."""
+"""Drives in a reconstructed log."""
 
 import contextlib
 import dataclasses
@@ -34,31 +34,31 @@ from foredrive.simulation.simple_agents import Replay
 from foredrive.simulation.threats import Threat, reference_mps, send_threat, threat_score
 
 REPLAY = "log"
-"""The driver that goes on as the log was driven."""
+"""The driver that repeats the logged drive (log replay)."""
 
 
 @dataclass(frozen=True)
 class RebuiltRoutes:
-    """A `Source`: a rebuilt log, from where on it is driven in, and against what."""
+    """A `Source` of drives in a reconstructed log: one for each start time and threat."""
 
     run: str
-    """Folder of the reconstruction."""
+    """Folder of the reconstruction run."""
     starts_s: tuple[float, ...] = ()
-    """Times of the log at which drives begin; none: as early as there are frames before."""
+    """Times of the log at which drives begin, s; empty: the first time with enough past frames."""
     threats: tuple[Threat, ...] = ()
-    """A drive for each from every start; none: as the log was."""
+    """Threats, each in its own drive from every start; empty: one drive without a threat."""
     edits: str | None = None
-    """File of edits to the scene."""
+    """File of edits to the scene; None: no edits."""
 
     in_turn = True
     grows = ("starts_s", "threats")
 
     def noted(self) -> Mapping[str, object]:
-        """The fields; the log's way is the route."""
+        """Return the fields, and the run as the routes."""
         return {**dataclasses.asdict(self), "routes": self.run}
 
     def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """A drive for each start and threat."""
+        """Return one drive for each start and threat."""
         past_frames = _past_frames(driver)
         _edits_of(self.edits)
         return [job for job, _, _ in self._plan(past_frames)]
@@ -74,7 +74,7 @@ class RebuiltRoutes:
 
     @contextlib.contextmanager
     def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
-        """Set a drive up in the scene."""
+        """Set up a drive in the reconstructed scene."""
         opened, edits, past_frames = _opened(self.run), _edits_of(self.edits), _past_frames(suite.driver)
         _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
         edited = edited_scene(opened.scene, edits)
@@ -107,7 +107,7 @@ class RebuiltRoutes:
             )
 
 
-@functools.lru_cache(maxsize=1)  # drives in a row are in one scene
+@functools.lru_cache(maxsize=1)  # consecutive drives share one scene
 def _opened(run: str) -> OpenRun:
     return open_rebuilt(Path(run))
 
@@ -121,7 +121,7 @@ def _past_frames(driver: str) -> int:
 
 
 def _lanes(folder: Path) -> LoggedLanes | None:
-    """Those of the map of a run's log; None if either is gone, or never was."""
+    """Read the lanes from the map of a run's log; return None if the log or its map is missing."""
     try:
         outlines = read_lane_outlines(Log(open_run_log(folder)[1]))
     except InputError:
@@ -131,13 +131,13 @@ def _lanes(folder: Path) -> LoggedLanes | None:
 
 @dataclass(frozen=True, eq=False)
 class _Through:
-    """An agent that looks through some of the cameras only."""
+    """An agent that receives only some of the cameras."""
 
     agent: Agent
     cameras: list[int]
 
     def act(self, observation: Clip) -> Trajectory:
-        """The plan of the agent."""
+        """Select the cameras and return the agent's plan."""
         return self.agent.act(observation.through(self.cameras))
 
 
@@ -151,7 +151,7 @@ def _driver(driver: str, simulator: RebuiltSimulator) -> Agent:
 
 
 def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatMet:
-    """What a drive through a threat is worth, by its first collision."""
+    """Score a drive against a threat by the severity of its first collision."""
     hits = [event.severity for event in driven.events if event.kind.startswith("collision")]
     impact_mps = hits[0] if hits else None
     return ThreatMet(threat, impact_mps, reference, threat_score(impact_mps, reference))

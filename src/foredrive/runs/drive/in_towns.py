@@ -1,4 +1,4 @@
-"""Routes through the embedded towns."""
+"""Drives over routes in the embedded towns."""
 
 import contextlib
 import dataclasses
@@ -27,20 +27,23 @@ from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 @dataclass(frozen=True)
 class TownRoutes:
-    """A `Source`: routes through towns, and under which circumstances they are driven."""
+    """A `Source` of routes through towns, with the conditions and the traffic of the drives."""
 
     routes: str
-    """A set that comes with the package, or a CARLA route file."""
+    """Name of a route set of the package, or path of a CARLA route file."""
     repetitions: int = 1
     seed: int = 0
-    """Of the place and the traffic in the first repetition; the next has the next."""
+    """Seed of the town and its traffic in the first repetition; each repetition adds one."""
     conditions: str | None = None
-    """A name, or `ANY_CONDITIONS`: drawn for each drive; None draws bright daylight from the seed."""
+    """Name of the conditions. `ANY_CONDITIONS` draws a name for each drive; None draws bright daylight from
+    the seed.
+    """
     image_hw: tuple[int, int] = (144, 256)
     vehicles: int = Crowd.vehicles
     people: int = Crowd.people
     scenarios: bool = True
-    """Whether others brake, cut in, run lights and step out on the way, as the seed decides."""
+    """Whether scenarios are on the route, chosen by the seed: actors brake, cut in, run lights and step out.
+    """
 
     in_turn = False
     grows = ("repetitions",)
@@ -53,18 +56,18 @@ class TownRoutes:
             raise InputError(f"no conditions are named {self.conditions}; there are {there_are}")
 
     def noted(self) -> Mapping[str, object]:
-        """The fields."""
+        """Return the fields."""
         return dataclasses.asdict(self)
 
     def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """Every route, once for each repetition."""
+        """Return one drive for each route and repetition."""
         needs_of(driver)
         routes = load_route_set(self.routes)
         return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
 
     @contextlib.contextmanager
     def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
-        """Set a drive up in its town."""
+        """Set up a drive in its town."""
         route = self.route_of(job)
         simulator, scenario = TownSimulator(), self.scenario_of(route, job.repetition, suite)
         lot = _lot(scenario.seed, job.route)
@@ -86,11 +89,11 @@ class TownRoutes:
             )
 
     def route_of(self, job: DriveJob) -> DriveRoute:
-        """The route of a drive, along the lanes."""
+        """Return the route of a drive, snapped to the lanes."""
         return snap_route(next(route for route in load_route_set(self.routes) if route.id == job.route))
 
     def scenario_of(self, route: DriveRoute, repetition: int, suite: DriveSuite) -> TownScenario:
-        """The circumstances of one drive."""
+        """Return the scenario of one drive: its seed, traffic, conditions and sensors."""
         needs = needs_of(suite.driver)
         seen = needs.lidar or suite.sensors
         seed = self.seed + repetition
@@ -113,10 +116,10 @@ class TownRoutes:
 
 
 def job_of(route: str, repetition: int) -> DriveJob:
-    """A drive of a route."""
+    """Return the job of driving a route in one repetition."""
     return DriveJob(f"route{route}_rep{repetition}", route, repetition)
 
 
 def _lot(seed: int, route: str) -> int:
-    """A number drawn for a drive, always the same."""
+    """Return a pseudo-random number for a drive; the same arguments give the same number."""
     return zlib.crc32(f"{seed} {route}".encode())

@@ -1,7 +1,7 @@
 """The agent file for CARLA's leaderboards and Bench2Drive: `--agent THIS_FILE --agent-config RUN`.
 
-The leaderboard is no package that can be installed; where its code is not on the path, the agent can be made
-and asked all the same, but by nobody who scores it.
+The leaderboard cannot be installed as a package. Where its code is not on the path, the agent still works,
+but nothing scores it.
 """
 
 import importlib
@@ -18,12 +18,14 @@ from foredrive.simulation.carla.leaderboard import LeaderboardDriver
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 SEPARATOR = "+"
-"""Bench2Drive appends this and the name of the route to the configuration, once more with each route."""
+"""The separator that Bench2Drive puts between the configuration and the route name. It adds both again with
+each route.
+"""
 METRICS = "metric_info.json"
 
 
 def get_entry_point() -> str:
-    """The class that the leaderboard is to make an agent of."""
+    """Return the name of the agent class, which the leaderboard asks for."""
     return ForedriveAgent.__name__
 
 
@@ -38,18 +40,18 @@ _AutonomousAgent: Any = _base_class()
 
 
 class ForedriveAgent(_AutonomousAgent):
-    """`AutonomousAgent` of a driver by the names of `foredrive drive --agent`, a run folder above all.
+    """An `AutonomousAgent` for each driver of `foredrive drive --agent`, mainly for run folders.
 
-    It sees what it would see in a town: the same cameras, images of the same size, as many key frames.
-    Leaderboard 1.0 calls `setup` while it makes the agent and gives the route afterwards, 2.x and Bench2Drive
-    the other way round: the route is taken up at the first step.
+    It receives the same inputs as in a town: the same cameras, image size and number of key frames.
+    Leaderboard 1.0 calls `setup` in the constructor and gives the route later; 2.x and Bench2Drive use the
+    other order. Therefore the agent reads the route at the first step.
     """
 
     def setup(self, path_to_conf_file: str) -> None:
-        """Load the driver; the track stays SENSORS, as the base class has it.
+        """Load the driver; the track stays SENSORS, as in the base class.
 
         Raises:
-            InputError: there is no such driver, or it drives in towns alone.
+            InputError: there is no such driver, or it drives only in towns.
         """
         driver, self._route_name = driver_of(path_to_conf_file)
         needs, self._t_s = needs_of(driver), 0.0
@@ -61,11 +63,11 @@ class ForedriveAgent(_AutonomousAgent):
         self._metrics: dict[str, Any] = {}
 
     def sensors(self) -> list[dict[str, Any]]:
-        """The cameras and the lidar, if it needs them; satellites, IMU and speedometer."""
+        """Return the sensors: the cameras and lidar that the driver requires, GNSS, IMU and speedometer."""
         return self._driver.sensors()
 
     def run_step(self, input_data: dict[str, tuple[int, Any]], timestamp: float) -> Any:
-        """A `carla.VehicleControl` for the step that begins now."""
+        """Return a `carla.VehicleControl` for the step that begins now."""
         if not self._has_route:
             self._driver.set_route(self._global_plan, self._global_plan_world_coord)
             self._has_route = True
@@ -76,7 +78,7 @@ class ForedriveAgent(_AutonomousAgent):
         return self._make_control(**pedals._asdict())
 
     def destroy(self, results: object = None) -> None:
-        """Leave what Bench2Drive computes efficiency and smoothness from, where SAVE_PATH asks for it."""
+        """Write the file from which Bench2Drive computes efficiency and smoothness, if SAVE_PATH is set."""
         metrics, self._metrics = getattr(self, "_metrics", {}), {}
         place = os.environ.get("SAVE_PATH")
         if place and metrics and self._route_name:
@@ -86,7 +88,7 @@ class ForedriveAgent(_AutonomousAgent):
 
 
 def driver_of(path_to_conf_file: str) -> tuple[str, str]:
-    """The driver that is meant, and the name of the route that Bench2Drive has appended to it, or ""."""
+    """Return the driver, and the route name that Bench2Drive appended to it, or ""."""
     if SEPARATOR not in path_to_conf_file or Path(path_to_conf_file).is_dir():
         return path_to_conf_file, ""
     driver, *names = path_to_conf_file.split(SEPARATOR)

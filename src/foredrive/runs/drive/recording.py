@@ -1,7 +1,7 @@
-"""Recording many drives at once, over processes or over Ray.
+"""Record many drives at once, in processes or on Ray.
 
-Drives are independent and each ends in a log that is whole or not there: what an interrupted campaign has
-recorded is not recorded again, and a drive that fails takes none of the others with it.
+Drives are independent. The log of a drive is either complete or absent. A campaign that is started again
+skips the complete logs, and a drive that fails does not stop the others.
 """
 
 import contextlib
@@ -26,14 +26,14 @@ from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 @dataclass(frozen=True)
 class Recorded:
-    """What came of some drives."""
+    """The result of recording several drives."""
 
     logs: dict[DrivePlan, LogPath]
-    """All that lie there whole now."""
+    """The complete logs."""
     skipped: int
-    """How many of them did so before."""
+    """Number of logs that were complete before."""
     failed: dict[DrivePlan, str]
-    """Why there is no log of a drive, in one line."""
+    """The reason in one line for each drive that has no log."""
 
 
 def record_drives(
@@ -45,17 +45,19 @@ def record_drives(
     on_ray: bool = False,
     tick: Callable[[], None] = lambda: None,
 ) -> Recorded:
-    """Record all drives that do not lie in the data root yet; the bytes are those of `record`.
+    """Record all drives that are not in the data root yet.
+
+    The bytes are the same as from `record`.
 
     Args:
-        out: 123D data root; of a Ray cluster with several machines one that they share.
-        image_hw: of the six cameras.
-        workers: drives recorded at a time. On Ray that is the size of a cluster which is started here; one
-            that RAY_ADDRESS names is used as it is.
-        tick: called as each drive is done with.
+        out: 123D data root; on a Ray cluster with several machines, a folder that they share.
+        image_hw: image size of the six cameras, px.
+        workers: number of drives recorded at a time. On Ray it is the size of the cluster that is started
+            here; a cluster that RAY_ADDRESS names is used as it is.
+        tick: called after each drive.
 
     Raises:
-        OSError: the disk is full; no other drive would fare better.
+        OSError: the disk is full, so that no other drive could be recorded.
     """
     logs, failed = {}, {}
     for plan in plans:
@@ -77,7 +79,7 @@ def record_drives(
 
 
 def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: int | None = None) -> LogPath:
-    """Record one drive, on as many threads."""
+    """Record one drive with this number of threads; None keeps the number."""
     if threads is not None:
         torch.set_num_threads(threads)
     return record(
@@ -94,12 +96,12 @@ def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: 
 
 
 def log_of(plan: DrivePlan, out: Path) -> LogPath:
-    """Where the log of a drive lies, or will."""
+    """Return the path of a drive's log, whether it exists or not."""
     return LogPath(out / "logs" / split_of(plan.town) / plan.log_name, out / "maps")
 
 
 def is_recorded(plan: DrivePlan, out: Path, image_hw: tuple[int, int]) -> bool:
-    """Whether the log is there, with the length, the rate and the images that are wanted."""
+    """Return whether the log exists with the planned length, rate and image size."""
     path = log_of(plan, out)
     if not path.folder.is_dir():
         return False

@@ -1,4 +1,4 @@
-"""Files of drives: DRIVES/NAME.json in a folder, and the figures of all together."""
+"""Files of drives (drives/NAME.json in a folder), and the summary of a suite."""
 
 import json
 import statistics
@@ -23,7 +23,7 @@ Figures = dict[str, float | int | str | None]
 
 
 def write_drive(path: Path, record: DriveRecord) -> None:
-    """Write what is kept of a drive as JSON."""
+    """Write the record of a drive as JSON."""
     content = _RECORD.dump_python(record, mode="json")
     if record.threat is None:
         del content["threat"]
@@ -31,10 +31,10 @@ def write_drive(path: Path, record: DriveRecord) -> None:
 
 
 def read_drive(path: Path) -> DriveRecord:
-    """What was kept of a drive.
+    """Read the record of a drive.
 
     Raises:
-        InputError: the file is no drive.
+        InputError: the file holds no record of a drive.
     """
     try:
         return _RECORD.validate_json(path.read_bytes())
@@ -47,10 +47,10 @@ def read_drive(path: Path) -> DriveRecord:
 
 
 def suite_title(folder: Path) -> str:
-    """Who drove what, for people.
+    """Return the title of a suite: the driver and the routes.
 
     Raises:
-        InputError: nothing of the kind is noted in the folder.
+        InputError: the folder has no suite file, or the file cannot be read.
     """
     try:
         suite = json.loads((folder / SUITE).read_text())
@@ -60,7 +60,10 @@ def suite_title(folder: Path) -> str:
 
 
 def summarise(drives: Sequence[DriveRecord]) -> Figures:
-    """The figures of a suite, flat; a driver who failed by his own fault is scored by what he drove."""
+    """Compute the metrics of a suite as a flat dict.
+
+    A drive that failed because of the driver is scored by the distance that it drove.
+    """
     suite = score_suite([drive.score for drive in drives])
     out: Figures = {
         "routes": suite.routes,
@@ -88,7 +91,7 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
 
 
 def _threat_figures(drives: Sequence[DriveRecord]) -> Figures:
-    """Mean score, and the share of drives with a collision, for each kind of threat that was met."""
+    """Return the mean score and the share of drives with a collision, for each kind of threat met."""
     out: Figures = {}
     for threat in Threat:
         met = [drive.threat for drive in drives if drive.threat and drive.threat.kind == threat]

@@ -1,7 +1,7 @@
-"""Drives of one driver over what a source offers; each is kept as it ends.
+"""Drives of one driver over all jobs of a source; each drive is saved when it ends.
 
-A suite is a folder: drives/NAME.json is all that came of a drive, logs/ has it as a 123D log, summary.json
-has the scores. What lies there is not driven again.
+A suite is a folder: drives/NAME.json is the record of a drive, logs/ has its 123D log, summary.json has the
+scores. A drive with a record is not driven again.
 """
 
 import contextlib
@@ -37,68 +37,68 @@ class DriveJob:
     """One drive of a suite."""
 
     name: str
-    """Of the drive's files."""
+    """Stem of the names of the drive's files."""
     route: str
     repetition: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """All that one drive takes, set up."""
+    """Everything that one drive needs, already set up."""
 
     simulator: Simulator
     scenario: object
-    """What the simulator is reset to."""
+    """The argument of the simulator's `reset`."""
     agent: Agent
     route_xyz: Float64[np.ndarray, "N 3"]
     length_m: float
-    """Of the route."""
+    """Length of the route, m."""
     log: LogWriter
     frame: Callable[[], Frame]
-    """What is logged of the latest key frame."""
+    """Returns the frame to log for the latest key frame."""
     town: str | None = None
-    """Whose lanes lie below; None: there is no map."""
+    """The town whose map is used; None: there is no map."""
     lanes_known: bool = True
     judge: Callable[[Drive], ThreatMet | None] = lambda drive: None
-    """What the drive is worth beside its score."""
+    """Scores the drive against a threat; None: there is no threat."""
 
 
 @runtime_checkable
 class Source(Protocol):
-    """A kind of world to drive in: it offers drives and sets each up."""
+    """A kind of world to drive in: it lists drives and sets up each one."""
 
     @property
     def in_turn(self) -> bool:
-        """Whether drives follow each other in this process, since they share something large."""
+        """Return whether drives run one after another in this process, because they share a large object."""
         ...
 
     @property
     def grows(self) -> tuple[str, ...]:
-        """Fields of which more may be asked for later, in the same folder."""
+        """Return the names of the fields that a later call may change in the same folder."""
         ...
 
     def noted(self) -> Mapping[str, object]:
-        """The fields, for JSON; "routes" names what is driven."""
+        """Return the fields for JSON; "routes" names the routes."""
         ...
 
     def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """The drives. Raises InputError if there are none, or there is no such driver."""
+        """Return the drives. Raise InputError if there are none, or there is no such driver."""
         ...
 
     def stage(self, job: DriveJob, suite: "DriveSuite", out: Path) -> AbstractContextManager[Stage]:
-        """Set a drive up; its log is whole when the context ends. Raises InputError if that cannot be."""
+        """Set up a drive; its log is complete when the context ends. Raise InputError if that fails."""
         ...
 
 
 @dataclass(frozen=True)
 class DriveSuite:
-    """Who drives what, and how it plans."""
+    """A driver, the source of its drives, and its planning period and latency."""
 
     driver: str
-    """See `agents.needs_of`."""
+    """Name of the driver; see `agents.needs_of`."""
     source: Source
     sensors: bool = True
-    """Drives of drivers that need none are logged with cameras and lidar all the same."""
+    """Whether cameras and lidar are logged even if the driver does not need them."""
     period_s: float = Pace.period_s
     latency_s: float = Pace.latency_s
 
@@ -106,15 +106,15 @@ class DriveSuite:
         Pace(self.period_s, self.latency_s)
 
     def jobs(self) -> Sequence[DriveJob]:
-        """The drives.
+        """Return the drives.
 
         Raises:
-            InputError: there is no such driver, or nothing to drive.
+            InputError: there is no such driver, or there are no drives.
         """
         return self.source.jobs(self.driver)
 
     def noted(self) -> dict[str, object]:
-        """As the suite's file has it."""
+        """Return the contents of the suite's file."""
         of_all = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         del of_all["source"]
         noted: dict[str, object] = json.loads(json.dumps({**of_all, **self.source.noted()}))
@@ -123,14 +123,14 @@ class DriveSuite:
 
 @dataclass(frozen=True)
 class Driven:
-    """What came of a suite."""
+    """The result of driving a suite."""
 
     drives: dict[DriveJob, DriveRecord]
-    """What was kept of each drive."""
+    """The record of each drive."""
     skipped: int
-    """How many lay there before."""
+    """Number of drives that had a record before."""
     broken: dict[DriveJob, str]
-    """Drives that the simulator, not the driver, failed at; they have no score."""
+    """The reason for each drive that failed because of the simulator, not the driver. It has no score."""
 
 
 def drive_suite(
@@ -141,15 +141,16 @@ def drive_suite(
     on_ray: bool = False,
     tick: Callable[[DriveJob, DriveRecord | None], None] = lambda job, drive: None,
 ) -> Driven:
-    """Drive all that does not lie in the folder yet, and write the summary once all are there.
+    """Drive all jobs that have no record in the folder yet; write the summary when every job has one.
 
     Args:
-        workers: drives at a time, of a source that allows it; on Ray as for `fan_out.fan_out`.
-        tick: told of each drive as it is done with, None if it broke.
+        workers: number of drives at a time, if the source allows more than one; on Ray as for
+            `fan_out.fan_out`.
+        tick: called after each drive with its record, or None if the drive broke.
 
     Raises:
-        InputError: there is no such driver or nothing to drive; the folder holds another suite, or another
-            process drives into it; a drive of a source that goes in turn cannot be set up.
+        InputError: there is no such driver or there are no drives; the folder holds another suite, or another
+            process drives into it; a drive of a source with `in_turn` cannot be set up.
         OSError: the disk is full.
     """
     jobs, in_turn = suite.jobs(), suite.source.in_turn
@@ -164,7 +165,7 @@ def drive_suite(
         skipped = len(drives)
         todo = [job for job in jobs if job not in drives]
         if not in_turn:
-            start_fork_server(preload=type(suite.source).__module__)  # what it imports is shared by workers
+            start_fork_server(preload=type(suite.source).__module__)  # workers share the imported modules
         results = _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray)
         with contextlib.closing(results):
             for job, result in results:
@@ -175,7 +176,7 @@ def drive_suite(
                     drives[job] = result
                     tick(job, result)
         driven = Driven({job: drives[job] for job in jobs if job in drives}, skipped, broken)
-        if not broken:  # a mean over what happened to work would be none of the suite
+        if not broken:  # a mean over only some of the drives would mislead
             write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
     return driven
 
@@ -188,7 +189,7 @@ def _in_turn(
 
 
 def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None = None) -> DriveRecord:
-    """Drive one route once; its files are there when this returns."""
+    """Drive one route once, and write its files before returning."""
     if threads is not None:
         torch.set_num_threads(threads)
     began = time.perf_counter()
@@ -217,7 +218,7 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
 
 
 def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
-    """The folder of a suite: another's while it holds drives of it."""
+    """Return the folder of a suite. It belongs to another suite while it holds drives of that suite."""
     path, wanted, grows = out / SUITE, suite.noted(), suite.source.grows
     what = "the drives of another suite"
 

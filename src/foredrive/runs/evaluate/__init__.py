@@ -1,1 +1,1 @@
-"""Evaluate a run on logs, and look at what it predicts."""
+"""Evaluate a run on logs, and inspect its predictions."""

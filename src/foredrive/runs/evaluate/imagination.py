@@ -1,4 +1,4 @@
-"""What a run imagines of the seconds after some times of a log, beside what came."""
+"""The futures that a run imagines from some times of a log, beside the recorded future."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -20,31 +20,32 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Moment:
-    """One time of a log, unbatched, and F key frames from it on, now first."""
+    """One time of a log, unbatched, with F key frames, now first."""
 
     example: Example
-    """With the images and labels of all F frames."""
+    """The example with the images and labels of all F frames."""
     futures: Bool[Tensor, "K F Z Y X"]
-    """Occupancy in K futures, each frame in its own ego frame; K is 1 for a model that knows no chance."""
+    """Occupancy in K futures, each frame in its own ego frame; K is 1 for a deterministic model."""
     rendered: Float[Tensor, "F C 3 h w"] | None
-    """What the cameras would see in the first future, RGB 0 to 1; None from a model that does not render."""
+    """Camera images of the first future, RGB 0 to 1; None from a model that does not render."""
 
 
 @torch.no_grad()
 def imagine_run(
     run: Run, log: LogPath, *, seconds: float, samples: int, moments: int, ray_stride: int = 1
 ) -> Iterator[Moment]:
-    """Imagine from some times spread evenly over a log.
+    """Imagine futures from times spread evenly over a log.
 
     Args:
-        seconds: how far.
-        samples: futures from a world model that knows chance; the same ones each time it is asked.
-        moments: how many times of the log; fewer if it has not as many.
+        seconds: length of a future, s.
+        samples: number of futures from a stochastic world model; the seed is fixed, so they are the same in
+            every call.
+        moments: number of times; fewer if the log is too short for as many.
         ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
 
     Raises:
-        InputError: on a log that cannot be read or is too short, a run without weights, or a model that does
-            not imagine as far.
+        InputError: the log cannot be read or is too short, the run has no weights, or the model cannot
+            imagine that far.
     """
     clips = run.recipe.clips
     steps = round(seconds / clips.frame_dt_s)
@@ -76,7 +77,7 @@ def _occupied(world: WorldModel, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X
 def _views(
     world: WorldModel, renderer: RayRenderer, beliefs: list[Belief], observed: Clip, ray_stride: int
 ) -> Tensor:
-    """Every camera at every frame, by the rig of now."""
+    """Render every camera at every frame, with the rig of the present frame."""
     rays = thinned_rays(observed, observed.now, ray_stride)
     _, c, _, h, w = rays.rgb.shape
     views = []

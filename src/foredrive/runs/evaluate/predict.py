@@ -1,4 +1,4 @@
-"""An agent under evaluation: what it says about a clip, in the form an evaluation asks for."""
+"""A trained agent in the form that an evaluation asks for."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,10 +19,10 @@ class AgentPredictor:
     Args:
         agent: in evaluation mode.
         steps: number of future key frames to predict.
-        ray_stride: one pixel in `ray_stride` along rows and columns is rendered, at now, by a world model
-            that renders; 0 renders nothing.
-        futures: how many futures to draw from a world model that knows chance; their states follow from the
-            order of clips.
+        ray_stride: one pixel in `ray_stride` along rows and columns is rendered, at the present frame, by a
+            world model that renders; 0 renders nothing.
+        futures: number of futures to draw from a stochastic world model. Their random states depend on the
+            order of the clips.
     """
 
     def __init__(self, agent: PlanningAgent[Any], steps: int, ray_stride: int, futures: int = 0) -> None:
@@ -31,7 +31,7 @@ class AgentPredictor:
 
     @torch.no_grad()
     def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
-        """Predict the plan, occupancy and flow now and at the next key frames; views and futures if asked."""
+        """Predict plan, occupancy and flow for now and the next key frames; views and futures if asked."""
         output = self.agent(observed, self.steps)
         decoded, world = output.decoded, self.agent.world_model
         flow = [frame.flow for frame in decoded if frame.flow is not None]

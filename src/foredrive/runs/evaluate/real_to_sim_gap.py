@@ -1,4 +1,4 @@
-"""The real-to-sim gap: what a trained run makes of real images, and of rendered ones of the same moments."""
+"""The real-to-sim gap: predictions of a trained run on real and on rendered images of the same times."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -37,26 +37,27 @@ GAP = "gap.json"
 REAL, RENDERED, AGREEMENT = "real", "rendered", "agreement"
 ASKED: frozenset[Part] = frozenset({"occupancy_logit", "plan"})
 _SAME_S = 1e-3
-"""Times of one exposure differ by less."""
+"""Tolerance of times that belong to one exposure, s."""
 
 
 def measure_gap(
     run: Run, rebuilt: Path, out: Path, on_items: Callable[[int, int], None] = lambda done, of: None
 ) -> Figures:
-    """Let a model look at real and at rendered images of the moments that a rebuilt log has held out.
+    """Compare predictions on real and on rendered images at the held-out times of a reconstructed log.
 
-    Writes `out/gap.json`: what `evaluate` finds on real images (`real.…`) and on rendered ones
-    (`rendered.…`), both against the truth, and on rendered ones against what the model says of real ones
-    (`agreement.…`). Key frames before now are rendered too, though the scene may have learned from those.
+    Write `out/gap.json` with three groups of metrics of `evaluate`: real images against the labels
+    (`real.…`), rendered images against the labels (`rendered.…`), and rendered images against the predictions
+    on real ones (`agreement.…`). Key frames before now are rendered too, although the scene may have been
+    trained on them.
 
     Args:
-        run: whose recipe asks for cameras that were rebuilt.
-        rebuilt: folder of a reconstruction, whose log is still there.
-        out: a folder.
-        on_items: told how many moments are done with, of how many.
+        run: its recipe must ask for cameras that were reconstructed.
+        rebuilt: folder of a reconstruction; its log must still exist.
+        out: output folder.
+        on_items: called with the number of finished times and of all times.
 
     Raises:
-        InputError: a camera was not rebuilt, or no clip lies at a moment that was held out.
+        InputError: a camera was not reconstructed, or no clip lies at a held-out time.
     """
     scene, (recipe, log) = open_rebuilt(rebuilt).scene, open_run_log(rebuilt)
     material = read_material(recipe, log, (rebuilt / "cache").absolute())
@@ -91,14 +92,17 @@ def measure_gap(
 def rendered_images(
     scene: RebuiltScene, clip: Clip, now_s: float, views: Sequence[CameraView], cameras: Sequence[int]
 ) -> Clip:
-    """An unbatched clip with the images up to now as the scene shows them.
+    """Return an unbatched clip whose images up to now are rendered from the scene.
 
     Args:
-        scene: as it was learned.
-        clip: of the log that it was learned from, at the size of the views' images.
-        now_s: when its now is, since the log's start.
-        views: of all frames of that log.
-        cameras: for each camera of the clip the one of the scene.
+        scene: the scene without edits.
+        clip: a clip of the log that the scene was trained on, with images of the same size as the views.
+        now_s: time of the clip's now since the start of the log, s.
+        views: views of all frames of that log.
+        cameras: for each camera of the clip, the index of the scene's camera.
+
+    Raises:
+        InputError: there is no view of a camera at a frame's time.
     """
     images, graph = clip.images.clone(), scene.graph
     late_s = clip.rig.exposed_dt_s
@@ -116,14 +120,14 @@ def rendered_images(
 
 
 def _own_names(log: Log, names: Sequence[str]) -> list[str]:
-    """What a log itself calls cameras, which may have 123D's names."""
+    """Return the log's own camera names for names that may be those of 123D."""
     there = pinhole_cameras(log)
     found = [find_camera(there, name) for name in names]
     return [name if camera is None else camera.camera_name for name, camera in zip(names, found, strict=True)]
 
 
 class Comparison:
-    """What a model says of moments that it is shown twice."""
+    """Collects a model's predictions on real and on rendered images of the same times."""
 
     def __init__(self, predictor: Predictor, image_hw: tuple[int, int]) -> None:
         self._predictor, self._image_hw = predictor, image_hw
@@ -132,7 +136,7 @@ class Comparison:
         self._psnr_db: list[Tensor] = []
 
     def add(self, example: Example, rendered: Clip) -> None:
-        """Show it one moment, unbatched."""
+        """Predict one unbatched example with its real and with its rendered images."""
         now, batch = example.clip.now, collate([example])
         for name, clip in ((REAL, example.clip), (RENDERED, rendered)):
             small = dataclasses.replace(example, clip=shrink_images(clip, self._image_hw))
@@ -145,7 +149,7 @@ class Comparison:
         self._examples.append(dataclasses.replace(batch, clip=_without_images(batch.clip)))
 
     def figures(self, frame_dt_s: float) -> Figures:
-        """All of them, under the names of what is compared."""
+        """Return the metrics of all comparisons, with the name of the comparison as prefix."""
         agreed = list(map(_as_truth, self._examples, self._said[REAL]))
         out: Figures = {"psnr_db": float(torch.cat(self._psnr_db).nanmean())}
         for name, said, truth in (
@@ -162,18 +166,18 @@ class Comparison:
 
 
 class _Said:
-    """Predictions that were made before, in their order."""
+    """A predictor that returns given predictions in order."""
 
     def __init__(self, predictions: Iterator[Prediction]) -> None:
         self._predictions = predictions
 
     def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
-        """The next one."""
+        """Return the next prediction."""
         return next(self._predictions)
 
 
 def _as_truth(example: Example, said: Prediction) -> Example:
-    """An example whose labels are what a model says."""
+    """Return an example whose labels are replaced by a prediction."""
     assert said.occupancy_logit is not None
     assert said.plan is not None
     values, known = example.occupancy.values.clone(), example.occupancy.known.clone()

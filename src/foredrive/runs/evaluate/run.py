@@ -1,4 +1,4 @@
-"""Evaluating a run on logs: the model and its baselines, one summary."""
+"""Evaluate a run on logs: the model and its baselines, in one summary."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -31,28 +31,28 @@ SUMMARY = "summary.json"
 RENDER_STRIDE = 2
 """One pixel in this many along rows and columns is rendered and compared."""
 FUTURES = 5
-"""Drawn from world models that know chance."""
+"""Number of futures drawn from a stochastic world model."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """One example, unbatched, and what the model made of it: for pictures."""
+    """One unbatched example and the model's predictions, for pictures."""
 
     example: Example
     occupancy_prob: Float[Tensor, "F Z Y X"]
-    """Now first, then the imagined key frames."""
+    """Occupancy probability at F key frames: now first, then the imagined ones."""
     rendered: Float[Tensor, "C 3 h w"] | None
-    """The views at now, RGB 0 to 1; None from a world model that does not render."""
+    """The rendered views at now, RGB 0 to 1; None from a world model that does not render."""
     volume: Float[Tensor, "D Z Y X"]
     plan: Trajectory
-    """[1 T]."""
+    """The plan; batch shape [1 T]."""
 
 
 def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = None) -> ClipDataset:
-    """Clips of `logs` as the recipe has them, with the boxes that collisions up to 3 s need.
+    """Open the clips of `logs` as the recipe defines them, with the boxes for collisions up to 3 s.
 
     Args:
-        stride_s: time between the clips' nows; None for the recipe's.
+        stride_s: time between the clips' nows, s; None: as in the recipe.
     """
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
@@ -62,7 +62,7 @@ def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = 
 
 
 class _Batches(Iterator[Example]):
-    """Clips in batches. A clip that cannot be read raises an InputError; the next call goes on after it."""
+    """Clips in batches. A clip that cannot be read raises an InputError; the next call continues after it."""
 
     def __init__(self, dataset: ClipDataset, batch_size: int) -> None:
         self._dataset, self._batch_size = dataset, batch_size
@@ -87,14 +87,14 @@ def evaluate_run(
     views: bool = True,
     stride_s: float | None = None,
 ) -> EvaluationResult:
-    """Judge a trained run on logs; writes `out/summary.json`. Clips that cannot be read count as failed.
+    """Evaluate a trained run on logs and write `out/summary.json`. Clips that cannot be read count as failed.
 
     Args:
-        views: render what the cameras see, and judge that too; a quarter of the time.
-        stride_s: time between the clips' nows; None for the recipe's.
+        views: whether to render the camera views and evaluate them too; this takes a quarter of the time.
+        stride_s: time between the clips' nows, s; None: as in the recipe.
 
     Raises:
-        InputError: if there is nothing to judge: the run has not finished a stage, no clip can be read.
+        InputError: the run has not finished a stage, or no clip can be read.
     """
     if batch_size < 1:
         raise InputError(f"a batch has at least one clip, got a batch size of {batch_size}")
@@ -130,7 +130,7 @@ def evaluate_run(
 
 @torch.no_grad()
 def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
-    """The model on `count` examples spread evenly over the logs; one that cannot be read is left out."""
+    """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
     agent = load_agent(run)
     clips = run.recipe.clips
     config = dataclasses.replace(clips, lidar=True, map=True)

@@ -1,4 +1,4 @@
-"""A trained agent looking at one clip at a time: everything that a person may want to see of it."""
+"""Run a trained agent on one clip at a time, for display."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,18 +19,19 @@ RAYS_AT_ONCE = 8192
 
 @dataclass(frozen=True)
 class Vision(Record):
-    """What the model holds to be the case: now first, then K imagined key frames, F = K + 1 in all."""
+    """The predictions of a model: now first, then K imagined key frames, F = K + 1 in all."""
 
     occupancy_logit: Float[Tensor, "F Z Y X"]
-    """Each in its own ego frame."""
+    """Occupancy logits, each frame in its own ego frame."""
     volume: Float[Tensor, "F D Z Y X"]
     T_now_ego: Float[Tensor, "F 4 4"]
-    """Predicted ego frame of each -> ego frame now."""
+    """Transform from the predicted ego frame of each frame to the ego frame now."""
     flow_m: Float[Tensor, "K 3 Z Y X"] | None
-    """Of imagined frames: the content at z came from z + flow since the frame before, over ground; None from
-    a model without flow."""
+    """Backward flow of the imagined frames over ground, m: the content at z came from z + flow in the frame
+    before. None from a model without flow.
+    """
     plan: Trajectory
-    """[1 T]."""
+    """The plan; batch shape [1 T]."""
 
     def movement_m(
         self, k: int, spec: VoxelSpec
@@ -62,12 +63,12 @@ class Observer:
 
     @property
     def renders(self) -> bool:
-        """Whether the world model can be rendered."""
+        """Return whether the world model renders images."""
         return self._renderer is not None
 
     @torch.no_grad()
     def look(self, observed: Clip) -> Vision:
-        """Everything about an observed clip, a batch of one."""
+        """Return all predictions for an observed clip, a batch of one."""
         output = self.agent(observed, self.steps)
         beliefs = output.beliefs
         eye = torch.eye(4)
@@ -85,11 +86,11 @@ class Observer:
 
     @torch.no_grad()
     def render(self, vision: Vision, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:
-        """What cameras that need not exist would see of frame k: RGB, 0 to 1.
+        """Render frame k for any cameras, real or virtual: RGB, 0 to 1.
 
         Args:
             vision: from `look`.
-            k: 0 is now.
+            k: index of the frame; 0 is now.
             rig: C cameras without leading dimensions; `T_ego_cam` leads to the ego frame of frame k.
         """
         renderer = self._renderer

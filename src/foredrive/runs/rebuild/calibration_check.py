@@ -1,4 +1,4 @@
-"""What is said of a log's calibration before it is rebuilt."""
+"""Check the calibration of a log before its reconstruction."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,25 +16,29 @@ from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
 
 LARGE_RAD, LARGE_M = math.radians(0.7), 0.15
-"""Offsets from which on something is said."""
+"""Minimum rotation (rad) and shift (m) that are reported."""
 _GAIN, _AGREED = 0.03, 0.8
-"""An offset is believed if agreement gains so much, and in so great a share of the views."""
+"""An offset is accepted if it raises the agreement by at least `_GAIN`, and does so in at least the share
+`_AGREED` of the views.
+"""
 _POOR, _CLEARLY = 0.5, 0.3
-"""A camera that agrees less than this may show another's images, if those agree so much more."""
+"""Images are assigned to another camera if their own agreement is below `_POOR` and the other's is higher by
+more than `_CLEARLY`.
+"""
 
 
 def calibration_doubts(
     names: Sequence[str], cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: Tracks
 ) -> list[str]:
-    """Sentences about sensors that do not seem to be where their calibration says; none where all is well.
+    """Return a sentence for each sensor whose pose does not agree with its calibration; none if all agree.
 
-    Where too little is seen to tell (without lidar, in tiny images) nothing is said.
+    Without enough evidence (no lidar, tiny images) it returns nothing.
 
     Args:
-        names: of the rig's cameras.
-        cameras: with images, of all cameras.
-        sweeps: of the same drive.
-        tracks: of what moves.
+        names: names of the rig's cameras.
+        cameras: views with images, of all cameras.
+        sweeps: lidar sweeps of the same drive.
+        tracks: tracks of the moving actors.
     """
     views = {name: [v for v in cameras if v.sensor == number] for number, name in enumerate(names)}
     seen = {name: glances(of_one, sweeps, tracks) for name, of_one in views.items()}
@@ -66,7 +70,7 @@ def _turned(fit: Fit) -> str:
 
 
 def _way(value: float, ahead: str, back: str) -> str:
-    """0.25 ° up, or 0.25 ° down."""
+    """Return the value with its direction, such as "0.25° up" or "0.25° down"."""
     unit = ahead if value >= 0 else back
     return f"{abs(value):.2f}{unit}" if unit.startswith("°") else f"{abs(value):.2f} {unit}"
 
@@ -76,7 +80,7 @@ def _believed(fit: Fit, large: float) -> bool:
 
 
 def _gain(*fits: Fit) -> float:
-    """By how much agreement grows, mean."""
+    """Return the mean increase of agreement."""
     return sum(fit.best - fit.given for fit in fits) / max(len(fits), 1)
 
 
@@ -87,7 +91,7 @@ def _whose_images(
     sweeps: Sequence[SweepView],
     tracks: Tracks,
 ) -> str | None:
-    """The camera in whose place a camera's images fit clearly better; None: none, or they fit well enough."""
+    """Return the camera whose pose fits a camera's images clearly better; None if there is none."""
     own = agreement(seen[name])
     if own is None or own >= _POOR:
         return None

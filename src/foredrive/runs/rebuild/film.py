@@ -1,4 +1,4 @@
-"""What sensors see on a drive through a rebuilt log, as it was and after edits, time by time."""
+"""Render the sensors on a drive through a reconstructed log, with or without edits, time by time."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,31 +21,31 @@ LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {
     "hdl32e": hdl32e,
     "vlp16": vlp16,
 }
-"""By name, to be put where the log's lidar was."""
+"""Lidars by name; each is mounted at the pose of the log's lidar."""
 _LEAST_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
 class Shooting:
-    """What is filmed of a run, and when."""
+    """The plan of a film: its times and its sensors."""
 
     t_s: tuple[float, ...]
     step_s: float
     cameras: tuple[int, ...]
-    """Of the vehicle's rig."""
+    """Indices of the cameras in the vehicle's rig."""
     lidar: SpinningLidar | None
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What is seen at one time."""
+    """The sensor data of one time."""
 
     t_s: float
     images: UInt8[Tensor, "C 3 H W"]
     sweep: LidarSweep | None
-    """In the ego frame, beams that did not return with it."""
+    """The sweep in the ego frame, including beams without a return."""
     boxes: Boxes
-    """Actors, in the ego frame."""
+    """Boxes of the actors, in the ego frame."""
 
 
 def plan_shooting(
@@ -57,18 +57,19 @@ def plan_shooting(
     seconds: float | None = None,
     rate_hz: float | None = None,
 ) -> Shooting:
-    """Settle what is filmed.
+    """Plan the times and the sensors of a film.
 
     Args:
-        vehicle: of the run.
-        cameras: by name, in this order; none: all.
-        lidar: one of `LIDARS` where the log's own was; None: that one.
-        start_s: of the film, since the log's start.
-        seconds: how long; None: until the log's end.
-        rate_hz: times a second; None: the log's own rate.
+        vehicle: vehicle of the run.
+        cameras: names of cameras, in this order; empty: all cameras.
+        lidar: a name in `LIDARS`, mounted at the pose of the log's lidar; None: the log's own lidar.
+        start_s: start of the film since the start of the log, s.
+        seconds: length, s; None: until the end of the log.
+        rate_hz: frames per second; None: the rate of the log.
 
     Raises:
-        InputError: on a camera or a lidar that there is not, a time outside of the log, or nothing to film.
+        InputError: a camera or a lidar does not exist, a time is outside the log, or there is nothing to
+            film.
     """
     chosen = tuple(vehicle.camera(name) for name in cameras) or tuple(range(len(vehicle.rig.names)))
     beams = vehicle.lidar
@@ -96,14 +97,14 @@ def plan_shooting(
 def shoot(scene: RebuiltScene, vehicle: Vehicle, edited: Edited, shooting: Shooting, number: int) -> Shot:
     """Render all sensors at one of the times.
 
-    Cameras look as much later as they did in the log; a lidar's revolution ends at the time itself.
+    Each camera keeps its exposure delay from the log; the lidar's revolution ends at the time itself.
 
     Args:
-        scene: of a run.
-        vehicle: of the run.
-        edited: the scene's graph after edits, or before any (`apply_edits(graph, [])`).
+        scene: scene of a run.
+        vehicle: vehicle of the run.
+        edited: the scene's graph after edits, or without edits (`apply_edits(graph, [])`).
         shooting: from `plan_shooting`.
-        number: which of its times.
+        number: index of the time.
     """
     t_s, rig = shooting.t_s[number], vehicle.rig
     images = torch.zeros(len(shooting.cameras), 3, *rig.size_hw, dtype=torch.uint8)
@@ -123,17 +124,17 @@ def shoot(scene: RebuiltScene, vehicle: Vehicle, edited: Edited, shooting: Shoot
 def edits_from_words(
     tracks: Tracks, known: Sequence[Edit], shift_left_m: float, remove: Sequence[int], insert: Sequence[str]
 ) -> list[Edit]:
-    """Edits as the command line has them.
+    """Return the edits of the command line.
 
     Args:
-        tracks: of the run that is edited.
-        known: edits that come before; ids of what is inserted are no copies' among them.
-        shift_left_m: of the ego vehicle; 0: none.
-        remove: ids of actors.
-        insert: "RUN:ACTOR@WAY": an actor of another run, on the way of one of this run's.
+        tracks: tracks of the edited run.
+        known: edits that come before; inserted actors get ids that these edits do not use.
+        shift_left_m: shift of the ego vehicle to the left, m; 0: none.
+        remove: ids of actors to remove.
+        insert: "RUN:ACTOR@WAY": an actor of another run, on the path of an actor of this run.
 
     Raises:
-        InputError: on an entry of `insert` that is written otherwise.
+        InputError: an entry of `insert` has another format.
     """
     edits: list[Edit] = []
     copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert | Send)]

@@ -1,4 +1,4 @@
-"""Finished reconstructions, opened without their logs."""
+"""Open finished reconstructions without their logs."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from foredrive.training.checkpoints import load_weights
 
 @dataclass(frozen=True)
 class OpenRun:
-    """A scene as it was learned, and the vehicle that saw it."""
+    """A scene without edits, and the vehicle that recorded it."""
 
     folder: Path
     scene: RebuiltScene
@@ -33,10 +33,10 @@ class OpenRun:
 
 
 def open_rebuilt(folder: Path) -> OpenRun:
-    """Open a run.
+    """Open a reconstruction.
 
     Raises:
-        InputError: on a folder without a finished run.
+        InputError: the folder holds no finished reconstruction.
     """
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
@@ -56,12 +56,12 @@ def open_rebuilt(folder: Path) -> OpenRun:
 
 
 def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> Edited:
-    """A scene after edits; runs that actors come from are opened."""
+    """Apply edits to a scene; open the runs that inserted actors come from."""
     return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
 
 
 def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
-    """A graph of the sizes that were saved, and how many cameras there are."""
+    """Return a graph of the saved sizes, and the number of cameras."""
     saved = load_file(weights)
     features = saved["albedo"].shape[1] + saved["feature"].shape[1]
     gaussians = Gaussians(
@@ -83,10 +83,10 @@ def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
 
 
 def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
-    """How a run was made, and the log it was made of.
+    """Return the recipe of a reconstruction and the path of its log.
 
     Raises:
-        InputError: on a folder without a run, or if its log is gone.
+        InputError: the folder holds no reconstruction, or its log no longer exists.
     """
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
@@ -101,10 +101,10 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
 
 
 def rebuilt_cameras(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Which of the rebuilt cameras each of those is that an agent looks through.
+    """Return the index of the reconstructed camera for each camera that an agent requires.
 
     Raises:
-        InputError: naming the cameras that were not rebuilt.
+        InputError: some cameras were not reconstructed; the error names them.
     """
     if missing := [name for name in wanted if name not in there]:
         raise InputError(f"not rebuilt: {', '.join(missing)}; there are: {', '.join(there) or 'no cameras'}")

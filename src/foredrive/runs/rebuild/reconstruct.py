@@ -1,4 +1,4 @@
-"""A log becomes a scene that can be rendered: a folder with its recipe, weights, figures and pictures."""
+"""Reconstruct a log as a scene that can be rendered: a folder with recipe, weights, metrics and pictures."""
 
 import dataclasses
 import json
@@ -37,23 +37,25 @@ from foredrive.training.loop import read_metrics
 from foredrive.training.rebuilding import Seen, rebuild
 
 VEHICLE = "vehicle.json"
-"""Where the log's vehicle drove and what it carried: a scene is looked at without its log."""
+"""File of the vehicle's path and sensors, which are needed to render a scene without its log."""
 GAUSSIANS = "static.ply"
-"""What stands, for viewers of 3-D Gaussians."""
+"""File of the static Gaussians, for viewers of 3-D Gaussians."""
 _log = logging.getLogger(__name__)
 
 _COPIES = 14
-"""Of each number of a Gaussian: itself, its gradient, two moments, and what autograd keeps of a step."""
+"""Copies of each number of a Gaussian: the value, its gradient, two moments, and the tensors that autograd
+keeps in a step.
+"""
 _OF_A_PIXEL = 600
-"""Floats that autograd keeps of each: features, the decoder's hidden layers, SSIM."""
+"""Floats that autograd keeps for each pixel: features, the decoder's hidden layers, SSIM."""
 _OF_A_BEAM = 120
-"""Bytes that are kept of each beam of the log."""
+"""Bytes kept for each beam of the log."""
 _BEAMS_A_SWEEP = 120_000
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a drive offers: what is learned from, and what is held out."""
+    """The training frames and the held-out frames of a drive."""
 
     learned: Seen
     held_out: Seen
@@ -63,7 +65,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """A run on disk, and its scene."""
+    """A reconstruction on disk, and its scene."""
 
     folder: Path
     recipe: RebuildRecipe
@@ -71,23 +73,23 @@ class Rebuilt:
     scene: RebuiltScene
     learned: Seen
     held_out: Seen
-    """What the scene was judged on."""
+    """The held-out frames on which the scene was evaluated."""
 
 
 def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None) -> Rebuilt:
-    """Rebuild a log, and judge the scene on the frames that were held out.
+    """Reconstruct a log, and evaluate the scene on held-out frames.
 
-    Goes on where an earlier call with the same recipe and log stopped.
+    It continues where an earlier call with the same recipe and log stopped.
 
     Args:
-        recipe: what is done.
-        path: of the log.
-        folder: of the run.
-        cache_dir: for shrunk images; by default in `folder`.
+        recipe: recipe of the reconstruction.
+        path: path of the log.
+        folder: folder of the run.
+        cache_dir: folder for shrunk images; by default in `folder`.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe or log, or another process writes to it; on a
-            log that cannot be read, has neither images nor sweeps, or needs more memory than there is.
+        InputError: `folder` holds a run of another recipe or log, or another process writes to it; the log
+            cannot be read, has neither images nor sweeps, or needs more memory than is free.
     """
     claim = _folder_of(recipe, path, folder)
     claim.check()
@@ -98,7 +100,7 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
 
 
 def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Material) -> Rebuilt:
-    """Do whatever of a reconstruction is not done yet."""
+    """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(material.vehicle, folder / VEHICLE)
     scene = begin(recipe, material)
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
@@ -121,7 +123,7 @@ def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Mater
 
 
 def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:
-    """Read a log's frames, and part them; says what the log lacks."""
+    """Read a log's frames and split them into training and held-out frames; warn if sensors are missing."""
     drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
     if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
         raise InputError(f"{path.folder}: neither images nor lidar sweeps, nothing to rebuild from")
@@ -150,7 +152,7 @@ def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Mate
 
 
 def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
-    """The scene before anything is learned."""
+    """Return the scene before training."""
     generator = torch.Generator().manual_seed(recipe.schedule.seed)
     graph = initial_scene(
         list(material.learned.cameras),
@@ -170,7 +172,7 @@ def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
 
 
 def tracks_without_actors(tracks: Tracks) -> Tracks:
-    """No actors at the same key times."""
+    """Return tracks with the same key times and no actors."""
     nobody = {
         field.name: getattr(tracks, field.name)[:0]
         for field in dataclasses.fields(tracks)
@@ -180,10 +182,10 @@ def tracks_without_actors(tracks: Tracks) -> Tracks:
 
 
 def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
-    """Refuse what does not fit, before it is begun.
+    """Check that the memory suffices before the reconstruction begins.
 
     Raises:
-        InputError: saying what would be needed and what there is.
+        InputError: there is not enough memory; the error states the required and the free memory.
     """
     log = Log(path)
     cameras = len(pinhole_cameras(log)) if recipe.cameras is None else len(recipe.cameras)
@@ -199,7 +201,7 @@ def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
 
 
 def memory_needed_gib(recipe: RebuildRecipe, *, frames: int, cameras: int) -> float:
-    """About how much memory a reconstruction takes."""
+    """Estimate the memory of a reconstruction, GiB."""
     pixels = recipe.image_hw[0] * recipe.image_hw[1]
     of_one = 3 + 4 + 3 + 1 + 3 + recipe.initial.features
     learning = 4 * (recipe.schedule.most_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
@@ -219,7 +221,7 @@ def _free_memory_gib() -> float:
 
 
 def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> Vehicle:
-    """The vehicle of a drive; its lidar as it is known to be, or as far as the sweeps tell."""
+    """Return the vehicle of a drive. Its lidar is the data set's model, or is estimated from the sweeps."""
     T_world_scene = drive.T_world_ego[0]
     seen = [view for view in sweeps if bool(view.beams.returned.any())]
     if not seen:

@@ -1,1 +1,1 @@
-"""Train towers, index logs and ask the index."""
+"""Train retrieval towers, index logs and query the index."""

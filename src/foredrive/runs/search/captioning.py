@@ -1,4 +1,4 @@
-"""Captions from embeddings: a decoder beside towers, trained on their images and asked for sweeps too."""
+"""Captions from embeddings: a decoder for towers, trained on image embeddings and also used on sweeps."""
 
 import json
 from collections.abc import Sequence
@@ -26,12 +26,12 @@ from foredrive.training import Schedule, train
 from foredrive.training.captioning import CaptionedEmbeddings, CaptionObjective
 
 CAPTIONS = "captions.safetensors"
-"""In the folder of the towers whose embeddings it reads."""
+"""File of the decoder, in the folder of the towers whose embeddings it reads."""
 _TOLD = "foredrive"
 
 
 class _CaptionedViews(Dataset[CaptionedEmbeddings]):
-    """Views of which something is known, read from memory."""
+    """Views with known facts, held in memory."""
 
     def __init__(self, items: Sequence[CaptionedEmbeddings]) -> None:
         self._items = items
@@ -46,19 +46,19 @@ class _CaptionedViews(Dataset[CaptionedEmbeddings]):
 def train_captions(
     logs: Sequence[LogPath], towers_folder: Path, folder: Path, schedule: Schedule, stride_s: float = 0.5
 ) -> Path:
-    """Train a decoder for towers, or go on with it, and put it beside them.
+    """Train a caption decoder for towers, or continue an interrupted run, and save it in the towers' folder.
 
     Args:
-        towers_folder: of towers that were trained here.
-        folder: of the run.
+        towers_folder: folder of towers that `train_towers` made.
+        folder: folder of the run.
 
     Returns:
         The decoder's file.
 
     Raises:
-        InputError: logs cannot be read, or tell nothing of any view.
+        InputError: the logs cannot be read, or no view has known facts.
     """
-    from foredrive.training import make_fabric  # Fabric takes seconds
+    from foredrive.training import make_fabric  # the import takes seconds
 
     towers = find_towers(str(towers_folder))
     views = gather_views(logs, stride_s, towers.image_side_px, folder / "cache")
@@ -90,10 +90,10 @@ def train_captions(
 
 
 def load_captions(file: Path, towers: Towers) -> CaptionDecoder:
-    """The decoder that lies beside towers.
+    """Load the decoder in the towers' folder.
 
     Raises:
-        InputError: there is none, it is damaged, or other towers' embeddings are what it reads.
+        InputError: there is none, it is damaged, or it was trained for other towers.
     """
     if not file.is_file():
         raise InputError(f"{file}: no captions were trained for these towers; search train-captions does")
@@ -111,14 +111,14 @@ def load_captions(file: Path, towers: Towers) -> CaptionDecoder:
 
 
 class Captioned(NamedTuple):
-    """What a decoder says of a view; None where the view has no image, or no return."""
+    """The captions of a view; None where the view has no image, or no lidar return."""
 
     by_image: str | None
     by_lidar: str | None
 
 
 def caption_views(views: dict[str, View], towers: Towers, decoder: CaptionDecoder) -> dict[str, Captioned]:
-    """Sentences of views, by image and by lidar."""
+    """Caption each view, once from its image and once from its lidar returns."""
     found = {}
     for name, view in views.items():
         pair = torch.from_numpy(embed_views(towers, [view])[0])

@@ -1,4 +1,4 @@
-"""Indexing logs for search, several parts of them at once."""
+"""Index logs for search, several parts at a time."""
 
 import contextlib
 import functools
@@ -23,16 +23,16 @@ from foredrive.search.embedding import embed_frames
 from foredrive.search.index import FrameIndex, Making, Part, Scores
 
 PART_FRAMES = 64
-"""Embedded by one worker in one go: what memory holds does not grow with the length of logs."""
+"""Frames that one worker embeds at a time. The limit keeps the memory independent of the length of a log."""
 FLUSH_ROWS, FLUSH_S = 20_000, 60.0
-"""Rows are written in large batches, but no work of more than a minute is lost when a machine stops."""
+"""Rows are written in large batches, but at least once a minute, so that a crash loses at most that."""
 COMPACT_WRITES = 100
-"""Writes before files are merged; until old versions are dropped, the disk then holds all rows twice."""
+"""Number of writes before files are merged. Until old versions are dropped, the disk holds all rows twice."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A part of a log to be embedded."""
+    """A part of a log to embed."""
 
     log: LogPath
     frames: tuple[int, ...]
@@ -41,18 +41,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Indexed:
-    """What came of some logs."""
+    """The result of indexing logs."""
 
     logs: int
-    """That are wholly in."""
+    """Number of logs that are completely indexed."""
     rows: int
-    """New ones."""
+    """Number of new rows."""
     there_before: int
-    """Parts of logs that were in already."""
+    """Number of parts that were in the index before."""
     failed: dict[str, str]
-    """Why a log, or a part of it, is not in, in one line."""
+    """The reason in one line for each log that is not completely in the index."""
     scored: int
-    """Rows that were given scores."""
+    """Number of rows that received scores."""
 
 
 def index_logs(
@@ -66,27 +66,27 @@ def index_logs(
     scores: Scores | None = None,
     tick: Callable[[int, int], None] = lambda done, total: None,
 ) -> Indexed:
-    """Embed what is not in the index yet; what is in stays as it is, unless its log has changed.
+    """Embed the parts that are not in the index yet. Indexed parts stay, unless their log has changed.
 
     Args:
-        uri: folder or place on object storage.
-        towers: as `find_towers` knows them.
-        stride_s: time between the moments that are indexed.
-        workers: parts embedded at a time.
-        scores: of frames, for rows that are in and those that come.
-        tick: told how many of the moments are done.
+        uri: folder, or location in object storage.
+        towers: name as for `find_towers`.
+        stride_s: time between the indexed moments, s.
+        workers: number of parts embedded at a time.
+        scores: scores of frames, for rows in the index and for new rows.
+        tick: called with the number of finished moments and of all moments.
 
     Raises:
-        InputError: the index was made by other towers or with another stride, or another process
-            writes to it; the stride is not above 0.
-        OSError: the disk is full or refuses.
+        InputError: the index was made by other towers or with another stride, or another process writes to
+            it; the stride is not above 0.
+        OSError: the disk is full or cannot be written.
     """
     if stride_s <= 0:
         raise InputError(f"a stride of {stride_s:g} s: moments lie apart by more than 0 s")
     tower = find_towers(towers)
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(embed_part, towers=towers, threads=threads)
-    here = workers == 1 and not on_ray  # a process of its own would first have to load the towers
+    here = workers == 1 and not on_ray  # a separate process would have to load the towers first
     embed = _one_by_one if here else functools.partial(fan_out, workers=workers, on_ray=on_ray)
     with contextlib.nullcontext() if "://" in uri else held(Path(uri)):
         index = FrameIndex.make(uri, Making(tower.name, tower.fingerprint, tower.dim, stride_s))
@@ -116,7 +116,7 @@ def index_logs(
 def _one_by_one(
     jobs: Sequence[Job], work: Callable[[Job], pa.Table]
 ) -> Generator[tuple[Job, pa.Table | BaseException], None, None]:
-    """As `fan_out`, in this process."""
+    """Run the jobs one after another in this process; the results have the form of `fan_out`."""
     for job in jobs:
         try:
             result = work(job)
@@ -126,13 +126,13 @@ def _one_by_one(
 
 
 class IndexWriter:
-    """Puts finished parts into an index, many at a time, and compacts it now and then.
+    """Writes finished parts to an index in batches, and compacts the index regularly.
 
-    A context: whatever waits at its end is put in, after an interruption as well.
+    It is a context manager: at its end, also after an interruption, it writes the parts that still wait.
     """
 
     rows: int
-    """That were put in."""
+    """Number of rows written."""
 
     def __init__(self, index: FrameIndex) -> None:
         self.rows = 0
@@ -149,14 +149,14 @@ class IndexWriter:
             self.flush()
 
     def add(self, part: Part, rows: pa.Table) -> None:
-        """Put a part in, now or with those that follow."""
+        """Add a part; it is written now or with a later batch."""
         self._waiting.append((part, rows))
         waiting = sum(len(rows) for _, rows in self._waiting)
         if waiting >= FLUSH_ROWS or time.monotonic() - self._flushed_s > FLUSH_S:
             self.flush()
 
     def flush(self) -> None:
-        """Put in whatever still waits."""
+        """Write all parts that still wait."""
         if self._waiting:
             self._index.add(self._waiting)
             self.rows += sum(len(rows) for _, rows in self._waiting)
@@ -169,7 +169,7 @@ class IndexWriter:
 
 
 def embed_part(job: Job, towers: str, threads: int | None = None) -> pa.Table:
-    """The rows of a part."""
+    """Embed the frames of a part; return its rows."""
     if threads is not None:
         torch.set_num_threads(threads)
     return embed_frames(_opened(job.log), job.frames, find_towers(towers))
@@ -181,7 +181,7 @@ def _opened(path: LogPath) -> Log:
 
 
 def _plan(logs: Sequence[LogPath], index: FrameIndex, failed: dict[str, str]) -> list[Job]:
-    """Every part of every log that can be opened; logs that have changed are taken out of the index."""
+    """Return all parts of the logs that can be opened; drop changed logs from the index."""
     jobs, folder_of = [], dict[str, Path]()
     digests = {part.log: part.digest for part in index.parts()}
     for path in logs:
@@ -202,7 +202,7 @@ def _plan(logs: Sequence[LogPath], index: FrameIndex, failed: dict[str, str]) ->
 
 
 def moments(log: Log, stride_s: float) -> list[int]:
-    """The frames nearest to every so many seconds of a log, in its parts if only those are meant."""
+    """Return the frames nearest to each multiple of `stride_s`, within the log's parts if it has any."""
     frame, found = log.nearest_frames(np.arange(log.t_us[0], log.t_us[-1] + 1, stride_s * 1e6))
     frames = np.unique(frame[found])
     if log.path.parts_s:
@@ -212,7 +212,7 @@ def moments(log: Log, stride_s: float) -> list[int]:
 
 
 def log_digest(path: LogPath) -> str:
-    """Changes when a log's files do: their names, sizes and times of change."""
+    """Return a hash of the names, sizes and modification times of a log's files."""
     digest = hashlib.sha256()
     for entry in sorted(os.scandir(path.folder), key=lambda entry: entry.name):
         facts = entry.stat()

@@ -1,4 +1,4 @@
-"""Asking an index, with the towers that made it."""
+"""Query an index with the towers that made it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +12,14 @@ from foredrive.search.target import Target, example_target, text_target
 
 
 def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble: bool = True) -> Found:
-    """The hits of a query.
+    """Return the hits of a query.
 
     Args:
-        towers: where the towers lie that made the index; by default where they lay then.
-        ensemble: word each text in several ways.
+        towers: folder or name of the towers that made the index; by default as noted in the index.
+        ensemble: whether to embed each text in several wordings.
 
     Raises:
-        InputError: these are other towers; the query cannot be answered.
+        InputError: the towers are not those of the index; the query cannot be answered.
     """
     return find(index, query, _target(index, query, towers, ensemble))
 
@@ -35,7 +35,9 @@ def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool)
 
 
 def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[str, object]:
-    """Hits as a list of clips (`data.clip_list`), each with some time before and after."""
+    """Return the hits as a list of clips (`data.clip_list`), each from `before_s` before to `after_s`
+    after.
+    """
     clips, notes = [], []
     for hit in hits:
         t_s = float(str(hit.facts["t_s"]))

@@ -1,4 +1,4 @@
-"""Views of logs as towers learn from them, read once and kept: images, returns and facts of sectors."""
+"""Views of logs for training towers: images, returns and facts of sectors, read once and cached on disk."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ from foredrive.search.facts import Thing, ViewFacts, view_facts
 
 ROWS, TENSORS = "rows.json", "views.safetensors"
 VIEWS_VERSION = 2
-"""Part of every file's name: raise it when views come out differently."""
+"""Part of the hash in each folder's name: raise it when the views change."""
 
 
 class Row(NamedTuple):
@@ -37,12 +37,12 @@ class Row(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For errors."""
+        """Return the name of the view for error messages."""
         return f"{self.log}@{self.frame}/{self.view}"
 
 
 class LogViews:
-    """The views of one log that have an image, in a folder that is read piece by piece."""
+    """The views with an image of one log, stored in a folder; each view is read when it is needed."""
 
     def __init__(self, folder: Path) -> None:
         try:
@@ -59,19 +59,19 @@ class LogViews:
         return len(self.rows)
 
     def image(self, row: int) -> UInt8[Tensor, "3 H W"]:
-        """The image of a view."""
+        """Return the image of a view."""
         view, at, _ = self._place[row]
         with safe_open(self._file, framework="pt") as opened:
             return opened.get_slice(f"image.{view}")[at]
 
     def points(self, row: int) -> Float[Tensor, "P 4"]:
-        """x, y, z and intensity of a view's returns."""
+        """Return x, y, z and intensity of a view's returns."""
         first, last = self._place[row][2]
         with safe_open(self._file, framework="pt") as opened:
             return opened.get_slice("points")[first:last]
 
     def images_by_view(self) -> Iterator[tuple[Int[Tensor, "f"], UInt8[Tensor, "f 3 H W"]]]:
-        """All images of each camera, with their rows."""
+        """Yield for each camera the row numbers and all its images."""
         for view in {view for view, _, _ in self._place}:
             rows = [row for row, place in enumerate(self._place) if place[0] == view]
             with safe_open(self._file, framework="pt") as opened:
@@ -80,10 +80,10 @@ class LogViews:
 
 
 def gather_views(logs: Sequence[LogPath], stride_s: float, side_px: int, cache_dir: Path) -> list[LogViews]:
-    """Every log's views, from what was kept earlier where there is some.
+    """Return the views of each log; read them from the log only if they are not in the cache.
 
     Raises:
-        InputError: on a log that cannot be read, or that has no view with an image.
+        InputError: a log cannot be read, or has no view with an image.
     """
     found = []
     for path in logs:
@@ -127,7 +127,7 @@ def _points(view: View) -> Float[Tensor, "P 4"]:
 
 
 def _row_of(log: str, frame: int, view: str, facts: Sequence[Any]) -> Row:
-    """A row as JSON has it."""
+    """Return a row from its JSON form."""
     time_of_day, weather, place, things = facts
     seen = None if things is None else tuple(Thing(noun, tuple(manners)) for noun, manners in things)
     return Row(log, frame, view, ViewFacts(time_of_day, weather, place, seen))

@@ -1,4 +1,4 @@
-"""What towers are trained on, item by item: images beside texts, sweeps beside images' embeddings."""
+"""Training data of towers: images with texts, and sweeps with image embeddings."""
 
 import bisect
 import hashlib
@@ -28,7 +28,7 @@ TEXTS_AT_ONCE = 4096
 
 
 class _Rows:
-    """Rows of several logs, counted through."""
+    """The rows of several logs under one running index."""
 
     def __init__(self, views: Sequence[LogViews]) -> None:
         self.views = views
@@ -38,28 +38,28 @@ class _Rows:
         return self._ends[-1]
 
     def find(self, index: int) -> tuple[LogViews, int]:
-        """The log of a row, and the row's number in it."""
+        """Return the log of a row, and the row's index in that log."""
         log = bisect.bisect_right(self._ends, index)
         return self.views[log], index - (self._ends[log - 1] if log else 0)
 
     def all(self) -> list[Row]:
-        """Every row."""
+        """Return all rows."""
         return [row for log in self.views for row in log.rows]
 
 
 class CaptionedViews(Dataset[CaptionedImages]):
-    """Views with T texts each; those of which nothing is known are left out.
+    """Views with T texts each; views without known facts are left out.
 
     Args:
-        embed: texts as vectors; it is asked once, for every text.
-        texts: T.
+        embed: maps texts to vectors; it is called once, with all texts.
+        texts: T, the number of texts of a view.
 
     Raises:
-        InputError: nothing is known of any view, or images are not all of one size.
+        InputError: no view has known facts, or the images differ in size.
     """
 
     text_mean: Float[Tensor, "D"]
-    """Of all texts."""
+    """Mean of the embeddings of all texts."""
 
     def __init__(
         self, views: Sequence[LogViews], embed: Callable[[list[str]], Float[Tensor, "N D"]], texts: int
@@ -108,7 +108,7 @@ class CaptionedViews(Dataset[CaptionedImages]):
 
 
 class ImagedViews(Dataset[ImagedSweeps]):
-    """Sweeps, and what towers say of their images, asked once for every image and its mirror image."""
+    """Sweeps with the image towers' embeddings of the same views, for the image and for its mirror image."""
 
     def __init__(self, views: Sequence[LogViews], targets: Float[Tensor, "n 2 D"]) -> None:
         self._rows, self._targets = _Rows(views), targets
@@ -124,7 +124,7 @@ class ImagedViews(Dataset[ImagedSweeps]):
 
 
 def text_targets(texts: Sequence[str], model: str, folder: Path) -> Float[Tensor, "N E"]:
-    """What a text encoder makes of texts; kept in a folder."""
+    """Embed texts with a text encoder; cache the result in a folder."""
     told = hashlib.sha256("\n".join([model, *texts]).encode()).hexdigest()[:24]
     file = folder / f"texts-{told}.safetensors"
     if not file.is_file():
@@ -137,7 +137,7 @@ def text_targets(texts: Sequence[str], model: str, folder: Path) -> Float[Tensor
 
 
 def image_targets(views: Sequence[LogViews], towers: Towers, folder: Path) -> Float[Tensor, "n 2 D"]:
-    """Embeddings of every view's image, as it is and mirrored; kept in a folder, one file a log."""
+    """Embed every view's image and its mirror image; cache the result in a folder, one file for each log."""
     return torch.cat([_targets_of(log, towers, folder) for log in views])
 
 
@@ -155,13 +155,13 @@ def _targets_of(log: LogViews, towers: Towers, folder: Path) -> Float[Tensor, "n
 
 
 def collate_captioned(items: Sequence[CaptionedImages]) -> CaptionedImages:
-    """A batch of views."""
+    """Return a batch of views."""
     keys = tuple(key for item in items for key in item.key)
     return replace(stack_records([replace(item, key=()) for item in items]), key=keys)
 
 
 def collate_imaged(items: Sequence[ImagedSweeps]) -> ImagedSweeps:
-    """A batch of sweeps, their points one after another."""
+    """Return a batch of sweeps with their points concatenated."""
     counts = torch.tensor([len(item.cloud.points) for item in items])
     cloud = PointCloud(
         torch.cat([item.cloud.points for item in items]),

@@ -1,4 +1,4 @@
-"""Training towers: an image tower beside sentences, then a lidar tower beside the image tower."""
+"""Train towers: an image tower on sentences, then a lidar tower on the image tower's embeddings."""
 
 import functools
 import json
@@ -48,20 +48,20 @@ TOWERS = "towers"
 
 @dataclass(frozen=True)
 class TowerRecipe:
-    """How towers are trained."""
+    """The settings of a training of towers."""
 
     contrast: Schedule
     distil: Schedule
     image: ImageSize
     lidar: LidarSize
     stride_s: float = 0.2
-    """Time between the moments of a log that are looked at."""
+    """Time between the moments of a log that are used, s."""
     texts: int = 16
-    """True of each view, of which a step takes one."""
+    """Number of true texts of each view; a training step uses one of them."""
     loss: Literal["mse", "cosine"] = "mse"
-    """Of the lidar tower."""
+    """Loss of the lidar tower."""
     text: str = IN_A_PACKAGE
-    """The sentence encoder, as `TextEncoder` knows it."""
+    """Name of the sentence encoder, as for `TextEncoder`."""
 
 
 def embedded_recipe(
@@ -70,7 +70,9 @@ def embedded_recipe(
     lidar_steps: int | None = None,
     seed: int = 0,
 ) -> TowerRecipe:
-    """That of the towers which need no download; of other lengths if steps are given."""
+    """Return the recipe of the towers that need no download; `image_steps` and `lidar_steps` set its
+    length.
+    """
     contrast = Schedule(batch_size=64, lr=1e-3, epochs=20, weight_decay=0.05, warmup_steps=100, seed=seed)
     distil = Schedule(batch_size=32, lr=1e-3, epochs=10, weight_decay=0.05, warmup_steps=100, seed=seed)
     return TowerRecipe(
@@ -95,22 +97,22 @@ def train_towers(
     cache_dir: Path | None = None,
     beside: str | None = None,
 ) -> Path:
-    """Train towers, or go on where an earlier call with the same arguments stopped.
+    """Train towers, or continue where an earlier call with the same arguments stopped.
 
     Args:
-        folder: of the run.
-        cache_dir: for images and points of views; by default in `folder`.
-        beside: towers, as `find_towers` knows them: only a lidar tower is trained, beside their image tower.
-            By default an image tower is trained first, beside the recipe's sentence encoder.
+        folder: folder of the run.
+        cache_dir: folder for images and points of views; by default in `folder`.
+        beside: name of towers, as for `find_towers`. Only a lidar tower is trained then, on the embeddings of
+            their image tower. By default an image tower is trained first, on the recipe's sentence encoder.
 
     Returns:
         The folder of the towers.
 
     Raises:
-        InputError: `folder` holds another run, or another process writes to it; logs cannot be read or
-            tell nothing.
+        InputError: `folder` holds another run, or another process writes to it; the logs cannot be read or
+            have no known facts.
     """
-    from foredrive.training import make_fabric  # Fabric takes seconds
+    from foredrive.training import make_fabric  # the import takes seconds
 
     with _folder_of(folder, recipe, logs, beside).claimed():
         cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
@@ -125,7 +127,7 @@ def train_towers(
 
 
 def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabric: "Fabric") -> Towers:
-    """The image tower, saved as towers without lidar: the lidar tower learns from what is kept."""
+    """Train the image tower and save it as towers without lidar, from which the lidar tower is trained."""
     stage = folder / IMAGE_STAGE
     if not (stage / TOWERS).is_dir():
         embed = functools.partial(text_targets, model=recipe.text, folder=stage)
@@ -152,7 +154,7 @@ def _train_lidar(
     fabric: "Fabric",
     base: Towers,
 ) -> Path:
-    """The lidar tower, which meets no text: its views come as points and embeddings of images."""
+    """Train the lidar tower from points and image embeddings; it uses no texts."""
     final = folder / TOWERS
     if not final.is_dir():
         dataset = ImagedViews(views, image_targets(views, base, folder / LIDAR_STAGE))
@@ -175,7 +177,7 @@ def _train_lidar(
 
 
 def _told(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
-    """What a card says of the training: the recipe, and on how much."""
+    """Return the description of the training for the card: the recipe, the logs and the number of views."""
     logs = sorted({row.log for log in views for row in log.rows})
     return {"recipe": asdict(recipe), "logs": logs, "views": sum(map(len, views))}
 

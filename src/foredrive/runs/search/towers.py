@@ -1,4 +1,4 @@
-"""Towers by name."""
+"""Load towers by name."""
 
 import functools
 from pathlib import Path
@@ -9,20 +9,20 @@ from foredrive.search.pretrained import PretrainedTowers
 from foredrive.search.towers import Towers
 
 EMBEDDED = "embedded"
-"""The towers that come with the package."""
+"""Name of the towers that come with the package."""
 SHIPPED = Path(foredrive.search.__file__).parent / "shipped"
 
 
 @functools.lru_cache(maxsize=1)
 def find_towers(name: str) -> Towers:
-    """Towers, kept for the next call.
+    """Load towers, and keep them in memory for the next call.
 
     Args:
-        name: `EMBEDDED`, or of a CLIP or SigLIP model on Hugging Face's hub, or its folder, or a folder of
-            towers that were trained here.
+        name: `EMBEDDED`; a CLIP or SigLIP model's name on the Hugging Face hub, or its folder; or a folder of
+            towers that `train_towers` made.
 
     Raises:
-        InputError: there are none, or they cannot be loaded.
+        InputError: there are no such towers, or they cannot be loaded.
     """
     folder = SHIPPED if name == EMBEDDED else Path(name).absolute()
     if (folder / CARD).is_file():

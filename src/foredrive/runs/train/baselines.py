@@ -1,4 +1,4 @@
-"""Baselines of a trained model, fitted to the very logs that it was trained on."""
+"""Baselines of a trained model, fitted to the logs that the model was trained on."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -15,23 +15,23 @@ from foredrive.scene import Clip, Example
 from foredrive.training import DrivenStatus, fit_ego_mlp, read_status
 
 
-@lru_cache(maxsize=1)  # training starts from it, evaluation wants it again, and so does a study's next arm
+@lru_cache(maxsize=1)  # training, evaluation and the next arm of a study use the same baselines
 def fit_baselines(
     logs: tuple[LogPath, ...], clips: ClipConfig, cache_dir: Path, past_frames: int, target: bool = False
 ) -> tuple[OccupancyPrior, EgoMLP]:
     """Return the occupancy prior of the labels and an ego MLP; reads all clips, without images.
 
-    The MLP's seed is always the same: two differ by as much as looking may bring.
+    The MLP's seed is fixed: MLPs with different seeds differ by as much as the use of images may gain.
 
     Args:
-        logs: of the training set.
-        clips: as the model has them.
-        cache_dir: of labels.
-        past_frames: of the ego status.
-        target: whether the ego status holds where the route leads.
+        logs: logs of the training set.
+        clips: clip configuration of the model.
+        cache_dir: folder of the cached labels.
+        past_frames: number of past frames in the ego status.
+        target: whether the ego status contains the route target.
 
     Raises:
-        InputError: on logs that cannot be read.
+        InputError: a log cannot be read.
     """
     blind = dataclasses.replace(clips, cameras=(), future_images=False)
     loader = DataLoader(ClipDataset(logs, blind, cache_dir), batch_size=16, collate_fn=collate)
@@ -43,16 +43,16 @@ def fit_baselines(
 def read_training_set(
     loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False
 ) -> tuple[OccupancyPrior, DrivenStatus]:
-    """Read the training data of the baselines in one pass; images are not looked at.
+    """Read the training data of the baselines in one pass; images are not used.
 
     Args:
-        loader: batches.
-        frames: now and future key frames of the occupancy prior.
-        past_frames: of the ego status.
-        target: whether the ego status holds where the route leads.
+        loader: yields batches.
+        frames: number of key frames in the occupancy prior: now and the future ones.
+        past_frames: number of past frames in the ego status.
+        target: whether the ego status contains the route target.
 
     Raises:
-        InputError: if there are none.
+        InputError: there are no batches.
     """
     prior: OccupancyPrior | None = None
 

@@ -1,4 +1,4 @@
-"""What a world model sees along the plans made without looking, of every demonstration; kept on disk."""
+"""Path features of every demonstration, sampled along plans that do not use the volume; cached on disk."""
 
 import dataclasses
 import hashlib
@@ -28,13 +28,12 @@ BATCH = 8
 def read_paths(
     agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
 ) -> PathDemonstrations:
-    """Read the present volume of clips `stride_s` apart along the plans made without looking; half precision
-    is kept.
+    """Sample the present volume of clips `stride_s` apart along the plans that do not use the volume.
 
-    Runs that look at the same logs with the same weights read once.
+    The features are stored in half precision. Runs with the same logs and the same weights share one file.
 
     Raises:
-        InputError: on logs that cannot be read.
+        InputError: a log cannot be read.
     """
     file = cache_dir / "paths" / f"{_key(agent, logs, clips, stride_s)}.safetensors"
     try:

@@ -1,4 +1,4 @@
-"""Training runs: a folder with the recipe, two stages, their weights."""
+"""Training runs: a folder with the recipe, the stages and their weights."""
 
 import json
 from collections.abc import Sequence
@@ -29,18 +29,22 @@ PATH = "path"
 
 @dataclass(frozen=True)
 class Run:
-    """A run on disk: its recipe, the logs it was trained on, where its label cache lies."""
+    """A run on disk: its recipe, its training logs, and the folder of its label cache."""
 
     folder: Path
     recipe: Recipe
     logs: tuple[LogPath, ...]
     cache_dir: Path
     start: Path | None = None
-    """The run whose pre-trained weights this one went on from, if it was not pre-trained itself."""
+    """The run that gave the pre-trained weights, if this run was not pre-trained itself."""
 
     @property
     def weights(self) -> Path:
-        """Weights of the last finished stage."""
+        """Return the path of the weights of the last finished stage.
+
+        Raises:
+            InputError: no stage has finished.
+        """
         for stage in (PATH, *reversed(STAGES)):
             if (self.folder / stage / WEIGHTS).is_file():
                 return self.folder / stage / WEIGHTS
@@ -48,7 +52,11 @@ class Run:
 
 
 def open_run(folder: Path) -> Run:
-    """Open a run folder that `train_run` made."""
+    """Open a run folder that `train_run` wrote.
+
+    Raises:
+        InputError: the folder is no run folder, or its list of logs cannot be read.
+    """
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not a run folder (no {CONFIG})")
     recipe = load_recipe(folder / CONFIG)
@@ -68,24 +76,24 @@ def train_run(
     cache_dir: Path | None = None,
     start: Path | None = None,
 ) -> Run:
-    """Pre-train, fine-tune, then fit what the planner reads along its path, if the recipe says so.
+    """Pre-train, fine-tune, then fit the path features of the planner, if the recipe says so.
 
-    Goes on where an earlier call with the same arguments stopped.
+    It continues where an earlier call with the same arguments stopped.
 
     Args:
-        recipe: one without pre-training starts from scratch.
-        logs: for both stages.
-        folder: of the run.
-        cache_dir: for labels and shrunk images; by default in `folder`.
-        start: a run folder. Its pre-trained world model is taken and that stage is left out here:
-            pre-trained on many logs, fine-tuned on few, or with another planner.
+        recipe: a recipe without pre-training starts from scratch.
+        logs: logs for all stages.
+        folder: folder of the run.
+        cache_dir: folder for labels and shrunk images; by default in `folder`.
+        start: a run folder. Its pre-trained world model is used, and this run skips that stage. It allows
+            pre-training on many logs and fine-tuning on few, or with another planner.
 
     Raises:
-        InputError: if `folder` holds a run of another recipe, other logs or another start, or another process
-            trains it; on logs that
-            cannot be read; if `start` has not finished pre-training or its world model has other sizes.
+        InputError: `folder` holds a run of another recipe, other logs or another start; another process
+            trains it; a log cannot be read; `start` has not finished pre-training, or its world model has
+            other sizes.
     """
-    from foredrive.training import make_fabric  # Fabric takes seconds, and runs are opened without it
+    from foredrive.training import make_fabric  # the import takes seconds; opening a run does without
 
     start = None if start is None else start.absolute()
     run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
@@ -93,7 +101,7 @@ def train_run(
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
     pretrained = None if start is None else _pretrained(start)
-    with claim.claimed():  # only now: logs that cannot be read must not make a run
+    with claim.claimed():  # only now: logs that cannot be read must not create a run
         fabric = make_fabric(recipe.precision)
         fabric.launch()
         _train_stages(run, dataset, pretrained, fabric)
@@ -101,7 +109,7 @@ def train_run(
 
 
 def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
-    """Whatever of a run is not finished yet, in order."""
+    """Train the stages that are not finished yet, in order."""
     recipe, folder = run.recipe, run.folder
     torch.manual_seed(recipe.finetune.schedule.seed)
     agent = build_agent(recipe)
@@ -110,7 +118,7 @@ def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabri
     elif recipe.pretrain is not None:
         _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
-        # The very rival it will be judged beside.
+        # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
         _, fitted = fit_baselines(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
         base.load_state_dict(fitted.state_dict())
@@ -120,7 +128,7 @@ def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabri
 
 
 def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric") -> None:
-    """Fit what the planner reads along its path in the volume as it has become."""
+    """Fit the planner's path features on the final volume."""
     path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
     if path is None or weights.is_file():
         return
@@ -160,7 +168,7 @@ def _train_stage(
 
 
 def load_agent(run: Run) -> PlanningAgent[Any]:
-    """The trained agent, ready to act."""
+    """Return the trained agent in evaluation mode."""
     agent = build_agent(run.recipe, fetch=False)
     load_weights(agent, run.weights)
     return agent.eval()
