@@ -18,7 +18,7 @@ def reconstruct(
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
     image_size: ImageSize | None = None,
     cache: OptionalPath = None,
-    set: Settings = (),  # noqa: A002: the flag's name
+    set: Settings = (),
 ) -> None:
     """Reconstruct a log as a scene that renders cameras and lidars, or continue an interrupted run.
 

@@ -16,7 +16,7 @@ def train(
     cache: OptionalPath = None,
     occupancy: Literal["lidar", "recorded"] = "lidar",
     start: OptionalPath = None,
-    set: Settings = (),  # noqa: A002: the flag's name
+    set: Settings = (),
 ) -> None:
     """Train a recipe on logs, or continue an interrupted run.
 
