@@ -251,10 +251,12 @@ def test_verbs_of_search_have_one_spelling(capsys: pytest.CaptureFixture[str]) -
     assert "Unrecognized options: search-index" in capsys.readouterr().err
 
 
-def test_an_unknown_recipe_is_told_the_known_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_recipe_is_told_the_nearest_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "sync.arrow").touch()  # looks like a log
     assert main(["train", "nemo_huge", "--logs", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
-    assert "there are: nemo_tiny, " in capsys.readouterr().err
+    assert "no recipe 'nemo_huge'; near: nemo_base" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -183,8 +183,7 @@ def test_a_folder_that_is_a_file_is_named(
     }
     code, err = foredrive(*arguments[verb], "--out", out)
     assert code == 2
-    assert err.startswith(f"foredrive: {out}")
-    assert err.endswith((": there is a file of that name\n", ": a part of this path is a file\n"))
+    assert err == f"foredrive: --out {out}: there is a file of that name; a folder is needed\n"
     assert out.read_text() == "something else"
 
 

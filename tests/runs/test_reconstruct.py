@@ -171,7 +171,7 @@ def test_too_little_memory_is_said_before(
 
 def test_named_recipes() -> None:
     assert find_rebuild_recipe("gaussians_tiny") == gaussians_tiny()
-    with pytest.raises(InputError, match="gaussians_tiny, gaussians_base"):
+    with pytest.raises(InputError, match="near: gaussians_base, gaussians_tiny"):
         find_rebuild_recipe("gaussians_huge")
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40

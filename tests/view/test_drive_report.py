@@ -7,7 +7,7 @@ from urllib.parse import quote
 from html_pages import EVIL, Page, assert_harmless
 
 from foredrive.evaluation import write_summary
-from foredrive.runs.drive.records import summarise
+from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.view.drive_report import score_table, write_drive_report
 
 
@@ -46,11 +46,11 @@ def write_suite(folder: Path, name: str) -> Path:
     """A folder of one drive, with a film that is there already."""
     for part in ("drives", "videos"):
         (folder / part).mkdir()
-    drive = make_drive(name)
-    (folder / "drives" / f"{name}.json").write_text(json.dumps(drive))
+    path = folder / "drives" / f"{name}.json"
+    path.write_text(json.dumps(make_drive(name)))
     (folder / "videos" / f"{name}.webp").touch()
     (folder / "suite.json").write_text(json.dumps({"driver": name, "routes": f"{name}.xml"}))
-    write_summary(folder / "summary.json", summarise([drive]) | {"command": name})
+    write_summary(folder / "summary.json", summarise([read_drive(path)]) | {"command": name})
     return write_drive_report(folder)
 
 
@@ -75,7 +75,9 @@ def test_a_drive_is_told_in_the_order_of_events(tmp_path: Path) -> None:
 
 
 def test_the_terminal_shows_scores_infractions_and_failures(tmp_path: Path) -> None:
-    table = score_table(summarise([make_drive("one")]))
+    path = tmp_path / "one.json"
+    path.write_text(json.dumps(make_drive("one") | {"error": ""}))
+    table = score_table(summarise([read_drive(path)]))
     rows = {str(row.cells[0]): row.cells[1] for section in table.sections for row in section.rows}
     assert table.title == "1 routes, 1 repetitions"
     assert rows["collision static"] == "1  (100.00 / km)"

@@ -223,11 +223,11 @@ def test_a_move_is_read_off_two_poses(run: OpenRun) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--edits", "{tmp}/none.json"], "none.json: cannot be read"),
+        (["--edits", "{tmp}/none.json"], "none.json: no such file"),
         (["--edits", "{tmp}/other.json"], "no actor 99; there are"),
         (["--t", "7"], "7 s is not in the log"),
         (["--save", "{tmp}/x.png"], "--run and --save are for logs"),
-        (["--port", "70000"], "no port 70000"),
+        (["--port", "70000"], "--port is 70000: a number from 1 to 65535 is needed"),
     ],
 )
 def test_what_cannot_be_opened_is_one_line(

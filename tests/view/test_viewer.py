@@ -119,7 +119,7 @@ def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run
     dataset = ClipDataset([log], run.recipe.clips, None)
     at = next(k for k in range(len(dataset)) if dataset.now_us(k) == times.now_us[10])
     observed = collate([dataset[at]]).clip.observed()
-    expected = AgentPredictor(observer.agent, 2, ray_stride=4).predict(observed).images
+    expected = AgentPredictor(observer.agent, 2, ray_stride=4).predict(observed, frozenset({"images"})).images
     assert expected is not None
     whole = observer.render(vision, 0, observed.rig[0, -1])
     assert whole[:, 2::4, 2::4].permute(0, 3, 1, 2).numpy() == pytest.approx(expected[0, 0].numpy(), abs=1e-5)
@@ -179,7 +179,7 @@ def test_a_camera_of_one_s_own_sees_as_wide_as_the_window() -> None:
         (["--run", "{tmp}"], "{tmp}: not a run folder"),
         (["--run", "{tmp}", "--save", "{tmp}/x.png"], "--save draws the log alone"),
         (["--host", "no-such-host.invalid"], "cannot serve a page at no-such-host.invalid"),
-        (["--port", "70000"], "no port 70000"),
+        (["--port", "70000"], "--port is 70000: a number from 1 to 65535 is needed"),
     ],
 )
 def test_what_cannot_be_shown_is_one_line(
