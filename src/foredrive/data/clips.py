@@ -47,7 +47,7 @@ class ClipConfig:
     """Time between the nows of successive clips, s."""
     future_images: bool = True
     lidar: bool = False
-    """Whether to read lidar sweeps into the clip."""
+    """Read lidar sweeps into the clip."""
     map: bool = False
     occupancy_source: Literal["lidar", "recorded"] = "lidar"
     """Source of the voxel labels: "lidar" for beams of the sweep, or "recorded" for the exact occupancy and

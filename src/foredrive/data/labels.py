@@ -39,7 +39,7 @@ class VoxelLabels:
 
     occupied: Bool[Tensor, "Z Y X"]
     known: Bool[Tensor, "Z Y X"]
-    """Whether the voxel is occupied, or a beam passed through it."""
+    """True where the voxel is occupied or a beam passed through it."""
     flow_mps: Float[Tensor, "3 Z Y X"]
     """Velocity over ground in the ego axes. 0 where not known."""
     flow_known: Bool[Tensor, "Z Y X"]

@@ -19,7 +19,7 @@ class EvaluationContext:
     frame_dt_s: float
     """Time between key frames."""
     prior: OccupancyPrior | None = None
-    """Of the training set, on the model's frames."""
+    """Occupancy prior of the training set, on the model's frames."""
 
     def frame_names(self, frames: int) -> list[str]:
         """Return the names of now and the key frames after it: now, future_500ms, future_1s, …"""

@@ -128,7 +128,7 @@ class FlowErrors(Record):
 
     error_mps: Float[Tensor, "F"]
     speed_mps: Float[Tensor, "F"]
-    """Of predicting no motion."""
+    """Error of predicting no motion."""
     voxels: Int[Tensor, "F"]
 
     def __add__(self, other: "FlowErrors") -> "FlowErrors":

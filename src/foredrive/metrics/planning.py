@@ -31,13 +31,13 @@ class PlanScores(Record):
     driven_collision: Float[Tensor, "b H"]
     """The same for the box of the driven vehicle: boxes and paths are not exact."""
     planned: Bool[Tensor, "b"]
-    """Whether the plan has all its steps, finite. Otherwise it is a failure, not a score."""
+    """True if the plan has all its steps, finite. Otherwise it is a failure, not a score."""
     complete: Bool[Tensor, "b"]
     """Whether the driven future has all its steps."""
     counted: Bool[Tensor, "b"]
     """Whether the protocol counts the frame."""
     collision_counted: Bool[Tensor, "b"]
-    """Whether its collisions count too: boxes are annotated at now and at every driven step."""
+    """True if its collisions count too: boxes are annotated at now and at every driven step."""
 
 
 def score_plan(

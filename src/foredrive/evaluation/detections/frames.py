@@ -26,7 +26,7 @@ STD_PX = 1.0
 """… and this, in quadrature."""
 MIN_STD_YAW_RAD = 1e-6
 MAX_NUMBER = 1e12
-"""Of numbers in files: beyond it, squares and products lose their precision."""
+"""Limit of numbers in files: beyond it, squares and products lose their precision."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Frame:
     range_m: Float[ndarray, "N"] | None = None
     """Distance of each object over ground."""
     visibility: Float[ndarray, "N"] | None = None
-    """Of each object, as the data set measures it: lidar points, or a level of occlusion."""
+    """Visibility of each object as the data set measures it: lidar points, or a level of occlusion."""
     relevance: Float[ndarray, "N"] | None = None
     """Weight of each object, where the truth has one."""
 
