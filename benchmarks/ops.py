@@ -16,7 +16,7 @@ from benchmarks.common.measuring import compare, in_a_process, measure_op
 from foredrive.evaluation import Benchmark
 from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.attention3d import attend_volume, attend_volume_reference
-from foredrive.ops.volume import places_before, sample_volume, sample_volume_reference, warp_volume
+from foredrive.ops.volume import sample_volume, sample_volume_reference, source_points, warp_volume
 from foredrive.scene import VoxelSpec
 
 RUNS = 7
@@ -53,8 +53,9 @@ def warp() -> Case:
     lower_m, voxel_m = (-24.0, -24.0, -1.5), 0.75
 
     def reference(volume: Tensor, flow: Tensor, T: Tensor) -> Tensor:
-        places = places_before(flow, T, lower_m, voxel_m).flatten(1, 3)
-        read = sample_volume_reference(volume.permute(0, 2, 3, 4, 1), places)
+        points = source_points(T, volume.shape[2:], lower_m, voxel_m).flatten(1, 3)
+        points = points + sample_volume_reference(flow.permute(0, 2, 3, 4, 1), points) / voxel_m
+        read = sample_volume_reference(volume.permute(0, 2, 3, 4, 1), points)
         return read.unflatten(1, volume.shape[2:]).permute(0, 4, 1, 2, 3)
 
     def fast(volume: Tensor, flow: Tensor, T: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3, inverse_se3, matrix_from_yaw
 from foredrive.ops.attention3d import attend_volume, attend_volume_reference
-from foredrive.ops.volume import sample_volume, sample_volume_reference, warp_volume
+from foredrive.ops.volume import compose_flows, sample_volume, sample_volume_reference, warp_volume
 
 Parity = Callable[..., None]
 Op = Callable[..., Tensor]
@@ -285,15 +285,39 @@ def test_warp_follows_the_ego_vehicle() -> None:
     assert warped[..., -1].abs().max() < 1e-6
 
 
-def test_warp_follows_the_flow_before_the_turn() -> None:
-    """ẑ = R (z + f) + t: after a quarter turn, one voxel along x is one along y of what is read."""
+def test_warp_applies_the_flow_on_the_grid_of_the_source() -> None:
+    """One voxel moves while the vehicle turns by a quarter: the moved content turns with the rest."""
     volume, flow = scene()
-    flow[:, 0] = VOXEL_M
+    flow[:, 0, :, 2, 1] = VOXEL_M  # what lies at row y = 2, column x = 1 of the source came from x = 2
     quarter = matrix_from_yaw(torch.tensor([math.pi / 2]), torch.zeros(1, 3))
+    moved = volume.clone()
+    moved[..., 2, 1] = volume[..., 2, 2]
+    expected = moved.transpose(-1, -2).flip(-2)  # out[y, x] = in[x, 3 - y], as R (x, y) = (-y, x)
     warped = warp_volume(volume, flow, quarter, LOWER_M, VOXEL_M)
-    turned = volume.transpose(-1, -2).flip(-2)  # out[y, x] = in[x, 3 - y], as R (x, y) = (-y, x)
-    torch.testing.assert_close(warped[..., :-1], turned[..., 1:], rtol=0, atol=1e-5)
-    assert warped[..., -1].abs().max() < 1e-5
+    torch.testing.assert_close(warped, expected, rtol=0, atol=1e-5)
+
+
+def test_warp_shows_a_given_feature_where_the_source_ends() -> None:
+    """After 1.5 voxels forward, the last column is outside and half of the one before is."""
+    volume, still = scene()
+    T_now_next = matrix_from_yaw(torch.zeros(1), torch.tensor([[1.5 * VOXEL_M, 0.0, 0.0]]))
+    outside = torch.tensor([5.0, -3.0])
+    warped = warp_volume(volume, still, T_now_next, LOWER_M, VOXEL_M, outside)
+    torch.testing.assert_close(warped[0, :, 0, 0, 3], outside, rtol=0, atol=1e-5)
+    halfway = 0.5 * volume[0, :, 0, 0, 3] + 0.5 * outside
+    torch.testing.assert_close(warped[0, :, 0, 0, 2], halfway, rtol=0, atol=1e-5)
+    without = warp_volume(volume, still, T_now_next, LOWER_M, VOXEL_M)
+    torch.testing.assert_close(warped[..., :2], without[..., :2], rtol=0, atol=1e-5)
+
+
+def test_flows_one_after_the_other() -> None:
+    """The last flow leads one voxel up in x, and the earlier flow is read there."""
+    last, before = torch.zeros(1, 3, *SIZE_ZYX), torch.zeros(1, 3, *SIZE_ZYX)
+    last[:, 0, 1, 2, 1] = VOXEL_M
+    before[:, 1, 1, 2, 2] = 3.0
+    both = compose_flows(last, before, VOXEL_M)
+    torch.testing.assert_close(both[0, :, 1, 2, 1], torch.tensor([VOXEL_M, 3.0, 0.0]), rtol=0, atol=1e-5)
+    torch.testing.assert_close(both[0, :, 1, 2, 2], torch.tensor([0.0, 3.0, 0.0]), rtol=0, atol=1e-5)
 
 
 def test_warp_there_and_back_is_smooth() -> None:

@@ -1,28 +1,44 @@
-"""Rigid motions as 4×4 matrices. `T_dst_src` maps points of frame src to frame dst."""
+"""Rigid motions as 4×4 matrices. `T_dst_src` maps points of frame src to frame dst.
+
+Products are computed in full precision, also within autocast.
+"""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.precision import full_precision
+
 
 def inverse_se3(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Invert rigid motions by transposing the rotation."""
-    R_t = T[..., :3, :3].transpose(-1, -2)
-    out = torch.zeros_like(T)
-    out[..., :3, :3] = R_t
-    out[..., :3, 3:] = -R_t @ T[..., :3, 3:]
-    out[..., 3, 3] = 1
-    return out
+    with full_precision(T) as (T,):
+        R_t = T[..., :3, :3].transpose(-1, -2)
+        out = torch.zeros_like(T)
+        out[..., :3, :3] = R_t
+        out[..., :3, 3:] = -R_t @ T[..., :3, 3:]
+        out[..., 3, 3] = 1
+        return out
+
+
+def compose_se3(
+    T_dst_mid: Float[Tensor, "*#b 4 4"], T_mid_src: Float[Tensor, "*#b 4 4"]
+) -> Float[Tensor, "*#b 4 4"]:
+    """Return T_dst_src of two motions one after the other."""
+    with full_precision(T_dst_mid, T_mid_src) as (T_dst_mid, T_mid_src):
+        return T_dst_mid @ T_mid_src
 
 
 def transform_points(T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b N 3"]) -> Float[Tensor, "*b N 3"]:
     """Map points from src to dst."""
-    return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
+    with full_precision(T, points) as (T, points):
+        return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
 def rotate_vectors(T: Float[Tensor, "*b 4 4"], vectors: Float[Tensor, "*b N 3"]) -> Float[Tensor, "*b N 3"]:
     """Rotate free vectors (directions, velocities) from src to dst."""
-    return vectors @ T[..., :3, :3].transpose(-1, -2)
+    with full_precision(T, vectors) as (T, vectors):
+        return vectors @ T[..., :3, :3].transpose(-1, -2)
 
 
 def yaw_of(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
@@ -43,21 +59,22 @@ def exp_se3(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
     Args:
         xi: translation part (3, m), then rotation vector (3, rad).
     """
-    rho, phi = xi[..., :3], xi[..., 3:]
-    theta2 = (phi * phi).sum(-1)[..., None, None]
-    small = theta2 < 1e-6
-    safe2 = torch.where(small, torch.ones_like(theta2), theta2)
-    theta = safe2.sqrt()
-    a = torch.where(small, 1 - theta2 / 6, theta.sin() / theta)
-    b = torch.where(small, 0.5 - theta2 / 24, (1 - theta.cos()) / safe2)
-    c = torch.where(small, 1 / 6 - theta2 / 120, (theta - theta.sin()) / (safe2 * theta))
-    W = hat(phi)
-    W2 = W @ W
-    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
-    top = torch.cat([eye + a * W + b * W2, (eye + b * W + c * W2) @ rho[..., None]], dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1
-    return torch.cat([top, bottom], dim=-2)
+    with full_precision(xi) as (xi,):
+        rho, phi = xi[..., :3], xi[..., 3:]
+        theta2 = (phi * phi).sum(-1)[..., None, None]
+        small = theta2 < 1e-6
+        safe2 = torch.where(small, torch.ones_like(theta2), theta2)
+        theta = safe2.sqrt()
+        a = torch.where(small, 1 - theta2 / 6, theta.sin() / theta)
+        b = torch.where(small, 0.5 - theta2 / 24, (1 - theta.cos()) / safe2)
+        c = torch.where(small, 1 / 6 - theta2 / 120, (theta - theta.sin()) / (safe2 * theta))
+        W = hat(phi)
+        W2 = W @ W
+        eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+        top = torch.cat([eye + a * W + b * W2, (eye + b * W + c * W2) @ rho[..., None]], dim=-1)
+        bottom = torch.zeros_like(top[..., :1, :])
+        bottom[..., 3] = 1
+        return torch.cat([top, bottom], dim=-2)
 
 
 def sensor_twist(T_ego_sensor: Float[Tensor, "4 4"], twist_ego: Float[Tensor, "6"]) -> Float[Tensor, "6"]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.geometry.se3 import transform_points
 from foredrive.scene import CameraRig, VoxelSpec
 
 
@@ -89,9 +90,7 @@ class LiftSplatEncoder(nn.Module):
         rays = pixels_to_rays(uv.expand(b, c, -1, 2), rig.K, rig.dist)
         rays = rays / rays[..., 2:]  # normalised by depth, not by range
         in_camera = rays[..., None, :] * self.depths_m[:, None]
-        R, t = rig.T_ego_cam[..., :3, :3], rig.T_ego_cam[..., :3, 3]
-        in_ego = torch.einsum("bcij,bcnkj->bcnki", R.float(), in_camera.float()) + t[:, :, None, None].float()
-        return in_ego.flatten(1, 3)
+        return transform_points(rig.T_ego_cam, in_camera.flatten(2, 3)).flatten(1, 2)
 
 
 def splat(

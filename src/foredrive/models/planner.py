@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_row
 from foredrive.models.few_queries import FewQueriesDecoderLayer
-from foredrive.ops.precision import full_precision
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import Command, Trajectory, VoxelSpec
 

@@ -5,8 +5,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.precision import full_precision
 from foredrive.ops.corners import BLOCK
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, numba_can, triton_can
 from foredrive.ops.volume_reading import ReadVolume, readers_of
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.ops.precision import full_precision
+from foredrive.geometry.precision import full_precision
 
 
 class Composite(NamedTuple):

@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from foredrive.geometry.precision import full_precision
 from foredrive.ops.corners import BLOCK
 from foredrive.ops.lifting_kernels import Gradients, Inputs, lift_pairs, lift_pairs_backward
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, numba_can, triton_can
 from foredrive.ops.threads import in_parallel
 
 MIN_QUERIES = 64

@@ -1,7 +1,5 @@
-"""Precision of the ops, and the conditions for their kernels."""
+"""Conditions for the kernels of the ops."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from importlib.util import find_spec
 
@@ -10,17 +8,6 @@ from torch import Tensor
 
 MAX_ITEM_SIZE = 2**31
 """Upper limit of floats in one image or volume, because kernels index them with 32 bits."""
-
-
-@contextmanager
-def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Disable autocast, and yield the tensors in float32, or in float64 if any of them is float64.
-
-    Sampling and compositing are not faster in half precision, and positions and depths would lose accuracy.
-    """
-    dtype = torch.float64 if any(t.dtype == torch.float64 for t in tensors) else torch.float32
-    with torch.autocast(tensors[0].device.type, enabled=False):
-        yield tuple(t.to(dtype) for t in tensors)
 
 
 def numba_can(*tensors: Tensor) -> bool:

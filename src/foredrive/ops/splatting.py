@@ -19,7 +19,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.ops.precision import full_precision, numba_can
+from foredrive.geometry.precision import full_precision
+from foredrive.ops.precision import numba_can
 from foredrive.ops.splat_points import TiledPoints
 
 MIN_ALPHA = 1 / 255

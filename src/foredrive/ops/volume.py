@@ -4,13 +4,16 @@ Coordinates in volumes are in voxel units, in the order x y z. Voxel i spans [i,
 i + 0.5.
 """
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.precision import full_precision
 from foredrive.geometry.se3 import transform_points
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, numba_can, triton_can
 from foredrive.ops.volume_reading import ReadVolume, readers_of
 
 
@@ -63,40 +66,69 @@ def warp_volume(
     T_src_dst: Float[Tensor, "b 4 4"],
     lower_m: tuple[float, float, float],
     voxel_m: float,
+    outside: Float[Tensor, "D"] | None = None,
 ) -> Float[Tensor, "b D Z Y X"]:
-    """Move a volume by a flow and a rigid motion, by gathering (NeMo eq. 7-8).
+    """Move a volume by a flow on its own grid, then by a rigid motion, in one gather (NeMo eq. 7-8).
 
-    out[z] = volume[R (z + f(z)) + t] at every voxel centre z (m, ego frame) of the result. The result is in
-    the frame dst (the future), the given volume in the frame src (now). Both the flow and (R, t) =
-    `T_src_dst` lead from coordinates of the future frame back to those of now. The result is zero where the
-    source is outside the volume.
+    out[z] = volume[y + f(y)] with y = `T_src_dst` z, at every voxel centre z of the result. The given volume
+    and the flow are in the frame src (now), the result is in the frame dst (the future).
 
     Args:
         volume: grid in the frame src. No copy is made if it is channels-last in memory.
-        flow: f, metres along x y z of dst.
+        flow: f, metres along x y z of src: the content at y came from y + f(y). It is zero outside the grid.
         T_src_dst: maps points of dst to src.
         lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, equal in both frames.
+        outside: feature of places outside the volume; zero if None.
     """
     with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
-        read = sample_volume(
-            volume.permute(0, 2, 3, 4, 1), places_before(flow, T_src_dst, lower_m, voxel_m).flatten(1, 3)
-        )
-        return read.unflatten(1, volume.shape[2:]).permute(0, 4, 1, 2, 3)
+        points = source_points(T_src_dst, volume.shape[2:], lower_m, voxel_m)
+        points = points + read_grid(flow, points).permute(0, 2, 3, 4, 1) / voxel_m
+        read = read_grid(volume, points)
+        if outside is None:
+            return read
+        beyond = 1 - coverage(points, volume.shape[2:])
+        return read + beyond[:, None] * outside[:, None, None, None]
 
 
-def places_before(
-    flow: Float[Tensor, "b 3 Z Y X"],
+def compose_flows(
+    last: Float[Tensor, "b 3 Z Y X"], before: Float[Tensor, "b 3 Z Y X"], voxel_m: float
+) -> Float[Tensor, "b 3 Z Y X"]:
+    """Return the flow of two motions on one grid: y ↦ last(y) + before(y + last(y)), m."""
+    with full_precision(last, before) as (last, before):
+        points = _centres(last) + last.permute(0, 2, 3, 4, 1) / voxel_m
+        return last + read_grid(before, points)
+
+
+def read_grid(
+    volume: Float[Tensor, "b D Z Y X"], points: Float[Tensor, "b Z Y X 3"]
+) -> Float[Tensor, "b D Z Y X"]:
+    """Return the volume interpolated at one point (x y z in voxel units) for each voxel of a grid."""
+    read = sample_volume(volume.permute(0, 2, 3, 4, 1), points.flatten(1, 3))
+    return read.unflatten(1, points.shape[1:4]).permute(0, 4, 1, 2, 3)
+
+
+def source_points(
     T_src_dst: Float[Tensor, "b 4 4"],
+    shape_zyx: Sequence[int],
     lower_m: tuple[float, float, float],
     voxel_m: float,
 ) -> Float[Tensor, "b Z Y X 3"]:
-    """Return the source positions of `warp_volume`: ẑ = R (z + f) + t of every voxel centre z.
+    """Return the positions (voxel units of src) of the voxel centres of an equal grid in the frame dst."""
+    centres = _centres(T_src_dst.new_empty(1, 1, *shape_zyx))
+    lower = T_src_dst.new_tensor(lower_m)
+    centres_m = (centres * voxel_m + lower).flatten(0, 2)
+    source_m = transform_points(T_src_dst, centres_m.expand(len(T_src_dst), -1, -1))
+    return ((source_m - lower) / voxel_m).unflatten(1, centres.shape[:3])
 
-    They are x y z in voxel units.
-    """
-    axes = [torch.arange(n, dtype=flow.dtype, device=flow.device) + 0.5 for n in flow.shape[2:]]
+
+def coverage(points: Float[Tensor, "b Z Y X 3"], shape_zyx: Sequence[int]) -> Float[Tensor, "b Z Y X"]:
+    """Return the share of trilinear interpolation at each point that reads voxels of the grid, 0 to 1."""
+    size_xyz = points.new_tensor(list(shape_zyx)[::-1])
+    per_axis = torch.minimum(points + 0.5, size_xyz - points + 0.5).clamp(0, 1)
+    return per_axis.prod(dim=-1)
+
+
+def _centres(grid: Float[Tensor, "b D Z Y X"]) -> Float[Tensor, "Z Y X 3"]:
+    axes = [torch.arange(n, dtype=grid.dtype, device=grid.device) + 0.5 for n in grid.shape[2:]]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
-    lower = flow.new_tensor(lower_m)
-    target_m = torch.stack([x, y, z], dim=-1) * voxel_m + lower + flow.permute(0, 2, 3, 4, 1)
-    source_m = transform_points(T_src_dst, target_m.flatten(1, 3))
-    return ((source_m - lower) / voxel_m).unflatten(1, flow.shape[2:])
+    return torch.stack([x, y, z], dim=-1)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.geometry.se3 import rotate_vectors
 from foredrive.scene import Clip
 
 
@@ -41,7 +42,7 @@ def thinned_rays(clip: Clip, frame: int, stride: int, generator: torch.Generator
     uv = pixel_centres(clip.rig.size_hw)[row::stride, column::stride].reshape(-1, 2).to(images.device)
     K, dist = clip.rig.K[:, frame], clip.rig.dist[:, frame]
     T_ego_cam = clip.rig.T_ego_cam[:, frame]
-    direction = pixels_to_rays(uv.expand(b, c, -1, 2), K, dist) @ T_ego_cam[..., :3, :3].transpose(-1, -2)
+    direction = rotate_vectors(T_ego_cam, pixels_to_rays(uv.expand(b, c, -1, 2), K, dist))
     origin = T_ego_cam[..., None, :3, 3].expand_as(direction)
     return ImageRays(
         origin=origin.flatten(1, 2),

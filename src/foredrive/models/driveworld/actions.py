@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from foredrive.geometry.se3 import inverse_se3, yaw_of
+from foredrive.geometry.se3 import compose_se3, inverse_se3, yaw_of
 from foredrive.scene import Clip, Frames
 
 WHEELBASE_M = 2.86
@@ -38,7 +38,7 @@ def actions_between(
     Args:
         T_any_ego: poses in any common frame.
     """
-    T_step = (inverse_se3(T_any_ego[:, :-1]) @ T_any_ego[:, 1:]).float()
+    T_step = compose_se3(inverse_se3(T_any_ego[:, :-1]), T_any_ego[:, 1:]).float()
     way_m = T_step[..., :2, 3].norm(dim=-1)
     dt_s = torch.diff(t_s, dim=1).to(way_m)
     speed = torch.where(speed_valid[:, :-1], speed_mps[:, :-1].to(way_m), way_m / dt_s)
@@ -50,7 +50,7 @@ def actions_between(
 
 def motion_of(action: Float[Tensor, "b 2"], dt_s: float) -> Float[Tensor, "b 4 4"]:
     """Return the pose after an action in the ego frame before it, along the arc of the bicycle."""
-    speed, steering = action.unbind(-1)
+    speed, steering = action.float().unbind(-1)
     way_m, curvature = speed * dt_s, torch.tan(steering) / WHEELBASE_M
     yaw = way_m * curvature
     cos, sin = yaw.cos(), yaw.sin()

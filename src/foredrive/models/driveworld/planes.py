@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.geometry.precision import full_precision
 from foredrive.scene import VoxelSpec
 
 
@@ -114,14 +115,14 @@ def carried_plane(
         plane: features over the ground of `spec`, in the frame src.
         T_src_dst: transform of points dst -> src; only its motion over the ground is used.
     """
-    size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
-    lower = plane.new_tensor(spec.lower_m[:2])
-    y, x = (torch.arange(n).to(plane) + 0.5 for n in spec.shape_zyx[1:])
-    cells_m = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * spec.voxel_m + lower
-    T = T_src_dst.to(plane)
-    read_m = torch.einsum("bij,yxj->byxi", T[:, :2, :2], cells_m) + T[:, None, None, :2, 3]
-    grid = 2 * (read_m - lower) / (spec.voxel_m * size_xy) - 1
-    return F.grid_sample(plane, grid, align_corners=False)
+    with full_precision(plane, T_src_dst.float()) as (plane, T):
+        size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
+        lower = plane.new_tensor(spec.lower_m[:2])
+        y, x = (torch.arange(n).to(plane) + 0.5 for n in spec.shape_zyx[1:])
+        cells_m = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * spec.voxel_m + lower
+        read_m = torch.einsum("bij,yxj->byxi", T[:, :2, :2], cells_m) + T[:, None, None, :2, 3]
+        grid = 2 * (read_m - lower) / (spec.voxel_m * size_xy) - 1
+        return F.grid_sample(plane, grid, align_corners=False)
 
 
 class PlanesToVolume(nn.Module):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv3d
 
 from foredrive.errors import InputError
-from foredrive.geometry.se3 import inverse_se3
+from foredrive.geometry.se3 import compose_se3, inverse_se3
 from foredrive.models.backbone import BackboneConfig, ImageBackbone
 from foredrive.models.driveworld.actions import actions_in, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian
@@ -203,7 +203,7 @@ class DriveWorld(nn.Module):
             latent, prior = self._ahead(latent, action)
             state = prior.mean if generator is None else prior.sample(generator)
             latent = _with_state(latent, state)
-            T_now_ego = T_now_ego @ motion_of(action, self.dt_s)
+            T_now_ego = compose_se3(T_now_ego, motion_of(action, self.dt_s))
             futures.append(self._decoded(latent, statics, "forecast", T_now_ego))
         return futures
 
@@ -238,23 +238,25 @@ class DriveWorld(nn.Module):
 
         Args:
             generator: samples the states. Without it, states are means and the statics are those of now.
-            statics_of: frame whose statics all frames are decoded with (§3.1: a random one).
+            statics_of: frame whose statics all frames are decoded with (§3.1: a random one, drawn per item).
         """
         latents, posteriors, priors = self._filter(seen, generator)
         frames = len(latents)
-        shown = frames - 1
+        batch = len(seen.planes)
+        shown = torch.full((batch,), frames - 1)
         if generator is not None and statics_of == "random":
-            shown = int(torch.randint(frames, (1,), generator=generator))
-        statics = self._statics(seen.planes[:, shown])
-        T_shown_now = inverse_se3(seen.T_now_ego[:, shown])
-        T_shown_ego = T_shown_now[:, None] @ seen.T_now_ego
+            shown = torch.randint(frames, (batch,), generator=generator)
+        chosen = torch.arange(batch), shown
+        statics = self._statics(seen.planes[chosen])
+        T_shown_now = inverse_se3(seen.T_now_ego[chosen])
+        T_shown_ego = compose_se3(T_shown_now[:, None], seen.T_now_ego)
         beliefs = [
             self._decoded(latent, statics, "occupancy", T_shown_ego[:, k]) for k, latent in enumerate(latents)
         ]
         policy = [self.states.action(each) for each in latents]
         latent, T = latents[-1], T_shown_now
         for _ in range(steps):
-            T = T @ motion_of(policy[-1], self.dt_s)
+            T = compose_se3(T, motion_of(policy[-1], self.dt_s))
             latent, prior = self._ahead(latent, policy[-1])
             latent = _with_state(latent, prior.mean if generator is None else prior.sample(generator))
             beliefs.append(self._decoded(latent, statics, "forecast", T))

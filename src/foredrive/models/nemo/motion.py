@@ -21,16 +21,16 @@ class MotionConfig:
 
 
 class Motion(NamedTuple):
-    """Motion over each of the next F key frames.
+    """Motion over each of the next F key frames, for gathering.
 
-    Flow and pose both map from the coordinates of frame t+k+1 back to those of frame t+k, because volumes are
-    warped by gathering: V̂_{t+k+1}[z] = V_{t+k}[R (z + f) + t].
+    The flows of all steps lie on the grid of frame t, on which they are predicted. The content at place y
+    (ego frame t) at step k + 1 was at y + flow(y) one step before.
     """
 
     flow: Float[Tensor, "b F 3 Z Y X"]
-    """f, in metres along x, y, z."""
+    """M, in metres along x, y, z of the ego frame t."""
     T_prev_next: Float[Tensor, "b F 4 4"]
-    """(R, t): the ego frame at t+k+1 -> the ego frame at t+k."""
+    """S: the ego frame at t+k+1 -> the ego frame at t+k."""
 
 
 class MotionFlow(nn.Module):

@@ -11,13 +11,14 @@ from pydantic import Discriminator
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.geometry.se3 import compose_se3, inverse_se3, rotate_vectors
 from foredrive.models.averaging import AveragingConfig, AveragingEncoder
 from foredrive.models.backbone import BackboneConfig, ImageBackbone
 from foredrive.models.bev import BevConfig, BevEncoder
 from foredrive.models.lifting import LiftingConfig, LiftingEncoder
 from foredrive.models.nemo.motion import MotionConfig, MotionFlow
 from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
-from foredrive.ops.volume import warp_volume
+from foredrive.ops.volume import compose_flows, warp_volume
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
 
 Encoder = LiftingEncoder | BevEncoder | AveragingEncoder
@@ -44,6 +45,8 @@ class NemoConfig:
     occupied_prior: float = 0.02
     """Initial occupancy probability of f_occ. It is small because most space is free and an opaque volume
     would hide what is behind."""
+    unseen: Literal["zero", "learned"] = "zero"
+    """Feature of voxels that come into view in imagined frames. The paper does not say."""
     kind: Literal["nemo"] = "nemo"
 
 
@@ -79,6 +82,7 @@ class Nemo(nn.Module):
         self.encoder = ENCODERS[type(config.encoder)](config.encoder, spec, channels=channels, levels=levels)
         self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
         self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)
+        self.unseen = nn.Parameter(torch.zeros(channels)) if config.unseen == "learned" else None
         to_logit = nn.Linear(config.occupancy_hidden, 1)
         nn.init.constant_(to_logit.bias, math.log(config.occupied_prior / (1 - config.occupied_prior)))
         self.occupancy = nn.Sequential(nn.Linear(channels, config.occupancy_hidden), nn.ReLU(), to_logit)
@@ -109,8 +113,9 @@ class Nemo(nn.Module):
     ) -> list[Belief]:
         """Warp the volume into the next key frames by predicted flow and ego motion (eq. 7–8).
 
-        NeMo predicts its own ego motion and takes no actions. It has only one future, so `generator` is
-        ignored.
+        Every step reads the volume of now once: V̂_{t+k}[z] = V_t[y + F_k(y)] with y = T_now_ego z. F_k is the
+        flow of k steps, accumulated on the grid of frame t. NeMo predicts its own ego motion and takes no
+        actions. It has only one future, so `generator` is ignored.
 
         Raises:
             InputError: the belief is an imagined one, actions are given, or `steps` is out of range.
@@ -122,16 +127,37 @@ class Nemo(nn.Module):
         if not 0 < steps <= self.max_steps:
             raise InputError(f"this NeMo imagines 1 to {self.max_steps} steps, not {steps}")
         motion = self.motion(belief.history)
-        volume = belief.volume
-        T_now_ego = torch.eye(4, device=volume.device).expand(len(volume), 4, 4)
+        T_now_ego = torch.eye(4, device=belief.volume.device).expand(len(belief.volume), 4, 4)
+        since_now_m = torch.zeros_like(motion.flow[:, 0])
         futures = []
         for k in range(steps):
-            T_prev_next = motion.T_prev_next[:, k]
-            came_from_m = motion.flow[:, k]
-            volume = warp_volume(volume, came_from_m, T_prev_next, self.spec.lower_m, self.spec.voxel_m)
-            T_now_ego = T_now_ego @ T_prev_next
-            futures.append(Belief(volume=volume, flow_mps=-came_from_m / self.dt_s, T_now_ego=T_now_ego))
+            T_now_ego = compose_se3(T_now_ego, motion.T_prev_next[:, k])
+            since_now_m = compose_flows(motion.flow[:, k], since_now_m, self.spec.voxel_m)
+            futures.append(
+                Belief(
+                    volume=self._warped(belief.volume, since_now_m, T_now_ego, self.unseen),
+                    flow_mps=self._velocity(motion.flow[:, k], T_now_ego),
+                    T_now_ego=T_now_ego,
+                )
+            )
         return futures
+
+    def _warped(
+        self,
+        volume: Float[Tensor, "b D Z Y X"],
+        flow_m: Float[Tensor, "b 3 Z Y X"],
+        T_now_ego: Float[Tensor, "b 4 4"],
+        outside: Float[Tensor, "D"] | None,
+    ) -> Float[Tensor, "b D Z Y X"]:
+        return warp_volume(volume, flow_m, T_now_ego, self.spec.lower_m, self.spec.voxel_m, outside)
+
+    def _velocity(
+        self, flow_m: Float[Tensor, "b 3 Z Y X"], T_now_ego: Float[Tensor, "b 4 4"]
+    ) -> Float[Tensor, "b 3 Z Y X"]:
+        """Return the velocity (m/s, axes of the imagined ego frame) of one step's flow on the grid of now."""
+        at_ego = self._warped(flow_m, torch.zeros_like(flow_m), T_now_ego, None)
+        along_ego = rotate_vectors(inverse_se3(T_now_ego), at_ego.flatten(2).transpose(1, 2))
+        return -along_ego.transpose(1, 2).unflatten(2, self.spec.shape_zyx) / self.dt_s
 
     def decode(self, belief: Belief) -> Decoded:
         """Return the occupancy of every voxel (eq. 4) and the volume itself as renderable features."""

@@ -1,0 +1,76 @@
+"""Geometry within bfloat16 autocast: positions, rays and poses stay exact."""
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from foredrive.geometry.se3 import compose_se3, exp_se3, inverse_se3, transform_points
+from foredrive.models.driveworld.planes import carried_plane
+from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
+from foredrive.models.lifting import project_to_cameras
+from foredrive.scene import Clip, Example, VoxelSpec
+from foredrive.sensors import camera_rays
+from foredrive.training.rays import thinned_rays
+
+SPEC = VoxelSpec(lower_m=(-25.6, -25.6, -2.0), voxel_m=0.8, shape_zyx=(8, 64, 64))
+BF16 = torch.autocast("cpu", torch.bfloat16)
+
+
+@pytest.fixture
+def clip(make_example: Callable[..., Example]) -> Clip:
+    """Four cameras whose rotations are no round numbers."""
+    clip = make_example(spec=SPEC, batch=1, past=0, future=0, cameras=4).clip
+    T_ego_cam = exp_se3(torch.tensor([0.9, -0.3, 0.2, 0.02, 0.05, 0.37])) @ clip.rig.T_ego_cam
+    return dataclasses.replace(clip, rig=dataclasses.replace(clip.rig, T_ego_cam=T_ego_cam))
+
+
+def angle_deg(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float(torch.rad2deg((a - b).norm(dim=-1)).max())
+
+
+def test_reference_points_move_by_less_than_a_hundredth_of_a_pixel(clip: Clip) -> None:
+    """Under autocast they moved by up to 1.9 px of an image of 800 px."""
+    rig = clip.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+    valid = clip.image_valid.flatten(0, 1)
+    exact, seen = project_to_cameras(SPEC.centres_m().flatten(0, 2), rig, valid)
+    with BF16:
+        points, seen_too = project_to_cameras(SPEC.centres_m().flatten(0, 2), rig, valid)
+    assert torch.equal(seen, seen_too)
+    assert seen.any()
+    assert 800 * (points - exact)[seen].abs().max() < 0.01
+
+
+def test_rays_turn_by_less_than_a_thousandth_of_a_degree(clip: Clip) -> None:
+    exact, exact_thin = camera_rays(clip.rig), thinned_rays(clip, 0, 2)
+    with BF16:
+        rays, thin = camera_rays(clip.rig), thinned_rays(clip, 0, 2)
+    assert angle_deg(rays.dir_ego, exact.dir_ego) < 1e-3
+    assert angle_deg(thin.direction, exact_thin.direction) < 1e-3
+
+
+def test_depths_fall_into_the_same_cells(clip: Clip) -> None:
+    """Under autocast 1.9 % of them changed their cell."""
+    rig = clip.rig.map_tensors(lambda tensor: tensor[:, 0])
+    depths = LiftSplatConfig(near_m=1.0, far_m=30.0, step_m=0.5)
+    encoder = LiftSplatEncoder(depths, SPEC, channels=4, width=4, levels=1)
+    exact = encoder.cells(rig, (8, 16))
+    with BF16:
+        told = encoder.cells(rig, (8, 16))
+    assert all(torch.equal(a, b) for a, b in zip(exact, told, strict=True))
+
+
+def test_poses_and_what_they_move_are_exact() -> None:
+    T = exp_se3(torch.tensor([12.0, 0.5, 0.1, 0.01, 0.02, 0.3]))
+    points = torch.tensor([[31.2, -17.3, 1.1]])
+    plane = torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with BF16:
+        T_too = exp_se3(torch.tensor([12.0, 0.5, 0.1, 0.01, 0.02, 0.3]))
+        assert torch.equal(T, T_too)
+        assert torch.equal(compose_se3(inverse_se3(T), T), compose_se3(inverse_se3(T_too), T_too))
+        moved = transform_points(T, points)
+        carried = carried_plane(plane, T[None], SPEC)
+    assert torch.equal(moved, transform_points(T, points))
+    assert torch.equal(carried, carried_plane(plane, T[None], SPEC))
+    assert (compose_se3(inverse_se3(T), T) - torch.eye(4)).abs().max() < 1e-5
