@@ -110,6 +110,9 @@ def test_mixed_precision_rounds_no_inputs(
     product = torch.bfloat16 if is_known else torch.float32
     assert seen == {"product": product, "inputs": (torch.float32, torch.float64)}
     assert losses(tmp_path)[-1] < losses(tmp_path)[0]
+    conditions = json.loads((tmp_path / "conditions.json").read_text())
+    precision = "bfloat16" if is_known else "float32"
+    assert conditions == {"device": "cpu", "precision": precision, "processes": 1}
 
 
 def test_a_finished_run_is_left_alone(make_example: Callable[..., Example], tmp_path: Path) -> None:
@@ -163,5 +166,9 @@ def test_learning_rate_by_hand() -> None:
     assert [schedule.lr_at(step, 10) for step in (0, 1, 2)] == [0.5, 1.0, 1.0]
     assert schedule.lr_at(6, 10) == pytest.approx(0.1 + 0.9 * 0.5)
     assert Schedule(batch_size=4, lr=1.0, epochs=3).total_steps(9) == 9
+    assert Schedule(batch_size=4, lr=1.0, epochs=3).total_steps(9, processes=2) == 6
+    assert schedule.total_steps(9, processes=4) == 3
+    assert [schedule.lr_at(step, 5, processes=2) for step in (0, 1)] == [1.0, 1.0]
+    assert schedule.lr_at(3, 5, processes=2) == pytest.approx(schedule.lr_at(6, 10))
     with pytest.raises(InputError, match="either"):
         Schedule(batch_size=4, lr=1.0).total_steps(9)

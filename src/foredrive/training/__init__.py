@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     )
     from foredrive.training.ego_mlp_fit import DrivenStatus, fit_ego_mlp, read_status
     from foredrive.training.fabric import make_fabric
-    from foredrive.training.loop import Schedule, read_metrics, train
+    from foredrive.training.loop import CONDITIONS, Schedule, read_metrics, train
     from foredrive.training.objective import LossWeights, NemoObjective, NemoStage
     from foredrive.training.path_fit import PathDemonstrations, PathFit, fit_path
     from foredrive.training.rays import ImageRays, thinned_rays
 
 __all__ = [
+    "CONDITIONS",
     "DriveWorldObjective",
     "DriveWorldStage",
     "DriveWorldWeights",
@@ -48,7 +49,7 @@ __getattr__ = on_demand(
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
         "ego_mlp_fit": ("DrivenStatus", "fit_ego_mlp", "read_status"),
         "fabric": ("make_fabric",),
-        "loop": ("Schedule", "read_metrics", "train"),
+        "loop": ("CONDITIONS", "Schedule", "read_metrics", "train"),
         "objective": ("LossWeights", "NemoObjective", "NemoStage"),
         "path_fit": ("PathDemonstrations", "PathFit", "fit_path"),
         "rays": ("ImageRays", "thinned_rays"),

@@ -35,15 +35,20 @@ class Batch(Protocol):
 
 B = TypeVar("B", bound=Batch)
 
+CONDITIONS = "conditions.json"
+"""File of a stage: device, precision and number of processes."""
+
 
 @dataclass(frozen=True)
 class Schedule:
     """Length and learning rate of a training: AdamW, linear warm-up, then a cosine to `final_lr_fraction`.
 
-    The length is given in steps, or in epochs over the data when `steps` is None.
+    The length is given in steps, or in epochs over the data when `steps` is None. Steps, here and in
+    `warmup_steps`, are those of one process: N processes consume N batches at a time and so take 1/N as many.
     """
 
     batch_size: int
+    """Items of one process in one step."""
     lr: float
     steps: int | None = None
     epochs: int | None = None
@@ -55,20 +60,21 @@ class Schedule:
     workers: int = 0
     seed: int = 0
 
-    def total_steps(self, items: int) -> int:
-        """Return the number of steps over a data set of `items`."""
+    def total_steps(self, items: int, processes: int = 1) -> int:
+        """Return the number of steps over a data set of `items` that several processes share."""
         if (self.steps is None) == (self.epochs is None):
             raise InputError("a schedule has either steps or epochs")
         if self.steps is not None:
-            return self.steps
+            return math.ceil(self.steps / processes)
         assert self.epochs is not None
-        return self.epochs * math.ceil(items / self.batch_size)
+        return self.epochs * math.ceil(items / (self.batch_size * processes))
 
-    def lr_at(self, step: int, total: int) -> float:
-        """Return the learning rate of step `step` (from 0)."""
-        if step < self.warmup_steps:
-            return self.lr * (step + 1) / self.warmup_steps
-        progress = (step - self.warmup_steps) / max(total - self.warmup_steps, 1)
+    def lr_at(self, step: int, total: int, processes: int = 1) -> float:
+        """Return the learning rate of step `step` (from 0) of `total`."""
+        warmup = math.ceil(self.warmup_steps / processes)
+        if step < warmup:
+            return self.lr * (step + 1) / warmup
+        progress = (step - warmup) / max(total - warmup, 1)
         floor = self.final_lr_fraction
         return self.lr * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))
 
@@ -103,7 +109,7 @@ def train(
     items = len(dataset)  # type: ignore[arg-type]
     if items == 0:
         raise InputError("there is nothing to train on: the data set is empty")
-    total = schedule.total_steps(items)
+    total = schedule.total_steps(items, fabric.world_size)
     optimizer = torch.optim.AdamW(
         [p for p in objective.parameters() if p.requires_grad],
         lr=schedule.lr,
@@ -116,6 +122,8 @@ def train(
     if done >= total:
         return
     log = MetricsLog(folder / "metrics.jsonl", done) if fabric.is_global_zero else None
+    if fabric.is_global_zero:
+        write_conditions(folder, fabric)
     loader: Any = fabric.setup_dataloaders(
         _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
     )
@@ -178,7 +186,7 @@ def _one_step(
     fabric: "Fabric",
 ) -> dict[str, Tensor]:
     for group in optimizer.param_groups:
-        group["lr"] = schedule.lr_at(step, total)
+        group["lr"] = schedule.lr_at(step, total, fabric.world_size)
     seed = (schedule.seed * 1_000_003 + step) * 1009 + fabric.global_rank
     torch.manual_seed(seed)  # dropout
     losses: dict[str, Tensor] = model(example, torch.Generator().manual_seed(seed))
@@ -190,6 +198,23 @@ def _one_step(
     fabric.clip_gradients(model, optimizer, max_norm=schedule.clip_grad_norm, error_if_nonfinite=False)
     optimizer.step()
     return {name: value.detach() for name, value in losses.items()}
+
+
+def write_conditions(folder: Path, fabric: "Fabric") -> None:
+    """Write device, precision and number of processes of a training to `folder/conditions.json`.
+
+    The precision is the one that was used: bfloat16 is not where it would be slower.
+    """
+    device = fabric.device.type
+    with fabric.autocast():
+        dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32
+    conditions = {
+        "device": device,
+        "precision": str(dtype).removeprefix("torch."),
+        "processes": fabric.world_size,
+    }
+    with atomic_path(folder / CONDITIONS) as temporary:
+        temporary.write_text(json.dumps(conditions) + "\n")
 
 
 def _progress(fabric: "Fabric") -> Progress:

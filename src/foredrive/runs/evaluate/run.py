@@ -124,7 +124,7 @@ def evaluate_run(
             on_items=lambda items: progress.advance(task, items),
         )
     origin = {"recipe": run.recipe.name, "run": str(run.folder)}
-    write_summary(out / SUMMARY, result.summary | collect_provenance() | origin)
+    write_summary(out / SUMMARY, result.summary | collect_provenance() | run.conditions | origin)
     return result
 
 

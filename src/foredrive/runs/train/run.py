@@ -1,5 +1,6 @@
 """Training runs: a folder with the recipe, the stages and their weights."""
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.path_features import read_paths
-from foredrive.training import PathFit, fit_path, load_weights, save_weights, train
+from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -49,6 +50,16 @@ class Run:
             if (self.folder / stage / WEIGHTS).is_file():
                 return self.folder / stage / WEIGHTS
         raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
+
+    @property
+    def conditions(self) -> dict[str, str | int]:
+        """Return device, precision and processes of each stage, as flat dotted keys. Older runs have none."""
+        found = {}
+        for stage in STAGES:
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                entries = json.loads((self.folder / stage / CONDITIONS).read_text()).items()
+                found |= {f"training.{stage}.{name}": value for name, value in entries}
+        return found
 
 
 def open_run(folder: Path) -> Run:
