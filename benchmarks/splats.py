@@ -10,6 +10,7 @@ process.
 
 The comparisons are plain PyTorch on a smaller case (`small`: 20 k Gaussians, 240 × 135 px), and the
 textbook's loop in numba, pixel by pixel over its tile's list (only compositing, forward, on the same lists).
+`street_range_error_mm_…` are errors of lidar ranges at three speeds (see the function).
 Rasterisers on PyPI that may run on a CPU (splax in JAX, gausscam) are not measured here.
 """
 
@@ -27,7 +28,7 @@ from torch import Tensor
 from benchmarks.common.measuring import in_a_process
 from benchmarks.common.measuring import measure as time_of
 from foredrive.evaluation import Benchmark
-from foredrive.geometry.se3 import exp_se3
+from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import (
     Composited,
@@ -36,7 +37,7 @@ from foredrive.ops.splatting import (
     composite_splats_reference,
     list_splats,
 )
-from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
+from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar, scan_times
 from foredrive.sensors import pandar64
 
 RUNS = 7
@@ -65,18 +66,22 @@ def street(count: int, begin_m: float, end_m: float) -> Gaussians:
     width_m = 0.6 * math.sqrt(area_m2 / len(mean))
     log_scale = math.log(width_m) + 0.5 * torch.randn(len(mean), 3, generator=rng)
     log_scale[:, 2] -= 2.0
-    nx, ny, nz = normal.unbind(-1)
-    from_z = torch.stack([1.001 + nz, -ny, nx, torch.zeros_like(nx)], -1)  # rotates z to the normal
     far = count - len(mean)
     around = 2 * math.pi * torch.rand(far, generator=rng)
     sky = torch.stack([200 * around.cos(), 200 * around.sin(), 100 * torch.rand(far, generator=rng)], -1)
     return Gaussians(
         mean_m=torch.cat([mean, sky]),
-        quaternion=torch.cat([from_z, torch.tensor([1.0, 0, 0, 0]).expand(far, 4)]),
+        quaternion=torch.cat([_from_z(normal), torch.tensor([1.0, 0, 0, 0]).expand(far, 4)]),
         log_scale=torch.cat([log_scale, torch.full((far, 3), math.log(5.0))]),
         opacity_logit=0.5 + 2 * torch.randn(count, generator=rng),
         feature=torch.rand(count, 3, generator=rng),
     )
+
+
+def _from_z(normal: Tensor) -> Tensor:
+    """Return quaternions (not normalised) that rotate z to the normals."""
+    nx, ny, nz = normal.unbind(-1)
+    return torch.stack([1.001 + nz, -ny, nx, torch.zeros_like(nx)], -1)
 
 
 def _ground(n: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -133,11 +138,55 @@ def lidar(count: int, device: str) -> View:
     twist = torch.tensor([10.0, 0, 0, 0, 0, 0.1])
     points = lidar_points(pandar64(T_ego_lidar).beams(twist), T_ego_lidar, twist).to(device)
     T, twist = exp_se3(torch.tensor([0.0, 0, -1.8, 0, 0, 0])).to(device), twist.to(device)
+    scan_s = scan_times(points)
 
     def project(gaussians: Gaussians) -> Splats:
-        return project_lidar(gaussians, T, twist_lidar=twist)
+        return project_lidar(gaussians, T, twist_lidar=twist, scan_s=scan_s)
 
     return View(project, points, _learnable(street(count, -80, 80), device))
+
+
+def street_range_error_mm(speed_mps: float, count: int = 200_000, within_m: float = 20.0) -> float:
+    """Return the median error of the median ranges of a driving lidar between ground and façades.
+
+    The Gaussians are flat discs on the surfaces. The truth is the range at which a beam meets a surface, from
+    where the lidar is when it fires. Beams that end within `within_m` count.
+    """
+    rng = torch.Generator().manual_seed(0)
+    length_m, half_m = 120.0, WIDTH_M / 2
+    (ground, up), (fronts, out) = _ground(count // 2, rng), _fronts(count // 2, rng)
+    mean = (torch.cat([ground, fronts]) - torch.tensor([0.5, 0, 0])) * torch.tensor([length_m, 1, 1])
+    log_scale = torch.full((len(mean), 3), math.log(0.6 * math.sqrt(length_m * (WIDTH_M + 20) / len(mean))))
+    log_scale[:, 2] = math.log(0.01)
+    gaussians = Gaussians(
+        mean_m=mean,
+        quaternion=_from_z(torch.cat([up, out])),
+        log_scale=log_scale,
+        opacity_logit=torch.full((len(mean),), 4.0),
+        feature=torch.ones(len(mean), 1),
+    )
+    T_ego_lidar, twist = (
+        exp_se3(torch.tensor([1.0, 0, 1.8, 0, 0, 0])),
+        torch.tensor([speed_mps, 0, 0, 0, 0, 0.1]),
+    )
+    rays = pandar64(T_ego_lidar).beams(twist)
+    middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
+    points = lidar_points(rays, T_ego_lidar, twist, middle_s)
+    splats = project_lidar(
+        gaussians,
+        inverse_se3(exp_se3(middle_s * twist) @ T_ego_lidar),
+        twist_lidar=sensor_twist(T_ego_lidar, twist),
+        scan_s=scan_times(points),
+    )
+    found_m = composite_splats(splats, points).median_range_m
+    origin, direction = rays.origin_ego, rays.dir_ego
+    to_ground_m = torch.where(direction[:, 2] < 0, -origin[:, 2] / direction[:, 2], math.inf)
+    side_m = half_m * direction[:, 1].sign()
+    to_front_m = torch.where(direction[:, 1] != 0, (side_m - origin[:, 1]) / direction[:, 1], math.inf)
+    truth_m = torch.minimum(to_ground_m, to_front_m)
+    top_m = origin[:, 2] + truth_m * direction[:, 2]
+    counts = (truth_m < within_m) & (top_m < HEIGHT_M) & found_m.isfinite()
+    return 1000 * float((found_m - truth_m).abs()[counts].median())
 
 
 def _learnable(gaussians: Gaussians, device: str) -> Gaussians:
@@ -246,6 +295,8 @@ def measure(device: str) -> dict[str, float]:
         took = [sum(found[path][f"{step}_{clock}"] for step in ("forward", "train")) for path in paths[2:4]]
         figures[f"small.speedup_over_reference{end}"] = took[1] / took[0]
     if device == "cpu":
+        for speed_mps in (0, 12, 25):
+            figures[f"street_range_error_mm_{speed_mps}mps"] = street_range_error_mm(speed_mps)
         figures |= {f"compositing.{name}": value for name, value in found["textbook"].items()}
         figures["compositing.speedup_over_textbook"] = (
             found["textbook"]["textbook_s"] / found["textbook"]["ours_s"]

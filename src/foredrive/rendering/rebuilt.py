@@ -1,5 +1,6 @@
 """A rebuilt scene: Gaussians, tracks, sensor corrections and decoders, all learned."""
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors, sensor_
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import composite_splats
 from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
-from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
+from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar, scan_times
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, place
 from foredrive.rendering.tracks import Tracks
 from foredrive.rendering.views import CameraView, SweepView
@@ -70,9 +71,15 @@ class SweepPoints:
     """The beams of a sweep in the form needed for compositing: prepared once, used in every step."""
 
     tiles: TiledPoints
+    """Times are relative to the middle of the sweep."""
+    scan_s: Float[Tensor, "S"] | None
+    """Result of `scan_times`. None: all beams are simultaneous."""
     dir_scene: Float[Tensor, "P 3"]
     T_scene_lidar: Float[Tensor, "4 4"]
+    """Pose at the middle of the sweep."""
     twist_lidar: Float[Tensor, "6"]
+    middle_s: float
+    """Middle of the firing times, relative to the time of the sweep."""
 
 
 class RebuiltScene(nn.Module):
@@ -213,22 +220,29 @@ class RebuiltScene(nn.Module):
         )
 
     def prepare_sweep(self, view: SweepView) -> SweepPoints:
-        """Return the beams of a sweep in the lidar's frame: axes of the vehicle, origin at the lidar."""
+        """Return the beams of a sweep in the lidar's frame: axes of the vehicle, origin at the lidar.
+
+        Time 0 of the beams is the middle of the sweep. The motion of each Gaussian is right at the time at
+        which its azimuth is scanned.
+        """
         beams = view.beams
         rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
         T_ego_lidar = torch.eye(4).to(beams.origin_ego)
         if len(beams.dt_s):
             T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
-        twist = view.twist_ego
-        tiles = lidar_points(rays, T_ego_lidar, twist)
+        twist, middle_s = view.twist_ego, 0.0
         if not self.rolling:
-            rays = TimedRays(rays.origin_ego, rays.dir_ego, torch.zeros_like(rays.dt_s))
-            tiles = lidar_points(rays, T_ego_lidar, torch.zeros_like(twist))
+            twist, rays = torch.zeros_like(twist), dataclasses.replace(rays, dt_s=torch.zeros_like(rays.dt_s))
+        elif len(rays.dt_s):
+            middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
+        tiles = lidar_points(rays, T_ego_lidar, twist, middle_s)
         return SweepPoints(
             tiles=tiles,
+            scan_s=scan_times(tiles) if bool(tiles.time_s.any()) else None,
             dir_scene=rotate_vectors(view.T_scene_ego, beams.dir_ego),
-            T_scene_lidar=view.T_scene_ego @ T_ego_lidar,
-            twist_lidar=sensor_twist(T_ego_lidar, twist),
+            T_scene_lidar=view.T_scene_ego @ exp_se3(middle_s * twist) @ T_ego_lidar,
+            twist_lidar=sensor_twist(T_ego_lidar, view.twist_ego),
+            middle_s=middle_s,
         )
 
     def sweep(
@@ -248,13 +262,14 @@ class RebuiltScene(nn.Module):
             hit_range_m: see `composite_splats`.
             mirror: see `place`.
         """
-        placed = place(graph, t_s, mirror)
+        placed = place(graph, t_s + points.middle_s, mirror)
         splats = project_lidar(
             placed.gaussians,
             inverse_se3(points.T_scene_lidar.to(placed.velocity_mps)),
             velocity_mps=placed.velocity_mps,
             twist_lidar=points.twist_lidar.to(placed.velocity_mps),
             reach_m=self.reach_m,
+            scan_s=None if points.scan_s is None else points.scan_s.to(placed.velocity_mps),
         )
         seen = composite_splats(splats, points.tiles, hit_range_m)
         intensity, drop_logit = self.lidar_decoder(

@@ -1,13 +1,21 @@
 """Projection of Gaussians to azimuth and elevation of a lidar (Hess et al., "SplatAD", 2025)."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.ops.splatting import Splats
-from foredrive.rendering.gaussians.footprint import footprint, in_sensor, positions_in_sensor, through
+from foredrive.rendering.gaussians.beams import sector_of
+from foredrive.rendering.gaussians.footprint import (
+    InSensor,
+    footprint,
+    in_sensor,
+    positions_in_sensor,
+    through,
+)
 from foredrive.rendering.gaussians.gaussians import Gaussians
 
 NEAR_M = 0.2
@@ -26,6 +34,7 @@ def project_lidar(
     twist_lidar: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
     reach_m: float = math.inf,
+    scan_s: Float[Tensor, "S"] | None = None,
 ) -> Splats:
     """Return splats over azimuth and elevation, for `beam_points`. Those that no beam can see are left out.
 
@@ -41,6 +50,8 @@ def project_lidar(
             See `geometry.se3.sensor_twist`.
         compensate: lower the opacity by as much as ε widens a splat.
         reach_m: maximum range of the centre of a visible Gaussian.
+        scan_s: result of `scan_times`: the motion of each Gaussian is then right at the time at which its
+            azimuth is scanned. None: right at time 0, and decimetres wrong at 25 m/s half a turn later.
     """
     position = positions_in_sensor(gaussians, T_lidar_scene)
     with torch.no_grad():
@@ -50,24 +61,83 @@ def project_lidar(
         seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
         chosen = seen.nonzero()[:, 0]
     them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
-    angles, range_m, jacobian = _project(them.position_m)
+    if scan_s is None:
+        angles, range_m, jacobian = _project(them.position_m)
+        centre = _Centre(angles, range_m, (jacobian * them.velocity_mps).sum(1))
+    else:
+        twist = them.position_m.new_zeros(6) if twist_lidar is None else twist_lidar
+        centre, jacobian = _scanned(them, twist, scan_s)
     spread = through(jacobian, them.factor_m)
     shape = footprint(spread[:2], SPREAD_RAD2)
     with_azimuth, with_elevation = (spread[:2] * spread[2]).sum(1)
     xx, xy, yy = shape.inverse.unbind(-1)
-    velocity = (jacobian * them.velocity_mps).sum(1)
     return Splats(
-        mean=angles,
+        mean=centre.angles,
         inverse_covariance=shape.inverse,
         opacity=them.opacity * shape.compensation if compensate else them.opacity,
-        range_m=range_m,
+        range_m=centre.range_m,
         range_slope=torch.stack(
             [xx * with_azimuth + xy * with_elevation, xy * with_azimuth + yy * with_elevation], -1
         ),
-        velocity=velocity[:2].T,
-        range_rate_mps=velocity[2],
+        velocity=centre.velocity[:2].T,
+        range_rate_mps=centre.velocity[2],
         feature=them.feature,
     )
+
+
+class _Centre(NamedTuple):
+    """Motion of the centres of splats, linear in time."""
+
+    angles: Float[Tensor, "N 2"]
+    """Azimuth and elevation at time 0, rad."""
+    range_m: Float[Tensor, "N"]
+    """Range at time 0."""
+    velocity: Float[Tensor, "3 N"]
+    """Change of azimuth, elevation (rad/s) and range (m/s)."""
+
+
+def _scanned(
+    them: InSensor, twist_lidar: Float[Tensor, "6"], scan_s: Float[Tensor, "S"]
+) -> tuple[_Centre, Float[Tensor, "3 3 N"]]:
+    """Return the centres such that they are right when they are scanned, and the Jacobian at that time.
+
+    A turn ends where it begins, so Gaussians near this seam are seen twice, and their places a turn earlier
+    or later must be right too. The motion is therefore the line through both places. The tangent would lead
+    near Gaussians astray within a turn. The Jacobian takes vectors in the axes of the lidar at time 0.
+    """
+    with torch.no_grad():
+        time_s = scan_s[sector_of(torch.atan2(them.position_m[1], them.position_m[0]))]
+        x, y, _ = _moved(them.position_m, them.velocity_mps, twist_lidar, time_s)
+        time_s = scan_s[sector_of(torch.atan2(y, x))]
+        turn_s = scan_s.max() - scan_s.min()
+        other_s = torch.where(time_s > 0, time_s - turn_s, time_s + turn_s)
+    here, there = (
+        _project(_moved(them.position_m, them.velocity_mps, twist_lidar, when_s))
+        for when_s in (time_s, other_s)
+    )
+    azimuth, elevation = (there[0] - here[0]).T
+    azimuth = torch.remainder(azimuth + math.pi, 2 * math.pi) - math.pi
+    velocity = torch.stack([azimuth, elevation, there[1] - here[1]]) / (other_s - time_s)
+    centre = _Centre(here[0] - (time_s * velocity[:2]).T, here[1] - time_s * velocity[2], velocity)
+    # Until then the axes turn by time · ω, and J (1 - time [ω]×) takes vectors in the axes at time 0.
+    turned = torch.linalg.cross(here[2], twist_lidar[None, 3:, None].expand_as(here[2]), dim=1)
+    return centre, here[2] - time_s * turned
+
+
+def _moved(
+    position_m: Float[Tensor, "3 N"],
+    velocity_mps: Float[Tensor, "3 N"],
+    twist_lidar: Float[Tensor, "6"],
+    time_s: Float[Tensor, "N"],
+) -> Float[Tensor, "3 N"]:
+    """Return positions in the lidar's frame at another time, to second order.
+
+    With p' = v in a frame that moves by u and turns by ω, p'' = -ω × (2 v + u + ω × p).
+    """
+    linear, turn = twist_lidar[:3, None], twist_lidar[3:, None].expand_as(position_m)
+    inner = 2 * velocity_mps + linear + torch.linalg.cross(turn, position_m, dim=0)
+    change = -torch.linalg.cross(turn, inner, dim=0)
+    return position_m + time_s * (velocity_mps + 0.5 * time_s * change)
 
 
 def _project(
