@@ -40,10 +40,10 @@ def at_the_kerb(traffic: Traffic, crossing: int) -> Pedestrians:
     walks = traffic.walks
     place = walks.ends[crossing, 0]
     walk = next(int(w) for w in walks.incident[place] if w >= 0 and not walks.is_crossing[w])
-    onward = 1 if walks.ends[walk, 1] == place else -1
-    s_m = np.array([walks.length_m[walk] - 0.05 if onward > 0 else 0.05])
+    direction = 1 if walks.ends[walk, 1] == place else -1
+    s_m = np.array([walks.length_m[walk] - 0.05 if direction > 0 else 0.05])
     person = draw_people(walks, np.random.default_rng(0), np.array([7]), np.array([walk]), s_m)
-    return dataclasses.replace(person, onward=np.array([onward]), next_walk=np.array([crossing]))
+    return dataclasses.replace(person, direction=np.array([direction]), next_walk=np.array([crossing]))
 
 
 def lone_car(traffic: Traffic, before_m: float, speed_mps: float) -> tuple[Vehicles, int]:
