@@ -13,7 +13,7 @@ from foredrive.towns.traffic.traffic import Traffic
 DT_S = 0.1
 
 
-def move_vehicles(
+def drive(
     town: TownMap, seed: int, seconds: float, vehicles: int = 20
 ) -> tuple[Traffic, ExpertDrive, list[DriveSnapshot]]:
     traffic = Traffic(town, seed, vehicles, people_count=10)

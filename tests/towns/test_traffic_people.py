@@ -7,7 +7,7 @@ import pytest
 
 from foredrive.scene import Category
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.drivers import drive
+from foredrive.towns.traffic.drivers import move_vehicles
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.pedestrians import (
     Pedestrians,
@@ -87,7 +87,7 @@ def test_a_person_waits_for_a_car_that_is_near_and_crosses_behind_it(traffic: Tr
                 person.s_m[0].clip(0, traffic.walks.length_m[person.walk[0]])
             )
             assert person.waited_s[0] > 0
-        cars = drive(cars, np.zeros(1), DT_S)
+        cars = move_vehicles(cars, np.zeros(1), DT_S)
     passed_s = (10.0 + cars.size_lwh[0, 0] + 3.4) / 10.0
     assert crossed_s is not None
     assert 10.0 / 10.0 < crossed_s < passed_s + 1.0
