@@ -62,7 +62,7 @@ def passed() -> int:
     The rounding of a machine's arithmetic decides which car drives there, so that its id is not fixed.
     """
     ahead: Counter[int] = Counter()
-    for moment in truth().moments[1::JUDGED_EVERY]:
+    for moment in truth().snapshots[1::JUDGED_EVERY]:
         R, ego_m = moment.T_world_ego[:3, :3], moment.T_world_ego[:3, 3]
         for actor in moment.actors:
             x_m, y_m, _ = R.T @ (actor.centre_m - ego_m)

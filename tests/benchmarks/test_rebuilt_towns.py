@@ -71,10 +71,10 @@ def car_ahead(T_world_ego: np.ndarray) -> ActorState:
 
 def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
     truth = TownTruth(DRIVE)
-    actor = car_ahead(truth.moments[4].T_world_ego)
-    truth.moments[4] = dataclasses.replace(truth.moments[4], actors=[actor])
+    actor = car_ahead(truth.snapshots[4].T_world_ego)
+    truth.snapshots[4] = dataclasses.replace(truth.snapshots[4], actors=[actor])
     driven = truth.seen(4).sweep
-    T_scene_world = torch.from_numpy(truth.moments[0].T_world_ego).inverse()
+    T_scene_world = torch.from_numpy(truth.snapshots[0].T_world_ego).inverse()
     centre_m = transform_points(T_scene_world, torch.from_numpy(actor.centre_m)[None]).float()[0]
     forward = (T_scene_world[:3, :3] @ torch.from_numpy(actor.velocity_mps)).float()
     forward = forward / forward.norm()
