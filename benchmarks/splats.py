@@ -37,7 +37,13 @@ from foredrive.ops.splatting import (
     composite_splats_reference,
     list_splats,
 )
-from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar, scan_times
+from foredrive.rendering.gaussians import (
+    Gaussians,
+    project_camera,
+    project_lidar,
+    scan_times,
+    tiled_lidar_beams,
+)
 from foredrive.sensors import pandar64
 
 RUNS = 7
@@ -136,7 +142,7 @@ def lidar(count: int, device: str) -> View:
     """Return 64 × 1800 beams of a Pandar64 with three features, range and median."""
     T_ego_lidar = exp_se3(torch.tensor([0.0, 0, 1.8, 0, 0, 0]))
     twist = torch.tensor([10.0, 0, 0, 0, 0, 0.1])
-    points = lidar_points(pandar64(T_ego_lidar).beams(twist), T_ego_lidar, twist).to(device)
+    points = tiled_lidar_beams(pandar64(T_ego_lidar).beams(twist), T_ego_lidar, twist).to(device)
     T, twist = exp_se3(torch.tensor([0.0, 0, -1.8, 0, 0, 0])).to(device), twist.to(device)
     scan_s = scan_times(points)
 
@@ -171,7 +177,7 @@ def street_range_error_mm(speed_mps: float, count: int = 200_000, within_m: floa
     )
     rays = pandar64(T_ego_lidar).beams(twist)
     middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
-    points = lidar_points(rays, T_ego_lidar, twist, middle_s)
+    points = tiled_lidar_beams(rays, T_ego_lidar, twist, middle_s)
     splats = project_lidar(
         gaussians,
         inverse_se3(exp_se3(middle_s * twist) @ T_ego_lidar),

@@ -10,13 +10,13 @@ MAX_ITEM_SIZE = 2**31
 """Upper limit of floats in one image or volume, because kernels index them with 32 bits."""
 
 
-def numba_can(*tensors: Tensor) -> bool:
+def numba_supports(*tensors: Tensor) -> bool:
     """Return whether the CPU kernels apply: all tensors on the CPU, none float64, nothing traced."""
     return _plain(tensors, "cpu")
 
 
-def triton_can(*tensors: Tensor) -> bool:
-    """Return whether the CUDA kernels apply: as `numba_can`, but on a GPU and with Triton installed."""
+def triton_supports(*tensors: Tensor) -> bool:
+    """Return whether the CUDA kernels apply: as `numba_supports`, but on a GPU and with Triton installed."""
     return _plain(tensors, "cuda") and _has_triton()
 
 

@@ -14,7 +14,7 @@ SECTORS = 720
 """Number of sectors of azimuth in `scan_times`: half a degree each, 0.14 ms of a spinning lidar."""
 
 
-def lidar_points(
+def tiled_lidar_beams(
     rays: TimedRays,
     T_ego_lidar: Float[Tensor, "4 4"],
     twist_ego: Float[Tensor, "6"],

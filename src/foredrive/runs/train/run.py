@@ -54,7 +54,7 @@ class Run:
     @property
     def conditions(self) -> dict[str, str | int]:
         """Return device, precision and processes of each stage, as flat dotted keys. Older runs have none."""
-        found = {}
+        found: dict[str, str | int] = {}
         for stage in STAGES:
             with contextlib.suppress(OSError, ValueError, AttributeError):
                 entries = json.loads((self.folder / stage / CONDITIONS).read_text()).items()
