@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.evaluation import Benchmark
@@ -27,7 +28,8 @@ def bench(
         folder: Folder of the benchmarks. Each benchmark is a Python file that defines BENCHMARK; its file
             name has _ in place of -.
     """
-    from foredrive.evaluation import run_benchmark
+    with importing():
+        from foredrive.evaluation import run_benchmark
 
     files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from foredrive.cli.arguments import OptionalPath, check_out_folder
+from foredrive.lazy import importing
 
 EXAMPLES, QUICK_EXAMPLES = 4, 1
 
@@ -18,14 +19,15 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     """
     check_out_folder(out)
 
-    from rich.console import Console
+    with importing():
+        from rich.console import Console
 
-    from foredrive.evaluation import read_summary
-    from foredrive.runs import full_demo, inspect_run, quick_demo, run_demo
-    from foredrive.view.hero import write_hero
-    from foredrive.view.report import write_report
-    from foredrive.view.run_report import inspection_panel, report_on_run
-    from foredrive.view.summary_tables import print_summary
+        from foredrive.evaluation import read_summary
+        from foredrive.runs import full_demo, inspect_run, quick_demo, run_demo
+        from foredrive.view.hero import write_hero
+        from foredrive.view.report import write_report
+        from foredrive.view.run_report import inspection_panel, report_on_run
+        from foredrive.view.summary_tables import print_summary
 
     started = time.perf_counter()
     folder = out or Path("runs", "demo-quick" if quick else "demo")

@@ -11,6 +11,7 @@ import tyro
 
 from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 from foredrive.towns.map.names import check_town
 
 if TYPE_CHECKING:
@@ -72,8 +73,9 @@ def record(
     for name in town:
         check_town(name)
 
-    from foredrive.runs.drive.recording import record_drives, record_plan
-    from foredrive.towns.campaign import Campaign, plan_drives
+    with importing():
+        from foredrive.runs.drive.recording import record_drives, record_plan
+        from foredrive.towns.campaign import Campaign, plan_drives
 
     campaign = Campaign(
         towns=town,

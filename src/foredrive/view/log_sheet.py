@@ -14,9 +14,9 @@ from foredrive.scene import CameraRig, Clip
 from foredrive.view import palette
 from foredrive.view.bev import draw_bev, legend_handles
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_points_on_image, resize
+from foredrive.view.log_times import CAMERA_WIDTH_PX
 from foredrive.view.sheet import Sheet
 
-CAMERA_WIDTH_PX = 640
 GAP_PX, HEAD_PX, AXIS_PX, LEGEND_PX = 10, 64, 60, 230
 MIN_BEV_PX = 640
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
 """Voxel grid of the labels, which every clip has and this module does not use."""
 KEPT = 16
+CAMERA_WIDTH_PX = 640
 
 
 class LogTimes:
