@@ -10,10 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import LidarSweep
-from foredrive.towns.conditions import CONDITIONS, Conditions
+from foredrive.scene.conditions import CONDITIONS, Conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World

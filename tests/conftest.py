@@ -166,7 +166,7 @@ def town02(town_of: "Callable[[str], TownMap]") -> "TownMap":
 
 @pytest.fixture(scope="session")
 def world02(town02: "TownMap") -> "World":
-    from foredrive.towns.conditions import Conditions
+    from foredrive.scene.conditions import Conditions
     from foredrive.towns.world import World
 
     return World(town02, seed=3, conditions=Conditions(hour=12.0))

@@ -19,7 +19,8 @@ from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
 from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
 from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
-from foredrive.runs.drive.in_towns import TownRoutes, job_of
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run

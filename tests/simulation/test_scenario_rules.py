@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.scenarios.acts import act
 from foredrive.simulation.scenarios.kinds import MEETINGS, Scenario, ScenarioKind, Way
 from foredrive.simulation.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
@@ -16,7 +17,6 @@ from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.driven import Driven
 from foredrive.towns.traffic.fleet import ego_vehicle
 from foredrive.towns.traffic.guests import cleared, granted_through, invited, points_on
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.strays import Stray
 from foredrive.towns.traffic.traffic import Traffic
@@ -310,7 +310,7 @@ def test_only_who_may_runs_a_light(traffic: Traffic, runs: bool) -> None:
     red_s = next(
         t
         for t in np.arange(0.0, 60.0, 0.5).tolist()
-        if all(traffic.signals.shows(t + ds)[lane] == Light.RED for ds in (0.0, 4.0))
+        if all(traffic.signals.shows(t + ds)[lane] == LightState.RED for ds in (0.0, 4.0))
     )
     begin_m = float(graph.length_m[before]) - 30.0
     high = points_on(graph, (before,), np.array([begin_m]))[0] + [0.0, 0.0, 40.0]

@@ -6,11 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from foredrive.data.setting import Doing, LightColour, Place, Setting
+from foredrive.data.setting import Doing, LightColour, Place, Setting, TimeOfDay, Weather
 from foredrive.data.setting import ObjectKind as Kind
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import CONDITIONS, Conditions
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import CONDITIONS, Conditions
 from foredrive.towns.labels.captions import Situation, Thing, caption
 from foredrive.towns.labels.situation import kind_of
 
@@ -24,8 +24,8 @@ def thing(kind: Kind, x: float, y: float, **changes: object) -> Thing:
 
 def situation(*things: Thing, conditions: Conditions = CONDITIONS["clear"], **changes: object) -> Situation:
     plain = Setting(
-        time_of_day=conditions.time_of_day,
-        weather=conditions.weather,
+        time_of_day=TimeOfDay.at_hour(conditions.hour),
+        weather=Weather.under(conditions),
         place=Place.STREET,
         doing=Doing.DRIVES,
         speed_mps=10.0,
@@ -169,4 +169,4 @@ def test_vans_and_riders_go_by_their_own_names() -> None:
     ],
 )
 def test_conditions_in_words(name: str, facts: tuple[str, str]) -> None:
-    assert (CONDITIONS[name].time_of_day, CONDITIONS[name].weather) == facts
+    assert (TimeOfDay.at_hour(CONDITIONS[name].hour), Weather.under(CONDITIONS[name])) == facts

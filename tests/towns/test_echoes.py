@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from foredrive.scene import Category
+from foredrive.scene.actors import ActorState
 from foredrive.sensors import SpinningLidar
-from foredrive.towns.actors import ActorState
+from foredrive.sensors.vehicle import camera_rig
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.echoes import chance_of_shares, group_echoes, pick_echo
-from foredrive.towns.sensing.rig import camera_rig
 from foredrive.towns.world import World
 
 

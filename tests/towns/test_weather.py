@@ -7,8 +7,9 @@ import pytest
 from scenes import STILL, actor_at, ego_pose
 from scipy.integrate import quad
 
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import CONDITIONS, Conditions, find_conditions
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import CONDITIONS, Conditions, find_conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture
 from foredrive.towns.sensing import lens
@@ -18,7 +19,6 @@ from foredrive.towns.sensing.capture import NOT_KNOWN, SensorSuite
 from foredrive.towns.sensing.lamps import UNIT_LUX, gather_lamps, lamp_light
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import daylight_lux, drive_lit, is_dark, make_light, sun_direction
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.sensing.shading import Surfaces, shade
 from foredrive.towns.sensing.wet import water_mirror
 from foredrive.towns.world import NOBODY, SensorFrame, World

@@ -10,9 +10,9 @@ from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.train.run import Run, train_run
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.recorder import LabelKinds, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 RATE_HZ = 2.0
 """Recording rate: one key frame every 0.5 s."""

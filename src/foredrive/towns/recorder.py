@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
@@ -18,9 +17,11 @@ from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
 from foredrive.ops.threads import one_ahead
-from foredrive.scene import Boxes, CameraRig, VoxelSpec
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions
+from foredrive.scene import CameraRig, VoxelSpec
+from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
+from foredrive.scene.conditions import BackgroundTraffic, Conditions
+from foredrive.scene.traffic_light import LightState
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.labels.captions import caption
 from foredrive.towns.labels.semantics import (
     CategoryOfTrack,
@@ -34,32 +35,20 @@ from foredrive.towns.labels.visibility import is_seen
 from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import Drive, Moment
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
 FIRST_TIME_US = 1_577_836_800_000_000
 """Midnight of 1 January 2020 UTC. The time in a log must not depend on when it was recorded."""
-BOXES_WITHIN_M = 80.0
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
 """Grid of NeMo."""
 FASTEST_HZ = 100.0
 STATUS_OF_LIGHT = {
-    Light.RED: TrafficLightStatus.RED,
-    Light.YELLOW: TrafficLightStatus.YELLOW,
-    Light.GREEN: TrafficLightStatus.GREEN,
+    LightState.RED: TrafficLightStatus.RED,
+    LightState.YELLOW: TrafficLightStatus.YELLOW,
+    LightState.GREEN: TrafficLightStatus.GREEN,
 }
-
-
-@dataclass(frozen=True)
-class Crowd:
-    """The numbers of other road users within about 140 m of the ego vehicle."""
-
-    vehicles: int = 30
-    people: int = 20
-    """Number of people, where the town has walkways."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +81,7 @@ def record(
     out: Path,
     rate_hz: float = 10.0,
     sensors: SensorSuite | None = None,
-    crowd: Crowd | None = None,
+    background_traffic: BackgroundTraffic | None = None,
     labels: LabelKinds | None = None,
     conditions: Conditions | None = None,
     log_name: str | None = None,
@@ -100,7 +89,7 @@ def record(
     """Record one drive. The same arguments give the same bytes on the same kind of processor.
 
     The log is written to out/logs/SPLIT/NAME and replaces a log of that name. The map is written to out/maps,
-    once for all logs of the town. There are boxes for all road users within `BOXES_WITHIN_M`, parked cars
+    once for all logs of the town. There are boxes for all road users within `BOX_RANGE_M`, parked cars
     included. The number of lidar returns from each one, and its visible share, distinguish hidden from
     visible ones.
 
@@ -111,7 +100,7 @@ def record(
         out: 123D data root.
         rate_hz: frames per second.
         sensors: by default six cameras of 144 × 256 px and a lidar of 32 × 720 beams.
-        crowd: `Crowd()` by default.
+        background_traffic: `BackgroundTraffic()` by default.
         labels: `LabelKinds()` by default.
         conditions: time of day and weather. None draws bright daylight from the seed.
         log_name: TOWN_seedN by default.
@@ -128,10 +117,10 @@ def record(
         raise InputError(f"a seed is 0 or more, got {seed}")
     town_map = load_town_map(town)
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
-    crowd = crowd or Crowd()
+    background_traffic = background_traffic or BackgroundTraffic()
     labels = labels or LabelKinds()
     world = World(town_map, seed, conditions)
-    traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
+    traffic = Traffic(town_map, seed, background_traffic.vehicles + 1, background_traffic.pedestrians)
     drive = Drive(traffic, seconds)
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
@@ -164,14 +153,14 @@ def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, Tr
 
     Args:
         town: the map.
-        lights: a `Light` for each of the town's stop zones.
+        lights: a `LightState` for each of the town's stop zones.
     """
     # The map's writer numbers lanes in the order of the parser, which is their order in the town.
     id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
     return {
-        id_of[lane]: STATUS_OF_LIGHT[Light(light)]
+        id_of[lane]: STATUS_OF_LIGHT[LightState(light)]
         for zone, light in zip(town.stop_zones, lights.tolist(), strict=True)
-        if light != Light.NONE
+        if light != LightState.NONE
         for lane in zone.lane_ids
     }
 
@@ -206,7 +195,7 @@ def _frame(
     """Return all recorded data of a moment."""
     moment, seen, seed = sensed
     everyone = [*moment.actors, *world.parked]
-    near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
+    near = in_box_range(everyone, moment.T_world_ego)
     returned = seen.beam_ids[seen.sweep.returned.numpy()]
     visibility, setting, text = None, None, None
     if labels.visibility or labels.captions:
@@ -225,7 +214,7 @@ def _frame(
         acceleration_ego_mps2=moment.acceleration_ego_mps2,
         images=seen.images,
         sweep=seen.sweep,
-        boxes=boxes_of(near, moment.T_world_ego),
+        boxes=boxes_in_ego_frame(near, moment.T_world_ego),
         occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
         lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         visibility=visibility if labels.visibility else None,
@@ -257,35 +246,11 @@ def _ray_labels(
     return out
 
 
-def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:
-    """Return the boxes of road users in the ego frame, unbatched."""
-    T_ego_world = np.linalg.inv(T_world_ego)
-    centre = (
-        np.array([a.centre_m for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
-    )
-    yaw = np.array([a.yaw for a in actors])
-    heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1) @ T_ego_world[:3, :3].T
-    velocity = np.array([a.velocity_mps for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T
-    return Boxes(
-        centre=torch.from_numpy(centre).float(),
-        size_lwh=torch.from_numpy(np.array([a.size_lwh for a in actors]).reshape(-1, 3)).float(),
-        yaw=torch.from_numpy(np.arctan2(heading[:, 1], heading[:, 0])).float(),
-        velocity=torch.from_numpy(velocity[:, :2]).float(),
-        track_id=torch.tensor([a.track_id for a in actors], dtype=torch.int64),
-        category=torch.tensor([int(a.category) for a in actors], dtype=torch.int64),
-        valid=torch.ones(len(actors), dtype=torch.bool),
-    )
-
-
 def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
     """Return how often each track was hit."""
     hit, count = np.unique(hit_ids, return_counts=True)
     counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
     return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
-
-
-def _distance_m(actor: ActorState, moment: Moment) -> float:
-    return float(np.linalg.norm(actor.centre_m - moment.T_world_ego[:3, 3]))
 
 
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:

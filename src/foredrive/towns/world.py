@@ -10,8 +10,9 @@ from jaxtyping import Float, Float32, Float64, Int, Int32, UInt8
 
 from foredrive.data.modalities import FullOccupancy
 from foredrive.scene import LidarSweep, VoxelSpec
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions, draw_daylight
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import Conditions, draw_daylight
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.labels.occupancy import full_occupancy
 from foredrive.towns.labels.semantics import NOBODY, SKY
 from foredrive.towns.labels.visibility import visibility
@@ -45,12 +46,11 @@ from foredrive.towns.sensing.columns import make_columns
 from foredrive.towns.sensing.lamps import gather_lamps
 from foredrive.towns.sensing.light import Rgb, drive_lit, is_dark, make_light
 from foredrive.towns.sensing.seen import Seen, surface_ids, track_ids
-from foredrive.towns.traffic.lights import Light
 
 ACTOR_REACH_M = 200.0
 """Distance from the vehicle beyond which road users are not rendered, m."""
 ACTOR_RADIUS_M = 8.0
-LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
+LAMP_ORDER = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 LAMP_LIT = srgb_to_linear(((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45)))
 HEADLIGHT_LIT, TAIL_LIT, BRAKE_LIT, STREET_LAMP_LIT = srgb_to_linear(
     ((1.0, 0.98, 0.95), (0.42, 0.02, 0.01), (1.0, 0.10, 0.07), (1.0, 0.93, 0.80))
@@ -184,7 +184,7 @@ class World:
             T_world_ego: pose of the vehicle.
             twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
             noise_seed: seed of range noise, of lost beams and of image noise.
-            lights: a `Light` for each of the town's stop zones. None: all lamps are off.
+            lights: a `LightState` for each of the town's stop zones. None: all lamps are off.
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
         moment = self._moment(near, lights, T_world_ego)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
-from foredrive.towns.conditions import FOG_M
+from foredrive.scene.conditions import FOG_M
 
 SEEN = 0.4
 """Minimum visibility of road users that are mentioned: nuScenes' lowest visibility level."""

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int
 from foredrive.data.modalities import FullOccupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.columns import COLUMN_M, TownColumns

@@ -9,7 +9,7 @@ from py123d.datatypes import DefaultLidarSegmentationLabel as LidarLabel
 
 from foredrive.errors import InputError
 from foredrive.scene import CameraRig, Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.looks import Surface
 
 SKY = -1

@@ -7,16 +7,16 @@ import shapely
 from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 
-from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting
+from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
 from foredrive.scene import Category, Command
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import Conditions
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.labels.captions import SEEN, Situation, Thing
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
 from foredrive.towns.traffic.expert import Moment
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.routes import Route
 
 STANDING_MPS = 0.3
@@ -124,8 +124,8 @@ class Narrator:
         leader, gap_m = self._leader(actors, centre - beside, visibility)
         now = self._conditions
         setting = Setting(
-            time_of_day=now.time_of_day,
-            weather=now.weather,
+            time_of_day=TimeOfDay.at_hour(now.hour),
+            weather=Weather.under(now),
             place=self._places.place(at),
             doing=self._doing(moment, leader, gap_m, aside_mps),
             speed_mps=float(moment.twist_ego[0]),
@@ -201,14 +201,14 @@ class Narrator:
             if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
                 lamps = self._signal_xyz[zone] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
                 in_view = any(np.linalg.norm(lamp) < LAMPS_M and sees(lamp) for lamp in lamps)
-                return _COLOUR_OF_LIGHT.get(Light(int(moment.lights[zone]))) if in_view else None
+                return _COLOUR_OF_LIGHT.get(LightState(int(moment.lights[zone]))) if in_view else None
         return None
 
 
 _COLOUR_OF_LIGHT = {
-    Light.RED: LightColour.RED,
-    Light.YELLOW: LightColour.YELLOW,
-    Light.GREEN: LightColour.GREEN,
+    LightState.RED: LightColour.RED,
+    LightState.YELLOW: LightColour.YELLOW,
+    LightState.GREEN: LightColour.GREEN,
 }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
 from foredrive.scene import CameraRig
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 

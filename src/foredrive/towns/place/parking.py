@@ -5,7 +5,7 @@ import shapely
 from jaxtyping import Float
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.place.looks import ASPHALT_RGB, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.actor_looks import MeshLooks
 from foredrive.towns.place.actor_meshes import DRESSES, PEOPLE, SHAPES_OF_KIND, THINGS, VEHICLES
 from foredrive.towns.place.assets import Assets, Palette

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 
 CONTRAST_LOST = 3.912
 """-ln 0.02: the product of visibility and extinction (Koschmieder)."""

@@ -13,6 +13,7 @@ from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
+from foredrive.sensors.vehicle import VehicleSensors
 from foredrive.towns.sensing import echoes, shading
 from foredrive.towns.sensing import wet as wet_ground
 from foredrive.towns.sensing.beams import add_beams
@@ -40,12 +41,9 @@ class EgoRays(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SensorSuite:
-    """The sensors of the recording vehicle."""
+class SensorSuite(VehicleSensors):
+    """The sensors of the recording vehicle, with the way in which a town's renderer samples them."""
 
-    rig: CameraRig
-    """Cameras, without leading dimensions."""
-    lidar: SpinningLidar
     samples_per_outline_pixel: int = 4
     """Number of rays of an outline pixel, a square number. Other pixels have one ray, because textures are
     filtered. Pixels with an outline or a shadow edge have this many."""

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Float64, Int32
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 
 UNIT_LUX = 65_000.0
 """Illuminance under which a white diffuse surface has radiance 1, lx."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 
 FALL_MPS = 7.0
 """Speed of falling drops of 2 mm, m/s (Gunn & Kinzer, J. Meteorology 6, 1949)."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 from foredrive.towns.sensing.air import CONTRAST_LOST, AirArrays, make_air
 from foredrive.towns.sensing.lamps import NO_LAMPS, UNIT_LUX, LampArrays
 from foredrive.towns.sensing.sky import FOG_TOP_M

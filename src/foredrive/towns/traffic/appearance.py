@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.traffic.pedestrians import Pedestrians
 from foredrive.towns.traffic.strays import Stray
 from foredrive.towns.traffic.vehicles import MOTION_S, Poses, Vehicles
