@@ -17,7 +17,7 @@ from foredrive.simulation.lane_rules import (
     way_driven,
 )
 from foredrive.towns.map.town_map import StopZoneKind, TownMap
-from foredrive.towns.traffic.near_lanes import NearLanes
+from foredrive.towns.traffic.lane_index import LaneIndex
 from foredrive.towns.traffic.traffic import Traffic
 
 LANES_WITHIN_M = 6.0
@@ -49,7 +49,7 @@ class LaneRules:
 
     def __init__(self, town: TownMap, traffic: Traffic) -> None:
         self._lines = stop_lines(town)
-        self._near: NearLanes = traffic.near_lanes
+        self._near: LaneIndex = traffic.lane_index
         self._graph = traffic.lanes
 
     def check(

@@ -16,7 +16,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
-from foredrive.ops.threads import one_ahead
+from foredrive.ops.threads import prefetched
 from foredrive.scene import CameraRig, VoxelSpec
 from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import BackgroundTraffic, Conditions
@@ -35,7 +35,7 @@ from foredrive.towns.labels.visibility import is_seen
 from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
@@ -43,7 +43,7 @@ FIRST_TIME_US = 1_577_836_800_000_000
 """Midnight of 1 January 2020 UTC. The time in a log must not depend on when it was recorded."""
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
 """Grid of NeMo."""
-FASTEST_HZ = 100.0
+MAX_RATE_HZ = 100.0
 STATUS_OF_LIGHT = {
     LightState.RED: TrafficLightStatus.RED,
     LightState.YELLOW: TrafficLightStatus.YELLOW,
@@ -111,8 +111,8 @@ def record(
     """
     if not seconds > 0:
         raise InputError(f"a recording takes more than 0 s, got {seconds:g}")
-    if not 0 < rate_hz <= FASTEST_HZ:
-        raise InputError(f"the frame rate lies above 0 and up to {FASTEST_HZ:g} Hz, got {rate_hz:g}")
+    if not 0 < rate_hz <= MAX_RATE_HZ:
+        raise InputError(f"the frame rate lies above 0 and up to {MAX_RATE_HZ:g} Hz, got {rate_hz:g}")
     if seed < 0:
         raise InputError(f"a seed is 0 or more, got {seed}")
     town_map = load_town_map(town)
@@ -121,11 +121,11 @@ def record(
     labels = labels or LabelKinds()
     world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, background_traffic.vehicles + 1, background_traffic.pedestrians)
-    drive = Drive(traffic, seconds)
+    drive = ExpertDrive(traffic, seconds)
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
-    sensed = one_ahead(_sensed(world, drive.moments(count, 1 / rate_hz), sensors, seed))
+    sensed = prefetched(_sensed(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
         for moment in track(sensed, description=f"recording {name}", total=count):
@@ -168,14 +168,14 @@ def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, Tr
 class SensedMoment(NamedTuple):
     """A moment of a drive with its sensor data."""
 
-    moment: Moment
+    moment: DriveSnapshot
     seen: SensorFrame
     seed: int
     """Seed of the random parts of the frame."""
 
 
 def _sensed(
-    world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int
+    world: World, moments: Iterator[DriveSnapshot], sensors: SensorSuite, seed: int
 ) -> Iterator[SensedMoment]:
     for index, moment in enumerate(moments):
         seen = world.render(
