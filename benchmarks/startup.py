@@ -29,7 +29,7 @@ LINES = {
 }
 IMPORTS = {
     "import torch": "torch",
-    "begin: view": "foredrive.view.log_sheet, foredrive.view.log_times",
+    "begin: view": "foredrive.view.log_sheet, foredrive.view.log_frames",
     "begin: convert": "foredrive.data.convert",
     "begin: record": "foredrive.runs.drive.recording, foredrive.towns.campaign",
     "begin: train": "foredrive.recipes, foredrive.runs.train.run",

@@ -12,7 +12,7 @@ from foredrive.data import find_logs
 from foredrive.runs import open_run
 from foredrive.view.example_panel import front_camera
 from foredrive.view.image_drawing import Camera, resize
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.volume_nodes import shown_voxels
 from foredrive.view.voxel_drawing import draw_volume_pca, draw_voxels
 
@@ -22,7 +22,7 @@ PCA_PX, GAP = 198, 6
 NAMES = ("camera", "rendered from the volume", "PCA, mean over Z", "occupancy now", "imagined, 1 s ahead")
 
 
-def row(times: LogTimes, t_s: float) -> list[np.ndarray]:
+def row(times: LogFrames, t_s: float) -> list[np.ndarray]:
     """What the front camera saw, and what the model made of it."""
     index = times.nearest(t_s)
     clip, vision = times.clip(index), times.vision(index)
@@ -57,7 +57,7 @@ def sheet(rows: list[list[np.ndarray]]) -> Image.Image:
 
 def main(log: Path, run: Path, *seconds: float) -> None:
     """One row a time."""
-    times = LogTimes(find_logs(log)[0], CELL_HW[1], open_run(run))
+    times = LogFrames(find_logs(log)[0], CELL_HW[1], open_run(run))
     page = sheet([row(times, t_s) for t_s in seconds])
     page.save(HERE / "nemo_volume.jpg", quality=88, optimize=True)
 

@@ -22,11 +22,11 @@ from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe, save_recipe
 from foredrive.recipes.driveworld_rows import driveworld_rows
-from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
+from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import Needs, needs_of
+from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
-from foredrive.runs.evaluate.vision import Observer
 from foredrive.runs.export import export_run
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
@@ -96,7 +96,7 @@ def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     assert "occupancy.iou_now.copy" not in summary
     assert "flow.epe_moving_now_mps" in summary
     assert "image.psnr_db" not in summary
-    report = report_on_run(run, [log], result.summary, inspect_run(run, [log], 1), result.failures)
+    report = report_on_run(run, [log], result.summary, predict_examples(run, [log], 1), result.failures)
     write_report(tmp_path / "report.html", report)
     assert "carried copy" in (tmp_path / "report.html").read_text()
 
@@ -150,7 +150,7 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     agent = load_agent(run)
     observed = collate([ClipDataset(run.logs, run.recipe.clips, run.cache_dir)[0]]).clip.observed()
     assert agent.act(observed).xy.shape == (1, 1, 6, 2)
-    seen = Observer(agent, 2).look(observed)
+    seen = DisplayPredictor(agent, 2).look(observed)
     assert seen.flow_m.shape == (2, 3, *run.recipe.clips.voxels.shape_zyx)
     start, end = seen.movement_m(1, run.recipe.clips.voxels)
     assert start.shape == end.shape

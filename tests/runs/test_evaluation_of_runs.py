@@ -11,7 +11,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation import EvaluationResult, read_summary
 from foredrive.metrics import PROTOCOLS
-from foredrive.runs import Inspection, Run, evaluate_run, inspect_run
+from foredrive.runs import ExamplePrediction, Run, evaluate_run, predict_examples
 from foredrive.runs.folder import WEIGHTS
 from foredrive.view.report import write_report
 from foredrive.view.run_report import report_on_run
@@ -31,8 +31,8 @@ def result(trained: Run, log: LogPath, folder: Path) -> EvaluationResult:
 
 
 @pytest.fixture(scope="module")
-def inspections(trained: Run, log: LogPath) -> list[Inspection]:
-    return inspect_run(trained, [log], 2)
+def inspections(trained: Run, log: LogPath) -> list[ExamplePrediction]:
+    return predict_examples(trained, [log], 2)
 
 
 def test_the_summary_says_what_it_promises(result: EvaluationResult, folder: Path) -> None:
@@ -75,7 +75,7 @@ def test_baselines_score_what_they_must_on_a_straight_drive(result: EvaluationRe
 
 
 def test_the_report_is_drawn_from_a_run(
-    trained: Run, log: LogPath, result: EvaluationResult, inspections: list[Inspection], tmp_path: Path
+    trained: Run, log: LogPath, result: EvaluationResult, inspections: list[ExamplePrediction], tmp_path: Path
 ) -> None:
     file = tmp_path / "report.html"
     write_report(file, report_on_run(trained, [log], result.summary, inspections, result.failures))
@@ -86,7 +86,7 @@ def test_the_report_is_drawn_from_a_run(
     assert "http://" not in html.replace("http://www.w3.org", "")
 
 
-def test_inspections_are_spread_over_the_log(trained: Run, inspections: list[Inspection]) -> None:
+def test_inspections_are_spread_over_the_log(trained: Run, inspections: list[ExamplePrediction]) -> None:
     past, future = trained.recipe.clips.past_frames, trained.recipe.clips.future_frames
     shape_zyx = trained.recipe.clips.voxels.shape_zyx
     times = [int(inspection.example.key[0].rpartition("@")[2]) for inspection in inspections]

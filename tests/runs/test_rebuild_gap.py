@@ -13,7 +13,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
 from foredrive.runs import Run
-from foredrive.runs.evaluate.real_to_sim_gap import Comparison, measure_gap, rendered_images
+from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, rebuilt_cameras
 from foredrive.runs.rebuild.reconstruct import read_material, reconstruct
 from foredrive.scene import Clip, Trajectory
@@ -80,7 +80,7 @@ def test_agreement_is_of_what_is_said_of_both(trained: Run, log: LogPath) -> Non
     example = ClipDataset([log], config, None)[0]
     bright = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 200))
     dark = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 10))
-    seen = Comparison(Told(), config.image_hw)
+    seen = RealToSimComparison(Told(), config.image_hw)
     seen.add(dataclasses.replace(example, clip=bright), dark)
     figures = seen.figures(0.5)
     assert figures["agreement.occupancy.iou_now"] == pytest.approx(0.5)

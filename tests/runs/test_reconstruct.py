@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.recipes.config import load_values
 from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
 from foredrive.rendering.initial import InitialSize
@@ -76,8 +76,8 @@ def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: L
     assert summary["gaussians"] > 2200  # those that learning may make, and ground that nobody saw
     material = read_material(recipe(), log, run / "cache")
     scene = begin(recipe(), material)
-    before = judge_cameras(scene, material.held_out.cameras, material.learned.cameras)
-    before |= judge_sweeps(scene, material.held_out.sweeps)
+    before = evaluate_cameras(scene, material.held_out.cameras, material.learned.cameras)
+    before |= evaluate_sweeps(scene, material.held_out.sweeps)
     after = {name: value for name, value in summary.items() if isinstance(value, float)}
     assert after["psnr_db"] > before["psnr_db"] + 2
     assert after["ssim"] > before["ssim"]

@@ -122,7 +122,7 @@ def test_what_is_inserted_has_an_id_of_its_own(run: Rebuilt) -> None:
 
 def test_captions_say_what_was_changed() -> None:
     edits = [ShiftEgo((0.0, -2.0, 0.0)), Move(4, (1.0, 0.0, 0.0)), Remove(7), Remove(8)]
-    assert rebuilt_video.caption_of(edits) == "edited: 2 m to the right, 4 moved, without 7, and 1 more"
+    assert rebuilt_video.describe_edits(edits) == "edited: 2 m to the right, 4 moved, without 7, and 1 more"
 
 
 @pytest.mark.parametrize(

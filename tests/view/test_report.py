@@ -21,9 +21,9 @@ from foredrive.view.example_panel import (
     front_camera,
     show_panel,
 )
-from foredrive.view.hero import write_hero
 from foredrive.view.loss_curves import draw_loss_curves
-from foredrive.view.origin import Origin
+from foredrive.view.origin import Provenance
+from foredrive.view.overview import write_overview
 from foredrive.view.report import ReportData, write_report
 from foredrive.view.summary_tables import (
     full_table,
@@ -86,7 +86,7 @@ def report(panel: ExamplePanel) -> ReportData:
     lines = [{"step": i, "loss": 3.0 / i, "occ": 2.0 / i, "perc": 0.0} for i in range(1, 40)]
     return ReportData(
         title="A run & more",
-        origin=Origin("foredrive evaluate runs/a", "abc123", "2 cores", "2026-11-21"),
+        origin=Provenance("foredrive evaluate runs/a", "abc123", "2 cores", "2026-11-21"),
         summary=summary(),
         losses={"pretrain": lines, "finetune": []},
         panels=[panel],
@@ -157,7 +157,7 @@ def test_names_from_outside_run_nothing(report: ReportData, panel: ExamplePanel,
     figures = {"planning.uniad.l2_avg_m": 1.0, f"planning.{EVIL}.failed": 3, EVIL: EVIL}
     evil = ReportData(
         title=EVIL,
-        origin=Origin(EVIL, EVIL, EVIL, EVIL),
+        origin=Provenance(EVIL, EVIL, EVIL, EVIL),
         summary=figures,
         losses={EVIL: [{"step": 1, EVIL: 2.0}]},
         panels=[dataclasses.replace(panel, title=EVIL, example=dataclasses.replace(example, clip=clip))],
@@ -292,11 +292,11 @@ def test_the_report_is_written_whole(report: ReportData, tmp_path: Path) -> None
 
 
 def test_the_hero_needs_images(panel: ExamplePanel, tmp_path: Path) -> None:
-    write_hero(tmp_path / "hero.png", panel)
+    write_overview(tmp_path / "hero.png", panel)
     with Image.open(tmp_path / "hero.png") as picture:
         assert picture.width > 1500
     clip = panel.example.clip
     dark = dataclasses.replace(clip, image_valid=torch.zeros_like(clip.image_valid))
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
     with pytest.raises(InputError, match="no camera images"):
-        write_hero(tmp_path / "none.png", blind)
+        write_overview(tmp_path / "none.png", blind)

@@ -8,7 +8,7 @@ import torch
 from foredrive.data import LogPath
 from foredrive.evaluation import Failure
 from foredrive.recipes import find_recipe
-from foredrive.runs import Inspection, Run
+from foredrive.runs import ExamplePrediction, Run
 from foredrive.scene import Example
 from foredrive.view.run_report import inspection_panel, report_on_run
 
@@ -47,7 +47,7 @@ def test_a_perceptual_loss_that_was_off_and_failures_are_said(tmp_path: Path) ->
 
 def test_an_example_is_named_by_log_and_time(example: Example) -> None:
     shape = example.occupancy.spec.shape_zyx
-    inspection = Inspection(
+    inspection = ExamplePrediction(
         example=Example(
             example.clip, example.occupancy, example.flow, ("town_test/Town05_seed3@1577836802250000",)
         ),

@@ -14,9 +14,9 @@ from miniature import miniature, write_log
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.runs import Run, train_run
-from foredrive.runs.evaluate.vision import Vision
+from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import pinhole
 from foredrive.view.page import free_port
 from foredrive.view.viewer import Viewer
@@ -38,7 +38,7 @@ def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def viewer(log: LogPath, run: Run) -> Iterator[Viewer]:
-    viewer = Viewer(LogTimes(log, 96, run), "localhost", 0)
+    viewer = Viewer(LogFrames(log, 96, run), "localhost", 0)
     yield viewer
     viewer.close()
 
@@ -48,7 +48,7 @@ def node(viewer: Viewer, name: str):
 
 
 def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
-    viewer = Viewer(LogTimes(log, 96), "localhost", 0)
+    viewer = Viewer(LogFrames(log, 96), "localhost", 0)
     with urllib.request.urlopen(viewer.url) as page:
         assert page.status == 200
         assert b"<html" in page.read().lower()
@@ -112,7 +112,7 @@ def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run
     from foredrive.data import ClipDataset, collate
     from foredrive.runs.evaluate.predict import AgentPredictor
 
-    times = LogTimes(log, 96, run)
+    times = LogFrames(log, 96, run)
     vision, observer = times.vision(10), times.observer
     assert vision is not None
     assert observer is not None
@@ -125,13 +125,13 @@ def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run
     assert whole[:, 2::4, 2::4].permute(0, 3, 1, 2).numpy() == pytest.approx(expected[0, 0].numpy(), abs=1e-5)
 
 
-def some_vision(flow: torch.Tensor) -> Vision:
+def some_vision(flow: torch.Tensor) -> DisplayPrediction:
     """Nothing but motion: the vehicle goes 2 m ahead and turns left by 90°."""
     turned = torch.eye(4)
     turned[:2, :2], turned[0, 3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]]), 2.0
     nothing = torch.zeros(2, *SPEC.shape_zyx)
     plan = Trajectory(torch.zeros(1, 1, 2), torch.zeros(1, 1), torch.ones(1, 1).bool(), torch.zeros(1), 0.5)
-    return Vision(nothing, nothing[:, None], torch.stack([torch.eye(4), turned]), flow, plan)
+    return DisplayPrediction(nothing, nothing[:, None], torch.stack([torch.eye(4), turned]), flow, plan)
 
 
 def test_what_stands_still_has_no_arrow_however_the_vehicle_goes() -> None:

@@ -60,10 +60,10 @@ def view(
     if run is not None:
         check_run(run)
 
+    from foredrive.view.log_frames import LogFrames
     from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
-    from foredrive.view.log_times import LogTimes
 
-    times = LogTimes(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    times = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
     index = times.nearest(t)
     if save is not None:
         title = f"{times.name}    t = {times.t_s[index]:.2f} s"

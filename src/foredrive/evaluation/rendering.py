@@ -21,7 +21,7 @@ MOVING_MPS = 0.5
 
 
 @torch.no_grad()
-def judge_cameras(
+def evaluate_cameras(
     scene: RebuiltScene,
     views: Sequence[CameraView],
     learned: Sequence[CameraView],
@@ -73,7 +73,7 @@ def _image(view: CameraView) -> Float[Tensor, "1 3 H W"]:
 
 
 @torch.no_grad()
-def judge_sweeps(
+def evaluate_sweeps(
     scene: RebuiltScene,
     views: Sequence[SweepView],
     *,

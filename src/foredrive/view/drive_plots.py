@@ -19,10 +19,10 @@ from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.html import INK_MARK
 
-AROUND_M, SMALLEST_M = 25.0, 45.0
-FASTEST_MPS = 14.0
+MARGIN_M, MIN_HALF_WIDTH_M = 25.0, 45.0
+MAX_SHOWN_MPS = 14.0
 SPEED_MAP, DARKEST = "plasma", -0.35
-"""Lower end of the speed colours, as a part of `FASTEST_MPS`. It keeps a standing vehicle away from the
+"""Lower end of the speed colours, as a part of `MAX_SHOWN_MPS`. It keeps a standing vehicle away from the
 darkest colours, which look like the road.
 """
 ROAD = "#333d4b"
@@ -39,7 +39,7 @@ LETTERS = {
 """The letter that marks each kind of infraction in the figures."""
 
 
-def draw_way(drive: DriveRecord) -> Figure:
+def draw_drive_path(drive: DriveRecord) -> Figure:
     """Draw the route over the town's lanes, and the driven path coloured by speed.
 
     North is up. Infractions and scenarios are marked. Without a town there are no lanes.
@@ -48,8 +48,8 @@ def draw_way(drive: DriveRecord) -> Figure:
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     route, track = np.array(drive.route_xy), np.array(drive.track.xy)
     everything = np.concatenate([route, track])
-    low, high = everything.min(axis=0) - AROUND_M, everything.max(axis=0) + AROUND_M
-    centre, half = 0.5 * (low + high), max(SMALLEST_M, 0.5 * float((high - low).max()))
+    low, high = everything.min(axis=0) - MARGIN_M, everything.max(axis=0) + MARGIN_M
+    centre, half = 0.5 * (low + high), max(MIN_HALF_WIDTH_M, 0.5 * float((high - low).max()))
     ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, facecolor=palette.PANEL, zorder=0))
     ax.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
     ax.set_aspect("equal")
@@ -64,7 +64,7 @@ def draw_way(drive: DriveRecord) -> Figure:
             list(np.stack([track[:-1], track[1:]], axis=1)),
             array=np.array(drive.track.speed_mps[1:]),
             cmap=SPEED_MAP,
-            norm=Normalize(DARKEST * FASTEST_MPS, FASTEST_MPS),
+            norm=Normalize(DARKEST * MAX_SHOWN_MPS, MAX_SHOWN_MPS),
             linewidth=2.4,
             capstyle="round",
             zorder=3,

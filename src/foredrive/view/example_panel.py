@@ -85,7 +85,7 @@ def show_panel(panel: ExamplePanel) -> ShownPanel:
         cameras=cameras,
         camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
         occupancy=[
-            picture(predicted_voxels(panel, 0), f"Predicted occupancy, {_how_much(panel, 0)}"),
+            picture(predicted_voxels(panel, 0), f"Predicted occupancy, {_content_text(panel, 0)}"),
             picture(labelled_voxels(panel, 0), "Occupancy seen by the lidar, coloured by height"),
         ],
         above=_above(panel),
@@ -198,7 +198,7 @@ def _above(panel: ExamplePanel) -> list[Picture]:
     return above
 
 
-def _how_much(panel: ExamplePanel, step: int) -> str:
+def _content_text(panel: ExamplePanel, step: int) -> str:
     """Return the end of a caption, which says whether any voxel is occupied; the picture is black without."""
     return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
 
@@ -207,7 +207,7 @@ def _later(panel: ExamplePanel) -> list[Picture]:
     clip, pictures = panel.example.clip, []
     for step in range(1, len(panel.occupied)):
         when = f"+{float(clip.t_s[clip.now + step]):.1f} s"
-        caption = f"Imagined occupancy at {when}, {_how_much(panel, step)}"
+        caption = f"Imagined occupancy at {when}, {_content_text(panel, step)}"
         pictures.append(picture(predicted_voxels(panel, step), caption))
         pictures.append(picture(comparison_picture(panel, step), f"Against lidar at {when}", "png"))
     return pictures

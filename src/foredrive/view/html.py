@@ -36,7 +36,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Tile:
+class MetricTile:
     """One of the main metrics of a page."""
 
     name: str

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
-from foredrive.runs.evaluate.imagination import Moment
+from foredrive.runs.evaluate.imagination import ImaginedFutures
 from foredrive.view import palette
 from foredrive.view.example_panel import COMPARISON_KEY, with_ego
 from foredrive.view.image_drawing import resize
@@ -24,31 +24,31 @@ HOLD = 2
 """Number of frames that show now; each later key frame is shown once."""
 
 
-def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: float) -> int:
-    """Write one moment after another, each from now on in real time; return the number of frames."""
+def write_imagination_video(path: Path, moments: Iterable[ImaginedFutures], frame_dt_s: float) -> int:
+    """Write the futures from one time after another, each from now on in real time; return the number of frames."""
     frames = []
-    for moment in moments:
-        shown = [draw_imagined(moment, step, frame_dt_s) for step in range(moment.futures.shape[1])]
+    for imagined in moments:
+        shown = [draw_imagined(imagined, step, frame_dt_s) for step in range(imagined.futures.shape[1])]
         frames += [shown[0]] * HOLD + shown[1:]
     write_video(path, frames, frame_dt_s)
     return len(frames)
 
 
-def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
+def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Image.Image:
     """Draw the recorded and all imagined futures at one key frame: front cameras above, occupancy below.
 
     Args:
         step: index of the key frame; 0 is now.
     """
-    rows = _camera_strips(moment, step)
-    label = moment.example.occupancy
-    frame = moment.example.clip.now + step
+    rows = _camera_strips(imagined, step)
+    label = imagined.example.occupancy
+    frame = imagined.example.clip.now + step
     truth, known = label.values[frame, 0] > 0.5, label.known[frame]
     panels = [("what happened", truth)]
-    count = len(moment.futures)
+    count = len(imagined.futures)
     panels += [
         (f"future {k + 1} of {count}" if count > 1 else "imagined", future[step])
-        for k, future in enumerate(moment.futures)
+        for k, future in enumerate(imagined.futures)
     ]
     lines = -(-len(panels) // COLUMNS)
     cell_h = TITLE_PX + PANEL_PX * truth.shape[2] // truth.shape[1] + GAP_PX
@@ -56,7 +56,7 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
     width = COLUMNS * (PANEL_PX + GAP_PX) + GAP_PX
     canvas = Image.new("RGB", (width, HEAD_PX + strips_h + lines * cell_h + KEY_PX), palette.GROUND)
     pen, y = ImageDraw.Draw(canvas), HEAD_PX
-    _write(pen, (GAP_PX, 9), _title(moment, step, frame_dt_s), 18, palette.INK)
+    _write(pen, (GAP_PX, 9), _title(imagined, step, frame_dt_s), 18, palette.INK)
     for title, strip in rows:
         _write(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
         canvas.paste(Image.fromarray(strip), (GAP_PX, y + TITLE_PX))
@@ -73,9 +73,9 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
     return canvas
 
 
-def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
+def _camera_strips(imagined: ImaginedFutures, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
     """Draw the three cameras that point most straight ahead: recorded images, and rendered ones if any."""
-    clip = moment.example.clip
+    clip = imagined.example.clip
     frame = clip.now + step
     order = camera_rows(clip.rig[frame])
     ahead = order[0][:COLUMNS] if order else []
@@ -83,8 +83,8 @@ def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarra
     if not shown:
         return []
     strips = [("what the cameras saw", _strip(clip.images[frame, shown]))]
-    if moment.rendered is not None:
-        rendered = (moment.rendered[step, shown].clamp(0, 1) * 255).byte()
+    if imagined.rendered is not None:
+        rendered = (imagined.rendered[step, shown].clamp(0, 1) * 255).byte()
         strips.append(("what they see in the imagined volume", _strip(rendered)))
     return strips
 
@@ -99,8 +99,8 @@ def _strip(images: Tensor) -> UInt8[np.ndarray, "h w 3"]:
     return np.concatenate(parts[:-1], axis=1)
 
 
-def _title(moment: Moment, step: int, frame_dt_s: float) -> str:
-    log, _, t_us = moment.example.key[0].rpartition("@")
+def _title(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> str:
+    log, _, t_us = imagined.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     when = f"+{step * frame_dt_s:.1f} s" if step else "now"
     return f"{log}  {taken:%H:%M:%S}   {when}"

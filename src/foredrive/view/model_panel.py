@@ -13,7 +13,7 @@ from viser.transforms import SO3
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.scene import CameraRig
 from foredrive.view import palette
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.scene_nodes import FRUSTUM_M, show_path
 from foredrive.view.volume_nodes import show_flow, show_occupancy, shown_voxels
 
@@ -29,7 +29,7 @@ class ModelPanel:
         times: a log with a run.
     """
 
-    def __init__(self, server: viser.ViserServer, times: LogTimes) -> None:
+    def __init__(self, server: viser.ViserServer, times: LogFrames) -> None:
         assert times.run is not None
         assert times.observer is not None
         self._server, self._times, self._observer = server, times, times.observer

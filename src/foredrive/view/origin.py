@@ -6,7 +6,7 @@ from foredrive.view.table import Summary
 
 
 @dataclass(frozen=True)
-class Origin:
+class Provenance:
     """The command, commit, machine and date of a summary."""
 
     command: str
@@ -15,7 +15,7 @@ class Origin:
     date: str = ""
 
     @classmethod
-    def of(cls, summary: Summary, date: str = "") -> "Origin":
+    def of(cls, summary: Summary, date: str = "") -> "Provenance":
         """Return the origin that a summary's provenance states."""
         machine = [
             f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",

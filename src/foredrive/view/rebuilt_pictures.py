@@ -16,7 +16,7 @@ from foredrive.rendering.free_views import free_camera
 from foredrive.runs.rebuild.film import Shooting, Shot, shoot
 from foredrive.runs.rebuild.rebuilt_run import OpenRun
 from foredrive.view import palette
-from foredrive.view.background import Background
+from foredrive.view.job_runner import JobRunner
 from foredrive.view.model_panel import pinhole
 from foredrive.view.rebuilt_video import Colour, sweep_colours
 from foredrive.view.scene_nodes import FRUSTUM_M, POINT_M, clear
@@ -27,7 +27,7 @@ LIDAR, CAMERAS = "/lidar", "/cameras"
 
 
 @dataclass(frozen=True)
-class Moment:
+class SceneAtTime:
     """An edited scene at one time."""
 
     edited: Edited
@@ -40,12 +40,12 @@ class RebuiltPictures:
     Args:
         server: server of the page.
         run: the shown reconstruction.
-        background: thread that renders everything.
+        jobs: thread that renders everything.
     """
 
-    def __init__(self, server: viser.ViserServer, run: OpenRun, background: Background) -> None:
-        self._server, self._run, self._background = server, run, background
-        self._moment: Moment | None = None
+    def __init__(self, server: viser.ViserServer, run: OpenRun, jobs: JobRunner) -> None:
+        self._server, self._run, self._jobs = server, run, jobs
+        self._shown: SceneAtTime | None = None
         self.layers = {"lidar": True, "cameras": True}
         server.scene.add_frame(CAMERAS, show_axes=False)
         gui, rig = server.gui, run.vehicle.rig
@@ -55,14 +55,14 @@ class RebuiltPictures:
                 "lidar by", ("height", "intensity"), visible=run.vehicle.lidar is not None
             )
             self.images = [gui.add_image(blank, label=name, jpeg_quality=85) for name in rig.names]
-        self.colour.on_update(lambda _: self._ask_lidar())
+        self.colour.on_update(lambda _: self._request_lidar())
 
     def show(self, edited: Edited, t_s: float) -> None:
-        """Request pictures of a moment; queued requests of earlier moments are dropped."""
-        self._moment = Moment(edited, t_s)
-        self._ask_lidar()
+        """Request pictures at a time; queued requests of earlier times are dropped."""
+        self._shown = SceneAtTime(edited, t_s)
+        self._request_lidar()
         for camera, name in enumerate(self._run.vehicle.rig.names):
-            self._background.ask(name, partial(self._show_camera, camera, self._moment))
+            self._jobs.submit(name, partial(self._show_camera, camera, self._shown))
 
     def show_layers(self) -> None:
         """Show the layers that are switched on."""
@@ -70,20 +70,20 @@ class RebuiltPictures:
             if (node := self._server.scene.get_handle_by_name(name)) is not None:
                 node.visible = self.layers[name[1:]]
 
-    def ask_own_view(self, client: viser.ClientHandle) -> None:
+    def request_own_view(self, client: viser.ClientHandle) -> None:
         """Render from the viewpoint of one browser, as the background of its page."""
-        self._background.ask(f"client {client.client_id}", partial(self._show_own_view, client))
+        self._jobs.submit(f"client {client.client_id}", partial(self._show_own_view, client))
 
-    def _ask_lidar(self) -> None:
-        if self._moment is not None and self._run.vehicle.lidar is not None:
-            self._background.ask(LIDAR, partial(self._show_lidar, self._moment))
+    def _request_lidar(self) -> None:
+        if self._shown is not None and self._run.vehicle.lidar is not None:
+            self._jobs.submit(LIDAR, partial(self._show_lidar, self._shown))
 
-    def _shot(self, moment: Moment, shooting: Shooting) -> Shot:
-        return shoot(self._run.scene, self._run.vehicle, moment.edited, shooting, 0)
+    def _shot(self, shown: SceneAtTime, shooting: Shooting) -> Shot:
+        return shoot(self._run.scene, self._run.vehicle, shown.edited, shooting, 0)
 
-    def _show_camera(self, camera: int, moment: Moment) -> None:
+    def _show_camera(self, camera: int, shown: SceneAtTime) -> None:
         rig = self._run.vehicle.rig
-        shot = self._shot(moment, Shooting((moment.t_s,), 1.0, (camera,), None))
+        shot = self._shot(shown, Shooting((shown.t_s,), 1.0, (camera,), None))
         rgb = shot.images[0].permute(1, 2, 0).numpy()
         self.images[camera].image = rgb
         pose = rig.T_ego_cam[camera].double().numpy()
@@ -101,8 +101,8 @@ class RebuiltPictures:
             receive_shadow=False,
         )
 
-    def _show_lidar(self, moment: Moment) -> None:
-        sweep = self._shot(moment, Shooting((moment.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
+    def _show_lidar(self, shown: SceneAtTime) -> None:
+        sweep = self._shot(shown, Shooting((shown.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
         assert sweep is not None
         returned = sweep[sweep.returned]
         if len(returned.range_m) == 0:
@@ -118,16 +118,16 @@ class RebuiltPictures:
         )
 
     def _show_own_view(self, client: viser.ClientHandle) -> None:
-        assert self._moment is not None
-        camera, moment = client.camera, self._moment
+        assert self._shown is not None
+        camera, shown = client.camera, self._shown
         T_ego_cam = np.eye(4)
         T_ego_cam[:3, :3], T_ego_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
         rig = pinhole(T_ego_cam, camera.fov, camera.aspect, OWN_HEIGHT_PX)
-        ego = self._run.vehicle.at(moment.t_s).shifted(moment.edited.T_ego_shifted.cpu())
+        ego = self._run.vehicle.at(shown.t_s).shifted(shown.edited.T_ego_shifted.cpu())
         scene = self._run.scene
         with torch.no_grad():
             view = free_camera(rig, 0, ego, sensor=0).to(scene.actor.device)
-            rgb = _bytes(scene(moment.edited.graph, view).rgb)
+            rgb = _bytes(scene(shown.edited.graph, view).rgb)
         client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)
 
 

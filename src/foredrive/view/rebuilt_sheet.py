@@ -14,7 +14,7 @@ from foredrive.metrics import psnr_db
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView
-from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
+from foredrive.view.palette import MAX_RANGE_M, MIN_RANGE_M, range_colours
 
 ROWS = 4
 WIDTH_IN = 4.0
@@ -53,7 +53,7 @@ def write_rebuilt_sheet(
             f"seen at {view.t_s:.1f} s": _bytes(real),
             f"rendered, {quality:.1f} dB": _bytes(rgb),
             "difference": _bytes((rgb - real).abs()),
-            f"range, {NEAREST_M:g} m bright to {FARTHEST_M:g} m dark": _ranges(picture.range_m.cpu()),
+            f"range, {MIN_RANGE_M:g} m bright to {MAX_RANGE_M:g} m dark": _ranges(picture.range_m.cpu()),
         }
         for axis, (name, image) in zip(row, shown.items(), strict=True):
             axis.imshow(image)

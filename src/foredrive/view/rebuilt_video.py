@@ -34,7 +34,7 @@ ABOVE_M = 100.0
 """Width of the view from above, m."""
 LOW_M, HIGH_M = -0.5, 4.0
 """Ends of the colour scale of heights above the ground, m."""
-MOST_EDITS = 3
+MAX_NAMED_EDITS = 3
 """Maximum number of edits that a caption names."""
 
 
@@ -49,7 +49,7 @@ def write_rebuilt_video(
     check_video(path)
     takes = [("as it was", apply_edits(run.scene.graph, []))]
     if edits:
-        takes.append((caption_of(edits), edited_scene(run.scene, edits)))
+        takes.append((describe_edits(edits), edited_scene(run.scene, edits)))
     make_folder(path.parent)
     rig, chosen = run.vehicle.rig, list(shooting.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
@@ -87,14 +87,14 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
     return canvas
 
 
-def caption_of(edits: Sequence[Edit]) -> str:
+def describe_edits(edits: Sequence[Edit]) -> str:
     """Describe edits."""
-    words = [words_of(edit) for edit in edits[:MOST_EDITS]]
-    more = len(edits) - MOST_EDITS
+    words = [describe_edit(edit) for edit in edits[:MAX_NAMED_EDITS]]
+    more = len(edits) - MAX_NAMED_EDITS
     return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
 
 
-def words_of(edit: Edit) -> str:
+def describe_edit(edit: Edit) -> str:
     """Describe an edit."""
     if isinstance(edit, Remove):
         return f"without {edit.actor}"
@@ -116,7 +116,7 @@ def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
     each_px = ONE_CAMERA_PX if longest == 1 else CAMERA_PX
     width = longest * (each_px + GAP_PX) - GAP_PX
     height = each_px * rig.size_hw[0] // rig.size_hw[1]
-    above = None if shot.sweep is None else _from_above(shot.sweep, shot.boxes, width, colour)
+    above = None if shot.sweep is None else _draw_from_above(shot.sweep, shot.boxes, width, colour)
     whole = len(rows) * (height + GAP_PX) + (0 if above is None else above.height)
     canvas = Image.new("RGB", (width, whole), palette.GROUND)
     for line, row in enumerate(rows):
@@ -128,7 +128,7 @@ def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
     return canvas
 
 
-def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
+def _draw_from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
     """Draw coloured returns, low ones first, and the outlines of the actors with their ids."""
     twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of lines
     height_px = round(ABOVE_HW[0] * width_px)

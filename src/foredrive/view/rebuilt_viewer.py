@@ -9,8 +9,8 @@ import viser
 
 from foredrive.rendering.edits import Edit
 from foredrive.runs.rebuild.rebuilt_run import OpenRun
-from foredrive.view.background import Background
 from foredrive.view.edit_panel import EditPanel
+from foredrive.view.job_runner import JobRunner
 from foredrive.view.page import close_page, open_page, page_url
 from foredrive.view.rebuilt_nodes import RebuiltNodes
 from foredrive.view.rebuilt_pictures import RebuiltPictures
@@ -47,16 +47,16 @@ class RebuiltViewer:
         self.server = open_page(run.folder.name, host, port)
         self.server.initial_camera.far = FAR_M
         self._showing = threading.RLock()
-        self.background = Background(self.tell)
+        self.jobs = JobRunner(self.tell)
         show_ego(self.server.scene)
         graph = run.scene.graph.map_tensors(lambda tensor: tensor.detach())
-        way_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
+        path_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
         self.nodes = RebuiltNodes(
-            self.server.scene, graph, way_m, lambda track_id: self.edits.choose(track_id)
+            self.server.scene, graph, path_m, lambda track_id: self.edits.choose(track_id)
         )
         self._add_controls()
         self.edits = EditPanel(self.server, graph, self.nodes, file, self.tell, self.show_now)
-        self.pictures = RebuiltPictures(self.server, run, self.background)
+        self.pictures = RebuiltPictures(self.server, run, self.jobs)
         self.server.on_client_connect(self._welcome)
         if not self.edits.replace(edits):
             self.show_now()
@@ -97,7 +97,7 @@ class RebuiltViewer:
 
     def close(self) -> None:
         """Stop rendering and serving."""
-        self.background.close()
+        self.jobs.close()
         close_page(self.server)
 
     def _add_controls(self) -> None:
@@ -146,10 +146,10 @@ class RebuiltViewer:
     def _show_own_views(self) -> None:
         if self.own.value:
             for client in self.server.get_clients().values():
-                self.pictures.ask_own_view(client)
+                self.pictures.request_own_view(client)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self.pictures.ask_own_view(client) if self.own.value else None)
+        client.camera.on_update(lambda _: self.pictures.request_own_view(client) if self.own.value else None)
         for pause_s in NUDGES_S:
             time.sleep(pause_s)
             self.nodes.nudge()

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.view.example_panel import ExamplePanel, show_panel
-from foredrive.view.html import Tile, write_page
+from foredrive.view.html import MetricTile, write_page
 from foredrive.view.loss_curves import Losses, draw_loss_curves
-from foredrive.view.origin import Origin
+from foredrive.view.origin import Provenance
 from foredrive.view.summary_tables import (
-    CONSTANT,
+    PRIOR,
     flow_table,
     full_table,
     image_table,
     occupancy_table,
     planning_overview,
     planning_table,
-    ratio_to_constant,
+    ratio_to_prior,
 )
 from foredrive.view.table import Summary, Value, number, words
 
@@ -25,7 +25,7 @@ COMMAND_SOURCES = {
     "driven_future": "the driven future, which leaks part of the answer",
     "none": "nowhere",
 }
-AGAINST = "constant_velocity"
+REFERENCE = "constant_velocity"
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ReportData:
     """The content of a report; a part without content is left out."""
 
     title: str
-    origin: Origin
+    origin: Provenance
     summary: Summary
     losses: Losses
     panels: Sequence[ExamplePanel]
@@ -82,25 +82,25 @@ def _alerts(report: ReportData) -> list[Alert]:
     return alerts + [Alert(note) for note in report.notes]
 
 
-def _tiles(summary: Summary) -> list[Tile]:
+def _tiles(summary: Summary) -> list[MetricTile]:
     """Return tiles of the main metrics."""
     tiles = []
 
     def add(name: str, value: Value, digits: int, unit: str = "", note: str = "") -> None:
         if value is not None:
-            tiles.append(Tile(name, number(value, digits), unit, note))
+            tiles.append(MetricTile(name, number(value, digits), unit, note))
 
     for scope, title in (("above_ground.", "above ground"), ("", "all")):
         key = f"occupancy.{scope}iou_now"
-        ratio, constant = ratio_to_constant(summary, key), number(summary.get(f"{key}.{CONSTANT}"))
+        ratio, constant = ratio_to_prior(summary, key), number(summary.get(f"{key}.{PRIOR}"))
         note = "" if ratio is None else f"{ratio:.1f} \N{MULTIPLICATION SIGN} the best constant's {constant}"
         add(f"Occupancy IoU, {title}, now", summary.get(key), 3, "", note)
     for metric, title, unit in (
         ("uniad.l2_avg_m", "Planning L2, UniAD, average", "m"),
         ("uniad.collision_avg_pct", "Planning collisions, UniAD, average", "%"),
     ):
-        other = summary.get(f"planning.{AGAINST}.{metric}")
-        note = "" if other is None else f"{words(AGAINST)}: {number(other, 2)} {unit}"
+        other = summary.get(f"planning.{REFERENCE}.{metric}")
+        note = "" if other is None else f"{words(REFERENCE)}: {number(other, 2)} {unit}"
         add(title, summary.get(f"planning.{metric}"), 2, unit, note)
     psnr = next((value for key, value in summary.items() if key.endswith(".psnr_db")), None)
     add("Rendered images, PSNR", psnr, 1, "dB")

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 from foredrive.data import LogPath
 from foredrive.evaluation import Failure
-from foredrive.runs import Inspection, Run
+from foredrive.runs import ExamplePrediction, Run
 from foredrive.runs.train.run import STAGES
 from foredrive.training import read_metrics
 from foredrive.view.example_panel import ExamplePanel
 from foredrive.view.loss_curves import Losses
-from foredrive.view.origin import Origin
+from foredrive.view.origin import Provenance
 from foredrive.view.report import ReportData
 from foredrive.view.table import Summary
 
@@ -22,14 +22,14 @@ def report_on_run(
     run: Run,
     logs: Sequence[LogPath],
     summary: Summary,
-    inspections: Sequence[Inspection],
+    inspections: Sequence[ExamplePrediction],
     failures: Sequence[Failure] = (),
 ) -> ReportData:
     """Collect the content of a run's report on some logs; the first few failures are named."""
     losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
     return ReportData(
         title=f"{run.recipe.name} on {_names(logs)}",
-        origin=Origin.of(summary, datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
+        origin=Provenance.of(summary, datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
         summary=summary,
         losses=losses,
         panels=[inspection_panel(inspection) for inspection in inspections],
@@ -37,7 +37,7 @@ def report_on_run(
     )
 
 
-def inspection_panel(inspection: Inspection) -> ExamplePanel:
+def inspection_panel(inspection: ExamplePrediction) -> ExamplePanel:
     """Return the panel of an example."""
     log, _, t_us = inspection.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)

@@ -5,7 +5,7 @@ from pathlib import Path
 from foredrive.evaluation.detections import FrameScore
 from foredrive.evaluation.detections.score import PARTS
 from foredrive.runs.score.run import ScoredDetections
-from foredrive.view.frame_of_detections import draw_frame
+from foredrive.view.detection_frame_plot import draw_detection_frame
 from foredrive.view.html import inline_svg, write_page
 from foredrive.view.reliability_diagram import draw_reliability
 from foredrive.view.summary_tables import full_table
@@ -70,7 +70,7 @@ def write_score_report(
         table=score_table(figures),
         diagrams=[inline_svg(draw_reliability(*each)) for each in scored.summary.diagrams.items()],
         frames=[
-            (inline_svg(draw_frame(frame, score, scored.detections.upright)), _caption(score))
+            (inline_svg(draw_detection_frame(frame, score, scored.detections.is_3d)), _caption(score))
             for frame, score in ranked[:worst]
         ],
         every_figure=full_table(figures),

@@ -22,7 +22,7 @@ from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import FACTS, IndexRow
 from foredrive.search.tables import quoted_list
-from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
+from foredrive.view.hit_picture import content_text, hit_name, hit_picture, score_text
 from foredrive.view.html import render_page
 
 JPEG_QUALITY = 85
@@ -45,8 +45,8 @@ class ShownHit:
     @classmethod
     def of(cls, hit: Hit) -> "ShownHit":
         """Return the shown values of a hit."""
-        why = why_matched(hit) if hit.scores else ""
-        return cls(_key(hit.row), hit_name(hit), why, what_is_there(hit), hit.row.caption)
+        why = score_text(hit) if hit.scores else ""
+        return cls(_key(hit.row), hit_name(hit), why, content_text(hit), hit.row.caption)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ShownHits:
 
 
 @dataclass(frozen=True)
-class Point:
+class MapPoint:
     """A whole scene on the map: its position, -1 to 1, and the facts that can colour it."""
 
     x: float
@@ -72,23 +72,23 @@ class Point:
     time_of_day: str | None
 
     @classmethod
-    def of(cls, xy: Sequence[float], row: IndexRow) -> "Point":
+    def of(cls, xy: Sequence[float], row: IndexRow) -> "MapPoint":
         """Return the point of a row of the index."""
         facts = (row.log, row.place, row.weather, row.time_of_day)
         return cls(xy[0], xy[1], _key(row), row.key, f"{row.log}@{row.t_s:.1f}s", *facts)
 
 
 @dataclass(frozen=True)
-class Map:
+class SceneMap:
     """All scenes on a plane, and the share of their variance that the plane shows."""
 
-    points: list[Point]
+    points: list[MapPoint]
     share: float
     total: int
 
 
 @dataclass(frozen=True)
-class Done:
+class StatusMessage:
     """A line about a finished action."""
 
     told: str
@@ -167,10 +167,10 @@ class SearchPage:
         how = "all compared" if found.exact else f"{found.compared} compared"
         return ShownHits([*map(ShownHit.of, found.hits)], f"{len(found.hits)} hits, {how}")
 
-    def _map(self, _: Mapping[str, str]) -> Map:
+    def _map(self, _: Mapping[str, str]) -> SceneMap:
         plane = project_scenes(self._index)
         scenes = zip(plane.xy.tolist(), plane.rows, strict=True)
-        return Map([Point.of(xy, row) for xy, row in scenes], plane.share, plane.total)
+        return SceneMap([MapPoint.of(xy, row) for xy, row in scenes], plane.share, plane.total)
 
     def _picture(self, asked: Mapping[str, str]) -> bytes:
         (hit,) = self._rows([_parse_key(asked["key"])])
@@ -182,20 +182,20 @@ class SearchPage:
         hits = self._rows([_parse_key(key) for key in told["keys"][:MAX_SHOWN]])
         return ShownHits([*map(ShownHit.of, hits)], f"{len(told['keys'])} scenes, {len(hits)} shown")
 
-    def _tag(self, told: Mapping[str, Any]) -> Done:
+    def _tag(self, told: Mapping[str, Any]) -> StatusMessage:
         name = str(told["tag"]).strip()
         if not name:
             raise InputError("a tag has a name")
         add_tag(self._index.uri, name, [_parse_key(key)[0] for key in told["keys"]])
-        return Done(f"{len(told['keys'])} moments are tagged {name}")
+        return StatusMessage(f"{len(told['keys'])} moments are tagged {name}")
 
     def _clips(self, told: Mapping[str, Any]) -> Mapping[str, object]:
         hits = self._rows([_parse_key(key) for key in told["keys"]])
         return listed_clips(hits, float(told["before"]), float(told["after"]))
 
-    def _save(self, told: Mapping[str, Any]) -> Done:
+    def _save(self, told: Mapping[str, Any]) -> StatusMessage:
         save_query(self._index.uri, str(told["name"]), query_of(told["asked"]).to_json())
-        return Done(f"kept as {told['name']}")
+        return StatusMessage(f"kept as {told['name']}")
 
     def _rows(self, keys: Sequence[Key]) -> list[Hit]:
         """Return the rows of some keys, in their order, as hits without scores."""

@@ -41,7 +41,7 @@ AGENT_TITLES = {MODEL: "this model", "ego_mlp": "MLP of ego status alone"}
 WHENS = (*HORIZON_NAMES, "avg")
 SCOPE_TITLES = {"": "all voxels", "above_ground.": "above the ground"}
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
-CONSTANT = "best_constant"
+PRIOR = "best_constant"
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
 _FLOW = re.compile(r"flow\.epe_moving_(\w+)_mps")
@@ -109,7 +109,7 @@ def occupancy_table(summary: Summary) -> Table | None:
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
         return None
-    others = [name for name in occupancy_baselines(summary) if name != CONSTANT]
+    others = [name for name in occupancy_baselines(summary) if name != PRIOR]
     columns = [
         Column(align="left"),
         *(Column(title, "this model") for title in OCCUPANCY_TITLES.values()),
@@ -123,8 +123,8 @@ def occupancy_table(summary: Summary) -> Table | None:
         for when in whens:
             iou = f"occupancy.{scope}iou_{when}"
             keys = [f"occupancy.{scope}{metric}_{when}" for metric in OCCUPANCY_TITLES]
-            keys += [f"{key}.{CONSTANT}" for key in keys]
-            ratio = ratio_to_constant(summary, iou)
+            keys += [f"{key}.{PRIOR}" for key in keys]
+            ratio = ratio_to_prior(summary, iou)
             cells = [summary.get(key) for key in keys]
             cells.append(MISSING if ratio is None else f"{ratio:.2f} \N{MULTIPLICATION SIGN}")
             cells += [summary.get(f"{iou}.{name}") for name in others]
@@ -161,9 +161,9 @@ def full_table(summary: Summary) -> Table:
     return simple_table((Column("key", align="left"), Column("value", digits=5)), sorted(summary.items()))
 
 
-def ratio_to_constant(summary: Summary, key: str) -> float | None:
+def ratio_to_prior(summary: Summary, key: str) -> float | None:
     """Return the model's value divided by that of the occupancy prior; None if a value is missing."""
-    value, constant = summary.get(key), summary.get(f"{key}.{CONSTANT}")
+    value, constant = summary.get(key), summary.get(f"{key}.{PRIOR}")
     if not isinstance(value, float) or not isinstance(constant, float) or not constant > 0:
         return None
     return value / constant

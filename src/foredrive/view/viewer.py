@@ -4,7 +4,7 @@ import threading
 import time
 
 from foredrive.view import palette
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import ModelPanel
 from foredrive.view.page import close_page, open_page, page_url
 from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_lidar, show_map, show_path
@@ -27,7 +27,7 @@ class Viewer:
         InputError: the page cannot be served there.
     """
 
-    def __init__(self, times: LogTimes, host: str, port: int) -> None:
+    def __init__(self, times: LogFrames, host: str, port: int) -> None:
         self.times = times
         self._drawing, self._drawn = threading.Lock(), -1
         self.server = open_page(times.name, host, port)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
-from foredrive.runs.evaluate.vision import Vision
+from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import VoxelSpec
 from foredrive.view import palette
 from foredrive.view.scene_nodes import clear
@@ -31,7 +31,7 @@ _CUBE_FACES = np.array(
 
 
 def shown_voxels(
-    vision: Vision, k: int, spec: VoxelSpec, above: float, lowest_m: float
+    vision: DisplayPrediction, k: int, spec: VoxelSpec, above: float, lowest_m: float
 ) -> Bool[Tensor, "Z Y X"]:
     """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
@@ -44,7 +44,7 @@ def shown_voxels(
 
 def show_occupancy(
     scene: viser.SceneApi,
-    vision: Vision,
+    vision: DisplayPrediction,
     k: int,
     spec: VoxelSpec,
     shown: Bool[Tensor, "Z Y X"],
@@ -76,7 +76,7 @@ def show_occupancy(
 
 
 def show_flow(
-    scene: viser.SceneApi, vision: Vision, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
+    scene: viser.SceneApi, vision: DisplayPrediction, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
 ) -> None:
     """Draw the movement of shown voxels since frame k - 1 as arrows over the ground; none for now."""
     movement = None if k == 0 else vision.movement_m(k, spec)

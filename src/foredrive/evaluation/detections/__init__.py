@@ -2,13 +2,13 @@
 
 from foredrive.evaluation.detections.files import read_detections
 from foredrive.evaluation.detections.frame_file import write_frame_scores
-from foredrive.evaluation.detections.frames import DetectionSet, Frame
+from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
 from foredrive.evaluation.detections.score import FrameScore, predicted_set, score_frames
 from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
 
 __all__ = [
+    "DetectionFrame",
     "DetectionSet",
-    "Frame",
     "FrameScore",
     "ScoreSummary",
     "compare_scores",

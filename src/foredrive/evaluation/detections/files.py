@@ -19,13 +19,13 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
     else:
-        said, true = _read_json(results), _read_json(truth)
+        predicted, true = _read_json(results), _read_json(truth)
         if not isinstance(true, dict):
             raise InputError(f"{truth}: neither an object with `results` (nuScenes) nor with `images` (COCO)")
-        if isinstance(said, dict):
-            read = read_nuscenes(said, true, results, truth, family)
-        elif isinstance(said, list):
-            read = read_coco(said, true, results, truth, family)
+        if isinstance(predicted, dict):
+            read = read_nuscenes(predicted, true, results, truth, family)
+        elif isinstance(predicted, list):
+            read = read_coco(predicted, true, results, truth, family)
         else:
             raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
     if not read.frames:

@@ -17,5 +17,5 @@ def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
     with atomic_path(path) as temporary, temporary.open("w") as file:
         for score in scores:
             parts = {"nll": score.nll, **score.parts}
-            told = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
-            file.write(json.dumps({"frame": score.name, **told}) + "\n")
+            scores = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
+            file.write(json.dumps({"frame": score.name, **scores}) + "\n")

@@ -44,7 +44,9 @@ class PlanningMetric:
             self._collisions[name] += torch.stack(kinds).cpu()
             self._frames[name] += int(scores.counted.sum())
             self._frames_with_boxes[name] += int(scores.collision_counted.sum())
-            invalid = int((scores.planned & ~scores.complete).sum())  # the same under every protocol
+            invalid = int(
+                (scores.plan_complete & ~scores.future_complete).sum()
+            )  # the same under every protocol
         self._frames_invalid += invalid
 
     def result(self) -> Figures:

@@ -35,7 +35,7 @@ FUTURES = 5
 
 
 @dataclass(frozen=True)
-class Inspection:
+class ExamplePrediction:
     """One unbatched example and the model's predictions, for pictures."""
 
     example: Example
@@ -129,7 +129,7 @@ def evaluate_run(
 
 
 @torch.no_grad()
-def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
+def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[ExamplePrediction]:
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
     agent = load_agent(run)
     clips = run.recipe.clips
@@ -147,7 +147,7 @@ def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspectio
         assert prediction.occupancy_logit is not None
         assert prediction.plan is not None
         found.append(
-            Inspection(
+            ExamplePrediction(
                 example=item,
                 occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
                 rendered=None if prediction.images is None else prediction.images[0, 0],

@@ -16,7 +16,7 @@ from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.files import atomic_path
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
@@ -256,8 +256,8 @@ def _summary(
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
         "peak_memory_gib": peak_rss_gib(),
-        **judge_cameras(scene, held.cameras, material.learned.cameras),
-        **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
+        **evaluate_cameras(scene, held.cameras, material.learned.cameras),
+        **evaluate_sweeps(scene, held.sweeps, drop=recipe.drop),
         **collect_provenance(),
     }
 

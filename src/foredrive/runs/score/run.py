@@ -71,7 +71,7 @@ def _score(results: Path, truth: Path, family: Family, k: int) -> ScoredDetectio
     detections = read_detections(results, truth, family)
     with Progress(transient=True) as progress:
         task = progress.add_task(results.name, total=len(detections.frames))
-        frames = score_frames(detections, k=k, told=lambda done: progress.update(task, completed=done))
+        frames = score_frames(detections, k=k, on_frame=lambda done: progress.update(task, completed=done))
     return ScoredDetections(detections, frames, summarise_scores(detections, frames))
 
 

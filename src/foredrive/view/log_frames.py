@@ -12,14 +12,14 @@ from foredrive.scene import Clip, VoxelSpec
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
-    from foredrive.runs.evaluate.vision import Observer, Vision
+    from foredrive.runs.evaluate.display import DisplayPrediction, DisplayPredictor
 
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
 """Voxel grid of the labels, which every clip has and this module does not use."""
 KEPT = 16
 
 
-class LogTimes:
+class LogFrames:
     """The frames of a log in the order of time.
 
     Args:
@@ -32,7 +32,7 @@ class LogTimes:
             model, or is too short for it.
     """
 
-    observer: "Observer | None"
+    observer: "DisplayPredictor | None"
     """Predicts with the run; None without a run."""
 
     def __init__(self, path: LogPath, image_width_px: int, run: "Run | None" = None) -> None:
@@ -57,11 +57,11 @@ class LogTimes:
         """Time of every frame since the start of the log, s."""
         self.observer = None
         if run is not None:
-            from foredrive.runs.evaluate.vision import Observer
+            from foredrive.runs.evaluate.display import DisplayPredictor
             from foredrive.runs.train.run import load_agent  # without a run, models are not imported
 
             size = run.recipe.clips
-            self.observer = Observer(load_agent(run), size.future_frames)
+            self.observer = DisplayPredictor(load_agent(run), size.future_frames)
             seen = dataclasses.replace(
                 size,
                 future_frames=0,
@@ -93,7 +93,7 @@ class LogTimes:
         """Read a frame as a clip of one key frame, without batch dimension."""
         return self._clips[index].clip
 
-    def _vision(self, index: int) -> "Vision | None":
+    def _vision(self, index: int) -> "DisplayPrediction | None":
         """Predict with the run; None without a run, and at frames without enough past."""
         if self.observer is None or (seen := self._observed_index[index]) is None:
             return None

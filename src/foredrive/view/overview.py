@@ -14,7 +14,7 @@ from foredrive.view import palette
 from foredrive.view.bev import path_points
 from foredrive.view.example_panel import ExamplePanel
 from foredrive.view.log_sheet import camera_picture, camera_rows
-from foredrive.view.voxel_drawing import Eye, draw_voxels
+from foredrive.view.voxel_drawing import Viewpoint, draw_voxels
 
 DPI = 100
 CAMERA_WIDTH_PX, VOXELS_WIDTH_PX = 384, 760
@@ -25,7 +25,7 @@ PATH_WIDTH_PX, DOT_PX = 4, 5
 CAPTION_OUT = "What the model makes of the cameras: occupancy and a plan (red; driven: green)"
 
 
-def write_hero(path: Path, panel: ExamplePanel) -> None:
+def write_overview(path: Path, panel: ExamplePanel) -> None:
     """Write the picture as a PNG, about 1,900 px wide.
 
     Raises:
@@ -59,29 +59,29 @@ def write_hero(path: Path, panel: ExamplePanel) -> None:
 
 def occupancy_with_paths(panel: ExamplePanel, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Draw predicted occupancy now in perspective, with the vehicle, the driven future and the plan."""
-    eye = Eye.behind(panel.spec, size_hw)
-    picture = draw_voxels(panel.occupied[0], panel.spec, size_hw, eye)
+    viewpoint = Viewpoint.behind(panel.spec, size_hw)
+    picture = draw_voxels(panel.occupied[0], panel.spec, size_hw, viewpoint)
     large_hw = (size_hw[0] * SUPERSAMPLING, size_hw[1] * SUPERSAMPLING)
     canvas = Image.fromarray(picture).resize(large_hw[::-1], Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(canvas)
-    _draw_path(draw, eye, large_hw, panel.example.clip.future, palette.EXPERT)
+    _draw_path(draw, viewpoint, large_hw, panel.example.clip.future, palette.EXPERT)
     if panel.plan is not None:
-        _draw_path(draw, eye, large_hw, panel.plan, palette.PLAN)
-    _draw_ego(draw, eye, large_hw)
+        _draw_path(draw, viewpoint, large_hw, panel.plan, palette.PLAN)
+    _draw_ego(draw, viewpoint, large_hw)
     return np.asarray(canvas.resize(size_hw[::-1], Image.Resampling.BOX))
 
 
 def _draw_path(
-    draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int], path: Trajectory, colour: str
+    draw: ImageDraw.ImageDraw, viewpoint: Viewpoint, size_hw: tuple[int, int], path: Trajectory, colour: str
 ) -> None:
-    points = [tuple(p) for p in eye.project(path_points(path).numpy(), size_hw).tolist()]
+    points = [tuple(p) for p in viewpoint.project(path_points(path).numpy(), size_hw).tolist()]
     draw.line(points, fill=colour, width=PATH_WIDTH_PX * SUPERSAMPLING, joint="curve")
     for x, y in points[1:]:
         draw.circle((x, y), DOT_PX * SUPERSAMPLING, fill=colour, outline=palette.GROUND, width=2)
 
 
-def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> None:
-    """Draw the vehicle as a box: the rear, right side and top that the eye sees."""
+def _draw_ego(draw: ImageDraw.ImageDraw, viewpoint: Viewpoint, size_hw: tuple[int, int]) -> None:
+    """Draw the vehicle as a box: the rear, right side and top that the viewpoint sees."""
     (x0, y0, z0), (x1, y1, z1) = EGO_LOWER_M, EGO_UPPER_M
     faces = (
         (0.62, [(x0, y0, z0), (x0, y1, z0), (x0, y1, z1), (x0, y0, z1)]),
@@ -89,7 +89,7 @@ def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> 
         (1.0, [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)]),
     )
     for light, face in faces:
-        corners = eye.project(np.array(face), size_hw)
+        corners = viewpoint.project(np.array(face), size_hw)
         fill = tuple(round(light * c) for c in palette.rgb255(palette.EGO))
         draw.polygon([tuple(p) for p in corners.tolist()], fill=fill, outline=palette.GROUND)
 
