@@ -32,8 +32,7 @@ from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
 from foredrive.training import DriveWorldObjective, load_weights, read_metrics, save_weights
 from foredrive.view.imagination_video import write_imagination_video
-from foredrive.view.report import write_report
-from foredrive.view.run_report import report_on_run
+from foredrive.view.run_report import report_on_run, write_run_report
 
 FUTURES = 2
 
@@ -97,7 +96,7 @@ def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     assert "flow.epe_moving_now_mps" in summary
     assert "image.psnr_db" not in summary
     report = report_on_run(run, [log], result.summary, predict_examples(run, [log], 1), result.failures)
-    write_report(tmp_path / "report.html", report)
+    write_run_report(tmp_path / "report.html", report)
     assert "carried copy" in (tmp_path / "report.html").read_text()
 
 
@@ -150,7 +149,7 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     agent = load_agent(run)
     observed = collate([ClipDataset(run.logs, run.recipe.clips, run.cache_dir)[0]]).clip.observed()
     assert agent.act(observed).xy.shape == (1, 1, 6, 2)
-    seen = DisplayPredictor(agent, 2).look(observed)
+    seen = DisplayPredictor(agent, 2).predict(observed)
     assert seen.flow_m.shape == (2, 3, *run.recipe.clips.voxels.shape_zyx)
     start, end = seen.movement_m(1, run.recipe.clips.voxels)
     assert start.shape == end.shape

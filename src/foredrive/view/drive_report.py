@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
+from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
 from foredrive.simulation.drive_record import DriveRecord, ThreatMet
@@ -18,8 +18,7 @@ from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
 from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
 from foredrive.view.drive_video import write_drive_video
-from foredrive.view.html import MetricTile, inline_svg, write_page
-from foredrive.view.origin import Provenance
+from foredrive.view.html import MetricTile, Provenance, inline_svg, write_page
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import (
     MISSING,
@@ -27,7 +26,6 @@ from foredrive.view.table import (
     Column,
     Row,
     Section,
-    Summary,
     Table,
     Value,
     number,
@@ -85,8 +83,8 @@ def score_table(summary: Summary) -> Table:
         if ending is not Ending.COMPLETED and summary[f"endings.{ending}"]
     ]
     rest = [
-        Row(["Drives that the agent failed at", summary["failed"]]),
-        Row(["Time of a plan, ms", number(summary["plan_ms"], 0)]),
+        Row(["Failed drives", summary["failed"]]),
+        Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
     title = f"{number(summary['routes'])} routes, {number(summary['repetitions'])} repetitions"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
@@ -114,7 +112,7 @@ def write_drive_report(out: Path) -> Path:
         out / REPORT,
         "drive_report.html.j2",
         title=title,
-        origin=Provenance.of(summary),
+        provenance=Provenance.of(summary),
         tiles=_tiles(summary),
         endings=_counted(summary, "endings", Ending),
         scenarios=_counted(summary, "scenarios", ScenarioKind),
@@ -122,7 +120,8 @@ def write_drive_report(out: Path) -> Path:
         letters={LETTERS[kind]: words(kind) for kind in LETTERS if summary[f"infractions.{kind}"]},
         table=_drive_table(drives),
         drives=[_show_drive(name, drives[name]) for name in worst_first],
-        every_figure=full_table(summary),
+        near_collision_s=f"{LEAST_S:g}",
+        all_metrics=full_table(summary),
     )
     return out / REPORT
 
@@ -138,10 +137,10 @@ def _tiles(summary: Summary) -> list[MetricTile]:
     comfortable = _percent(summary["comfortable_share"])
     return [
         *tiles,
-        MetricTile("Drives the agent failed at", failed, note=f"of {number(summary['drives'])}"),
+        MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),
         MetricTile("Comfortable time, %", comfortable, note="within nuPlan's bounds"),
         MetricTile("Near collision, % of time", near, note=f"less than {LEAST_S:g} s away"),
-        MetricTile("Time of a plan", number(summary["plan_ms"], 0), "ms", "median"),
+        MetricTile("Planning time", number(summary["plan_ms"], 0), "ms", "median"),
     ]
 
 
@@ -236,8 +235,7 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
 def _threat(met: ThreatMet) -> DriveEvent:
     """Return the outcome of a threat as one entry of the list."""
     hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
-    by_the_log = f"{met.reference_mps:.1f} m/s by who goes on as the log did"
-    text = f"{hit} ({by_the_log}), score {met.score:.1f} of 5"
+    text = f"{hit} ({met.reference_mps:.1f} m/s if driven as logged), score {met.score:.1f} of 5"
     return DriveEvent(None, f"{words(met.kind)} threat", text)
 
 

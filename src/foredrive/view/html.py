@@ -16,6 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
 
+from foredrive.evaluation.summary import Summary
 from foredrive.files import atomic_path
 from foredrive.view.table import Cell, Value, number, words
 
@@ -43,6 +44,33 @@ class MetricTile:
     value: str
     unit: str = ""
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The command, commit, machine and date of a summary."""
+
+    command: str
+    commit: str
+    machine: str
+    date: str = ""
+
+    @classmethod
+    def of(cls, summary: Summary, date: str = "") -> "Provenance":
+        """Return the provenance that a summary states."""
+        machine = [
+            f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
+            f"{summary.get('machine.ram_gib')} GiB",
+            summary.get("machine.gpu"),
+            f"Python {summary.get('version.python')}",
+            f"torch {summary.get('version.torch')}",
+        ]
+        return cls(
+            command=str(summary.get("command")),
+            commit=str(summary.get("commit") or "not a git checkout"),
+            machine=", ".join(str(part) for part in machine if part),
+            date=date,
+        )
 
 
 def write_page(path: Path, template: str, **content: object) -> None:

@@ -25,7 +25,7 @@ HOLD = 2
 
 
 def write_imagination_video(path: Path, moments: Iterable[ImaginedFutures], frame_dt_s: float) -> int:
-    """Write the futures from one time after another, each from now on in real time; return the number of frames."""
+    """Write the futures from each time, one after another, in real time; return the number of frames."""
     frames = []
     for imagined in moments:
         shown = [draw_imagined(imagined, step, frame_dt_s) for step in range(imagined.futures.shape[1])]
@@ -44,7 +44,7 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
     label = imagined.example.occupancy
     frame = imagined.example.clip.now + step
     truth, known = label.values[frame, 0] > 0.5, label.known[frame]
-    panels = [("what happened", truth)]
+    panels = [("recorded", truth)]
     count = len(imagined.futures)
     panels += [
         (f"future {k + 1} of {count}" if count > 1 else "imagined", future[step])
@@ -82,10 +82,10 @@ def _camera_strips(imagined: ImaginedFutures, step: int) -> list[tuple[str, UInt
     shown = [camera for camera in ahead if bool(clip.image_valid[frame, camera])]
     if not shown:
         return []
-    strips = [("what the cameras saw", _strip(clip.images[frame, shown]))]
+    strips = [("recorded images", _strip(clip.images[frame, shown]))]
     if imagined.rendered is not None:
         rendered = (imagined.rendered[step, shown].clamp(0, 1) * 255).byte()
-        strips.append(("what they see in the imagined volume", _strip(rendered)))
+        strips.append(("rendered from the imagined volume", _strip(rendered)))
     return strips
 
 

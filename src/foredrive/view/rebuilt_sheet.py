@@ -50,7 +50,7 @@ def write_rebuilt_sheet(
         known = torch.ones(1, *view.size_hw, dtype=torch.bool)
         quality = float(psnr_db(rgb[None], real[None], known))
         shown = {
-            f"seen at {view.t_s:.1f} s": _bytes(real),
+            f"recorded at {view.t_s:.1f} s": _bytes(real),
             f"rendered, {quality:.1f} dB": _bytes(rgb),
             "difference": _bytes((rgb - real).abs()),
             f"range, {MIN_RANGE_M:g} m bright to {MAX_RANGE_M:g} m dark": _ranges(picture.range_m.cpu()),

@@ -7,7 +7,7 @@ from foredrive.metrics.reliability import Reliability
 from foredrive.view.html import INK_MARK
 
 TITLES = {
-    "d_ece": "Scores and hits (2 m, or overlap 0.5)",
+    "d_ece": "Score and hits (2 m, or overlap 0.5)",
     "existence": "Existence and associations",
 }
 
@@ -25,7 +25,7 @@ def draw_reliability(name: str, diagram: Reliability) -> Figure:
     title = f"{TITLES.get(name, name)}: error {diagram.error:.3f}"
     axes.set_title(title, color=INK_MARK, loc="left", fontsize=10)
     axes.set_xlabel("confidence", color=INK_MARK)
-    axes.set_ylabel("came true", color=INK_MARK)
+    axes.set_ylabel("observed frequency", color=INK_MARK)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     axes.tick_params(colors=INK_MARK, labelsize=9)
     axes.grid(color="#8888884d", linewidth=0.6)

@@ -31,7 +31,7 @@ _CUBE_FACES = np.array(
 
 
 def shown_voxels(
-    vision: DisplayPrediction, k: int, spec: VoxelSpec, above: float, lowest_m: float
+    prediction: DisplayPrediction, k: int, spec: VoxelSpec, above: float, lowest_m: float
 ) -> Bool[Tensor, "Z Y X"]:
     """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
@@ -39,12 +39,12 @@ def shown_voxels(
         lowest_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
     """
     z = spec.centres_m()[..., 2]
-    return (vision.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
+    return (prediction.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
 
 
 def show_occupancy(
     scene: viser.SceneApi,
-    vision: DisplayPrediction,
+    prediction: DisplayPrediction,
     k: int,
     spec: VoxelSpec,
     shown: Bool[Tensor, "Z Y X"],
@@ -52,9 +52,9 @@ def show_occupancy(
 ) -> None:
     """Draw voxels of frame k as cubes in the ego frame now, where the model expects them."""
     colours: UInt8[np.ndarray, "Z Y X 3"] = (
-        height_colours(spec) if colour_by == "height" else pca_colours(vision.volume[k], shown)
+        height_colours(spec) if colour_by == "height" else pca_colours(prediction.volume[k], shown)
     )
-    pose = vision.T_now_ego[k].double().numpy()
+    pose = prediction.T_now_ego[k].double().numpy()
     count = int(shown.sum())
     if count == 0:
         return clear(scene, "/occupancy")
@@ -76,10 +76,14 @@ def show_occupancy(
 
 
 def show_flow(
-    scene: viser.SceneApi, vision: DisplayPrediction, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
+    scene: viser.SceneApi,
+    prediction: DisplayPrediction,
+    k: int,
+    spec: VoxelSpec,
+    shown: Bool[Tensor, "Z Y X"],
 ) -> None:
     """Draw the movement of shown voxels since frame k - 1 as arrows over the ground; none for now."""
-    movement = None if k == 0 else vision.movement_m(k, spec)
+    movement = None if k == 0 else prediction.movement_m(k, spec)
     if movement is None:
         return clear(scene, "/flow")
     start, end = movement

@@ -12,6 +12,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
 from foredrive.evaluation.detections.score import PARTS, FrameScore
+from foredrive.evaluation.summary import Figures
 from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
 from foredrive.metrics.detection import (
     COCO_OVERLAPS,
@@ -30,14 +31,13 @@ SIDES_PX = (0.0, 32.0, 96.0, np.inf)
 """Roots of areas: COCO's small, medium and large."""
 RANGES_M = (0.0, 20.0, 40.0, 60.0, np.inf)
 COVERAGE = 0.9
-Summary = dict[str, float | int | str | None]
 
 
 @dataclass(frozen=True)
 class ScoreSummary:
     """Flat figures and reliability diagrams."""
 
-    figures: Summary
+    figures: Figures
     diagrams: Mapping[str, Reliability]
 
 
@@ -49,7 +49,7 @@ def summarise_scores(
     Likelihoods are averaged over frames where they are finite; the others are counted.
     """
     rng = np.random.default_rng(seed)
-    figures: Summary = {}
+    figures: Figures = {}
     for compute in FIGURE_FUNCTIONS:
         figures |= compute(detection_set, scores, rng)
     return ScoreSummary(figures, _diagrams(detection_set, scores))
@@ -78,7 +78,7 @@ def _joined(scores: Sequence[FrameScore], part: str, field: str) -> ndarray:
     return np.concatenate([getattr(getattr(score, part), field) for score in scores], axis=-1)
 
 
-def _counts(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _counts(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Count frames, objects, detections, and what was assumed or missing."""
     return {
         "frames": len(scores),
@@ -91,7 +91,7 @@ def _counts(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.r
 
 def _likelihood(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
-) -> Summary:
+) -> Figures:
     """Average the likelihood and its parts over frames where it is finite."""
     nll = np.array([score.nll for score in scores])
     finite = np.isfinite(nll)
@@ -99,7 +99,7 @@ def _likelihood(
         return {}
     sequences = [score.sequence for score in scores]
     interval = bootstrap_mean(nll[finite], np.array(sequences)[finite].tolist(), rng)
-    figures: Summary = {
+    figures: Figures = {
         "pmb_nll.mean": interval.mean,
         "pmb_nll.low_95": interval.low,
         "pmb_nll.high_95": interval.high,
@@ -113,7 +113,7 @@ def _likelihood(
 
 def _distances(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
-) -> Summary:
+) -> Figures:
     """Average GOSPA and P-GOSPA, and their parts, over frames."""
     return {
         f"{name}.{part}": float(np.mean([getattr(getattr(score, name), part) for score in scores]))
@@ -124,7 +124,7 @@ def _distances(
 
 def _precision(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
-) -> Summary:
+) -> Figures:
     """Return average precision by class and threshold, as the data sets define it."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
@@ -136,7 +136,7 @@ def _precision(
             for c in range(len(detection_set.classes))
         ]
     )
-    figures: Summary = {"map": mean_of_valid(table.ravel().tolist())}
+    figures: Figures = {"map": mean_of_valid(table.ravel().tolist())}
     for t, threshold in enumerate(thresholds):
         unit = f"{threshold:g}_m" if detection_set.is_3d else f"{threshold:.2f}"
         figures[f"map_at.{unit}"] = mean_of_valid(table[:, t].tolist())
@@ -145,7 +145,7 @@ def _precision(
     return figures
 
 
-def _pdq(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _pdq(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return PDQ of image boxes."""
     counts = [score.pdq for score in scores if score.pdq is not None]
     return {"pdq": pdq(counts)} if counts else {}
@@ -153,7 +153,7 @@ def _pdq(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.rand
 
 def _reliability(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
-) -> Summary:
+) -> Figures:
     """Return the errors of the reliability diagrams."""
     return {
         f"calibration.{name}": diagram.error for name, diagram in _diagrams(detection_set, scores).items()
@@ -174,13 +174,13 @@ def _diagrams(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> dict
 
 def _calibration(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
-) -> Summary:
+) -> Figures:
     """Return D-ECE by class and range, object-level error, and LaECE (hits at 0.5), LaECE₀ of image boxes."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
     at = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
     of_objects = _joined(scores, "objects", "brier")
-    figures: Summary = {
+    figures: Figures = {
         "brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None,
         "calibration.object_level": float(of_objects.mean()) if len(of_objects) else None,
     }
@@ -202,7 +202,7 @@ def _calibration(
     return figures
 
 
-def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return proper scores, scale of σ and coverage of boxes and objects in the likeliest associations."""
     boxes, objects = [], []
     for frame, score in zip(detection_set.frames, scores, strict=True):
@@ -217,7 +217,7 @@ def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.ra
     std = density.chol.square().sum(-1).sqrt().numpy()
     crps = crps_gaussian if density.family == "gaussian" else crps_laplace
     axes = ("x_m", "y_m", "z_m") if detection_set.is_3d else ("x1_px", "y1_px", "x2_px", "y2_px")
-    figures: Summary = {
+    figures: Figures = {
         f"crps.{axis}": float(crps(mean[:, d], std[:, d], state[:, d]).mean()) for d, axis in enumerate(axes)
     }
     some = rng.permutation(len(mean))[:2000]
@@ -230,10 +230,10 @@ def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.ra
     return figures
 
 
-def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return the cost of objects by class, size, range and visibility, nats an object."""
     label = _joined(scores, "objects", "label")
-    figures: Summary = _relevance(detection_set, scores)
+    figures: Figures = _relevance(detection_set, scores)
     size = np.concatenate([_size(frame.objects, detection_set.is_3d) for frame in detection_set.frames])
     steps, unit = (LENGTHS_M, "m") if detection_set.is_3d else (SIDES_PX, "px")
     for low, high in pairwise(steps):
@@ -262,12 +262,12 @@ def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.r
     return figures
 
 
-def _relevance(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+def _relevance(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> Figures:
     """Return the mean cost of an object, plain and weighted where the truth has weights."""
     cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
     if not np.size(cost):
         return {}
-    figures: Summary = {"object_cost": float(np.mean(cost))}
+    figures: Figures = {"object_cost": float(np.mean(cost))}
     weights = [
         np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in detection_set.frames
     ]
@@ -293,8 +293,8 @@ def _size(objects: LabelledBoxes, is_3d: bool) -> Float[ndarray, "N"]:
     return np.sqrt((state[:, 2:] - state[:, :2]).prod(-1))
 
 
-def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Summary:
-    figures: Summary = {f"{name}.objects": len(which)}
+def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Figures:
+    figures: Figures = {f"{name}.objects": len(which)}
     for part in ("localisation", "classification", "missed", "missed_probability"):
         values: Float[ndarray, _] = _joined(scores, "objects", part)[which]
         figures[f"{name}.{part}"] = float(values.mean()) if len(values) else None
@@ -313,7 +313,7 @@ def _stacked_objects(parts: Sequence[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(torch.cat([part.label for part in parts]), torch.cat([part.state for part in parts]))
 
 
-FIGURE_FUNCTIONS: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator], Summary], ...] = (
+FIGURE_FUNCTIONS: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator], Figures], ...] = (
     _counts,
     _likelihood,
     _distances,

@@ -67,7 +67,7 @@ class DisplayPredictor:
         return self._renderer is not None
 
     @torch.no_grad()
-    def look(self, observed: Clip) -> DisplayPrediction:
+    def predict(self, observed: Clip) -> DisplayPrediction:
         """Return all predictions for an observed clip, a batch of one."""
         output = self.agent(observed, self.steps)
         beliefs = output.beliefs
@@ -85,17 +85,17 @@ class DisplayPredictor:
         return -self.agent.world_model.dt_s * torch.stack(flow) if flow else None
 
     @torch.no_grad()
-    def render(self, vision: DisplayPrediction, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:
+    def render(self, prediction: DisplayPrediction, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:
         """Render frame k for any cameras, real or virtual: RGB, 0 to 1.
 
         Args:
-            vision: from `look`.
+            prediction: from `predict`.
             k: index of the frame; 0 is now.
             rig: C cameras without leading dimensions; `T_ego_cam` leads to the ego frame of frame k.
         """
         renderer = self._renderer
         assert renderer is not None
-        volume, logit = vision.volume[k : k + 1], vision.occupancy_logit[k : k + 1]
+        volume, logit = prediction.volume[k : k + 1], prediction.occupancy_logit[k : k + 1]
         rays = camera_rays(rig)
         origin, direction = rays.origin_ego.flatten(0, 1), rays.dir_ego.flatten(0, 1)
         parts = [

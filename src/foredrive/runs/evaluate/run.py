@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.progress import Progress
 from torch import Tensor
 
@@ -39,10 +39,10 @@ class ExamplePrediction:
     """One unbatched example and the model's predictions, for pictures."""
 
     example: Example
-    occupancy_prob: Float[Tensor, "F Z Y X"]
-    """Occupancy probability at F key frames: now first, then the imagined ones."""
+    occupied: Bool[Tensor, "F Z Y X"]
+    """Voxels predicted occupied at now and at the F - 1 key frames after it, each in its own ego frame."""
     rendered: Float[Tensor, "C 3 h w"] | None
-    """The rendered views at now, RGB 0 to 1; None from a world model that does not render."""
+    """The rendered views at now, RGB 0 to 1, of any size; None from a world model that does not render."""
     volume: Float[Tensor, "D Z Y X"]
     plan: Trajectory
     """The plan; batch shape [1 T]."""
@@ -149,7 +149,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
         found.append(
             ExamplePrediction(
                 example=item,
-                occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
+                occupied=prediction.occupancy_logit[0] > 0,
                 rendered=None if prediction.images is None else prediction.images[0, 0],
                 volume=agent.world_model.observe(observed).volume[0],
                 plan=prediction.plan[0],

@@ -18,7 +18,7 @@ from foredrive.evaluation.detections import (
     write_frame_scores,
 )
 from foredrive.evaluation.detections.frames import Family
-from foredrive.evaluation.detections.summary import Summary
+from foredrive.evaluation.summary import Figures
 
 SUMMARY, FRAMES = "summary.json", "frames.jsonl"
 
@@ -40,7 +40,7 @@ def score_detections(
     against: Path | None = None,
     family: Family = "gaussian",
     k: int = 25,
-) -> tuple[ScoredDetections, Summary]:
+) -> tuple[ScoredDetections, Figures]:
     """Score detections; write `out/summary.json` and `out/frames.jsonl`.
 
     Args:
@@ -75,7 +75,7 @@ def _score(results: Path, truth: Path, family: Family, k: int) -> ScoredDetectio
     return ScoredDetections(detections, frames, summarise_scores(detections, frames))
 
 
-def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Summary:
+def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Figures:
     """Return the other file's figures, and the difference to them."""
     difference, uncompared = compare_scores(scored.frames, other.frames)
     return {f"against.{key}": value for key, value in other.summary.figures.items()} | {
