@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits

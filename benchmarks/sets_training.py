@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.common.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.runs.demo import camera_rig, roof_lidar
 from foredrive.scene import VoxelSpec
 from foredrive.towns.recorder import LabelKinds, record

@@ -11,7 +11,7 @@ import resource
 import subprocess
 import sys
 
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 
 REPETITIONS = 3
 NOWHERE = "/nonexistent"

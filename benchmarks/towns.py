@@ -16,7 +16,7 @@ from types import FrameType
 
 import torch
 
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import Crowd, record
 from foredrive.towns.sensing.capture import SensorSuite

@@ -14,7 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
-from foredrive.evaluation.detections import DetectionFrame, DetectionSet, score_frames, summarise_scores
+from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
+from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.models.detection import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel

@@ -18,7 +18,7 @@ import pytest
 from miniature import miniature
 
 from foredrive.data import LogPath
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, train_run
 from foredrive.training import read_metrics
 

@@ -14,7 +14,7 @@ from transformers import BertConfig, BertModel, BertTokenizerFast
 from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.models.driveworld import DriveWorld
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.models.lifting import LiftingConfig

@@ -9,8 +9,9 @@ from miniature import write_log
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import EvaluationResult, read_summary
-from foredrive.metrics import PROTOCOLS
+from foredrive.evaluation.run import EvaluationResult
+from foredrive.evaluation.summary import read_summary
+from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.runs import ExamplePrediction, Run, evaluate_run, predict_examples
 from foredrive.runs.folder import WEIGHTS
 from foredrive.view.run_report import report_on_run, write_run_report

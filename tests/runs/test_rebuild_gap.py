@@ -10,8 +10,8 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run
 from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, rebuilt_cameras

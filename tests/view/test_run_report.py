@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.evaluation import Failure
+from foredrive.evaluation.run import Failure
 from foredrive.recipes import find_recipe
 from foredrive.runs import Run
 from foredrive.scene import Example

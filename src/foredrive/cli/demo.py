@@ -20,7 +20,7 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
 
     from rich.console import Console
 
-    from foredrive.evaluation import read_summary
+    from foredrive.evaluation.summary import read_summary
     from foredrive.runs import full_demo, predict_examples, quick_demo, run_demo
     from foredrive.view.overview import write_overview
     from foredrive.view.run_report import report_on_run, write_run_report

@@ -49,7 +49,7 @@ def evaluate(
 
     from rich.console import Console
 
-    from foredrive.evaluation import read_summary
+    from foredrive.evaluation.summary import read_summary
     from foredrive.runs import evaluate_run, open_run, predict_examples
     from foredrive.view.run_report import report_on_run, write_run_report
     from foredrive.view.summary_tables import print_summary

@@ -7,7 +7,7 @@ from typing import Protocol
 from foredrive.errors import InputError
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.evaluation.summary import Figures
-from foredrive.metrics import OccupancyPrior
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.scene import Clip, Example, VoxelGrid
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.metrics import psnr_db, ssim
+from foredrive.metrics.images import psnr_db, ssim
 from foredrive.metrics.lidar_rendering import SweepScores, score_sweep
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph

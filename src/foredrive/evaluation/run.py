@@ -15,7 +15,7 @@ from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactor
 from foredrive.evaluation.metrics import METRICS
 from foredrive.evaluation.predictor import Part, PlannerPredictor, Prediction, Predictor
 from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.metrics import OccupancyPrior
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.metrics.protocols import STEPS
 from foredrive.scene import Agent, Example, Trajectory
 

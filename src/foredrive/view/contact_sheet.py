@@ -17,6 +17,7 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, read_map_patch
 from foredrive.scene import Command, MapKind, MapPatch
 from foredrive.view import palette
+from foredrive.view.bev import start_path_map
 from foredrive.view.sheet import Sheet
 
 THUMBNAIL_HW = (126, 224)
@@ -125,17 +126,7 @@ def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
 def draw_drive_path(ax: Axes, log: Log) -> None:
     """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
-    low, high = xy.min(axis=0) - MARGIN_M, xy.max(axis=0) + MARGIN_M
-    half = max(float((high - low).max()) / 2, MIN_HALF_WIDTH_M)
-    centre = (low + high) / 2
-    ax.set_facecolor(palette.PANEL)
-    ax.set(
-        xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal"
-    )
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for spine in ax.spines.values():
-        spine.set_visible(False)
+    start_path_map(ax, xy, MARGIN_M, MIN_HALF_WIDTH_M)
     for frame in _frames_every(xy, RADIUS_M):
         patch = read_map_patch(log, frame)
         for kind, width in MAP_LINES.items():

@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon
 from numpy import ndarray
 
-from foredrive.evaluation.detections import DetectionFrame, FrameScore
-from foredrive.view.html import INK_MARK
+from foredrive.evaluation.detections.frames import DetectionFrame
+from foredrive.evaluation.detections.score import FrameScore
+from foredrive.view.html import style_axes
 
 OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
 MIN_EXISTENCE = 0.02
@@ -31,9 +32,9 @@ def draw_detection_frame(frame: DetectionFrame, score: FrameScore, is_3d: bool) 
     yaw = boxes.yaw.numpy() if boxes.yaw is not None else np.zeros(len(mean))
     true_yaw = frame.objects.yaw.numpy() if frame.objects.yaw is not None else np.zeros(len(state))
     covariance = (boxes.chol @ boxes.chol.mT).numpy()
-    seen = np.flatnonzero(existence >= MIN_EXISTENCE)
+    seen, title = np.flatnonzero(existence >= MIN_EXISTENCE), ""
     if len(seen) > MAX_DRAWN:
-        axes.set_title(f"{MAX_DRAWN:,} surest of {len(seen):,} detections", color=INK_MARK, fontsize=8)
+        title = f"the {MAX_DRAWN:,} likeliest of {len(seen):,} detections"
         seen = seen[np.argsort(-existence[seen], kind="stable")[:MAX_DRAWN]]
     for i in seen:
         corners = _corners(mean[i], float(yaw[i]), is_3d)
@@ -51,11 +52,7 @@ def draw_detection_frame(frame: DetectionFrame, score: FrameScore, is_3d: bool) 
     if not is_3d:
         axes.invert_yaxis()
     unit = "m" if is_3d else "px"
-    axes.set_xlabel(f"x, {unit}", color=INK_MARK, fontsize=8)
-    axes.set_ylabel(f"y, {unit}", color=INK_MARK, fontsize=8)
-    axes.tick_params(colors=INK_MARK, labelsize=8)
-    axes.grid(color="#88888833", linewidth=0.5)
-    axes.spines[:].set_visible(False)
+    style_axes(axes, title, f"x, {unit}", f"y, {unit}")
     return figure
 
 

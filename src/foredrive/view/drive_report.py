@@ -139,7 +139,7 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         *tiles,
         MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),
         MetricTile("Comfortable time, %", comfortable, note="within nuPlan's bounds"),
-        MetricTile("Near collision, % of time", near, note=f"less than {LEAST_S:g} s away"),
+        MetricTile("Near collision, % of time", near, note=f"time to collision below {LEAST_S:g} s"),
         MetricTile("Planning time", number(summary["plan_ms"], 0), "ms", "median"),
     ]
 

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
-from torch import Tensor
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.runs import ExamplePrediction
@@ -18,7 +17,7 @@ from foredrive.scene import Clip, Command, Example, Trajectory, VoxelSpec
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points
 from foredrive.view.html import Picture, picture
-from foredrive.view.image_drawing import Camera, draw_path_on_image, resize
+from foredrive.view.image_drawing import Camera, draw_path_on_image, resize, to_image
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.voxel_drawing import draw_comparison, draw_volume_pca, draw_voxels
 
@@ -162,11 +161,13 @@ def _cameras(shown: ExamplePrediction) -> dict[str, list[Picture]]:
     seen = [camera for camera in order if bool(clip.image_valid[clip.now, camera])]
     if not seen:
         return {}
-    halves = {"Camera images": clip.images[clip.now]}
+    halves = {"Camera images": clip.images[clip.now].float() / 255}
     if shown.rendered is not None:
-        halves["Rendered from the volume"] = (shown.rendered.clamp(0, 1) * 255).byte()
+        halves["Rendered from the volume"] = shown.rendered
+    height, width = clip.rig.size_hw
+    size_hw = (round(CAMERA_WIDTH_PX * height / width), CAMERA_WIDTH_PX)
     return {
-        title: [picture(_as_wide(images[camera]), clip.rig.names[camera]) for camera in seen]
+        title: [picture(resize(to_image(images[camera]), size_hw), clip.rig.names[camera]) for camera in seen]
         for title, images in halves.items()
     }
 
@@ -209,8 +210,3 @@ def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.n
     ]
     ImageDraw.Draw(canvas).polygon(outline, outline=palette.rgb255(palette.EGO), width=2)
     return np.asarray(canvas)
-
-
-def _as_wide(image: UInt8[Tensor, "3 H W"]) -> UInt8[np.ndarray, "h w 3"]:
-    height, width = image.shape[1:]
-    return resize(image.permute(1, 2, 0).numpy(), (round(CAMERA_WIDTH_PX * height / width), CAMERA_WIDTH_PX))

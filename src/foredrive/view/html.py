@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -105,6 +106,17 @@ def inline_svg(figure: Figure) -> Markup:
     svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
     svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)
     return Markup(re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg))
+
+
+def style_axes(ax: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
+    """Give axes the page's colours, a faint grid and no frame."""
+    ax.set_title(title, color=INK_MARK, loc="left", fontsize=10)
+    ax.set_xlabel(xlabel, color=INK_MARK, fontsize=9)
+    ax.set_ylabel(ylabel, color=INK_MARK, fontsize=9)
+    ax.tick_params(which="both", colors=INK_MARK, length=0, labelsize=9)
+    ax.grid(color="#8888884d", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[:].set_visible(False)
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.runs.evaluate.imagination import ImaginedFutures
 from foredrive.view import palette
 from foredrive.view.example_panel import COMPARISON_KEY, with_ego
-from foredrive.view.image_drawing import resize
+from foredrive.view.image_drawing import resize, write_text
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.video import write_video
 from foredrive.view.voxel_drawing import draw_comparison
@@ -56,9 +56,9 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
     width = COLUMNS * (PANEL_PX + GAP_PX) + GAP_PX
     canvas = Image.new("RGB", (width, HEAD_PX + strips_h + lines * cell_h + KEY_PX), palette.GROUND)
     pen, y = ImageDraw.Draw(canvas), HEAD_PX
-    _write(pen, (GAP_PX, 9), _title(imagined, step, frame_dt_s), 18, palette.INK)
+    write_text(pen, (GAP_PX, 9), _title(imagined, step, frame_dt_s), 18, palette.INK)
     for title, strip in rows:
-        _write(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
+        write_text(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
         canvas.paste(Image.fromarray(strip), (GAP_PX, y + TITLE_PX))
         y += TITLE_PX + strip.shape[0] + GAP_PX
     for number, (title, occupied) in enumerate(panels):
@@ -67,7 +67,7 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
         columns = draw_comparison(occupied, truth, known, label.spec, ABOVE_GROUND_M)
         picture = with_ego(columns, label.spec)
         size_hw = (PANEL_PX * picture.shape[0] // picture.shape[1], PANEL_PX)
-        _write(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
+        write_text(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
         canvas.paste(Image.fromarray(resize(picture, size_hw)), (at[0], at[1] + TITLE_PX))
     _draw_key(pen, canvas.height - KEY_PX + 6)
     return canvas
@@ -113,7 +113,3 @@ def _draw_key(pen: ImageDraw.ImageDraw, y: int) -> None:
         pen.rectangle((x, y + 2, x + 14, y + 16), fill=colour, outline=palette.GRID)
         pen.text((x + 20, y), name, fill=palette.FAINT, font=font)
         x += 20 + round(pen.textlength(name, font=font)) + 24
-
-
-def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

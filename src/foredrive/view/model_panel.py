@@ -13,6 +13,7 @@ from viser.transforms import SO3
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.scene import CameraRig
 from foredrive.view import palette
+from foredrive.view.image_drawing import to_image
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.scene_nodes import FRUSTUM_M, show_path
 from foredrive.view.volume_nodes import show_flow, show_occupancy, shown_voxels
@@ -95,7 +96,7 @@ class ModelPanel:
             T_now_cam[:3, :3], T_now_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
             T_ego_cam = np.linalg.inv(prediction.T_now_ego[k].double().numpy()) @ T_now_cam
             rig = pinhole(T_ego_cam, camera.fov, camera.aspect, RENDERED_HEIGHT_PX)
-            rgb = (255 * self._predictor.render(prediction, k, rig)[0]).to(torch.uint8).numpy()
+            rgb = to_image(self._predictor.render(prediction, k, rig)[0].permute(2, 0, 1))
         self._rendered.image, self._rendered.visible = rgb, True
         self._server.scene.add_camera_frustum(
             "/rendered",

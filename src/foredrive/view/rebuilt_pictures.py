@@ -7,23 +7,21 @@ from typing import cast
 import numpy as np
 import torch
 import viser
-from jaxtyping import UInt8
-from torch import Tensor
 from viser.transforms import SO3
 
 from foredrive.rendering.edits import Edited
 from foredrive.rendering.free_views import free_camera
 from foredrive.runs.rebuild.film import Shooting, Shot, shoot
 from foredrive.runs.rebuild.rebuilt_run import OpenRun
-from foredrive.view import palette
+from foredrive.view.image_drawing import to_image
 from foredrive.view.job_runner import JobRunner
 from foredrive.view.model_panel import pinhole
 from foredrive.view.rebuilt_video import Colour, sweep_colours
-from foredrive.view.scene_nodes import FRUSTUM_M, POINT_M, clear
+from foredrive.view.scene_nodes import CAMERAS, POINT_M, clear, show_camera
 
 OWN_HEIGHT_PX = 360
 """Height of the picture from the browser's viewpoint, px."""
-LIDAR, CAMERAS = "/lidar", "/cameras"
+LIDAR = "/lidar"
 
 
 @dataclass(frozen=True)
@@ -86,20 +84,7 @@ class RebuiltPictures:
         shot = self._shot(shown, Shooting((shown.t_s,), 1.0, (camera,), None))
         rgb = shot.images[0].permute(1, 2, 0).numpy()
         self.images[camera].image = rgb
-        pose = rig.T_ego_cam[camera].double().numpy()
-        self._server.scene.add_camera_frustum(
-            f"{CAMERAS}/{rig.names[camera]}",
-            fov=2 * float(np.arctan(rig.size_hw[0] / 2 / float(rig.K[camera, 1, 1]))),
-            aspect=rig.size_hw[1] / rig.size_hw[0],
-            scale=FRUSTUM_M,
-            color=palette.rgb255(palette.FAINT),
-            image=rgb,
-            jpeg_quality=85,
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
-            position=pose[:3, 3],
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        show_camera(self._server.scene, rig, camera, rgb)
 
     def _show_lidar(self, shown: SceneAtTime) -> None:
         sweep = self._shot(shown, Shooting((shown.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
@@ -127,9 +112,5 @@ class RebuiltPictures:
         scene = self._run.scene
         with torch.no_grad():
             view = free_camera(rig, 0, ego, sensor=0).to(scene.actor.device)
-            rgb = _bytes(scene(shown.edited.graph, view).rgb)
+            rgb = to_image(scene(shown.edited.graph, view).rgb)
         client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)
-
-
-def _bytes(rgb: Tensor) -> UInt8[np.ndarray, "H W 3"]:
-    return (255 * rgb.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()

@@ -18,7 +18,7 @@ from foredrive.runs.rebuild.rebuilt_run import OpenRun, edited_scene
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
-from foredrive.view.image_drawing import resize
+from foredrive.view.image_drawing import resize, write_text
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.video import check_video, write_video
 
@@ -78,10 +78,10 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
     width = sum(column.width for column in columns) + GAP_PX * (len(columns) + 1)
     canvas = Image.new("RGB", (width, columns[0].height + 2 * TITLE_PX + GAP_PX), palette.GROUND)
     pen = ImageDraw.Draw(canvas)
-    _write(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
+    write_text(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
     x = GAP_PX
     for (caption, _), column in zip(shots, columns, strict=True):
-        _write(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
+        write_text(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
         canvas.paste(column, (x, 2 * TITLE_PX))
         x += column.width + GAP_PX
     return canvas
@@ -174,7 +174,3 @@ def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]
         share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # most returns are faint
         mapped = palette.RANGE_MAP(faint + (bright - faint) * share)
     return (mapped[:, :3] * 255).astype(np.uint8)
-
-
-def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

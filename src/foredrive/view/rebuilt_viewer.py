@@ -11,7 +11,7 @@ from foredrive.rendering.edits import Edit
 from foredrive.runs.rebuild.rebuilt_run import OpenRun
 from foredrive.view.edit_panel import EditPanel
 from foredrive.view.job_runner import JobRunner
-from foredrive.view.page import close_page, open_page, page_url
+from foredrive.view.page import Page
 from foredrive.view.rebuilt_nodes import RebuiltNodes
 from foredrive.view.rebuilt_pictures import RebuiltPictures
 from foredrive.view.scene_nodes import show_ego
@@ -25,7 +25,7 @@ NUDGES_S = (2.0, 6.0)
 NOTE_S = 8.0
 
 
-class RebuiltViewer:
+class RebuiltViewer(Page):
     """A page with a slider for time, sensors rendered at that time, and edits.
 
     The browser draws the Gaussians' albedo by itself. Sensor images are rendered in the background, the
@@ -43,8 +43,8 @@ class RebuiltViewer:
     """
 
     def __init__(self, run: OpenRun, edits: Sequence[Edit], file: Path, host: str, port: int) -> None:
+        super().__init__(run.folder.name, host, port)
         self.run = run
-        self.server = open_page(run.folder.name, host, port)
         self.server.initial_camera.far = FAR_M
         self._showing = threading.RLock()
         self.jobs = JobRunner(self.tell)
@@ -60,11 +60,6 @@ class RebuiltViewer:
         self.server.on_client_connect(self._welcome)
         if not self.edits.replace(edits):
             self.show_now()
-
-    @property
-    def url(self) -> str:
-        """Return the page's address."""
-        return page_url(self.server)
 
     def show(self, t_s: float) -> None:
         """Go to a time since the start of the log, s."""
@@ -98,7 +93,7 @@ class RebuiltViewer:
     def close(self) -> None:
         """Stop rendering and serving."""
         self.jobs.close()
-        close_page(self.server)
+        super().close()
 
     def _add_controls(self) -> None:
         gui, vehicle = self.server.gui, self.run.vehicle

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.evaluation import Failure
+from foredrive.evaluation.run import Failure
 from foredrive.evaluation.summary import Summary
 from foredrive.runs import ExamplePrediction, Run
 from foredrive.runs.train.run import STAGES

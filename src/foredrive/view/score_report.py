@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from foredrive.evaluation.detections import FrameScore
-from foredrive.evaluation.detections.score import PARTS
+from foredrive.evaluation.detections.score import PARTS, FrameScore
 from foredrive.evaluation.summary import Summary
 from foredrive.runs.score.run import ScoredDetections
 from foredrive.view.detection_frame_plot import draw_detection_frame

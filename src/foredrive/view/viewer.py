@@ -6,14 +6,14 @@ import time
 from foredrive.view import palette
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import ModelPanel
-from foredrive.view.page import close_page, open_page, page_url
+from foredrive.view.page import Page
 from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_lidar, show_map, show_path
 
 LAYERS = ("lidar", "boxes", "map", "cameras", "driven")
 PLAY_PERIOD_S = 0.1
 
 
-class Viewer:
+class Viewer(Page):
     """A page with a slider for time and, with a run, a slider for the imagined time ahead.
 
     All nodes are in the ego frame at the time shown, so that the view follows the vehicle. The server runs in
@@ -30,16 +30,11 @@ class Viewer:
     def __init__(self, frames: LogFrames, host: str, port: int) -> None:
         self.frames = frames
         self._drawing, self._drawn = threading.Lock(), -1
-        self.server = open_page(frames.name, host, port)
+        super().__init__(frames.name, host, port)
         show_ego(self.server.scene)
         self._add_controls()
         self.model = None if frames.predictor is None else ModelPanel(self.server, frames)
         self.show(0)
-
-    @property
-    def url(self) -> str:
-        """Return the page's address."""
-        return page_url(self.server)
 
     def show(self, index: int) -> None:
         """Go to a frame of the log."""
@@ -52,10 +47,6 @@ class Viewer:
             time.sleep(PLAY_PERIOD_S)
             if self._play.value:
                 self.show((self._frame.value + 1) % len(self.frames))
-
-    def close(self) -> None:
-        """Stop serving."""
-        close_page(self.server)
 
     def _add_controls(self) -> None:
         gui, count = self.server.gui, len(self.frames)

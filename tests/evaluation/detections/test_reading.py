@@ -9,7 +9,7 @@ import pytest
 from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections import read_detections
+from foredrive.evaluation.detections.files import read_detections
 
 
 def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:

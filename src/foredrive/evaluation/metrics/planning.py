@@ -5,8 +5,9 @@ from torch import Tensor
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import PROTOCOLS, future_obstacles, score_plan
-from foredrive.metrics.protocols import HORIZON_NAMES, STEP_S, STEPS
+from foredrive.metrics.obstacles import future_obstacles
+from foredrive.metrics.planning import score_plan
+from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Example
 
 COLLISIONS = ("collision", "collision_centre", "driven_collision")

@@ -12,17 +12,13 @@ from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
-from foredrive.evaluation import (
-    Figures,
-    Part,
-    Prediction,
-    Predictor,
-    collect_provenance,
-    evaluate,
-    write_summary,
-)
+from foredrive.evaluation.metric import Figures
 from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, PERSISTENCE
-from foredrive.metrics import psnr_db
+from foredrive.evaluation.predictor import Part, Prediction, Predictor
+from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.summary import write_summary
+from foredrive.metrics.images import psnr_db
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.views import CameraView

@@ -12,14 +12,10 @@ from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import (
-    ConstantVelocity,
-    EvaluationResult,
-    StandStill,
-    collect_provenance,
-    evaluate,
-    write_summary,
-)
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.run import EvaluationResult, evaluate
+from foredrive.evaluation.summary import write_summary
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips

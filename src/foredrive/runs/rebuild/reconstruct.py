@@ -15,8 +15,9 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.evaluation.summary import read_summary, write_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.config import load_values, save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe
