@@ -9,10 +9,10 @@ import torch
 import viser
 from viser.transforms import SO3
 
-from foredrive.rendering.edits import Edited
-from foredrive.rendering.free_views import free_camera
-from foredrive.runs.rebuild.film import Shooting, Shot, shoot
-from foredrive.runs.rebuild.rebuilt_run import OpenRun
+from foredrive.rendering.edits import EditedScene
+from foredrive.rendering.novel_views import novel_camera_view
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction
+from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_frame
 from foredrive.view.image_drawing import to_image
 from foredrive.view.job_runner import JobRunner
 from foredrive.view.model_panel import pinhole
@@ -28,7 +28,7 @@ LIDAR = "/lidar"
 class SceneAtTime:
     """An edited scene at one time."""
 
-    edited: Edited
+    edited: EditedScene
     t_s: float
 
 
@@ -41,7 +41,7 @@ class RebuiltPictures:
         jobs: thread that renders everything.
     """
 
-    def __init__(self, server: viser.ViserServer, run: OpenRun, jobs: JobRunner) -> None:
+    def __init__(self, server: viser.ViserServer, run: OpenedReconstruction, jobs: JobRunner) -> None:
         self._server, self._run, self._jobs = server, run, jobs
         self._shown: SceneAtTime | None = None
         self.layers = {"lidar": True, "cameras": True}
@@ -55,7 +55,7 @@ class RebuiltPictures:
             self.images = [gui.add_image(blank, label=name, jpeg_quality=85) for name in rig.names]
         self.colour.on_update(lambda _: self._request_lidar())
 
-    def show(self, edited: Edited, t_s: float) -> None:
+    def show(self, edited: EditedScene, t_s: float) -> None:
         """Request pictures at a time; queued requests of earlier times are dropped."""
         self._shown = SceneAtTime(edited, t_s)
         self._request_lidar()
@@ -76,18 +76,18 @@ class RebuiltPictures:
         if self._shown is not None and self._run.vehicle.lidar is not None:
             self._jobs.submit(LIDAR, partial(self._show_lidar, self._shown))
 
-    def _shot(self, shown: SceneAtTime, shooting: Shooting) -> Shot:
-        return shoot(self._run.scene, self._run.vehicle, shown.edited, shooting, 0)
+    def _shot(self, shown: SceneAtTime, plan: RenderPlan) -> RenderedFrame:
+        return render_frame(self._run.scene, self._run.vehicle, shown.edited, plan, 0)
 
     def _show_camera(self, camera: int, shown: SceneAtTime) -> None:
         rig = self._run.vehicle.rig
-        shot = self._shot(shown, Shooting((shown.t_s,), 1.0, (camera,), None))
+        shot = self._shot(shown, RenderPlan((shown.t_s,), 1.0, (camera,), None))
         rgb = shot.images[0].permute(1, 2, 0).numpy()
         self.images[camera].image = rgb
         show_camera(self._server.scene, rig, camera, rgb)
 
     def _show_lidar(self, shown: SceneAtTime) -> None:
-        sweep = self._shot(shown, Shooting((shown.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
+        sweep = self._shot(shown, RenderPlan((shown.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
         assert sweep is not None
         returned = sweep[sweep.returned]
         if len(returned.range_m) == 0:
@@ -111,6 +111,6 @@ class RebuiltPictures:
         ego = self._run.vehicle.at(shown.t_s).shifted(shown.edited.T_ego_shifted.cpu())
         scene = self._run.scene
         with torch.no_grad():
-            view = free_camera(rig, 0, ego, sensor=0).to(scene.actor.device)
+            view = novel_camera_view(rig, 0, ego, sensor=0).to(scene.actor.device)
             rgb = to_image(scene(shown.edited.graph, view).rgb)
         client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)

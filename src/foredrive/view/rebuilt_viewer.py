@@ -8,7 +8,7 @@ from pathlib import Path
 import viser
 
 from foredrive.rendering.edits import Edit
-from foredrive.runs.rebuild.rebuilt_run import OpenRun
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction
 from foredrive.view.edit_panel import EditPanel
 from foredrive.view.job_runner import JobRunner
 from foredrive.view.page import Page
@@ -42,7 +42,9 @@ class RebuiltViewer(Page):
         InputError: the page cannot be served there.
     """
 
-    def __init__(self, run: OpenRun, edits: Sequence[Edit], file: Path, host: str, port: int) -> None:
+    def __init__(
+        self, run: OpenedReconstruction, edits: Sequence[Edit], file: Path, host: str, port: int
+    ) -> None:
         super().__init__(run.folder.name, host, port)
         self.run = run
         self.server.initial_camera.far = FAR_M
