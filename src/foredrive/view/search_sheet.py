@@ -92,7 +92,7 @@ def hits_table(hits: Sequence[Hit]) -> Table:
     """Return the hits as a table."""
     columns = (
         Column(),
-        *(Column(name, align="left") for name in ("moment and view", "why", "what is there")),
+        *(Column(name, align="left") for name in ("moment and view", "score", "content")),
     )
     rows = [(n, hit_name(hit), score_text(hit), content_text(hit)) for n, hit in enumerate(hits, 1)]
     return simple_table(columns, rows)
