@@ -15,8 +15,8 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, sensor_twist
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo
-from foredrive.rendering.free_views import free_camera
-from foredrive.rendering.vehicle import EgoMoment
+from foredrive.rendering.novel_views import novel_camera_view
+from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import load_town_map
@@ -113,10 +113,11 @@ class TownTruth:
         )
         T_world_scene = torch.from_numpy(self.snapshots[0].T_world_ego)
         T_scene_ego = (inverse_se3(T_world_scene) @ torch.from_numpy(T_world_ego)).float()
-        seen_from = EgoMoment(T_scene_ego, twist_ego.float(), moment.t_s)
+        seen_from = EgoState(T_scene_ego, twist_ego.float(), moment.t_s)
         cameras = [
             dataclasses.replace(
-                free_camera(sensors.rig, number, seen_from), image=torch.from_numpy(image).permute(2, 0, 1)
+                novel_camera_view(sensors.rig, number, seen_from),
+                image=torch.from_numpy(image).permute(2, 0, 1),
             )
             for number, image in enumerate(picture.images.values())
         ]

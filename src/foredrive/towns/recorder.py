@@ -17,7 +17,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
-from foredrive.ops.threads import one_ahead
+from foredrive.ops.threads import prefetched
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
@@ -136,7 +136,7 @@ def record(
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     collector = FactCollector(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
-    sensed = one_ahead(_sense(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
+    sensed = prefetched(_sense(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
         for snapshot in track(sensed, description=f"recording {name}", total=count):
