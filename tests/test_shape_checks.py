@@ -1,11 +1,13 @@
-"""The shapes and dtypes in public signatures are checked while tests run."""
+"""The types, shapes and dtypes in signatures are checked while tests run."""
 
 import pytest
 import torch
+from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import TypeCheckError
 
 from foredrive.geometry.se3 import transform_points
-from foredrive.scene import Trajectory
+from foredrive.scene import Trajectory, VoxelSpec
+from foredrive.towns.conditions import find_conditions
 
 
 def test_a_wrong_shape_is_caught_in_a_function() -> None:
@@ -22,3 +24,10 @@ def test_a_wrong_shape_is_caught_in_a_record() -> None:
             log_prob=torch.zeros(1),
             dt_s=0.5,
         )
+
+
+def test_a_wrong_type_is_caught_without_shapes() -> None:
+    with pytest.raises(BeartypeCallHintViolation):
+        find_conditions(3)  # type: ignore[arg-type]
+    with pytest.raises(BeartypeCallHintViolation):
+        VoxelSpec(lower_m=(0.0, 0.0), voxel_m=1.0, shape_zyx=(2, 4, 4))  # type: ignore[arg-type]
