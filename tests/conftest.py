@@ -62,6 +62,10 @@ def real_data() -> Path:
     return folder
 
 
+def pytest_runtest_setup() -> None:
+    shape_checks.begin_test()
+
+
 def synthetic_example(
     *, batch: int = 2, past: int = 1, future: int = 2, cameras: int = 2, spec: VoxelSpec, seed: int = 0
 ) -> Example:

@@ -4,6 +4,7 @@ import pytest
 import torch
 from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import TypeCheckError
+from shape_checks import CALLS
 
 from foredrive.geometry.se3 import transform_points
 from foredrive.scene import Trajectory, VoxelSpec
@@ -24,6 +25,13 @@ def test_a_wrong_shape_is_caught_in_a_record() -> None:
             log_prob=torch.zeros(1),
             dt_s=0.5,
         )
+
+
+def test_the_hundredth_call_is_still_checked() -> None:
+    for _ in range(CALLS - 1):
+        transform_points(torch.eye(4), torch.zeros(5, 3))
+    with pytest.raises(TypeCheckError):
+        transform_points(torch.eye(3), torch.zeros(5, 3))
 
 
 def test_a_wrong_type_is_caught_without_shapes() -> None:
