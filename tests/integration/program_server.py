@@ -6,6 +6,7 @@ Each program is a process of its own, forked before anything has run, with its o
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,7 @@ class ProgramServer:
     def __init__(self, scratch: Path) -> None:
         path = os.pathsep.join([str(TESTS), str(TESTS / "data"), os.environ.get("PYTHONPATH", "")])
         self._err = scratch / "stderr"
+        self._group: int | None = None
         self._process = subprocess.Popen(
             [sys.executable, "-W", "error", "-c", SERVER],
             bufsize=0,  # so that `select` sees every line that is not read yet
@@ -60,11 +62,13 @@ class ProgramServer:
 
     def start(self, *args: str | Path) -> int:
         """Start the program, which knows the recipe "miniature" too, and return its process and group."""
+        self._end_the_last()
         files = [os.devnull, os.devnull, str(self._err)]
         asked = json.dumps({"args": [str(arg) for arg in args], "files": files})
         assert self._process.stdin is not None
         self._process.stdin.write(asked.encode() + b"\n")
-        return self._read(START_S)
+        self._group = self._read(START_S)
+        return self._group
 
     def is_running(self) -> bool:
         """Return whether the program that was started last has not ended yet."""
@@ -72,11 +76,19 @@ class ProgramServer:
 
     def finish(self, patience_s: float) -> tuple[int, str]:
         """Wait for the program to end; return its exit code and what it printed on stderr."""
-        return self._read(patience_s), self._err.read_text()
+        code, self._group = self._read(patience_s), None
+        return code, self._err.read_text()
 
     def close(self) -> None:
         """End the server."""
+        self._end_the_last()
         self._process.communicate(timeout=START_S)
+
+    def _end_the_last(self) -> None:
+        """End a program that a failed test has left."""
+        if self._group is not None:
+            os.killpg(self._group, signal.SIGKILL)
+            self.finish(START_S)
 
     def _read(self, patience_s: float) -> int:
         assert self._process.stdout is not None
