@@ -20,7 +20,7 @@ from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
+from foredrive.towns.recorder import Crowd, LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, find_lidar
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
@@ -60,7 +60,7 @@ class TownDrive:
         path = LogPath(out / "logs" / split_of(self.town) / name, out / "maps")
         if path.folder.is_dir():
             return path
-        labels = LabelKinds(occupancy=None, visibility=False, captions=False)
+        labels = LabelOptions(occupancy=None, visibility=False, captions=False)
         return record(
             self.town,
             self.seconds,

@@ -97,7 +97,7 @@ def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     assert "image.psnr_db" not in summary
     report = report_on_run(run, [log], result.summary, predict_examples(run, [log], 1), result.failures)
     write_run_report(tmp_path / "report.html", report)
-    assert "carried copy" in (tmp_path / "report.html").read_text()
+    assert "ego-compensated persistence" in (tmp_path / "report.html").read_text()
 
 
 def test_what_a_log_was_trained_on_is_not_what_a_forecast_is_judged_by(

@@ -92,7 +92,7 @@ def test_the_verb_shows_a_table(
     trained: Run, rebuilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", str(trained.folder), "--in", str(rebuilt), "--out", str(tmp_path)]) == 0
-    assert "rendered beside real" in capsys.readouterr().out
+    assert "agreement of both" in capsys.readouterr().out
 
 
 def test_a_camera_that_was_not_rebuilt_is_named() -> None:

@@ -13,7 +13,7 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
-from foredrive.runs.rebuild import render
+from foredrive.runs.rebuild import render as rebuilt_render
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames, render_frame
@@ -180,4 +180,4 @@ def test_a_saved_edit_is_not_written_before_it_is_known_to_work(run: Reconstruct
 
 
 def test_lidars_have_names() -> None:
-    assert set(render.LIDARS) == {"pandar64", "hdl32e", "vlp16"}
+    assert set(rebuilt_render.LIDARS) == {"pandar64", "hdl32e", "vlp16"}

@@ -88,8 +88,8 @@ def test_pictures_follow_time_and_edits(page: Page) -> None:
     assert node(page, "/scene").position == pytest.approx((0, -2, 0), abs=1e-4)
     assert np.abs(picture(page) - removed).mean() > 1
     assert page.edits.edits == [Remove(MOVING), ShiftEgo((0.0, 2.0, 0.0))]
-    page.edits._take_back()
-    page.edits._take_back()
+    page.edits._undo()
+    page.edits._undo()
     assert page.edits.undo.disabled
     assert np.array_equal(picture(page), before)
 

@@ -51,7 +51,7 @@ def to_image(rgb: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
     return (255 * rgb.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
-def write_text(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, size: int, colour: str) -> None:
+def write_text(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
     """Write one line of text below and to the right of a point."""
     pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))
 
