@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.convert import convert
 from foredrive.errors import InputError
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.vehicle import camera_rig, find_lidar

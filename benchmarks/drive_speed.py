@@ -16,7 +16,7 @@ import torch
 from benchmarks.common.measuring import held_mib
 from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent
 from foredrive.scene import Clip

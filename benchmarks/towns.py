@@ -16,7 +16,7 @@ from types import FrameType
 
 import torch
 
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import load_town_map

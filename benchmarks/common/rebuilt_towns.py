@@ -22,7 +22,7 @@ from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, find_lidar
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import LabelKinds, record, split_of
+from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
@@ -63,7 +63,7 @@ class TownDrive:
         path = LogPath(out / "logs" / split_of(self.town) / name, out / "maps")
         if path.folder.is_dir():
             return path
-        labels = LabelKinds(occupancy=None, visibility=False, captions=False)
+        labels = LabelOptions(occupancy=None, visibility=False, captions=False)
         return record(
             self.town,
             self.seconds,

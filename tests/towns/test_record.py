@@ -32,7 +32,7 @@ from foredrive.scene.traffic_light import LightState
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns import recorder
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.recorder import LabelKinds, record, split_of
+from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
@@ -44,7 +44,7 @@ RATE_HZ = 2.0
 
 def record_small(out: Path, seed: int = 3, town: str = "Town02") -> LogPath:
     sensors = SensorSuite(camera_rig((36, 64)), roof_lidar(channels=16, azimuth_steps=180))
-    labels = LabelKinds(depth=True, semantic=True, instance=True)
+    labels = LabelOptions(depth=True, semantic=True, instance=True)
     return record(
         town,
         FRAMES / RATE_HZ,
@@ -349,7 +349,7 @@ def test_boxes_move_as_their_velocities_say(town02: TownMap) -> None:
 
 @pytest.mark.usefixtures("built_already")
 def test_labels_may_be_left_out(tmp_path: Path) -> None:
-    bare = LabelKinds(occupancy=None, visibility=False, captions=False)
+    bare = LabelOptions(occupancy=None, visibility=False, captions=False)
     sensors = SensorSuite(camera_rig((12, 16)), roof_lidar(channels=4, azimuth_steps=36))
     log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, BackgroundTraffic(4, 2), bare))
     assert read_visibility(log, 0) is read_caption(log, 0) is read_setting(log, 0) is None

@@ -21,7 +21,7 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.patterns import band, bands
-from foredrive.towns.world import NOBODY, World
+from foredrive.towns.world import NO_ACTOR, World
 
 SIZE = (48, 80)
 
@@ -214,7 +214,7 @@ def test_parked_cars_are_told_apart(world02: World, town02: TownMap, sensors: Se
     frame = world02.render([car], sensors, T, STILL, noise_seed=0)
     seen = set(np.unique(frame.pixel_ids["PCAM_F0"]).tolist())
     assert car.track_id in seen
-    assert NOBODY in seen
+    assert NO_ACTOR in seen
 
 
 def test_filtered_bands_keep_their_share() -> None:

@@ -15,8 +15,8 @@ from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import (
     FIRST_TIME_US,
     camera_specs,
-    lights_of_lanes,
     split_of,
+    traffic_light_states,
     write_town_map,
 )
 
@@ -52,7 +52,7 @@ def town_log_frame(simulator: TownSimulator, taught: Trajectory | None = None) -
     return dataclasses.replace(
         log_frame(state.frames[-1], state.ego, None if sensors is None else sensors.rig),
         taught=None if taught is None else taught[0],
-        traffic_lights=lights_of_lanes(load_town_map(simulator.scenario.town), lights),
+        traffic_lights=traffic_light_states(load_town_map(simulator.scenario.town), lights),
     )
 
 

@@ -73,7 +73,7 @@ def footprint(actor: ActorState) -> shapely.Polygon:
     return shapely.Polygon([centre + x + y, centre - x + y, centre - x - y, centre + x - y])
 
 
-def numbered(cars: list[ActorState]) -> tuple[ActorState, ...]:
+def with_track_ids(cars: list[ActorState]) -> tuple[ActorState, ...]:
     """Return parked cars with their track ids."""
     return tuple(
         ActorState(**{**vars(car), "track_id": FIRST_TRACK_ID + number}) for number, car in enumerate(cars)
