@@ -47,8 +47,8 @@ def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
     with atomic_path(path) as temporary, temporary.open("w") as file:
         for score in scores:
             parts = {"nll": score.nll, **score.parts}
-            scores = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
-            file.write(json.dumps({"frame": score.name, **scores}) + "\n")
+            values = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
+            file.write(json.dumps({"frame": score.name, **values}) + "\n")
 
 
 def _read_json(path: Path) -> Any:
