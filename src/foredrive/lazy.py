@@ -53,7 +53,8 @@ def defer_package(package: str) -> None:
     if package in sys.modules:
         return
     spec = importlib.util.find_spec(package)
-    assert spec is not None and spec.loader is not None, f"{package} is not installed"
+    assert spec is not None, f"{package} is not installed"
+    assert spec.loader is not None
     loader = spec.loader
     module = importlib.util.module_from_spec(spec)
     path = vars(module).pop("__path__")  # an import of one of its modules asks for this

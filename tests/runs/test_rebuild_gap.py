@@ -10,12 +10,12 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run
-from foredrive.runs.evaluate.real_to_sim_gap import Comparison, measure_gap, rendered_images
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, rebuilt_cameras
-from foredrive.runs.rebuild.reconstruct import read_material, reconstruct
+from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
+from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import read_reconstruction_data, reconstruct
 from foredrive.scene import Clip, Trajectory
 
 RECIPE = dataclasses.replace(SMALLEST, hold_out_every=4)
@@ -32,8 +32,8 @@ def test_what_is_rendered_are_the_moments_of_the_clip(trained: Run, log: LogPath
     """Rendered images are nearer to the clip's own than to those of other times; later frames are left."""
     config = dataclasses.replace(trained.recipe.clips, image_hw=RECIPE.image_hw)
     dataset = ClipDataset([log], config, None)
-    material = read_material(RECIPE, log, rebuilt / "cache")
-    views = [*material.learned.cameras, *material.held_out.cameras]
+    data = read_reconstruction_data(RECIPE, log, rebuilt / "cache")
+    views = [*data.train.cameras, *data.held_out.cameras]
     clip = dataset.clip(0)
     shown = rendered_images(open_rebuilt(rebuilt).scene, clip, 0.5, views, [0, 1])
     assert not torch.equal(shown.images[: clip.now + 1], clip.images[: clip.now + 1])
@@ -80,7 +80,7 @@ def test_agreement_is_of_what_is_said_of_both(trained: Run, log: LogPath) -> Non
     example = ClipDataset([log], config, None)[0]
     bright = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 200))
     dark = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 10))
-    seen = Comparison(Told(), config.image_hw)
+    seen = RealToSimComparison(Told(), config.image_hw)
     seen.add(dataclasses.replace(example, clip=bright), dark)
     figures = seen.figures(0.5)
     assert figures["agreement.occupancy.iou_now"] == pytest.approx(0.5)
@@ -92,10 +92,10 @@ def test_the_verb_shows_a_table(
     trained: Run, rebuilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", str(trained.folder), "--in", str(rebuilt), "--out", str(tmp_path)]) == 0
-    assert "rendered beside real" in capsys.readouterr().out
+    assert "agreement of both" in capsys.readouterr().out
 
 
 def test_a_camera_that_was_not_rebuilt_is_named() -> None:
-    assert rebuilt_cameras(("a", "b"), ("b", "a")) == [1, 0]
+    assert camera_indices(("a", "b"), ("b", "a")) == [1, 0]
     with pytest.raises(InputError, match="not rebuilt: c; there are: a, b"):
-        rebuilt_cameras(("a", "b"), ("a", "c"))
+        camera_indices(("a", "b"), ("a", "c"))

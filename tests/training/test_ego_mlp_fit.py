@@ -7,7 +7,7 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.evaluation import ConstantVelocity
+from foredrive.evaluation.baselines import ConstantVelocity
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.training import fit_ego_mlp, read_status
 from foredrive.training.ego_mlp_fit import EGO_MLP_FIT

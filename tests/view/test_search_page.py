@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 from html_pages import EVIL, Page, assert_harmless
 from miniature import write_log
@@ -22,7 +23,7 @@ from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
-from foredrive.search.rows import FACTS
+from foredrive.search.rows import FACTS, IndexRow
 from foredrive.view.search_page import SearchPage, query_of
 from foredrive.view.search_sheet import write_search_sheet
 
@@ -56,10 +57,10 @@ def fetch(page: SearchPage, path: str, body: object = None, **asked: object) -> 
 
 def test_a_text_has_hits_with_pictures(page: SearchPage) -> None:
     found = fetch(page, "/find", text="car at night", gap_s=0.4, top=2, view="sectors", modality="image")
-    assert found["told"] == "2 hits, all compared"
+    assert found["message"] == "2 hits, all compared"
     hit = found["hits"][0]
     assert hit["name"].startswith("flat_train/flat@")
-    assert hit["why"].startswith("image ")
+    assert hit["score"].startswith("image ")
     assert fetch(page, "/picture", key=hit["key"]).startswith(b"\xff\xd8")
 
 
@@ -82,7 +83,7 @@ def test_scenes_in_a_lasso_are_shown_tagged_and_listed(page: SearchPage, tmp_pat
     assert (len(plane["points"]), plane["total"]) == (MOMENTS, MOMENTS)
     keys = [point["key"] for point in plane["points"][1:]]
     assert [hit["key"] for hit in fetch(page, "/moments", {"keys": keys})["hits"]] == keys
-    assert fetch(page, "/tag", {"tag": "late", "keys": keys})["told"] == "2 moments are tagged late"
+    assert fetch(page, "/tag", {"tag": "late", "keys": keys})["message"] == "2 moments are tagged late"
     assert len(fetch(page, "/find", tag="late", gap_s=0, view="all")["hits"]) == 2
     assert "error" in fetch(page, "/tag", {"tag": " ", "keys": keys})
     listed = tmp_path / "clips.json"
@@ -118,7 +119,7 @@ def browse(url: str, profile: Path) -> Page:
 def test_the_page_opens_with_scenes(page: SearchPage, tmp_path: Path) -> None:
     shown = browse(page.url, tmp_path)
     assert [tag for tag, _ in shown.tags].count("figure") == MOMENTS
-    assert "3 of 3 whole scenes, evenly chosen" in shown.text
+    assert "3 of 3 whole scenes, evenly selected" in shown.text
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium here")
@@ -133,17 +134,23 @@ def test_a_browser_draws_the_grid(page: SearchPage, tmp_path: Path) -> None:
     assert "svg" not in {tag for tag, _ in shown.tags}
 
 
+def index_row(**columns: str) -> IndexRow:
+    """A row with these columns; most of the others are null."""
+    texts = dict.fromkeys(("key", "log", "folder", "maps_dir", "view"), "-")
+    row = {**texts, "t_s": 1.0, "t_us": 0, "frame": 0, **columns}
+    return IndexRow.all_of(pa.Table.from_pylist([row], schema=FACTS))[0]
+
+
 def test_names_from_outside_run_nothing_on_a_contact_sheet(tmp_path: Path) -> None:
-    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0}
-    facts |= dict.fromkeys(("log", "folder", "maps_dir", "view", "place", "weather", "caption"), EVIL)
+    names = ("log", "folder", "maps_dir", "view", "place", "weather", "caption")
+    row = index_row(**dict.fromkeys(names, EVIL))
     query = Query(text=EVIL, where=EVIL)
-    write_search_sheet(tmp_path / "hits.html", query, [Hit(facts, 0.5, {EVIL: 0.5})])
+    write_search_sheet(tmp_path / "hits.html", query, [Hit(row, 0.5, {EVIL: 0.5})])
     # title and heading (text and condition), and of the hit: log, view, score, place, weather, caption
     assert_harmless((tmp_path / "hits.html").read_text(), times=4 + 6)
 
 
 def test_a_query_with_dollars_is_no_formula(tmp_path: Path) -> None:
-    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0, "folder": "$\\frac$", "maps_dir": ""}
-    hit = Hit(facts, 0.5, {"$\\x$": 1.0})
+    hit = Hit(index_row(folder="$\\frac$", maps_dir=""), 0.5, {"$\\x$": 1.0})
     write_search_sheet(tmp_path / "hits.png", Query(text="5 $ or $\\frac$"), [hit])
     assert (tmp_path / "hits.png").stat().st_size > 1000

@@ -49,7 +49,7 @@ def evaluate(
     named = find_all_logs(logs)
 
     with importing():
-        from foredrive.runs import evaluate_run, inspect_run, open_run
+        from foredrive.runs import evaluate_run, open_run, predict_examples
 
     trained = open_run(run)
     chosen = named or trained.logs
@@ -58,16 +58,15 @@ def evaluate(
 
     from rich.console import Console
 
-    from foredrive.evaluation import read_summary
-    from foredrive.view.report import write_report
-    from foredrive.view.run_report import report_on_run
+    from foredrive.evaluation.summary import read_summary
+    from foredrive.view.run_report import report_on_run, write_run_report
     from foredrive.view.summary_tables import print_summary
 
     summary = read_summary(folder / "summary.json")
     print_summary(summary, Console(), trained.recipe.name)
-    inspections = inspect_run(trained, chosen, examples)
-    report = report_on_run(trained, chosen, summary, inspections, result.failures)
-    write_report(folder / "report.html", report)
+    predictions = predict_examples(trained, chosen, examples)
+    report = report_on_run(trained, chosen, summary, predictions, result.failures)
+    write_run_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
 
 

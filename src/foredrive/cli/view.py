@@ -62,23 +62,23 @@ def view(
         check_run(run)
 
     with importing():
-        from foredrive.view.log_times import CAMERA_WIDTH_PX, LogTimes
+        from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 
-    times = LogTimes(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
-    index = times.nearest(t)
+    frames = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    index = frames.nearest(t)
     if save is not None:
         from foredrive.view.log_sheet import write_log_sheet
 
-        title = f"{times.name}    t = {times.t_s[index]:.2f} s"
-        write_log_sheet(save, times.clip(index), title, reach)
+        title = f"{frames.name}    t = {frames.t_s[index]:.2f} s"
+        write_log_sheet(save, frames.clip(index), title, reach)
         print(f"wrote {save}")
         return
     from foredrive.view.viewer import Viewer
 
-    viewer = Viewer(times, host, port)
+    viewer = Viewer(frames, host, port)
     try:
         viewer.show(index)
-        print(f"{times.name} is at {viewer.url} until you press Ctrl-C")
+        print(f"{frames.name} is at {viewer.url} until you press Ctrl-C")
         viewer.play()
     finally:
         viewer.close()

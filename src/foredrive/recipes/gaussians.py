@@ -7,7 +7,7 @@ from pathlib import Path
 from foredrive.errors import InputError
 from foredrive.recipes.config import is_recipe_file, load_values, overridden, validated
 from foredrive.recipes.known import nearest_name
-from foredrive.rendering.initial import InitialSize
+from foredrive.rendering.initial import InitialGaussians
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 
@@ -17,7 +17,7 @@ class RebuildRecipe:
 
     name: str
     image_hw: tuple[int, int]
-    initial: InitialSize
+    initial: InitialGaussians
     schedule: RebuildSchedule
     cameras: tuple[str, ...] | None = None
     """Names of cameras, their own or 123D's; None takes all."""
@@ -42,7 +42,7 @@ def gaussians_tiny() -> RebuildRecipe:
         name="gaussians_tiny",
         about="a log rebuilt from Gaussians in minutes on two CPU cores",
         image_hw=(270, 480),
-        initial=InitialSize(
+        initial=InitialGaussians(
             lidar_points=45_000,
             unseen_points=30_000,
             pixel_points=100_000,
@@ -73,7 +73,7 @@ def gaussians_base() -> RebuildRecipe:
         name="gaussians_base",
         about="SplatAD's sizes, for a GPU",
         image_hw=(1080, 1920),
-        initial=InitialSize(
+        initial=InitialGaussians(
             lidar_points=1_500_000,
             unseen_points=500_000,
             pixel_points=300_000,

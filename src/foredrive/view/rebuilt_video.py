@@ -12,13 +12,13 @@ from rich.progress import track
 
 from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
-from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, Send, apply_edits
-from foredrive.runs.rebuild.film import Shooting, Shot, shoot
-from foredrive.runs.rebuild.rebuilt_run import OpenRun, edited_scene
+from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, Insert, Move, Remove, apply_edits
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, edited_scene
+from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_frame
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
-from foredrive.view.image_drawing import resize
+from foredrive.view.image_drawing import resize, write_text
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.video import check_video, write_video
 
@@ -34,12 +34,12 @@ ABOVE_M = 100.0
 """Width of the view from above, m."""
 LOW_M, HIGH_M = -0.5, 4.0
 """Ends of the colour scale of heights above the ground, m."""
-MOST_EDITS = 3
+MAX_NAMED_EDITS = 3
 """Maximum number of edits that a caption names."""
 
 
 def write_rebuilt_video(
-    path: Path, run: OpenRun, edits: list[Edit], shooting: Shooting, colour: Colour
+    path: Path, run: OpenedReconstruction, edits: list[Edit], plan: RenderPlan, colour: Colour
 ) -> None:
     """Write a video of a run in real time, beside the run after edits if there are any.
 
@@ -49,23 +49,25 @@ def write_rebuilt_video(
     check_video(path)
     takes = [("as it was", apply_edits(run.scene.graph, []))]
     if edits:
-        takes.append((caption_of(edits), edited_scene(run.scene, edits)))
+        takes.append((describe_edits(edits), edited_scene(run.scene, edits)))
     make_folder(path.parent)
-    rig, chosen = run.vehicle.rig, list(shooting.cameras)
+    rig, chosen = run.vehicle.rig, list(plan.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
     frames = (
         draw_shots(
-            [(name, shoot(run.scene, run.vehicle, edited, shooting, k)) for name, edited in takes],
+            [(name, render_frame(run.scene, run.vehicle, edited, plan, k)) for name, edited in takes],
             rig,
             run.folder.name,
             colour,
         )
-        for k in track(range(len(shooting.t_s)), description=f"filming {run.folder.name}")
+        for k in track(range(len(plan.t_s)), description=f"filming {run.folder.name}")
     )
-    write_video(path, frames, shooting.step_s)
+    write_video(path, frames, plan.step_s)
 
 
-def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, colour: Colour) -> Image.Image:
+def draw_shots(
+    shots: Sequence[tuple[str, RenderedFrame]], rig: CameraRig, name: str, colour: Colour
+) -> Image.Image:
     """Draw a frame: shots of the same time side by side, each under its caption.
 
     Args:
@@ -78,29 +80,29 @@ def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, col
     width = sum(column.width for column in columns) + GAP_PX * (len(columns) + 1)
     canvas = Image.new("RGB", (width, columns[0].height + 2 * TITLE_PX + GAP_PX), palette.GROUND)
     pen = ImageDraw.Draw(canvas)
-    _write(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
+    write_text(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
     x = GAP_PX
     for (caption, _), column in zip(shots, columns, strict=True):
-        _write(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
+        write_text(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
         canvas.paste(column, (x, 2 * TITLE_PX))
         x += column.width + GAP_PX
     return canvas
 
 
-def caption_of(edits: Sequence[Edit]) -> str:
+def describe_edits(edits: Sequence[Edit]) -> str:
     """Describe edits."""
-    words = [words_of(edit) for edit in edits[:MOST_EDITS]]
-    more = len(edits) - MOST_EDITS
+    words = [describe_edit(edit) for edit in edits[:MAX_NAMED_EDITS]]
+    more = len(edits) - MAX_NAMED_EDITS
     return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
 
 
-def words_of(edit: Edit) -> str:
+def describe_edit(edit: Edit) -> str:
     """Describe an edit."""
     if isinstance(edit, Remove):
         return f"without {edit.actor}"
     if isinstance(edit, Move):
         return f"{edit.actor} moved"
-    if isinstance(edit, Duplicate | Send):
+    if isinstance(edit, Duplicate | DriveStraight):
         return f"{edit.copy} like {edit.actor}"
     if isinstance(edit, Insert):
         return f"{edit.copy} inserted on the way of {edit.follows}"
@@ -110,13 +112,13 @@ def words_of(edit: Edit) -> str:
     return " ".join(part for part in (aside, ahead) if part) or "ego vehicle turned"
 
 
-def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
+def _column(shot: RenderedFrame, rig: CameraRig, colour: Colour) -> Image.Image:
     rows = camera_rows(rig) if rig.names else []
     longest = max((len(row) for row in rows), default=1)
     each_px = ONE_CAMERA_PX if longest == 1 else CAMERA_PX
     width = longest * (each_px + GAP_PX) - GAP_PX
     height = each_px * rig.size_hw[0] // rig.size_hw[1]
-    above = None if shot.sweep is None else _from_above(shot.sweep, shot.boxes, width, colour)
+    above = None if shot.sweep is None else _draw_from_above(shot.sweep, shot.boxes, width, colour)
     whole = len(rows) * (height + GAP_PX) + (0 if above is None else above.height)
     canvas = Image.new("RGB", (width, whole), palette.GROUND)
     for line, row in enumerate(rows):
@@ -128,7 +130,7 @@ def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
     return canvas
 
 
-def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
+def _draw_from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
     """Draw coloured returns, low ones first, and the outlines of the actors with their ids."""
     twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of lines
     height_px = round(ABOVE_HW[0] * width_px)
@@ -174,7 +176,3 @@ def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]
         share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # most returns are faint
         mapped = palette.RANGE_MAP(faint + (bright - faint) * share)
     return (mapped[:, :3] * 255).astype(np.uint8)
-
-
-def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

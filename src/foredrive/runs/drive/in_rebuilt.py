@@ -15,15 +15,15 @@ from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs.drive.agents import make_driver, needs_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
 from foredrive.runs.rebuild.rebuilt_run import (
-    OpenRun,
+    OpenedReconstruction,
+    camera_indices,
     edited_scene,
     open_rebuilt,
     open_run_log,
-    rebuilt_cameras,
 )
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.drive import Drive
-from foredrive.simulation.drive_log import rebuilt_drive_log, rebuilt_key_frame
+from foredrive.simulation.drive_log import drive_log, log_frame
 from foredrive.simulation.drive_record import ThreatMet
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
@@ -89,7 +89,8 @@ class RebuiltRoutes:
         sensors = suite.sensors or (suite.driver != REPLAY and needs_of(suite.driver).lidar)
         agent = _driver(suite.driver, simulator)
         route_xyz = drive.route_from(start_s)
-        with rebuilt_drive_log(renderer.rig if sensors else None, route_xyz, out, job.name) as log:
+        rig = renderer.rig if sensors else None
+        with drive_log(out, job.name, route_xyz, rig) as log:
             yield Stage(
                 simulator,
                 RebuiltScenario(start_s, sensors, past_frames),
@@ -97,7 +98,7 @@ class RebuiltRoutes:
                 route_xyz,
                 RouteLine(route_xyz).length_m,
                 log,
-                lambda: rebuilt_key_frame(simulator),
+                lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes is not None,
                 judge=lambda driven: (
                     None
@@ -108,7 +109,7 @@ class RebuiltRoutes:
 
 
 @functools.lru_cache(maxsize=1)  # consecutive drives share one scene
-def _opened(run: str) -> OpenRun:
+def _opened(run: str) -> OpenedReconstruction:
     return open_rebuilt(Path(run))
 
 
@@ -147,7 +148,7 @@ def _driver(driver: str, simulator: RebuiltSimulator) -> Agent:
     agent = make_driver(driver, lambda: simulator.state.t_s)
     there = [name.lower() for name in simulator.renderer.rig.names]
     wanted = [name.lower() for name in needs_of(driver).camera_names or there]
-    return _Through(agent, rebuilt_cameras(there, wanted)) if wanted != there else agent
+    return _Through(agent, camera_indices(there, wanted)) if wanted != there else agent
 
 
 def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatMet:

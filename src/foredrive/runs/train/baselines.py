@@ -8,8 +8,8 @@ from pathlib import Path
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
-from foredrive.evaluation import labels_from_now
-from foredrive.metrics import OccupancyPrior
+from foredrive.evaluation.metric import labels_from_now
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.scene import Clip, Example
 from foredrive.training import DrivenStatus, fit_ego_mlp, read_status
