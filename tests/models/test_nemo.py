@@ -193,9 +193,9 @@ def test_what_is_trained_is_what_gets_a_gradient(row: str, stage: str, example: 
     assert all(math.isfinite(value.item()) for value in losses.values())
     assert ("agent.planner.plan" in trained) == (stage == "finetune") == ("wpts" in losses)
     part = {name.split(".")[2] for name in reached if name.startswith("agent.world_model.")}
-    weights, looks_ahead = chosen.weights, stage == "finetune" and objective.agent.planner.looks_ahead > 0
+    weights, imagines = chosen.weights, stage == "finetune" and objective.agent.planner.imagined_frames > 0
     expected = {"backbone", "encoder"}
-    expected |= {"motion"} if chosen.imagine or looks_ahead else set()
+    expected |= {"motion"} if chosen.imagine or imagines else set()
     expected |= {"occupancy"} if weights.occ or weights.recon else set()
     expected |= {"renderer"} if weights.recon else set()
     assert part == expected

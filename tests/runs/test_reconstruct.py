@@ -15,8 +15,13 @@ from safetensors.torch import load_file
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
-from foredrive.recipes.config import load_values
-from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
+from foredrive.recipes.gaussians import (
+    RebuildRecipe,
+    find_rebuild_recipe,
+    gaussians_base,
+    gaussians_tiny,
+    load_rebuild_recipe,
+)
 from foredrive.rendering.initial import InitialSize
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.runs.rebuild.reconstruct import begin, memory_needed_gib, read_material, reconstruct
@@ -42,7 +47,7 @@ def recipe(steps: int = STEPS) -> RebuildRecipe:
         ),
         schedule=RebuildSchedule(
             steps=steps,
-            most_gaussians=2200,
+            max_gaussians=2200,
             rates=LearningRates(mean_m=1e-3, albedo=1e-2),
             images_per_sweep=2,
             beam_stride=2,
@@ -110,7 +115,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
-    assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+    assert load_rebuild_recipe(run / "config.yaml") == recipe()
 
 
 def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
@@ -162,7 +167,7 @@ def test_too_little_memory_is_said_before(
     log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     huge = dataclasses.replace(
-        recipe(), schedule=dataclasses.replace(recipe().schedule, most_gaussians=10**12)
+        recipe(), schedule=dataclasses.replace(recipe().schedule, max_gaussians=10**12)
     )
     with pytest.raises(InputError, match=r"smallest needs about \d+\.\d GiB .* GiB are free"):
         reconstruct(huge, log, tmp_path / "huge")

@@ -17,7 +17,7 @@ from foredrive.losses import waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
-from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
+from foredrive.recipes.world_models import WORLD_MODELS, WorldModelEntry
 from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
 from foredrive.runs.drive.in_towns import TownRoutes, job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one
@@ -115,7 +115,7 @@ def recipe() -> Recipe[FrozenConfig, FrozenStage]:
 def known() -> Iterator[None]:
     """The one row that a new world model adds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(WORLD_MODELS, "frozen", WorldModelKind(FrozenConfig, FrozenStage, build, objective))
+        patch.setitem(WORLD_MODELS, "frozen", WorldModelEntry(FrozenConfig, FrozenStage, build, objective))
         yield
 
 

@@ -42,11 +42,11 @@ def driveworld_rows(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
     rows = {
         "scratch": replace(full, pretrain=None),
         "occupancy": replace(full, pretrain=replace(stage, temporal=False)),
-        "rssm": replace(full, model=replace(ssp, statics=0)),
+        "rssm": replace(full, model=replace(ssp, statics=None)),
         "ssp": replace(full, model=ssp),
         "dmb": replace(full, model=dmb),
         "mln": replace(full, model=mln),
-        "carried": replace(full, model=replace(size, carry_statics=True)),
+        "carried": replace(full, model=replace(size, warp_statics=True)),
     }
     found = {full.name: full}
     for name, recipe in rows.items():

@@ -62,6 +62,8 @@ class RebuildWeights:
     intensity: float = 1.0
     drop: float = 0.1
     line_of_sight: float = 0.1
+    depth_quantile: float = 0.95
+    """Share of the returned beams that count for `depth`. The worst hit something thin or moving."""
     scale: float = 1e-3
     opacity: float = 5e-3
 
@@ -71,7 +73,7 @@ class RebuildSchedule:
     """Length of a scene's training, and its growth."""
 
     steps: int
-    most_gaussians: int
+    max_gaussians: int
     rates: LearningRates = field(default_factory=LearningRates)
     weights: RebuildWeights = field(default_factory=RebuildWeights)
     images_per_sweep: int = 1
@@ -237,7 +239,9 @@ class _Trainer:
         seen = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
         assert seen.alpha_before_hit is not None
         losses = {
-            "depth": range_loss(seen.range_m, beams.range_m, beams.returned),
+            "depth": range_loss(
+                seen.range_m, beams.range_m, beams.returned, self.schedule.weights.depth_quantile
+            ),
             "intensity": intensity_loss(seen.intensity, beams.intensity, beams.returned),
             "line_of_sight": line_of_sight_loss(seen.alpha_before_hit, beams.returned),
         }
@@ -257,6 +261,6 @@ class _Trainer:
         schedule, scene = self.schedule, self.scene
         if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
             relocate(scene, self.optimizer, generator)
-            grow(scene, self.optimizer, schedule.most_gaussians, schedule.growth, generator)
+            grow(scene, self.optimizer, schedule.max_gaussians, schedule.growth, generator)
         rate = next(group["lr"] for group in self.optimizer.param_groups if group["name"] == "mean_m")
         scene.mean_m.add_(random_walk_m(scene.gaussians, schedule.walk * rate, generator))
