@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, naming
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
-from foredrive.training.interrupts import hold_interrupts, start_fork_server
+from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
@@ -157,6 +157,7 @@ def _loader(
         batch_sampler=mine,
         collate_fn=collate,
         num_workers=schedule.workers,
+        worker_init_fn=end_with_parent,
         # Forked workers crash if numba's threads have run in the parent.
         multiprocessing_context="forkserver" if schedule.workers else None,
     )
