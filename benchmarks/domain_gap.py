@@ -24,7 +24,7 @@ from foredrive.towns.conditions import CONDITIONS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, find_lidar
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
@@ -70,8 +70,8 @@ def town(name: str, conditions: str, seed: int) -> Iterator[Sensed]:
     town_map = load_town_map(name)
     world = World(town_map, seed, CONDITIONS[conditions])
     sensors = SensorSuite(camera_rig(SIZE_HW), find_lidar("pandar64"))
-    drive = Drive(Traffic(town_map, seed, VEHICLES + 1, PEOPLE), FRAMES * SPACING_S)
-    for index, m in enumerate(drive.moments(FRAMES, SPACING_S)):
+    drive = ExpertDrive(Traffic(town_map, seed, VEHICLES + 1, PEOPLE), FRAMES * SPACING_S)
+    for index, m in enumerate(drive.snapshots(FRAMES, SPACING_S)):
         seen = world.render(m.actors, sensors, m.T_world_ego, m.twist_ego, index, m.lights)
         yield Sensed(seen.sweep, np.stack(list(seen.images.values())))
 

@@ -23,7 +23,7 @@ from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
+from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.scene import Category
 from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
@@ -62,7 +62,7 @@ def passed() -> int:
     The rounding of a machine's arithmetic decides which car drives there, so that its id is not fixed.
     """
     ahead: Counter[int] = Counter()
-    for moment in truth().moments[1::JUDGED_EVERY]:
+    for moment in truth().snapshots[1::JUDGED_EVERY]:
         R, ego_m = moment.T_world_ego[:3, :3], moment.T_world_ego[:3, 3]
         for actor in moment.actors:
             x_m, y_m, _ = R.T @ (actor.centre_m - ego_m)
@@ -118,15 +118,15 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
     return figures
 
 
-def judge(run: Rebuilt, views: Sequence[TrueViews], graph: SceneGraph) -> dict[str, float]:
+def judge(run: Reconstruction, views: Sequence[TrueViews], graph: SceneGraph) -> dict[str, float]:
     """Return all metrics of views, over all their pixels and beams."""
     cameras = [camera for view in views for camera in view.cameras]
-    found = judge_cameras(run.scene, cameras, run.learned.cameras, graph)
+    found = judge_cameras(run.scene, cameras, run.train.cameras, graph)
     found |= judge_sweeps(run.scene, [view.sweep for view in views], graph=graph)
     return {name: found[name] for name in OF_IMAGES + OF_SWEEPS}
 
 
-def judge_changed(run: Rebuilt, name: str, graph: SceneGraph) -> dict[str, float]:
+def judge_changed(run: Reconstruction, name: str, graph: SceneGraph) -> dict[str, float]:
     """Return the same metrics over changed pixels and beams only, for the scene with and without the edit."""
     pixels, beams = [], []
     for before, after in zip(true_views("held_out"), true_views(name), strict=True):
@@ -136,7 +136,7 @@ def judge_changed(run: Rebuilt, name: str, graph: SceneGraph) -> dict[str, float
     found = {}
     for prefix, shown in (("changed.", graph), ("unedited.changed.", run.scene.graph)):
         cameras, where = zip(*pixels, strict=True)
-        figures = judge_cameras(run.scene, cameras, run.learned.cameras, shown, where)
+        figures = judge_cameras(run.scene, cameras, run.train.cameras, shown, where)
         sweeps, which = zip(*beams, strict=True)
         figures |= judge_sweeps(run.scene, sweeps, graph=shown, where=which)
         found |= named(f"{name}.{prefix}", {key: figures[key] for key in OF_IMAGES + OF_SWEEPS})

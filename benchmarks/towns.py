@@ -21,7 +21,7 @@ from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import Crowd, record
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
@@ -52,7 +52,7 @@ def sensors(seed: int) -> dict[str, float]:
     """Measure key frames per second without labels and disk."""
     town = load_town_map(TOWN)
     world, traffic = World(town, seed), Traffic(town, seed, VEHICLES + 1, PEOPLE)
-    moments = list(Drive(traffic, FRAMES / RATE_HZ).moments(FRAMES + 1, 1 / RATE_HZ))
+    moments = list(ExpertDrive(traffic, FRAMES / RATE_HZ).snapshots(FRAMES + 1, 1 / RATE_HZ))
     suite = _suite()
 
     def render(first: int, last: int) -> float:

@@ -13,7 +13,7 @@ from benchmarks.common.traffic_audit import Audit
 from foredrive.evaluation import Benchmark
 from foredrive.towns.map.names import TOWNS
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 
 VEHICLES, PEOPLE = 40, 20
@@ -32,7 +32,7 @@ def measure(seed: int, town: str, hours: float = HOURS) -> Mapping[str, float]:
     for drive_index in range(max(1, round(hours * 3600 / CHUNK_S))):
         length_s = min(CHUNK_S, hours * 3600)
         traffic = Traffic(town_map, 1000 * seed + drive_index, VEHICLES, PEOPLE)
-        drive, audit = Drive(traffic, length_s, STEERING_NOISE_RAD), Audit(town_map, traffic)
+        drive, audit = ExpertDrive(traffic, length_s, STEERING_NOISE_RAD), Audit(town_map, traffic)
         for _ in range(round(length_s / DT_S)):
             before, started = drive.state, time.perf_counter()
             drive.step(DT_S)

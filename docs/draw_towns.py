@@ -14,7 +14,7 @@ from foredrive.towns.conditions import CONDITIONS, Conditions
 from foredrive.towns.map.town_map import TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
@@ -31,7 +31,7 @@ def see(town: str, all_conditions: Mapping[str, Conditions], at_s: float = 6.0) 
     """What the expert's sensors see some seconds into its drive, in several conditions."""
     town_map = load_town_map(town)
     sensors = SensorSuite(camera_rig(SIZE_HW), roof_lidar(channels=64, azimuth_steps=1024))
-    *_, moment = Drive(Traffic(town_map, SEED, 31, 20), at_s + 1.0).moments(int(at_s * 5) + 1, 0.2)
+    *_, moment = ExpertDrive(Traffic(town_map, SEED, 31, 20), at_s + 1.0).snapshots(int(at_s * 5) + 1, 0.2)
     world = World(town_map, SEED, CONDITIONS["clear"])
     return {
         name: world.under(conditions).render(

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, transform_points, yaw_of
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, transform_points, yaw_from_matrix
 from foredrive.scene import (
     Boxes,
     CameraRig,
@@ -81,7 +81,7 @@ def one_example(seed: int) -> Example:
         target_valid=torch.zeros(1, dtype=torch.bool),
         future=Trajectory(
             xy=T_now_ego[None, None, PAST + 1 :, :2, 3].float(),
-            yaw=yaw_of(T_now_ego)[None, None, PAST + 1 :].float(),
+            yaw=yaw_from_matrix(T_now_ego)[None, None, PAST + 1 :].float(),
             valid=torch.ones(1, 1, FUTURE, dtype=torch.bool),
             log_prob=torch.zeros(1, 1),
             dt_s=DT_S,

@@ -15,15 +15,15 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, sensor_twist
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo
-from foredrive.rendering.free_views import free_camera
-from foredrive.rendering.vehicle import EgoMoment
+from foredrive.rendering.novel_views import novel_camera_view
+from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, find_lidar
-from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
@@ -91,8 +91,8 @@ class TownTruth:
         town = load_town_map(drive.town)
         self._world = World(town, drive.seed)
         traffic = Traffic(town, drive.seed, drive.crowd.vehicles + 1, drive.crowd.people)
-        moments = Drive(traffic, drive.seconds).moments(drive.frames, 1 / drive.rate_hz)
-        self.moments: list[Moment] = list(moments)
+        moments = ExpertDrive(traffic, drive.seconds).snapshots(drive.frames, 1 / drive.rate_hz)
+        self.snapshots: list[DriveSnapshot] = list(moments)
 
     def seen(self, frame: int, edits: Sequence[Edit] = ()) -> TrueViews:
         """Return the true sensor views at a frame's time after edits, in the frame of the first ego pose.
@@ -104,19 +104,20 @@ class TownTruth:
         Raises:
             InputError: there is another kind of edit.
         """
-        moment, sensors = self.moments[frame], self.drive.sensors
+        moment, sensors = self.snapshots[frame], self.drive.sensors
         actors, T_ego_shifted = _edited(moment.actors, edits)
         T_world_ego = moment.T_world_ego @ T_ego_shifted.numpy()
         twist_ego = sensor_twist(T_ego_shifted, torch.from_numpy(moment.twist_ego))
         picture = self._world.render(
             actors, sensors, T_world_ego, twist_ego.numpy(), noise_seed=frame, lights=moment.lights
         )
-        T_world_scene = torch.from_numpy(self.moments[0].T_world_ego)
+        T_world_scene = torch.from_numpy(self.snapshots[0].T_world_ego)
         T_scene_ego = (inverse_se3(T_world_scene) @ torch.from_numpy(T_world_ego)).float()
-        seen_from = EgoMoment(T_scene_ego, twist_ego.float(), moment.t_s)
+        seen_from = EgoState(T_scene_ego, twist_ego.float(), moment.t_s)
         cameras = [
             dataclasses.replace(
-                free_camera(sensors.rig, number, seen_from), image=torch.from_numpy(image).permute(2, 0, 1)
+                novel_camera_view(sensors.rig, number, seen_from),
+                image=torch.from_numpy(image).permute(2, 0, 1),
             )
             for number, image in enumerate(picture.images.values())
         ]

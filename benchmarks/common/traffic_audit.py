@@ -111,7 +111,7 @@ class Audit:
         stays = w.lane == v.lane
         reaches = ~stays | (w.front_m > graph.length_m[w.lane])
         crosses = (v.front_m <= graph.length_m[v.lane]) & reaches & (w.lane == np.where(stays, v.lane, ahead))
-        return crosses & signals.guarded[ahead] & (signals.shows(before.time_s)[ahead] == Light.RED)
+        return crosses & signals.guarded[ahead] & (signals.light_states(before.time_s)[ahead] == Light.RED)
 
     def _compare_outlines(self, state: TrafficState, poses: Poses) -> None:
         live = np.flatnonzero(state.vehicles.active)

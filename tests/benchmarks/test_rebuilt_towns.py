@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
-from foredrive.rendering.calibration import with_images_of
+from foredrive.rendering.calibration import with_images_from
 from foredrive.rendering.edits import Duplicate, Move, Remove, ShiftEgo
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.runs.rebuild.calibration_check import calibration_doubts
+from foredrive.runs.rebuild.calibration_check import calibration_findings
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 
@@ -24,7 +24,7 @@ DRIVE = TownDrive(
 )
 AHEAD = 1_000
 """A car that is put ahead: whom traffic puts there depends on the last digits of the machine's arithmetic."""
-NOBODY = Tracks(
+NOBODY = ActorTracks(
     torch.zeros(0, dtype=torch.int64),
     torch.zeros(0, dtype=torch.int64),
     torch.zeros(0, 3),
@@ -71,10 +71,10 @@ def car_ahead(T_world_ego: np.ndarray) -> ActorState:
 
 def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
     truth = TownTruth(DRIVE)
-    actor = car_ahead(truth.moments[4].T_world_ego)
-    truth.moments[4] = dataclasses.replace(truth.moments[4], actors=[actor])
+    actor = car_ahead(truth.snapshots[4].T_world_ego)
+    truth.snapshots[4] = dataclasses.replace(truth.snapshots[4], actors=[actor])
     driven = truth.seen(4).sweep
-    T_scene_world = torch.from_numpy(truth.moments[0].T_world_ego).inverse()
+    T_scene_world = torch.from_numpy(truth.snapshots[0].T_world_ego).inverse()
     centre_m = transform_points(T_scene_world, torch.from_numpy(actor.centre_m)[None]).float()[0]
     forward = (T_scene_world[:3, :3] @ torch.from_numpy(actor.velocity_mps)).float()
     forward = forward / forward.norm()
@@ -99,14 +99,14 @@ def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
         truth.seen(4, [Duplicate(AHEAD, 1)])
 
 
-def doubts(cameras: list[CameraView], sweeps: list[SweepView]) -> list[str]:
-    return calibration_doubts(DRIVE.cameras, cameras, sweeps, NOBODY)
+def findings(cameras: list[CameraView], sweeps: list[SweepView]) -> list[str]:
+    return calibration_findings(DRIVE.cameras, cameras, sweeps, NOBODY)
 
 
-def test_a_calibration_that_is_right_is_not_doubted(driven: list[TrueViews]) -> None:
+def test_a_right_calibration_gives_no_finding(driven: list[TrueViews]) -> None:
     cameras, sweeps = [c for seen in driven for c in seen.cameras], [seen.sweep for seen in driven]
-    assert doubts(cameras, sweeps) == []
-    assert doubts(cameras, []) == []
+    assert findings(cameras, sweeps) == []
+    assert findings(cameras, []) == []
 
 
 def test_a_camera_that_is_turned_is_told(driven: list[TrueViews]) -> None:
@@ -115,14 +115,14 @@ def test_a_camera_that_is_turned_is_told(driven: list[TrueViews]) -> None:
         dataclasses.replace(seen.cameras[1], T_scene_cam=seen.cameras[1].T_scene_cam @ turned)
         for seen in driven
     ]
-    (said,) = doubts(cameras, [seen.sweep for seen in driven])
-    assert said.startswith("camera PCAM_R0: it fits the lidar better turned")
+    (said,) = findings(cameras, [seen.sweep for seen in driven])
+    assert said.startswith("camera PCAM_R0 fits the lidar better if it is turned")
     assert any(f"{degrees:.2f}° to the left" in said for degrees in (1.75, 2.0, 2.25))
 
 
 def test_cameras_that_are_exchanged_are_told(driven: list[TrueViews]) -> None:
     front, right = ([seen.cameras[i] for seen in driven] for i in (0, 1))
-    cameras = with_images_of(front, right) + with_images_of(right, front)
-    said = doubts(cameras, [seen.sweep for seen in driven])
-    assert "camera PCAM_F0: its images fit the place of PCAM_R0" in said
-    assert "camera PCAM_R0: its images fit the place of PCAM_F0" in said
+    cameras = with_images_from(front, right) + with_images_from(right, front)
+    said = findings(cameras, [seen.sweep for seen in driven])
+    assert "the images of camera PCAM_F0 fit the pose of PCAM_R0" in said
+    assert "the images of camera PCAM_R0 fit the pose of PCAM_F0" in said

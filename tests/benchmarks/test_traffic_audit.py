@@ -9,7 +9,7 @@ from benchmarks.common.traffic_audit import Audit
 from foredrive.scene import Category
 from foredrive.towns.map.names import TOWNS
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 
 DT_S = 0.1
@@ -23,7 +23,7 @@ SECONDS = dict.fromkeys(TOWNS, 8.0) | dict.fromkeys(("Town03", "Town04", "Town05
 def test_nothing_goes_wrong(town: str, town_of: Callable[[str], TownMap]) -> None:
     town_map, seconds = town_of(town), SECONDS[town]
     traffic = Traffic(town_map, seed=5, vehicle_count=30, people_count=15)
-    drive, audit = Drive(traffic, seconds, steering_noise=0.02), Audit(town_map, traffic)
+    drive, audit = ExpertDrive(traffic, seconds, steering_noise=0.02), Audit(town_map, traffic)
     state, driven_m = drive.state, 0.0
     for _ in range(round(seconds / DT_S)):
         before = state

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from foredrive.ops.threads import one_ahead
+from foredrive.ops.threads import prefetched
 
 
 @pytest.fixture(params=[1, 2])
@@ -26,7 +26,7 @@ def test_items_come_in_order_and_no_more_than_one_ahead(threads: int) -> None:
             made.append(i)
             yield i
 
-    for i, item in enumerate(one_ahead(items())):
+    for i, item in enumerate(prefetched(items())):
         assert item == i
         assert len(made) <= i + threads
     assert made == list(range(5))
@@ -38,14 +38,14 @@ def test_a_failure_arrives_after_what_was_made_before_it(threads: int) -> None:
         yield 0
         raise OSError("the disk is full")
 
-    ahead = one_ahead(items())
+    ahead = prefetched(items())
     assert next(ahead) == 0
     with pytest.raises(OSError, match="full"):
         next(ahead)
 
 
 def test_whoever_stops_early_leaves_no_thread(threads: int) -> None:
-    for item in (ahead := one_ahead(iter(range(100)))):
+    for item in (ahead := prefetched(iter(range(100)))):
         if item == 2:
             break
     ahead.close()

@@ -9,18 +9,18 @@ from test_scene_graph import graph_of, two_actors
 
 from foredrive.errors import InputError
 from foredrive.rendering.edits import (
+    DriveStraight,
     Duplicate,
     Edit,
     Insert,
     Move,
     Remove,
-    Send,
     ShiftEgo,
     apply_edits,
     load_edits,
     save_edits,
 )
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, place
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, place_gaussians
 
 
 def scene() -> SceneGraph:
@@ -38,13 +38,13 @@ def test_removing_takes_the_gaussians_along() -> None:
     edited = apply_edits(scene(), [Remove(7)]).graph
     assert edited.tracks.track_id.tolist() == [11]
     assert edited.actor.tolist() == [STATIC, 0]
-    assert place(edited, 0.0).source.tolist() == [0]
+    assert place_gaussians(edited, 0.0).source.tolist() == [0]
 
 
 def test_a_copy_is_another_actor() -> None:
     edited = apply_edits(scene(), [Duplicate(7, copy=8, offset_m=(0.0, 3.0, 0.0)), Remove(7)]).graph
     assert edited.tracks.track_id.tolist() == [11, 8]
-    placed = place(edited, 0.0).gaussians
+    placed = place_gaussians(edited, 0.0).gaussians
     assert torch.allclose(placed.mean_m[-1], torch.tensor([1.0, 3, 1]))
 
 
@@ -59,7 +59,9 @@ def test_an_inserted_actor_stands_on_the_same_ground() -> None:
 
 def test_a_sent_copy_goes_straight_on_all_the_time() -> None:
     """At 2 m/s to the left through a point at 1 s, wherever its original is then."""
-    sent = Send(7, copy=9, at_m=(10.0, 4.0, 1.0), at_s=1.0, velocity_mps=(0.0, 2.0, 0.0), yaw_rad=math.pi / 2)
+    sent = DriveStraight(
+        7, copy=9, at_m=(10.0, 4.0, 1.0), at_s=1.0, velocity_mps=(0.0, 2.0, 0.0), yaw_rad=math.pi / 2
+    )
     edited = apply_edits(scene(), [sent]).graph
     tracks = edited.tracks
     assert tracks.track_id.tolist() == [7, 11, 9]
@@ -68,7 +70,7 @@ def test_a_sent_copy_goes_straight_on_all_the_time() -> None:
     assert torch.allclose(tracks.T_scene_actor[2, :, 1, 3], 4.0 + 2.0 * since_s)
     assert torch.allclose(tracks.T_scene_actor[2, :, :2, 0], torch.tensor([0.0, 1.0]), atol=1e-6)
     assert torch.equal(tracks.T_scene_actor[:2], scene().tracks.T_scene_actor)
-    placed = place(edited, float(tracks.t_s[0])).gaussians.mean_m[-1]
+    placed = place_gaussians(edited, float(tracks.t_s[0])).gaussians.mean_m[-1]
     ahead_m = 1.0  # of its middle its Gaussian is
     at_first = torch.tensor([10.0, 4.0 + 2.0 * float(since_s[0]) + ahead_m, 1.0])
     assert torch.allclose(placed, at_first, atol=1e-5)
@@ -82,7 +84,7 @@ def test_the_ego_vehicle_is_shifted_in_its_own_frame() -> None:
 
 def test_edits_from_a_file_do_the_same(tmp_path: Path) -> None:
     edits: list[Edit] = [Move(7, (1.0, 2.0, 0.0), 0.3), Duplicate(11, 12, (0.0, 1.0, 0.0)), Remove(11)]
-    edits.append(Send(7, 13, (5.0, 0.0, 1.0), 0.5, (-1.0, 0.0, 0.0)))
+    edits.append(DriveStraight(7, 13, (5.0, 0.0, 1.0), 0.5, (-1.0, 0.0, 0.0)))
     save_edits(edits, tmp_path / "edits.json")
     again = load_edits(tmp_path / "edits.json")
     assert again == edits

@@ -12,14 +12,14 @@ from foredrive.data import find_logs
 from foredrive.data.drives import read_drive
 from foredrive.errors import InputError
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.initial import InitialSize, initial_scene
+from foredrive.rendering.initial import InitialGaussians, initial_scene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.seed_points import UNSEEN_RAD, SeedPoints, like_neighbours
+from foredrive.rendering.seed_points import UNSEEN_RAD, SeedPoints, colour_from_neighbours
 from foredrive.rendering.tracks import read_tracks, states_at
 from foredrive.rendering.views import camera_views, sweep_views
 from foredrive.scene import Clip
 
-SIZE = InitialSize(
+SIZE = InitialGaussians(
     lidar_points=4000, unseen_points=20_000, pixel_points=200, near_points=100, actor_points=60, features=2
 )
 
@@ -112,9 +112,9 @@ def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:
         scale_m=torch.ones(5),
     )
     # three points have colours, so that each is a neighbour of all
-    assert like_neighbours(points).rgb[:, 0].tolist() == pytest.approx([0.2, 0.6, 0.8, 0.6, 0.6])
-    assert like_neighbours(points[2:]).rgb[:, 0].tolist() == pytest.approx([0.8, 0.8, 0.8])
-    assert torch.equal(like_neighbours(points[3:]).rgb, points[3:].rgb)
+    assert colour_from_neighbours(points).rgb[:, 0].tolist() == pytest.approx([0.2, 0.6, 0.8, 0.6, 0.6])
+    assert colour_from_neighbours(points[2:]).rgb[:, 0].tolist() == pytest.approx([0.8, 0.8, 0.8])
+    assert torch.equal(colour_from_neighbours(points[3:]).rgb, points[3:].rgb)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist, transform_points
 from foredrive.ops.splat_points import LANES, beam_points
 from foredrive.ops.splatting import Splats, composite_splats
-from foredrive.rendering.gaussians import Gaussians, lidar_points, project_lidar
+from foredrive.rendering.gaussians import Gaussians, project_lidar, tiled_lidar_beams
 from foredrive.sensors import TimedRays, pandar64, vlp16
 
 STILL = torch.zeros(6)
@@ -16,7 +16,7 @@ TWIST = torch.tensor([12.0, 0.0, 0.0, 0.0, 0.0, 0.3])
 
 def test_every_beam_has_one_slot_and_channels_stay_whole() -> None:
     lidar = pandar64(torch.eye(4))
-    points = lidar_points(lidar.beams(STILL), torch.eye(4), STILL)
+    points = tiled_lidar_beams(lidar.beams(STILL), torch.eye(4), STILL)
     index = points.index.flatten()
     assert torch.equal(index[index >= 0].sort().values, torch.arange(points.count))
     assert points.count == 64 * 1800
@@ -36,7 +36,7 @@ def test_beams_look_as_the_sensor_fires_them() -> None:
     """The turn of the vehicle since is undone: elevations are the channels', whatever it does."""
     T = exp_se3(torch.tensor([1.2, 0.0, 1.8, 0.0, 0.02, 0.1]))
     lidar = vlp16(T)
-    still, driven = (lidar_points(lidar.beams(twist), T, twist) for twist in (STILL, TWIST))
+    still, driven = (tiled_lidar_beams(lidar.beams(twist), T, twist) for twist in (STILL, TWIST))
     for points in (still, driven):
         index = points.index.flatten()
         elevation = torch.empty(points.count)
@@ -54,7 +54,7 @@ def test_a_moving_lidar_meets_a_point_where_it_is() -> None:
     T_end_lidar = exp_se3(t_s * twist) @ T_ego_lidar  # the lidar when it fires -> ego frame at time 0
     away = point - T_end_lidar[:3, 3]
     rays = TimedRays(origin_ego=T_end_lidar[None, :3, 3], dir_ego=away / away.norm(), dt_s=t_s)
-    beam = lidar_points(rays, T_ego_lidar, twist)
+    beam = tiled_lidar_beams(rays, T_ego_lidar, twist)
     fired = transform_points(inverse_se3(T_end_lidar), point)[0]
     torch.testing.assert_close(beam.position[0, 0, 0], torch.atan2(fired[1], fired[0]))
     one = Gaussians(
@@ -90,7 +90,7 @@ def test_a_wall_all_around_is_where_it_is() -> None:
     lidar = pandar64(torch.eye(4))
     chosen = (lidar.channel >= 10) & (lidar.channel < 60)  # those that meet the wall well inside its borders
     rays = lidar.beams(STILL)[chosen]
-    points = lidar_points(rays, torch.eye(4), STILL)
+    points = tiled_lidar_beams(rays, torch.eye(4), STILL)
     seen = composite_splats(project_lidar(wall, torch.eye(4)), points)
     assert seen.alpha.min() > 0.95
     expected = 10 / rays.dir_ego[:, :2].norm(dim=-1)

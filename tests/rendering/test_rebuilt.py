@@ -9,7 +9,7 @@ from foredrive.geometry.se3 import exp_se3, transform_points
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 from foredrive.scene import LidarSweep
@@ -18,7 +18,7 @@ FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 
 """Camera (x right, y down, z forward) in a frame with x forward and z up."""
 
 
-def scene_of(mean_m: torch.Tensor, tracks: Tracks, *, rolling: bool = True) -> RebuiltScene:
+def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, *, rolling: bool = True) -> RebuiltScene:
     """Small, hard, white Gaussians."""
     count = len(mean_m)
     gaussians = Gaussians(
@@ -33,8 +33,8 @@ def scene_of(mean_m: torch.Tensor, tracks: Tracks, *, rolling: bool = True) -> R
 
 
 @pytest.fixture
-def nobody() -> Tracks:
-    one = Tracks(
+def nobody() -> ActorTracks:
+    one = ActorTracks(
         torch.tensor([1]),
         torch.tensor([0]),
         torch.ones(1, 3),
@@ -65,7 +65,7 @@ def centre_px(scene: RebuiltScene, camera: CameraView, rows: slice) -> float:
     return float((alpha.sum(0) * (torch.arange(96) + 0.5)).sum() / alpha.sum())
 
 
-def test_a_pole_leans_when_the_camera_passes_it(nobody: Tracks) -> None:
+def test_a_pole_leans_when_the_camera_passes_it(nobody: ActorTracks) -> None:
     """To the right at 10 m/s, 40 ms from the first row to the last: at 6 m a row is off by 10·dt·60/6 px."""
     pole = torch.tensor([[6.0, 0.0, z / 20] for z in range(-60, 61)])
     camera = view([10.0, 0, 0, 0, 0, 0], readout_s=0.04)
@@ -75,7 +75,7 @@ def test_a_pole_leans_when_the_camera_passes_it(nobody: Tracks) -> None:
     assert centre_px(still, camera, slice(4, 12)) == pytest.approx(48.0, abs=0.05)
 
 
-def test_turning_shows_as_well(nobody: Tracks) -> None:
+def test_turning_shows_as_well(nobody: ActorTracks) -> None:
     """About the camera's y axis, to its right, 1 rad/s: what is straight ahead goes left by 60 px/rad."""
     pole = torch.tensor([[6.0, 0.0, z / 20] for z in range(-60, 61)])
     camera = view([0.0, 0, 0, 0, 1.0, 0], readout_s=0.04)
@@ -85,7 +85,7 @@ def test_turning_shows_as_well(nobody: Tracks) -> None:
 
 
 @torch.no_grad()
-def test_exposing_later_is_being_further(nobody: Tracks) -> None:
+def test_exposing_later_is_being_further(nobody: ActorTracks) -> None:
     scene = scene_of(torch.tensor([[6.0, 0.3, 0.2], [9.0, -1, 0]]), nobody)
     camera = view([1.0, 0.5, 8.0, 0.1, 0.3, 0], readout_s=0.02)
     scene.camera_late_s[0] = 0.05
@@ -96,7 +96,7 @@ def test_exposing_later_is_being_further(nobody: Tracks) -> None:
     assert float((late - scene(scene.graph, camera).alpha).abs().max()) > 0.1
 
 
-def test_corrections_of_cameras_are_learned(nobody: Tracks) -> None:
+def test_corrections_of_cameras_are_learned(nobody: ActorTracks) -> None:
     scene = scene_of(torch.tensor([[6.0, 0.3, 0.2]]), nobody)
     camera = view([1.0, 0, 8.0, 0, 0, 0], readout_s=0.04)
     scene(scene.graph, camera).rgb[:, :, :48].sum().backward()
@@ -106,7 +106,7 @@ def test_corrections_of_cameras_are_learned(nobody: Tracks) -> None:
 
 
 @torch.no_grad()
-def test_a_moving_lidar_measures_from_where_each_beam_left(nobody: Tracks) -> None:
+def test_a_moving_lidar_measures_from_where_each_beam_left(nobody: ActorTracks) -> None:
     """At 8 m/s in a curve; the beams' origins and directions are those that the vehicle's motion gives."""
     targets = torch.tensor([[12.0, 0, 1], [0.0, 9, 2], [-15.0, 1, 0], [3.0, -8, 1.5]])
     dt_s = torch.tensor([0.0, -0.025, -0.05, -0.075])

@@ -6,23 +6,23 @@ import pytest
 import torch
 
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.relocation import random_walk_m, shared_among
+from foredrive.rendering.relocation import random_walk_m, split_evenly
 
 
 def test_one_alone_stays_as_it_is() -> None:
-    opacity, scale = shared_among(torch.tensor([0.3, 0.9]), torch.tensor([1, 1]))
+    opacity, scale = split_evenly(torch.tensor([0.3, 0.9]), torch.tensor([1, 1]))
     assert torch.allclose(opacity, torch.tensor([0.3, 0.9]))
     assert torch.allclose(scale, torch.ones(2))
 
 
 def test_two_that_share() -> None:
-    opacity, scale = shared_among(torch.tensor([0.75]), torch.tensor([2]))
+    opacity, scale = split_evenly(torch.tensor([0.75]), torch.tensor([2]))
     assert float(opacity) == pytest.approx(0.5)
     assert float(scale) == pytest.approx(0.75 / (0.5 + 0.5 - 0.25 / math.sqrt(2)))
 
 
 def test_as_many_as_can_be_stay_sound() -> None:
-    opacity, scale = shared_among(torch.tensor([0.999999, 0.01]), torch.tensor([51, 51]))
+    opacity, scale = split_evenly(torch.tensor([0.999999, 0.01]), torch.tensor([51, 51]))
     assert opacity.isfinite().all()
     assert ((scale > 0) & (scale < 1.5)).all()
 

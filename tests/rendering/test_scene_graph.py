@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, mirrored, place
-from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, mirrored, place_gaussians
+from foredrive.rendering.tracks import ActorTracks, states_at
 from foredrive.scene import Category
 
 
-def two_actors() -> Tracks:
+def two_actors() -> ActorTracks:
     """A car that turns left by 90° over 2 s and goes from (0, 0) to (4, 0), and a person who comes late."""
     turning = matrix_from_yaw(torch.tensor([0.0, math.pi / 2]), torch.tensor([[0.0, 0, 1], [4.0, 0, 1]]))
     late = matrix_from_yaw(torch.zeros(2), torch.tensor([[0.0, 9, 0], [0.0, 9, 0]]))
-    return Tracks(
+    return ActorTracks(
         track_id=torch.tensor([7, 11]),
         category=torch.tensor([Category.CAR, Category.PEDESTRIAN]),
         size_lwh=torch.tensor([[4.0, 2, 2], [1, 1, 2]]),
@@ -30,7 +30,7 @@ def two_actors() -> Tracks:
     )
 
 
-def graph_of(mean_m: list[list[float]], actor: list[int], tracks: Tracks) -> SceneGraph:
+def graph_of(mean_m: list[list[float]], actor: list[int], tracks: ActorTracks) -> SceneGraph:
     count = len(actor)
     gaussians = Gaussians(
         mean_m=torch.tensor(mean_m),
@@ -78,7 +78,7 @@ def test_time_and_poses_have_gradients() -> None:
 
 def test_gaussians_turn_and_move_with_their_actor() -> None:
     graph = graph_of([[5.0, 5, 5], [2.0, 0, 0], [0.0, 0, 0]], [STATIC, 0, 1], two_actors())
-    placed = place(graph, 2.0)
+    placed = place_gaussians(graph, 2.0)
     assert placed.source.tolist() == [0, 1]  # the late one is not there between the key times
     assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[5.0, 5, 5], [4, 2, 1]]), atol=1e-6)
     turned = torch.diag(torch.tensor([0.1, 1.0, 0.2]) ** 2)
@@ -90,9 +90,9 @@ def test_gaussians_turn_and_move_with_their_actor() -> None:
 
 def test_velocities_are_those_of_the_poses() -> None:
     graph = graph_of([[1.0, 0.5, 0.2]], [0], two_actors())
-    before, after = place(graph, 0.999), place(graph, 1.001)
+    before, after = place_gaussians(graph, 0.999), place_gaussians(graph, 1.001)
     measured = (after.gaussians.mean_m - before.gaussians.mean_m) / 0.002
-    assert torch.allclose(place(graph, 1.0).velocity_mps, measured, atol=2e-3)
+    assert torch.allclose(place_gaussians(graph, 1.0).velocity_mps, measured, atol=2e-3)
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.1))
@@ -107,7 +107,7 @@ def test_mirroring_is_a_reflection_of_place_and_shape(q: list[float]) -> None:
 
 def test_only_the_actors_that_are_named_are_mirrored() -> None:
     graph = graph_of([[0.0, 1, 0], [0.0, 1, 0]], [0, STATIC], two_actors())
-    placed = place(graph, 0.0, mirror=torch.tensor([True, False]))
+    placed = place_gaussians(graph, 0.0, mirror=torch.tensor([True, False]))
     assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[0.0, 1, 0], [0, -1, 1]]))
 
 

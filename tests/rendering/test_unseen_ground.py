@@ -10,7 +10,7 @@ from test_scene_graph import two_actors
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.unseen_ground import WITHIN_M, add_unseen_ground, guessed_ground
+from foredrive.rendering.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
 from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 
 WAY = torch.eye(4).repeat(21, 1, 1)
@@ -37,7 +37,7 @@ def plane(hole: tuple[float, float, float, float], rise: float = 0.0) -> Gaussia
 
 def test_a_hole_is_filled_like_what_is_around() -> None:
     """4.6 × 1.8 m under a parked vehicle; next to the rim there is ground already."""
-    added = guessed_ground(plane((8.0, 3.0, 12.6, 4.8)), WAY, 0.4)
+    added = extrapolated_ground(plane((8.0, 3.0, 12.6, 4.8)), WAY, 0.4)
     x, y, z = added.mean_m.unbind(-1)
     assert float(x.min()) > 8.0
     assert float(x.max()) < 12.6
@@ -53,7 +53,7 @@ def test_a_hole_is_filled_like_what_is_around() -> None:
 def test_it_rises_with_the_road() -> None:
     slope = math.atan(RISE)
     rising = exp_se3(torch.tensor([0.0, 0, 0, 0, -slope, 0])) @ WAY
-    added = guessed_ground(plane((8.0, -5.0, 12.0, -3.0), RISE), rising)
+    added = extrapolated_ground(plane((8.0, -5.0, 12.0, -3.0), RISE), rising)
     assert len(added.mean_m) > 10
     assert torch.allclose(added.mean_m[:, 2], RISE * added.mean_m[:, 0], atol=0.02)
     assert torch.allclose(added.feature, torch.full_like(added.feature, 0.6))
@@ -61,18 +61,18 @@ def test_it_rises_with_the_road() -> None:
 
 def test_nothing_is_made_up_far_from_known_ground_or_from_the_way() -> None:
     """A hole of 14 m stays open in its middle, one beyond the reach altogether."""
-    added = guessed_ground(plane((2.0, 3.0, 16.0, 17.0)), WAY)
+    added = extrapolated_ground(plane((2.0, 3.0, 16.0, 17.0)), WAY)
     middle = ((added.mean_m[:, :2] - torch.tensor([9.0, 10.0])).abs() < 1.0).all(-1)
     assert len(added.mean_m) > 100
     assert not bool(middle.any())
-    assert len(guessed_ground(plane((5.0, WITHIN_M + 1, 9.0, WITHIN_M + 4)), WAY).mean_m) == 0
+    assert len(extrapolated_ground(plane((5.0, WITHIN_M + 1, 9.0, WITHIN_M + 4)), WAY).mean_m) == 0
 
 
 @pytest.mark.parametrize("height_m", [3.0, -2.0])
 def test_what_is_no_ground_is_left_alone(height_m: float) -> None:
     roof = plane((8.0, 3.0, 12.6, 4.8))
     roof.mean_m[:, 2] = height_m
-    assert len(guessed_ground(roof, WAY).mean_m) == 0
+    assert len(extrapolated_ground(roof, WAY).mean_m) == 0
 
 
 def test_a_colour_that_nobody_has_checked_does_not_spread() -> None:
@@ -81,7 +81,7 @@ def test_a_colour_that_nobody_has_checked_does_not_spread() -> None:
     rim = ((ground.mean_m[:, :2] - torch.tensor([10.0, 2.9])).abs() < 0.3).all(-1)
     ground.feature[rim] = 9.0
     assert 0 < int(rim.sum()) < 16
-    assert float(guessed_ground(ground, WAY).feature.max()) < 0.3
+    assert float(extrapolated_ground(ground, WAY).feature.max()) < 0.3
 
 
 @torch.no_grad()

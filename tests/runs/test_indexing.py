@@ -58,12 +58,12 @@ def test_an_index_is_made_once_goes_on_and_is_asked(
     assert [hit.score for hit in hits] == sorted((hit.score for hit in hits), reverse=True)
     itself = ask(index, Query(like="two@1s/left", gap_s=0.4, view="left", top=9)).hits
     assert len(itself) == 9  # of ten moments one is the example
-    other = next(hit for hit in itself if hit.facts["log"] == "flat_train/one" and hit.facts["t_s"] == 1.0)
+    other = next(hit for hit in itself if hit.row.log == "flat_train/one" and hit.row.t_s == 1.0)
     assert other.score == pytest.approx(1.0, abs=1e-5)  # the same drive under another name
     listed = tmp_path / "clips.json"
     write_clip_list(listed, listed_clips(hits[:1], 0.3, 0.4))
     (log,) = find_logs(listed)
-    t_s = float(str(hits[0].facts["t_s"]))
+    t_s = hits[0].row.t_s
     assert log.parts_s == ((max(0.0, t_s - 0.3), t_s + 0.4),)
 
 

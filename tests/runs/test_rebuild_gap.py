@@ -14,8 +14,8 @@ from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
 from foredrive.runs import Run
 from foredrive.runs.evaluate.real_to_sim_gap import Comparison, measure_gap, rendered_images
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, rebuilt_cameras
-from foredrive.runs.rebuild.reconstruct import read_material, reconstruct
+from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt
+from foredrive.runs.rebuild.reconstruct import read_reconstruction_data, reconstruct
 from foredrive.scene import Clip, Trajectory
 
 RECIPE = dataclasses.replace(SMALLEST, hold_out_every=4)
@@ -32,8 +32,8 @@ def test_what_is_rendered_are_the_moments_of_the_clip(trained: Run, log: LogPath
     """Rendered images are nearer to the clip's own than to those of other times; later frames are left."""
     config = dataclasses.replace(trained.recipe.clips, image_hw=RECIPE.image_hw)
     dataset = ClipDataset([log], config, None)
-    material = read_material(RECIPE, log, rebuilt / "cache")
-    views = [*material.learned.cameras, *material.held_out.cameras]
+    data = read_reconstruction_data(RECIPE, log, rebuilt / "cache")
+    views = [*data.train.cameras, *data.held_out.cameras]
     clip = dataset.clip(0)
     shown = rendered_images(open_rebuilt(rebuilt).scene, clip, 0.5, views, [0, 1])
     assert not torch.equal(shown.images[: clip.now + 1], clip.images[: clip.now + 1])
@@ -96,6 +96,6 @@ def test_the_verb_shows_a_table(
 
 
 def test_a_camera_that_was_not_rebuilt_is_named() -> None:
-    assert rebuilt_cameras(("a", "b"), ("b", "a")) == [1, 0]
+    assert camera_indices(("a", "b"), ("b", "a")) == [1, 0]
     with pytest.raises(InputError, match="not rebuilt: c; there are: a, b"):
-        rebuilt_cameras(("a", "b"), ("a", "c"))
+        camera_indices(("a", "b"), ("a", "c"))

@@ -13,34 +13,34 @@ from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.rendering.edits import Insert, Remove
-from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
+from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
+from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
     folder = tmp_path_factory.mktemp("opened")
     (log,) = find_logs(world.write(folder, frames=5))
     return reconstruct(ONE_CAMERA, log, folder / "run")
 
 
 @torch.no_grad()
-def test_an_opened_scene_shows_the_same(run: Rebuilt) -> None:
+def test_an_opened_scene_shows_the_same(run: Reconstruction) -> None:
     scene = open_rebuilt(run.folder).scene
     view = run.held_out.cameras[0]
     assert torch.equal(scene(scene.graph, view).rgb, run.scene(run.scene.graph, view).rgb)
 
 
 @torch.no_grad()
-def test_a_view_that_is_asked_for_is_the_recorded_one(run: Rebuilt) -> None:
+def test_a_view_that_is_asked_for_is_the_recorded_one(run: Reconstruction) -> None:
     """The vehicle drives at a constant speed, so that its poses between frames are known as well."""
     opened = open_rebuilt(run.folder)
     vehicle, recorded = opened.vehicle, run.held_out.cameras[1]
     assert vehicle.rig.names == ("ahead",)
-    view = free_camera(vehicle.rig, vehicle.camera("ahead"), vehicle.at(recorded.t_s))
+    view = novel_camera_view(vehicle.rig, vehicle.camera("ahead"), vehicle.at(recorded.t_s))
     assert torch.allclose(view.T_scene_cam, recorded.T_scene_cam, atol=1e-4)
     assert torch.allclose(view.twist_cam, recorded.twist_cam, atol=1e-3)
     asked, judged = (opened.scene(opened.scene.graph, v).rgb for v in (view, recorded))
@@ -48,13 +48,13 @@ def test_a_view_that_is_asked_for_is_the_recorded_one(run: Rebuilt) -> None:
     between = vehicle.at(0.13)
     assert torch.allclose(between.T_scene_ego[:3, 3], torch.tensor([0.65, 0, 0]), atol=1e-4)
     left = between.shifted(matrix_from_yaw(torch.tensor(0.0), torch.tensor([0.0, 2.0, 0.0])))
-    aside = free_camera(vehicle.rig, 0, left.later(0.1))
+    aside = novel_camera_view(vehicle.rig, 0, left.later(0.1))
     assert aside.t_s == pytest.approx(0.23)
     assert torch.allclose(aside.T_scene_cam[:3, 3], torch.tensor([1.15 + 1.6, 2.0, 1.5]), atol=1e-4)
 
 
 @torch.no_grad()
-def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Rebuilt) -> None:
+def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Reconstruction) -> None:
     """Its channels, columns and reach are told from the recorded beams."""
     opened = open_rebuilt(run.folder)
     lidar = opened.vehicle.lidar
@@ -64,7 +64,7 @@ def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Rebuilt
     assert lidar.rate_hz == pytest.approx(10)
     farthest_m = max(float(v.beams.range_m[v.beams.returned].max()) for v in run.held_out.sweeps)
     assert lidar.max_range_m == opened.vehicle.reach_m == pytest.approx(farthest_m, abs=1.0)
-    view = free_sweep(lidar, opened.vehicle.at(0.2))
+    view = novel_sweep_view(lidar, opened.vehicle.at(0.2))
     scene = opened.scene
     sweep = rendered_sweep(view, scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s))
     assert 0.1 < float(sweep.returned.float().mean()) <= 1
@@ -73,7 +73,7 @@ def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Rebuilt
 
 
 @torch.no_grad()
-def test_nothing_beyond_a_lidars_reach_returns(run: Rebuilt) -> None:
+def test_nothing_beyond_a_lidars_reach_returns(run: Reconstruction) -> None:
     opened = open_rebuilt(run.folder)
     scene, view = opened.scene, run.held_out.sweeps[0]
     points = scene.prepare_sweep(view)
@@ -89,7 +89,7 @@ def test_nothing_beyond_a_lidars_reach_returns(run: Rebuilt) -> None:
 
 
 @torch.no_grad()
-def test_an_actor_of_another_run_is_where_one_of_this_was(run: Rebuilt) -> None:
+def test_an_actor_of_another_run_is_where_one_of_this_was(run: Reconstruction) -> None:
     edits = [Insert(str(run.folder), actor=7, copy=70, follows=11), Remove(11)]
     edited = edited_scene(run.scene, edits)
     assert edited.graph.tracks.track_id.tolist() == [7, 70]
@@ -100,7 +100,7 @@ def test_an_actor_of_another_run_is_where_one_of_this_was(run: Rebuilt) -> None:
     assert float(changed[:, :24].float().mean()) < 0.02  # it is to the right
 
 
-def test_what_is_no_finished_run_is_told(run: Rebuilt, tmp_path: Path) -> None:
+def test_what_is_no_finished_run_is_told(run: Reconstruction, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not the folder of a reconstruction"):
         open_rebuilt(tmp_path)
     (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())

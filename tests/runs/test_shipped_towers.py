@@ -58,7 +58,7 @@ def test_searching_works_with_nothing_else(
     assert main(["search", "index", *logs, "--index", index, "--workers", "1"]) == 0
     for modality in ("image", "joint"):
         hits = ask(FrameIndex(index), Query(text="at night", modality=modality, view="sectors")).hits
-        assert "night" in str(hits[0].facts["log"])
+        assert "night" in hits[0].row.log
     assert main(["search", "a car close by", "--modality", "lidar", "--index", index]) == 0
 
 

@@ -85,7 +85,7 @@ def test_looking_up_finds_what_comparing_all_does(
     query = Query(text="x", modality=modality, rule=rule, top=4, where="ego_speed > 2")
     exact, looked_up = find(index, query, target), find(index, query, target, exact_up_to=0)
     assert not looked_up.exact
-    assert [hit.facts for hit in looked_up.hits] == [hit.facts for hit in exact.hits]
+    assert [hit.row for hit in looked_up.hits] == [hit.row for hit in exact.hits]
     assert [hit.score for hit in looked_up.hits] == pytest.approx([hit.score for hit in exact.hits], abs=1e-5)
 
 
@@ -97,14 +97,14 @@ def test_partitions_find_what_comparing_all_does_and_grow_with_the_rows(
     names = {made.name for made in index._frames.list_indices()}
     assert names == {"image_6", "lidar_4", "joint_6"}  # of 240 rows 160 have lidar
     query = Query(text="x", gap_s=0.0, top=5)
-    expected = [hit.facts for hit in find(index, query, target).hits]
-    assert [hit.facts for hit in find(index, query, target, exact_up_to=0).hits] == expected
+    expected = [hit.row for hit in find(index, query, target).hits]
+    assert [hit.row for hit in find(index, query, target, exact_up_to=0).hits] == expected
     index.optimise(exact_up_to=100)
     assert {made.name for made in index._frames.list_indices()} == names
     monkeypatch.setattr("foredrive.search.index.PARTITION_ROWS", 20)  # as if there were twice the rows
     index.optimise(exact_up_to=100)
     assert {made.name for made in index._frames.list_indices()} == {"image_12", "lidar_8", "joint_12"}
-    assert [hit.facts for hit in find(index, query, target, exact_up_to=0).hits] == expected
+    assert [hit.row for hit in find(index, query, target, exact_up_to=0).hits] == expected
 
 
 def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
@@ -124,13 +124,13 @@ def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
 
 def test_what_has_no_lidar_is_not_found_by_it(index: FrameIndex, target: Target) -> None:
     found = find(index, Query(text="x", modality="lidar", top=50), target)
-    assert {hit.facts["log"] for hit in found.hits} == set(LOGS[:2])
+    assert {hit.row.log for hit in found.hits} == set(LOGS[:2])
 
 
 def test_neighbours_in_a_log_are_one_hit(index: FrameIndex, target: Target) -> None:
     hits = find(index, Query(text="x", gap_s=4.0, top=100), target).hits
     for log in LOGS:
-        times = sorted(float(str(hit.facts["t_s"])) for hit in hits if hit.facts["log"] == log)
+        times = sorted(hit.row.t_s for hit in hits if hit.row.log == log)
         assert len(times) >= 3
         assert np.diff(times).min() >= 4.0
 
@@ -138,7 +138,7 @@ def test_neighbours_in_a_log_are_one_hit(index: FrameIndex, target: Target) -> N
 def test_an_example_does_not_find_itself(index: FrameIndex, target: Target) -> None:
     moment = (LOGS[0], 1_000_000 + 500_000 * 10)
     hits = find(index, Query(like="a@5s", gap_s=2.0, top=200), target._replace(moment=moment)).hits
-    ours = [float(str(hit.facts["t_s"])) for hit in hits if hit.facts["log"] == LOGS[0]]
+    ours = [hit.row.t_s for hit in hits if hit.row.log == LOGS[0]]
     assert ours
     assert all(abs(t_s - 5.0) >= 2.0 for t_s in ours)
 
@@ -149,7 +149,7 @@ def test_conditions_hold_for_every_hit(index: FrameIndex, target: Target) -> Non
     )
     hits = find(index, query, target).hits
     assert len(hits) == 16  # four of ten frames
-    assert {(hit.facts["log"], hit.facts["view"]) for hit in hits} == {(LOGS[2], "front")}
+    assert {(hit.row.log, hit.row.view) for hit in hits} == {(LOGS[2], "front")}
 
 
 @pytest.mark.parametrize("where", ["ego_speed >", "nonsense = 3", "log = 'a"])
@@ -165,11 +165,11 @@ def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) ->
     assert index.set_scores(missed) == 2 * FRAMES
     assert index.count() == 6 * FRAMES
     worst = find(index, Query(by="score_missed", top=3, gap_s=0.0), None).hits
-    assert [hit.facts["score_missed"] for hit in worst] == [39, 38, 37]
+    assert [hit.row.frame for hit in worst] == [39, 38, 37]
     alone = find(index, Query(text="x", by="score_missed", mix=1.0, top=3, gap_s=0.0), target).hits
-    assert [hit.facts["t_us"] for hit in alone] == [hit.facts["t_us"] for hit in worst]
+    assert [hit.row.t_us for hit in alone] == [hit.row.t_us for hit in worst]
     mixed = find(index, Query(text="x", by="score_missed", mix=0.5, top=1), target).hits[0]
-    assert mixed.facts["log"] == LOGS[1]
+    assert mixed.row.log == LOGS[1]
 
 
 def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
@@ -178,7 +178,7 @@ def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
     add_tag(index.uri, "odd", moments[:1])
     assert sorted(tagged(index.uri, "odd")) == sorted(moments)
     hits = find(index, Query(text="x", tag="odd", gap_s=0.0), target).hits
-    assert sorted(str(hit.facts["key"]) for hit in hits) == sorted(moments)
+    assert sorted(hit.row.key for hit in hits) == sorted(moments)
     remove_tag(index.uri, "odd")
     assert find(index, Query(tag="odd"), None).hits == []
     query = Query(text="rain", where="ego_speed > 5", diverse="facility")

@@ -15,8 +15,8 @@ from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import Tracks
-from foredrive.rendering.vehicle import Vehicle
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import Agent, BicycleState, CameraRig, Category
 from foredrive.simulation.drive import Drive, drive_route
 from foredrive.simulation.dynamics import EGO
@@ -32,11 +32,11 @@ WORLD_YAW = 0.7
 SLOPE = 0.1
 
 
-def actor(x_m: float, speed_mps: float, category: Category = Category.CAR, track_id: int = 3) -> Tracks:
+def actor(x_m: float, speed_mps: float, category: Category = Category.CAR, track_id: int = 3) -> ActorTracks:
     """Somebody on the line that the log drives along, as seen at its start."""
     t_s = torch.arange(0.0, END_S + 1e-6, PERIOD_S)
     xyz = torch.stack([x_m + speed_mps * t_s, torch.zeros_like(t_s), torch.full_like(t_s, 0.8)], dim=-1)
-    return Tracks(
+    return ActorTracks(
         track_id=torch.tensor([track_id]),
         category=torch.tensor([int(category)]),
         size_lwh=torch.tensor([[4.0, 1.8, 1.6]]),
@@ -46,7 +46,7 @@ def actor(x_m: float, speed_mps: float, category: Category = Category.CAR, track
     )
 
 
-def vehicle() -> Vehicle:
+def vehicle() -> LoggedVehicle:
     """Straight on and uphill in its world; the scene's frame is the first ego frame."""
     t_s = torch.arange(0.0, END_S + 1e-6, PERIOD_S)
     way = torch.stack([SPEED_MPS * t_s, torch.zeros_like(t_s), torch.zeros_like(t_s)], dim=-1)
@@ -56,10 +56,10 @@ def vehicle() -> Vehicle:
     T_world_scene[:3, 3] = torch.tensor([500.0, -30.0, 12.0])
     rig = CameraRig(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), torch.zeros(0, 5), torch.zeros(0), (), (4, 4))
     poses = matrix_from_yaw(torch.zeros_like(t_s), way)
-    return Vehicle(t_s, poses, T_world_scene, rig, None, None, math.inf)
+    return LoggedVehicle(t_s, poses, T_world_scene, rig, None, None, math.inf)
 
 
-def scene_with(tracks: Tracks) -> SceneGraph:
+def scene_with(tracks: ActorTracks) -> SceneGraph:
     """One Gaussian on the actor."""
     one = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.ones(1, 5)

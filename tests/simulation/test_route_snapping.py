@@ -202,7 +202,7 @@ def test_a_junction_s_way_is_the_option_within_it_and_follow_before_and_after(gr
 
 def lanes_side_by_side(graph: LaneGraph) -> int:
     """A long lane that may be left to the left; it has no tight curves."""
-    good = graph.may_cross[0] & (graph.length_m > 200) & (graph.tightest_m > 100)
+    good = graph.may_cross[0] & (graph.length_m > 200) & (graph.min_radius_m > 100)
     return int(np.flatnonzero(good)[0])
 
 

@@ -13,12 +13,12 @@ from foredrive.simulation.scenarios.scene import Ego, Play, Scene
 from foredrive.simulation.scenarios.strays import pace_among
 from foredrive.simulation.time_to_collision import MovingBoxes
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.traffic.driven import Driven
+from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
-from foredrive.towns.traffic.guests import cleared, granted_through, invited, points_on
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.orders import Orders
-from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, grant_junction, points_along
+from foredrive.towns.traffic.scripted_actors import ScriptedActor
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import BEHIND
 
@@ -96,11 +96,11 @@ def scene_on(
     """Guests on the long lane, the first of which plays; they meet at 120 m of it, and 100 m of the route."""
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([12.0])))
-    for slot, along_m in zip(traffic.guest_slots, guests_m, strict=False):
-        state = invited(traffic, state, slot, (lane,), along_m, mps)
+    for slot, along_m in zip(traffic.scenario_slots, guests_m, strict=False):
+        state = add_vehicle(traffic, state, slot, (lane,), along_m, mps)
     scenario = Scenario(kind, 100.0, 13.9, ways=(Way((lane,), 120.0, 110.0),), ego_lane=lane)
     count = len(guests_m) if kind in MEETINGS else 1
-    play = Play(cast=tuple(traffic.guest_slots[:count]))
+    play = Play(cast=tuple(traffic.scenario_slots[:count]))
     ego = Ego(5.0, done_m, ego_mps, 0.0, traffic.poses(state).centre_m[0], 0.0)
     return Scene(traffic, scenario, play, state, ego, Orders.none(len(state.vehicles.active)))
 
@@ -112,11 +112,11 @@ def test_who_waits_for_the_ego_vehicle_does_not_hold_up_others_for_long(
 ) -> None:
     guests_m = (70.0,) if follower_m is None else (70.0, follower_m)
     scene = scene_on(traffic, kind, guests_m)
-    slot, goes = traffic.guest_slots[0], []
+    slot, goes = traffic.scenario_slots[0], []
     for _ in range(60):
-        scene.orders.most_mps2[:] = np.inf
+        scene.orders.max_mps2[:] = np.inf
         scene = act(scene, DT_S)
-        goes.append(bool(scene.orders.most_mps2[slot] > 0.0))
+        goes.append(bool(scene.orders.max_mps2[slot] > 0.0))
     if follower_m is None:
         assert not any(goes)
     else:
@@ -125,10 +125,10 @@ def test_who_waits_for_the_ego_vehicle_does_not_hold_up_others_for_long(
 
 
 def test_who_has_passed_is_not_waited_for(traffic: Traffic) -> None:
-    kind, (first, second) = ScenarioKind.ONCOMING_TRAFFIC, traffic.guest_slots
+    kind, (first, second) = ScenarioKind.ONCOMING_TRAFFIC, traffic.scenario_slots
     scene = act(scene_on(traffic, kind, (135.0, 100.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
     assert scene.play.cast == (second,)
-    assert np.isinf(scene.orders.most_mps2[first])
+    assert np.isinf(scene.orders.max_mps2[first])
     scene = act(scene_on(traffic, kind, (136.0, 129.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
     assert (scene.play.number, scene.play.begun) == (1, ())
 
@@ -150,12 +150,12 @@ def test_who_is_over_the_line_does_not_brake_for_a_scenario(traffic: Traffic) ->
     scene = scene_on(traffic, ScenarioKind.LEAD_BRAKES, (123.0,), 7.0, done_m=90.0, ego_mps=8.0)
     scene = act(scene, DT_S)
     assert (scene.play.number, scene.play.begun) == (1, ())
-    assert np.isinf(scene.orders.most_mps2).all()
+    assert np.isinf(scene.orders.max_mps2).all()
 
 
-def stray(way: list[list[float]], **changes: float) -> Stray:
+def stray(way: list[list[float]], **changes: float) -> ScriptedActor:
     size = np.array([0.5, 0.6, 1.7])
-    return Stray(40_000, Category.PEDESTRIAN, 0, size, np.array(way, dtype=float), **changes)
+    return ScriptedActor(40_000, Category.PEDESTRIAN, 0, size, np.array(way, dtype=float), **changes)
 
 
 def test_a_stray_follows_its_way_and_stands_at_its_end() -> None:
@@ -180,7 +180,7 @@ def test_a_stray_follows_its_way_and_stands_at_its_end() -> None:
 
 @pytest.fixture(scope="module")
 def traffic() -> Traffic:
-    return Traffic(load_town_map("Town02"), 1, 1, 0, guest_count=2)
+    return Traffic(load_town_map("Town02"), 1, 1, 0, scenario_slot_count=2)
 
 
 def long_lane(traffic: Traffic) -> int:
@@ -188,17 +188,19 @@ def long_lane(traffic: Traffic) -> int:
     return int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
 
 
-def ego_on(traffic: Traffic, lane: int, s_m: float) -> Driven:
+def ego_on(traffic: Traffic, lane: int, s_m: float) -> EgoPose:
     """Standing on a lane, its middle there."""
     graph = traffic.lanes
     here, ahead = graph.position(np.array([lane, lane]), np.array([s_m, s_m + 1.0]))
     step = ahead - here
     yaw = float(np.arctan2(step[1], step[0]))
-    return Driven(here - 1.65 * np.array([np.cos(yaw), np.sin(yaw), 0.0]), yaw, 0.0)
+    return EgoPose(here - 1.65 * np.array([np.cos(yaw), np.sin(yaw), 0.0]), yaw, 0.0)
 
 
 def test_guest_slots_stay_free_and_change_nothing() -> None:
-    with_guests, without = (Traffic(load_town_map("Town02"), 1, 6, 4, guest_count=count) for count in (3, 0))
+    with_guests, without = (
+        Traffic(load_town_map("Town02"), 1, 6, 4, scenario_slot_count=count) for count in (3, 0)
+    )
     lane = np.array([long_lane(without)])
     ends = []
     for rules in (with_guests, without):
@@ -216,13 +218,13 @@ def test_a_guest_is_where_it_was_put_and_does_as_ordered(traffic: Traffic) -> No
     lane = long_lane(traffic)
     onward = int(traffic.lanes.successors[lane, 0])
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
-    slot = traffic.guest_slots[0]
-    state = invited(traffic, state, slot, (lane, onward), 60.0, 8.0)
-    (there,) = points_on(traffic.lanes, (lane, onward), np.array([60.0]))
+    slot = traffic.scenario_slots[0]
+    state = add_vehicle(traffic, state, slot, (lane, onward), 60.0, 8.0)
+    (there,) = points_along(traffic.lanes, (lane, onward), np.array([60.0]))
     np.testing.assert_allclose(traffic.poses(state).centre_m[slot, :2], there[:2], atol=0.6)
     assert state.vehicles.path[slot, BEHIND + 1] == onward
     orders = Orders.none(len(state.vehicles.active))
-    orders.most_mps2[slot] = -4.0
+    orders.max_mps2[slot] = -4.0
     ego = ego_on(traffic, lane, 20.0)
     for _ in range(25):
         state = traffic.step(state, DT_S, ego, orders)
@@ -239,11 +241,11 @@ def test_who_is_blind_does_not_brake_for_vehicle_0_alone(traffic: Traffic, blind
     lane = long_lane(traffic)
     ego = ego_on(traffic, lane, 90.0)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([90.0])))
-    first, second = traffic.guest_slots
+    first, second = traffic.scenario_slots
     for slot, along_m in ((first, 60.0), (second, 45.0)):
-        state = invited(traffic, state, slot, (lane,), along_m, 8.0)
+        state = add_vehicle(traffic, state, slot, (lane,), along_m, 8.0)
     orders = Orders.none(len(state.vehicles.active))
-    orders.blind[first] = blind
+    orders.ignores_ego[first] = blind
     for _ in range(40):
         state = traffic.step(state, DT_S, ego, orders)
     v = state.vehicles
@@ -257,12 +259,12 @@ def test_who_is_blind_does_not_brake_for_vehicle_0_alone(traffic: Traffic, blind
 def test_room_is_made_only_out_of_sight(traffic: Traffic) -> None:
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
-    slot = traffic.guest_slots[0]
-    state = invited(traffic, state, slot, (lane,), 70.0, 0.0)
-    room = points_on(traffic.lanes, (lane,), np.array([66.0, 70.0]))
-    assert cleared(traffic, state, room, seen_within_m=80.0) is None
-    assert cleared(traffic, state, room - [50.0, 50.0, 0.0], seen_within_m=80.0) is not None
-    out_of_sight = cleared(traffic, state, room, seen_within_m=30.0)
+    slot = traffic.scenario_slots[0]
+    state = add_vehicle(traffic, state, slot, (lane,), 70.0, 0.0)
+    room = points_along(traffic.lanes, (lane,), np.array([66.0, 70.0]))
+    assert clear_area(traffic, state, room, seen_within_m=80.0) is None
+    assert clear_area(traffic, state, room - [50.0, 50.0, 0.0], seen_within_m=80.0) is not None
+    out_of_sight = clear_area(traffic, state, room, seen_within_m=30.0)
     assert out_of_sight is not None
     assert not out_of_sight.vehicles.active[slot]
     assert out_of_sight.vehicles.active[0]
@@ -271,12 +273,12 @@ def test_room_is_made_only_out_of_sight(traffic: Traffic) -> None:
 def test_drivers_stop_for_who_strays_into_their_lane(traffic: Traffic) -> None:
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
-    slot = traffic.guest_slots[0]
-    state = invited(traffic, state, slot, (lane,), 40.0, 8.0)
-    here, ahead = points_on(traffic.lanes, (lane,), np.array([75.0, 76.0]))
+    slot = traffic.scenario_slots[0]
+    state = add_vehicle(traffic, state, slot, (lane,), 40.0, 8.0)
+    here, ahead = points_along(traffic.lanes, (lane,), np.array([75.0, 76.0]))
     left = np.array([-(ahead - here)[1], (ahead - here)[0], 0.0])
     walker = stray([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
-    state = dataclasses.replace(state, strays=(walker,))
+    state = dataclasses.replace(state, scripted_actors=(walker,))
     ego = ego_on(traffic, lane, 20.0)
     for _ in range(80):
         state = traffic.step(state, DT_S, ego)
@@ -290,11 +292,11 @@ def test_drivers_stop_for_who_strays_into_their_lane(traffic: Traffic) -> None:
 def test_vehicle_0_stops_for_strays_as_well_while_it_drives_itself(traffic: Traffic) -> None:
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
-    here, ahead = points_on(traffic.lanes, (lane,), np.array([75.0, 76.0]))
+    here, ahead = points_along(traffic.lanes, (lane,), np.array([75.0, 76.0]))
     left = np.array([-(ahead - here)[1], (ahead - here)[0], 0.0])
     walker = stray([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
     free = state
-    state = dataclasses.replace(state, strays=(walker,))
+    state = dataclasses.replace(state, scripted_actors=(walker,))
     for _ in range(120):
         state, free = traffic.step(state, DT_S), traffic.step(free, DT_S)
     assert 66.0 < state.vehicles.front_m[0] < 74.0
@@ -310,19 +312,19 @@ def test_only_who_may_runs_a_light(traffic: Traffic, runs: bool) -> None:
     red_s = next(
         t
         for t in np.arange(0.0, 60.0, 0.5).tolist()
-        if all(traffic.signals.shows(t + ds)[lane] == Light.RED for ds in (0.0, 4.0))
+        if all(traffic.signals.light_states(t + ds)[lane] == Light.RED for ds in (0.0, 4.0))
     )
     begin_m = float(graph.length_m[before]) - 30.0
-    high = points_on(graph, (before,), np.array([begin_m]))[0] + [0.0, 0.0, 40.0]
+    high = points_along(graph, (before,), np.array([begin_m]))[0] + [0.0, 0.0, 40.0]
     state = traffic.start(ego_vehicle(graph, np.array([lane]), np.array([0.0])))
-    slot = traffic.guest_slots[0]
-    state = invited(traffic, state, slot, (before, lane), begin_m, 9.0)
+    slot = traffic.scenario_slots[0]
+    state = add_vehicle(traffic, state, slot, (before, lane), begin_m, 9.0)
     state = dataclasses.replace(state, time_s=red_s)
     orders = Orders.none(len(state.vehicles.active))
-    orders.runs[slot] = runs
+    orders.runs_lights[slot] = runs
     for _ in range(35):
         if runs and state.vehicles.path[slot, BEHIND] == before:
-            state = granted_through(traffic, state, slot, lane)
-        state = traffic.step(state, DT_S, Driven(high, 0.0, 0.0), orders)
+            state = grant_junction(traffic, state, slot, lane)
+        state = traffic.step(state, DT_S, EgoPose(high, 0.0, 0.0), orders)
     assert state.vehicles.active[slot]
     assert (state.vehicles.path[slot, BEHIND] != before) == runs

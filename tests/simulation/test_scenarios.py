@@ -67,7 +67,7 @@ def happens(simulator: TownSimulator, route: DriveRoute, scenario: Scenario, wha
         events, states = drive(simulator, Driver(route, scenario.limit_mps, attentive))
         play = states[-1].play
         assert [number for number, _ in play.begun] == [0]
-        actors = {str(stray.track_id) for stray in states[-1].decided.strays} or {"1", "2", "3"}
+        actors = {str(stray.track_id) for stray in states[-1].decided.scripted_actors} or {"1", "2", "3"}
         hits = [event for event in events if event.kind == f"collision_{what}"]
         assert len({hit.detail.split()[1] for hit in hits}) == len(hits)  # each is counted once
         if attentive:
@@ -152,8 +152,8 @@ def test_a_drive_with_a_scenario_goes_on_bit_by_bit(
     driver = Driver(route, scenario.limit_mps, attentive=True)
     simulator.reset(town_scenario(route, (scenario,)))
     _, states = drive(simulator, driver)
-    middle = next(state for state in states if state.decided.strays[0].s_m > 1.0)
-    assert middle.decided.strays[0].is_under_way
+    middle = next(state for state in states if state.decided.scripted_actors[0].s_m > 1.0)
+    assert middle.decided.scripted_actors[0].is_under_way
     saved = pickle.loads(pickle.dumps(dataclasses.replace(simulator.save(), state=middle)))
     simulator.reset(town_scenario(route, ()))
     simulator.restore(saved)
@@ -161,7 +161,9 @@ def test_a_drive_with_a_scenario_goes_on_bit_by_bit(
     assert len(again) == len(states) - states.index(middle)
     assert again[-1].ego == states[-1].ego
     assert again[-1].play == states[-1].play
-    for first, second in zip(states[-1].decided.strays, again[-1].decided.strays, strict=True):
+    for first, second in zip(
+        states[-1].decided.scripted_actors, again[-1].decided.scripted_actors, strict=True
+    ):
         assert (first.s_m, first.speed_mps) == (second.s_m, second.speed_mps)
         np.testing.assert_array_equal(first.xyz, second.xyz)
 

@@ -13,16 +13,16 @@ from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.simulation.town_expert import TownExpert, _is_free, _is_too_late, _rejoined
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import Crowd
-from foredrive.towns.traffic.driven import Driven
+from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
-from foredrive.towns.traffic.guests import invited
 from foredrive.towns.traffic.lane_graph import Control
 from foredrive.towns.traffic.lights import Light
+from foredrive.towns.traffic.scenario_vehicles import add_vehicle
 from foredrive.towns.traffic.traffic import Traffic
 
 FRONT_M = EGO.axle_to_centre_m + 0.5 * EGO.length_m
 BEGIN_M = 20.0
-HERE = Driven(np.zeros(3), 0.0, 5.0)
+HERE = EgoPose(np.zeros(3), 0.0, 5.0)
 STRAIGHT = np.stack([np.arange(0.0, 31.0), np.zeros(31)], axis=1)
 
 
@@ -91,7 +91,7 @@ def test_nobody_sets_off_over_a_line_that_closes_before_he_is_over_it(
     state.vehicles.speed_mps[0] = mps
     times = np.arange(0.0, 120.0, 0.5).tolist()
     at_s = next(
-        t for t in times if tuple(traffic.signals.shows(t + ds)[inside] for ds in (0.0, 2.5)) == shows
+        t for t in times if tuple(traffic.signals.light_states(t + ds)[inside] for ds in (0.0, 2.5)) == shows
     )
     assert _is_too_late(traffic, dataclasses.replace(state, time_s=at_s)) == late
 
@@ -112,9 +112,9 @@ def test_it_edges_along_the_route_until_somebody_is_near(
     simulator: TownSimulator, ahead_m: float | None, mps: float
 ) -> None:
     traffic, now, (lane,) = simulator.traffic, simulator.foresight(), simulator.scenario.lanes
-    slot = traffic.guest_slots[0]
+    slot = traffic.scenario_slots[0]
     if ahead_m is not None:
-        there = invited(traffic, now.traffic, slot, (lane,), BEGIN_M + ahead_m, mps)
+        there = add_vehicle(traffic, now.traffic, slot, (lane,), BEGIN_M + ahead_m, mps)
         now = dataclasses.replace(now, traffic=there)
     expert = TownExpert(simulator)
     expert._imagined = [now] * 31

@@ -12,13 +12,13 @@ from foredrive.towns.campaign import (
     ANY_CONDITIONS,
     Campaign,
     DrivePlan,
-    choose_balanced,
-    commands_met,
+    driven_commands,
     plan_drives,
+    select_balanced,
 )
 from foredrive.towns.conditions import CONDITIONS
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 
 RANGES = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(lambda ends: (min(ends), max(ends)))
@@ -83,7 +83,7 @@ def test_chosen_seeds_turn_left_and_right_and_go_straight_alike() -> None:
     plans = plan_drives(campaign)
     assert Counter(plan.conditions for plan in plans) == {"clear": 1, "night": 1}
     assert len({plan.seed for plan in plans}) == 2
-    commands = sum((commands_met(plan) for plan in plans), Counter())
+    commands = sum((driven_commands(plan) for plan in plans), Counter())
     assert spread(commands) <= 1
     assert commands.total() >= 1
 
@@ -101,7 +101,7 @@ def test_what_is_met_is_what_is_driven() -> None:
     for seed in (1, 7):
         plan = DrivePlan("Town02", seed, None, 0, 0, 15.0, 10.0)
         traffic = Traffic(load_town_map(plan.town), seed, 1, 0)
-        drive, lanes = Drive(traffic, plan.seconds), traffic.lanes
+        drive, lanes = ExpertDrive(traffic, plan.seconds), traffic.lanes
         driven = Counter[Command]()
         for _ in range(plan.frames - 1):
             before = int(drive.state.vehicles.lane[0])
@@ -109,7 +109,7 @@ def test_what_is_met_is_what_is_driven() -> None:
             lane = int(drive.state.vehicles.lane[0])
             if lane != before and lanes.successor_count[before] > 1:
                 driven[lanes.command(lane)] += 1
-        assert commands_met(plan) == driven
+        assert driven_commands(plan) == driven
         met.update(driven)
     assert met.total() > 0
 
@@ -117,17 +117,17 @@ def test_what_is_met_is_what_is_driven() -> None:
 def test_the_rarest_command_decides() -> None:
     left, right = Counter([Command.LEFT]), Counter([Command.RIGHT])
     routes = [left, left, right, left + right]
-    assert list(choose_balanced(routes, 1, Counter(), routes.__getitem__)) == [3]
-    assert list(choose_balanced(routes, 2, Counter({Command.LEFT: 1}), routes.__getitem__)) == [3, 2]
-    assert list(choose_balanced(routes, 4, Counter(), routes.__getitem__)) == [3, 0, 2, 1]
+    assert list(select_balanced(routes, 1, Counter(), routes.__getitem__)) == [3]
+    assert list(select_balanced(routes, 2, Counter({Command.LEFT: 1}), routes.__getitem__)) == [3, 2]
+    assert list(select_balanced(routes, 4, Counter(), routes.__getitem__)) == [3, 0, 2, 1]
 
 
 def test_a_route_that_does_not_keep_its_promise_stands_back() -> None:
     left, right = Counter([Command.LEFT]), Counter([Command.RIGHT])
     promised = [left + right, left, right, right]
     met = [left, left, right, left]
-    assert choose_balanced(promised, 2, Counter(), met.__getitem__) == {0: left, 2: right}
-    assert choose_balanced(promised, 1, Counter({Command.LEFT: 1}), met.__getitem__) == {2: right}
+    assert select_balanced(promised, 2, Counter(), met.__getitem__) == {0: left, 2: right}
+    assert select_balanced(promised, 1, Counter({Command.LEFT: 1}), met.__getitem__) == {2: right}
 
 
 @given(
@@ -136,9 +136,9 @@ def test_a_route_that_does_not_keep_its_promise_stands_back() -> None:
     )
 )
 def test_no_route_is_chosen_twice(routes: list[Counter[Command]]) -> None:
-    chosen = choose_balanced(routes, 4, Counter(), routes[::-1].__getitem__)
+    chosen = select_balanced(routes, 4, Counter(), routes[::-1].__getitem__)
     assert len(chosen) == 4
-    assert chosen == choose_balanced(routes, 4, Counter(), routes[::-1].__getitem__)
+    assert chosen == select_balanced(routes, 4, Counter(), routes[::-1].__getitem__)
     assert set(chosen) <= set(range(len(routes)))
 
 

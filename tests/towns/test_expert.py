@@ -7,7 +7,7 @@ import pytest
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 
 DT_S = 0.1
@@ -15,21 +15,21 @@ DT_S = 0.1
 
 def drive(
     town: TownMap, seed: int, seconds: float, vehicles: int = 20
-) -> tuple[Traffic, Drive, list[Moment]]:
+) -> tuple[Traffic, ExpertDrive, list[DriveSnapshot]]:
     traffic = Traffic(town, seed, vehicles, people_count=10)
-    driven = Drive(traffic, seconds)
-    return traffic, driven, list(driven.moments(round(seconds / DT_S), DT_S))
+    driven = ExpertDrive(traffic, seconds)
+    return traffic, driven, list(driven.snapshots(round(seconds / DT_S), DT_S))
 
 
 @pytest.fixture(scope="module", params=[("Town02", 3), ("Town07", 5)], ids=str)
 def driven(
     request: pytest.FixtureRequest, town_of: Callable[[str], TownMap]
-) -> tuple[Traffic, Drive, list[Moment]]:
+) -> tuple[Traffic, ExpertDrive, list[DriveSnapshot]]:
     name, seed = request.param
     return drive(town_of(name), seed, seconds=20.0)
 
 
-def test_the_rear_axle_is_on_the_route(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
+def test_the_rear_axle_is_on_the_route(driven: tuple[Traffic, ExpertDrive, list[DriveSnapshot]]) -> None:
     traffic, drive, moments = driven
     line = drive.route.polyline(traffic.lanes)
     steps = np.linspace(line[:-1], line[1:], 10, endpoint=False).reshape(-1, 3)
@@ -39,7 +39,7 @@ def test_the_rear_axle_is_on_the_route(driven: tuple[Traffic, Drive, list[Moment
         assert beside < (0.15 if np.linalg.norm(axle - line[0]) > 3 else 3.0)
 
 
-def test_poses_are_rigid_and_level(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
+def test_poses_are_rigid_and_level(driven: tuple[Traffic, ExpertDrive, list[DriveSnapshot]]) -> None:
     for moment in driven[2][::10]:
         R = moment.T_world_ego[:3, :3]
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
@@ -48,7 +48,7 @@ def test_poses_are_rigid_and_level(driven: tuple[Traffic, Drive, list[Moment]]) 
         assert R[2, 2] > 0.9
 
 
-def test_motion_is_that_of_a_car(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
+def test_motion_is_that_of_a_car(driven: tuple[Traffic, ExpertDrive, list[DriveSnapshot]]) -> None:
     moments = driven[2]
     T = np.array([moment.T_world_ego for moment in moments])
     speed = np.array([moment.twist_ego[0] for moment in moments])
@@ -78,7 +78,7 @@ def test_motion_is_that_of_a_car(driven: tuple[Traffic, Drive, list[Moment]]) ->
 def test_velocities_and_turn_rates_are_those_of_the_poses(town02: TownMap) -> None:
     dt_s, count = 0.05, 400
     traffic = Traffic(town02, 1, vehicle_count=20, people_count=0)
-    moments = list(Drive(traffic, 20.0, steering_noise=0.02).moments(count, dt_s))
+    moments = list(ExpertDrive(traffic, 20.0, steering_noise=0.02).snapshots(count, dt_s))
     T = np.array([moment.T_world_ego for moment in moments])
     twist = np.array([moment.twist_ego for moment in moments[1:-1]])
     driven_mps = np.einsum("nji,nj->ni", T[1:-1, :3, :3], T[2:, :3, 3] - T[:-2, :3, 3]) / (2 * dt_s)
@@ -100,7 +100,7 @@ def test_velocities_and_turn_rates_are_those_of_the_poses(town02: TownMap) -> No
     assert np.quantile(off_mps, 0.95) < 0.1
 
 
-def test_the_drive_gets_somewhere_and_turns(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
+def test_the_drive_gets_somewhere_and_turns(driven: tuple[Traffic, ExpertDrive, list[DriveSnapshot]]) -> None:
     moments = driven[2]
     speed = np.array([moment.twist_ego[0] for moment in moments])
     assert speed[0] > 3.0
@@ -108,7 +108,7 @@ def test_the_drive_gets_somewhere_and_turns(driven: tuple[Traffic, Drive, list[M
     assert np.sum(DT_S * speed) > 20.0
 
 
-def test_nobody_touches_the_ego_vehicle(driven: tuple[Traffic, Drive, list[Moment]]) -> None:
+def test_nobody_touches_the_ego_vehicle(driven: tuple[Traffic, ExpertDrive, list[DriveSnapshot]]) -> None:
     for moment in driven[2][::3]:
         T_ego_world = np.linalg.inv(moment.T_world_ego)
         for actor in moment.actors:
@@ -141,7 +141,7 @@ def test_traffic_appears_and_disappears_out_of_sight(town_of: Callable[[str], To
 
 def test_moments_do_not_depend_on_how_often_one_looks(town02: TownMap) -> None:
     often = drive(town02, 1, 3.0)[2]
-    seldom = list(Drive(Traffic(town02, 1, 20, people_count=10), 3.0).moments(6, 0.5))
+    seldom = list(ExpertDrive(Traffic(town02, 1, 20, people_count=10), 3.0).snapshots(6, 0.5))
     for index, moment in enumerate(seldom):
         np.testing.assert_allclose(moment.T_world_ego, often[5 * index].T_world_ego, atol=1e-9)
         assert moment.t_s == pytest.approx(often[5 * index].t_s)

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from foredrive.towns.map.town_map import Lane, MarkingKind, TownMap
-from foredrive.towns.traffic.drivers import Situation
+from foredrive.towns.traffic.drivers import DrivingContext
 from foredrive.towns.traffic.lane_changes import (
     COURTEOUS_MPS2,
-    HAS_TO_MPS2,
     LEFT,
+    MANDATORY_MPS2,
     POLITENESS,
     RIGHT,
-    Gaps,
+    LaneGaps,
     begin_change,
     choose_change,
+    courtesy_limits,
+    find_change_ranges,
     find_gaps,
-    find_stretches,
     incentive,
-    let_in,
-    who_may_change,
+    lane_change_allowed,
 )
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
-from foredrive.towns.traffic.leaders import Ahead, find_leaders
+from foredrive.towns.traffic.leaders import Leaders, find_leaders
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts, vehicle_poses
 
 INNER_M, LANE_M = 200.0, 3.5
@@ -88,20 +88,20 @@ def cars(graph: LaneGraph, where: list[tuple[str, float, float]]) -> Vehicles:
     return Vehicles(**{**vars(empty_slots(count)), **values})
 
 
-def seen(graph: LaneGraph, vehicles: Vehicles, free: list[float]) -> Situation:
+def seen(graph: LaneGraph, vehicles: Vehicles, free: list[float]) -> DrivingContext:
     ahead = find_leaders(graph, vehicles, path_starts(graph, vehicles.path))
-    return Situation(np.array(free), ahead, np.full(len(free), np.inf))
+    return DrivingContext(np.array(free), ahead, np.full(len(free), np.inf))
 
 
-def following(leader: list[int], gap_m: list[float], free: list[float]) -> Situation:
-    ahead = Ahead(*2 * (np.array(leader), np.array(gap_m)))
-    return Situation(np.array(free), ahead, np.full(len(free), np.inf))
+def following(leader: list[int], gap_m: list[float], free: list[float]) -> DrivingContext:
+    ahead = Leaders(*2 * (np.array(leader), np.array(gap_m)))
+    return DrivingContext(np.array(free), ahead, np.full(len(free), np.inf))
 
 
 def gaps(
     vehicles: Vehicles, leader: list[int], ahead: list[float], behind: list[int], b: list[float]
-) -> Gaps:
-    return Gaps(np.array(leader), np.array(ahead), np.array(behind), np.array(b))
+) -> LaneGaps:
+    return LaneGaps(np.array(leader), np.array(ahead), np.array(behind), np.array(b))
 
 
 def test_the_incentive_is_mobils_formula(graph: LaneGraph) -> None:
@@ -173,16 +173,16 @@ def test_who_has_to_change_is_let_in(graph: LaneGraph) -> None:
         behind_deg = np.rad2deg((gap_m + 4.0) / (INNER_M + LANE_M))
         v = cars(graph, [("inner0", 90, 8.0), ("outer0", 90 - behind_deg, 8.0), ("outer0", 40, 8.0)])
         starts_m = path_starts(graph, v.path)
-        limit = let_in(graph, v, starts_m, seen(graph, v, [1.0] * 3), target, RIGHT)
+        limit = courtesy_limits(graph, v, starts_m, seen(graph, v, [1.0] * 3), target, RIGHT)
         assert limit[1] == pytest.approx(limit_mps2, abs=0.02)
         assert limit[0] == limit[2] == np.inf
 
 
-def chosen(graph: LaneGraph, v: Vehicles, urge: np.ndarray | None = None) -> tuple[int, int] | None:
-    stretches, count = find_stretches(graph), len(v.active)
-    urge = np.zeros((2, count)) if urge is None else urge
-    may = who_may_change(graph, stretches, v, np.ones((count, 4), dtype=bool), urge > 0)
-    return choose_change(graph, stretches, v, seen(graph, v, [1.0] * count), may, urge)
+def chosen(graph: LaneGraph, v: Vehicles, bonus: np.ndarray | None = None) -> tuple[int, int] | None:
+    change_ranges, count = find_change_ranges(graph), len(v.active)
+    bonus = np.zeros((2, count)) if bonus is None else bonus
+    may = lane_change_allowed(graph, change_ranges, v, np.ones((count, 4), dtype=bool), bonus > 0)
+    return choose_change(graph, change_ranges, v, seen(graph, v, [1.0] * count), may, bonus)
 
 
 def test_a_slow_leader_is_passed_and_a_fast_one_is_not(graph: LaneGraph) -> None:
@@ -191,9 +191,9 @@ def test_a_slow_leader_is_passed_and_a_fast_one_is_not(graph: LaneGraph) -> None
 
 
 def test_who_has_to_changes_without_a_gain_unless_it_is_unsafe(graph: LaneGraph) -> None:
-    urge = np.array([[0.0, 0.0], [HAS_TO_MPS2, 0.0]])
-    assert chosen(graph, cars(graph, [("inner0", 40, 8.0), ("outer0", 120, 8.0)]), urge) == (0, RIGHT)
-    assert chosen(graph, cars(graph, [("inner0", 40, 8.0), ("outer0", 40, 8.0)]), urge) is None
+    bonus = np.array([[0.0, 0.0], [MANDATORY_MPS2, 0.0]])
+    assert chosen(graph, cars(graph, [("inner0", 40, 8.0), ("outer0", 120, 8.0)]), bonus) == (0, RIGHT)
+    assert chosen(graph, cars(graph, [("inner0", 40, 8.0), ("outer0", 40, 8.0)]), bonus) is None
 
 
 def test_solid_lines_are_not_crossed() -> None:

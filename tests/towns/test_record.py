@@ -31,7 +31,7 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import Crowd, LabelKinds, boxes_of, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.expert import Drive
+from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
@@ -153,7 +153,7 @@ def test_traffic_lights_stand_at_the_lanes_that_they_guard(recording: LogPath, t
     api = log.scene.get_map_api()
     assert api is not None
     ends = {lane.lane_id: lane.centreline_xyz[[0, -1], :2] for lane in town02.lanes}
-    began_s = Drive(traffic, FRAMES / RATE_HZ).state.time_s
+    began_s = ExpertDrive(traffic, FRAMES / RATE_HZ).state.time_s
     for frame in range(FRAMES):
         recorded = read_traffic_lights(log, frame)
         assert recorded is not None
@@ -322,7 +322,7 @@ def test_boxes_move_as_their_velocities_say(town02: TownMap) -> None:
     """At the time of the frame; only who starts, stops or turns on the spot differs."""
     dt_s, at, velocity = 0.05, {}, {}
     traffic = Traffic(town02, 3, 13, 8)
-    for k, moment in enumerate(Drive(traffic, 3.0).moments(60, dt_s)):
+    for k, moment in enumerate(ExpertDrive(traffic, 3.0).snapshots(60, dt_s)):
         boxes, R = boxes_of(moment.actors, moment.T_world_ego), moment.T_world_ego[:3, :3]
         for row, track in enumerate(boxes.track_id.tolist()):
             at[track, k] = R @ boxes.centre[row].double().numpy() + moment.T_world_ego[:3, 3]

@@ -7,8 +7,8 @@ import pytest
 
 from foredrive.errors import InputError
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.expert import Drive
-from foredrive.towns.traffic.recovery import FARTHEST_M, LATERAL_MPS2, Sway, step_sway
+from foredrive.towns.traffic.expert import ExpertDrive
+from foredrive.towns.traffic.recovery import LATERAL_MPS2, MAX_OFFSET_M, PathDeviation, step_deviation
 from foredrive.towns.traffic.traffic import Traffic
 
 DT_S = 0.1
@@ -17,24 +17,24 @@ DT_S = 0.1
 @pytest.mark.parametrize("speed_mps", [6.0, 13.0, 30.0])
 def test_the_expert_is_back_within_seconds_and_does_not_overshoot(speed_mps: float) -> None:
     rng = np.random.default_rng(0)
-    sway, aside = Sway(aside_m=0.8, yaw_rad=0.02, next_s=np.inf), []
+    deviation, aside = PathDeviation(lateral_m=0.8, yaw_rad=0.02, next_s=np.inf), []
     for _ in range(70):
-        sway = step_sway(sway, speed_mps, 2.8, 0.0, DT_S, rng)
-        aside.append(sway.aside_m)
+        deviation = step_deviation(deviation, speed_mps, 2.8, 0.0, DT_S, rng)
+        aside.append(deviation.lateral_m)
     assert abs(aside[-1]) < 0.05
-    assert abs(sway.yaw_rad) < 0.01
+    assert abs(deviation.yaw_rad) < 0.01
     assert min(aside) > -0.08
 
 
 def test_disturbances_push_the_vehicle_aside_but_not_off_its_lane() -> None:
-    rng, sway = np.random.default_rng(3), Sway()
+    rng, deviation = np.random.default_rng(3), PathDeviation()
     swayed = []
     for _ in range(6000):
-        sway = step_sway(sway, 12.0, 2.8, 0.02, DT_S, rng)
-        swayed.append(sway)
-    aside = np.array([s.aside_m for s in swayed])
+        deviation = step_deviation(deviation, 12.0, 2.8, 0.02, DT_S, rng)
+        swayed.append(deviation)
+    aside = np.array([s.lateral_m for s in swayed])
     yaw = np.array([s.yaw_rad for s in swayed])
-    assert 0.3 < np.abs(aside).max() < FARTHEST_M
+    assert 0.3 < np.abs(aside).max() < MAX_OFFSET_M
     assert np.median(np.abs(aside)) < 0.1  # on its path most of the time
     assert max(abs(s.curvature) for s in swayed) * 12.0**2 <= LATERAL_MPS2 + 1e-9
     # It goes where it points: no step to the side without a heading for it.
@@ -43,14 +43,14 @@ def test_disturbances_push_the_vehicle_aside_but_not_off_its_lane() -> None:
 
 
 def test_a_vehicle_that_stands_does_not_slide() -> None:
-    sway = Sway(aside_m=0.4, yaw_rad=0.05, next_s=-1.0, noise=0.05)
-    moved = step_sway(sway, 0.0, 2.8, 0.05, DT_S, np.random.default_rng(0))
-    assert (moved.aside_m, moved.yaw_rad) == (0.4, 0.05)
+    deviation = PathDeviation(lateral_m=0.4, yaw_rad=0.05, next_s=-1.0, noise=0.05)
+    moved = step_deviation(deviation, 0.0, 2.8, 0.05, DT_S, np.random.default_rng(0))
+    assert (moved.lateral_m, moved.yaw_rad) == (0.4, 0.05)
 
 
 def test_a_disturbed_drive_stays_near_the_flawless_one(town02: TownMap) -> None:
-    drives = [Drive(Traffic(town02, 1, 6, 0), 15.0, steering_noise=noise) for noise in (0.0, 0.03)]
-    flawless, disturbed = (list(drive.moments(150, DT_S)) for drive in drives)
+    drives = [ExpertDrive(Traffic(town02, 1, 6, 0), 15.0, steering_noise=noise) for noise in (0.0, 0.03)]
+    flawless, disturbed = (list(drive.snapshots(150, DT_S)) for drive in drives)
     beside = np.array(
         [
             (np.linalg.inv(a.T_world_ego) @ b.T_world_ego)[:2, 3]
@@ -58,7 +58,7 @@ def test_a_disturbed_drive_stays_near_the_flawless_one(town02: TownMap) -> None:
         ]
     )
     np.testing.assert_allclose(beside[:, 0], 0.0, atol=1e-9)  # the same speed
-    assert 0.05 < np.abs(beside[:, 1]).max() < FARTHEST_M
+    assert 0.05 < np.abs(beside[:, 1]).max() < MAX_OFFSET_M
     for before, after in itertools.pairwise(disturbed):
         step = np.linalg.inv(before.T_world_ego) @ after.T_world_ego
         assert abs(step[1, 3]) < 0.15
@@ -68,9 +68,9 @@ def test_a_disturbed_drive_stays_near_the_flawless_one(town02: TownMap) -> None:
 
 def test_the_outline_of_the_ego_vehicle_sways_with_it(town02: TownMap) -> None:
     traffic = Traffic(town02, 1, 6, 0)
-    drive = Drive(traffic, 15.0, steering_noise=0.03)
-    aside_m = []
-    for moment in drive.moments(100, DT_S):
+    drive = ExpertDrive(traffic, 15.0, steering_noise=0.03)
+    lateral_m = []
+    for moment in drive.snapshots(100, DT_S):
         poses = drive.poses()
         T_ego_world = np.linalg.inv(moment.T_world_ego)
         size_m = drive.state.vehicles.size_lwh[0]
@@ -79,11 +79,11 @@ def test_the_outline_of_the_ego_vehicle_sways_with_it(town02: TownMap) -> None:
         np.testing.assert_allclose(T_ego_world[:3, :3] @ poses.forward[0], [1.0, 0.0, 0.0], atol=1e-9)
         on_path = traffic.poses(drive.state)
         np.testing.assert_array_equal(poses.centre_m[1:], on_path.centre_m[1:])
-        aside_m.append(np.linalg.norm(poses.axle_xyz[0] - on_path.axle_xyz[0]))
-    assert aside_m[0] == pytest.approx(0.0, abs=1e-9)
-    assert max(aside_m) > 0.05
+        lateral_m.append(np.linalg.norm(poses.axle_xyz[0] - on_path.axle_xyz[0]))
+    assert lateral_m[0] == pytest.approx(0.0, abs=1e-9)
+    assert max(lateral_m) > 0.05
 
 
 def test_noise_is_not_negative(town02: TownMap) -> None:
     with pytest.raises(InputError, match="steering noise"):
-        Drive(Traffic(town02, 1, 2, 0), 1.0, steering_noise=-0.1)
+        ExpertDrive(Traffic(town02, 1, 2, 0), 1.0, steering_noise=-0.1)

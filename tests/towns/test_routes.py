@@ -10,7 +10,7 @@ import pytest
 from foredrive.data.commands import LATERAL_M, route_offset_m
 from foredrive.scene import Command
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.fleet import find_starts
+from foredrive.towns.traffic.fleet import find_start_points
 from foredrive.towns.traffic.lane_graph import Control, LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import LIGHT_S, ROUTE_SPACING_M, Route, draw_route
 
@@ -21,7 +21,7 @@ def graph(town02: TownMap) -> LaneGraph:
 
 
 def routes(graph: LaneGraph, count: int, length_m: float = 600.0) -> list[Route]:
-    starts = find_starts(graph)
+    starts = find_start_points(graph)
     return [
         draw_route(graph, starts, np.random.default_rng(seed), length_m, 0.0, 45.0) for seed in range(count)
     ]
@@ -59,7 +59,7 @@ def test_routes_turn_left_and_right_and_go_straight(graph: LaneGraph) -> None:
     taken = Counter(command for route in drawn for command in route.commands(graph, 600.0))
     assert min(taken[command] for command in Command) > 0.5 * max(taken.values())
     for route in drawn:
-        soon = route.commands(graph, route.driven_m(graph, 45.0))
+        soon = route.commands(graph, route.distance_m(graph, 45.0))
         assert set(soon) - {Command.STRAIGHT}
         assert len(set(soon)) > 1
 
@@ -73,16 +73,16 @@ def test_commands_count_from_the_start_of_the_route(graph: LaneGraph) -> None:
 
 def test_long_drives_turn_left_and_right_and_go_straight(town_of: Callable[[str], TownMap]) -> None:
     graph = build_lane_graph(town_of("Town06"))  # few roads lead to the right there
-    starts = find_starts(graph)
+    starts = find_start_points(graph)
     for seed in range(5):
         route = draw_route(graph, starts, np.random.default_rng(seed), 9000.0, 0.0, 300.0)
-        assert set(route.commands(graph, route.driven_m(graph, 300.0))) == set(Command)
+        assert set(route.commands(graph, route.distance_m(graph, 300.0))) == set(Command)
 
 
 def test_lights_and_curves_take_time(graph: LaneGraph) -> None:
     route = routes(graph, 1)[0]
-    assert route.driven_m(graph, 0.0) == 0.0
-    driven_m = np.array([route.driven_m(graph, float(s)) for s in range(100)])
+    assert route.distance_m(graph, 0.0) == 0.0
+    driven_m = np.array([route.distance_m(graph, float(s)) for s in range(100)])
     assert (np.diff(driven_m) >= 0).all()
     assert np.diff(driven_m).max() <= graph.limit_mps.max()
     to_light_m = graph.length_m[route.lanes[0]] - route.start_m
@@ -94,7 +94,7 @@ def test_lights_and_curves_take_time(graph: LaneGraph) -> None:
 def test_a_planned_lane_change_is_no_turn(town_of: Callable[[str], TownMap], limit_mps: float) -> None:
     graph = build_lane_graph(town_of("Town04"))
     graph = dataclasses.replace(graph, limit_mps=np.full_like(graph.limit_mps, limit_mps))
-    straight = (graph.tightest_m > 2000.0) & (graph.length_m > 80.0) & (graph.left >= 0)
+    straight = (graph.min_radius_m > 2000.0) & (graph.length_m > 80.0) & (graph.left >= 0)
     for lane in np.flatnonzero(straight)[:3]:
         line = Route(np.array([lane]), 5.0, graph.left[[lane]]).polyline(graph)[:, :2]
         arc_m = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])

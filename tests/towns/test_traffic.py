@@ -9,7 +9,7 @@ import shapely
 
 from foredrive.scene import Category
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.car_following import HARDEST_BRAKING_MPS2
+from foredrive.towns.traffic.car_following import MAX_BRAKING_MPS2
 from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, Light
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
@@ -76,7 +76,7 @@ def test_speeds_and_accelerations_are_bounded(watched: Watched) -> None:
         assert (v.speed_mps >= 0).all()
         assert (v.speed_mps[v.active] <= 1.1 * limit[v.lane[v.active]]).all()
         assert (v.acceleration_mps2[v.active] <= v.accel_mps2[v.active] + 1e-9).all()
-        assert (v.acceleration_mps2[v.active] >= -HARDEST_BRAKING_MPS2).all()
+        assert (v.acceleration_mps2[v.active] >= -MAX_BRAKING_MPS2).all()
 
 
 def test_hard_braking_is_rare(watched: Watched) -> None:
@@ -127,7 +127,7 @@ def test_nobody_passes_a_red_light(watched: Watched) -> None:
         still_there = w.lane == v.lane
         crossed = np.where(still_there, graph.length_m[v.lane] - w.front_m < 0, True) & (to_line >= 0)
         guarded = v.active & crossed & signals.guarded[ahead]
-        assert (signals.shows(before.time_s)[ahead[guarded]] != Light.RED).all(), before.time_s
+        assert (signals.light_states(before.time_s)[ahead[guarded]] != Light.RED).all(), before.time_s
         passed += int(guarded.sum())
     assert passed > 10 or not signals.guarded.any()
 
@@ -191,7 +191,7 @@ def test_lights_show_green_to_one_axis_at_a_time(town02: TownMap) -> None:
     heading = np.arctan2(start[:, 1], start[:, 0])
     seen = np.zeros((len(signals.guarded), 4), dtype=bool)
     for time_s in np.arange(0.0, 2 * PHASE_S, 0.5):
-        light = signals.shows(float(time_s))
+        light = signals.light_states(float(time_s))
         seen[np.arange(len(light)), light] = True
         for junction in np.unique(graph.junction[signals.guarded]):
             lanes = np.flatnonzero(signals.guarded & (graph.junction == junction) & (light == Light.GREEN))

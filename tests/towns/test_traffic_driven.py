@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.driven import Driven, find_lane, see_driven
-from foredrive.towns.traffic.fleet import ego_vehicle, place
+from foredrive.towns.traffic.external_ego import EgoPose, find_lane, perceive_ego
+from foredrive.towns.traffic.fleet import ego_vehicle, place_vehicles
 from foredrive.towns.traffic.lane_graph import Control
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
@@ -26,7 +26,7 @@ def longest_lane(traffic: Traffic) -> int:
 
 def driven_at(
     traffic: Traffic, lane: int, s_m: float, aside_m: float = 0.0, turned_rad: float = 0.0, mps: float = 0.0
-) -> Driven:
+) -> EgoPose:
     """The ego vehicle with its middle beside a point of a lane."""
     graph = traffic.lanes
     here, ahead = graph.position(np.array([lane, lane]), np.array([s_m, s_m + 0.5]))
@@ -34,7 +34,7 @@ def driven_at(
     centre = here + aside_m * np.array([-np.sin(lane_yaw), np.cos(lane_yaw), 0.0])
     yaw = lane_yaw + turned_rad
     axle = centre - AXLE_TO_CENTRE_M * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return Driven(axle, float(yaw), mps)
+    return EgoPose(axle, float(yaw), mps)
 
 
 def followed(traffic: Traffic, lane: int, s_m: float, behind_m: float) -> TrafficState:
@@ -42,10 +42,10 @@ def followed(traffic: Traffic, lane: int, s_m: float, behind_m: float) -> Traffi
     ego = ego_vehicle(traffic.lanes, np.array([lane]), np.array([s_m]))
     state = traffic.start(ego)
     other = dataclasses.replace(ego, track_id=np.array([77]))
-    other = place(traffic.lanes, other, np.array([lane]), np.array([s_m - behind_m]))
+    other = place_vehicles(traffic.lanes, other, np.array([lane]), np.array([s_m - behind_m]))
     vehicles = state.vehicles.replace_rows(np.array([1]), other)
     vehicles = dataclasses.replace(vehicles, active=np.arange(len(vehicles.active)) < 2)
-    return traffic._know_path(dataclasses.replace(state, vehicles=vehicles), np.random.default_rng(0))
+    return traffic._extend_paths(dataclasses.replace(state, vehicles=vehicles), np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -97,29 +97,29 @@ def test_a_shadow_lies_on_the_lane_that_is_entered_soon(town_of: Callable[[str],
     traffic = Traffic(town_of("Town05"), 1, vehicle_count=2, people_count=0)
     graph = traffic.lanes
     free = (graph.left >= 0) & (graph.junction < 0) & (graph.length_m > 80)
-    lane = int(np.argmax(np.where(free, graph.tightest_m, 0.0)))
+    lane = int(np.argmax(np.where(free, graph.min_radius_m, 0.0)))
     beside = int(graph.left[lane])
     state = followed(traffic, lane, 50.0, behind_m=30.0)
     for turned_rad, expected in ((0.0, False), (0.15, True)):
         ego = driven_at(traffic, lane, 50.0, turned_rad=turned_rad, mps=12.0)
-        seen = see_driven(graph, traffic.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
-        shadows = seen.everyone.path[seen.count :, BEHIND]
+        seen = perceive_ego(graph, traffic.lane_index, state.vehicles, ego, state.route, 0, 0.0)
+        shadows = seen.vehicles.path[seen.count :, BEHIND]
         assert (beside in shadows) == expected
         if expected:
             row = seen.count + int(np.flatnonzero(shadows == beside)[0])
             # Where the rear will be in a second, less the way until then: next to where it is now.
-            assert seen.everyone.rear_m[row] == pytest.approx(50.0 - 2.4, abs=2.0)
-            assert seen.everyone.speed_mps[row] == pytest.approx(12.0 * np.cos(0.15), abs=0.1)
+            assert seen.vehicles.rear_m[row] == pytest.approx(50.0 - 2.4, abs=2.0)
+            assert seen.vehicles.speed_mps[row] == pytest.approx(12.0 * np.cos(0.15), abs=0.1)
 
 
 def test_against_the_traffic_a_shadow_comes_towards_it(alone: Traffic) -> None:
     lane = longest_lane(alone)
     state = followed(alone, lane, 80.0, behind_m=50.0)
     ego = driven_at(alone, lane, 80.0, turned_rad=np.pi, mps=6.0)
-    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
-    ahead = find_leaders(alone.lanes, seen.everyone, path_starts(alone.lanes, seen.everyone.path))
+    seen = perceive_ego(alone.lanes, alone.lane_index, state.vehicles, ego, state.route, 0, 0.0)
+    ahead = find_leaders(alone.lanes, seen.vehicles, path_starts(alone.lanes, seen.vehicles.path))
     assert ahead.leader[1] >= seen.count
-    assert seen.everyone.speed_mps[ahead.leader[1]] == pytest.approx(-6.0, abs=0.05)
+    assert seen.vehicles.speed_mps[ahead.leader[1]] == pytest.approx(-6.0, abs=0.05)
     # Both bumpers to the other's: 50 m less a length, but for the spacing of samples.
     assert ahead.leader_gap_m[1] == pytest.approx(50.0 - 4.9, abs=0.6)
 
@@ -135,7 +135,7 @@ def before_a_light(traffic: Traffic) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(
-    ("to_line_m", "mps", "turn_came_s", "way_taken", "asks"),
+    ("to_line_m", "mps", "turn_came_s", "way_taken", "requests"),
     [
         (3.0, 12.0, 0.0, True, True),
         (30.0, 9.0, 0.0, False, True),
@@ -160,22 +160,22 @@ def before_a_light(traffic: Traffic) -> tuple[int, int]:
     ],
 )
 def test_the_way_through_a_junction_is_taken_by_who_cannot_stop_before_it(
-    alone: Traffic, to_line_m: float, mps: float, turn_came_s: float, way_taken: bool, asks: bool
+    alone: Traffic, to_line_m: float, mps: float, turn_came_s: float, way_taken: bool, requests: bool
 ) -> None:
     before, _ = before_a_light(alone)
     s_m = float(alone.lanes.length_m[before]) - to_line_m - 2.45
     state = followed(alone, before, s_m, behind_m=10.0)
     ego = driven_at(alone, before, s_m, mps=mps)
     state.vehicles.rank[0] = turn_came_s
-    seen = see_driven(alone.lanes, alone.near_lanes, state.vehicles, ego, state.route, 0, 20.0)
-    assert (seen.everyone.granted[0] > 0) == way_taken
-    assert seen.may_ask[0] == asks
-    assert seen.may_ask[1:].all()
+    seen = perceive_ego(alone.lanes, alone.lane_index, state.vehicles, ego, state.route, 0, 20.0)
+    assert (seen.vehicles.granted[0] > 0) == way_taken
+    assert seen.may_request[0] == requests
+    assert seen.may_request[1:].all()
 
 
 def test_who_turns_in_wide_has_not_changed_his_mind(alone: Traffic) -> None:
     """In a junction he is taken to be on the lane that he meant to take, though another is nearer."""
-    graph, near, nowhere = alone.lanes, alone.near_lanes, np.zeros(0, dtype=np.int64)
+    graph, near, nowhere = alone.lanes, alone.lane_index, np.zeros(0, dtype=np.int64)
     tried = 0
     for meant in np.flatnonzero(graph.junction >= 0).tolist():
         lanes = graph.siblings.other[graph.siblings.first[meant] : graph.siblings.first[meant + 1]]
@@ -210,8 +210,8 @@ def test_who_drives_through_a_junction_has_the_rest_of_it(alone: Traffic) -> Non
     graph = dataclasses.replace(alone.lanes, contested=contested)
     for mps, granted in ((6.0, 1), (0.0, 0)):
         ego = driven_at(alone, lane, s_m, mps=mps)
-        seen = see_driven(graph, alone.near_lanes, state.vehicles, ego, state.route, 0, 0.0)
-        assert seen.everyone.granted[0] == granted
+        seen = perceive_ego(graph, alone.lane_index, state.vehicles, ego, state.route, 0, 0.0)
+        assert seen.vehicles.granted[0] == granted
 
 
 def test_cross_traffic_waits_for_who_runs_a_red_light(town_of: Callable[[str], TownMap]) -> None:
@@ -248,7 +248,7 @@ def test_people_do_not_step_in_front_of_it(town02: TownMap) -> None:
     # A vehicle on the pavement, three metres ahead of the person, across its way.
     across = np.array([-forward[1], forward[0], 0.0])
     axle = person.xyz[who] + 3.0 * forward - AXLE_TO_CENTRE_M * across
-    ego = Driven(axle, float(np.arctan2(across[1], across[0])), 0.0)
+    ego = EgoPose(axle, float(np.arctan2(across[1], across[0])), 0.0)
     for _ in range(60):
         state = traffic.step(state, DT_S, ego)
         beside = (state.people.xyz[who] - axle) @ forward
@@ -259,7 +259,7 @@ def test_traffic_turns_over_around_it_and_its_slot_is_kept(town02: TownMap) -> N
     traffic = Traffic(town02, 3, vehicle_count=20, people_count=10)
     lane = longest_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
-    far_off = Driven(np.array([1000.0, 1000.0, 0.0]), 0.3, 2.0)
+    far_off = EgoPose(np.array([1000.0, 1000.0, 0.0]), 0.3, 2.0)
     state = traffic.step(state, DT_S, far_off)
     assert state.vehicles.active[0]
     assert not state.vehicles.active[1:].any()  # all were far from there
@@ -290,5 +290,5 @@ def test_the_road_is_as_high_as_its_lanes(town_of: Callable[[str], TownMap]) -> 
     lane = rng.integers(0, len(graph.ids), 300)
     at = graph.position(lane, rng.random(300) * graph.length_m[lane])
     for xyz in at:
-        z = traffic.near_lanes.height_m(xyz[None, :2], float(xyz[2]) + 0.4)[0]
+        z = traffic.lane_index.height_m(xyz[None, :2], float(xyz[2]) + 0.4)[0]
         assert z == pytest.approx(xyz[2], abs=0.12)

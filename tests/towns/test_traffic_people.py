@@ -7,7 +7,7 @@ import pytest
 
 from foredrive.scene import Category
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.drivers import drive
+from foredrive.towns.traffic.drivers import move_vehicles
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.pedestrians import (
     Pedestrians,
@@ -40,10 +40,10 @@ def at_the_kerb(traffic: Traffic, crossing: int) -> Pedestrians:
     walks = traffic.walks
     place = walks.ends[crossing, 0]
     walk = next(int(w) for w in walks.incident[place] if w >= 0 and not walks.is_crossing[w])
-    onward = 1 if walks.ends[walk, 1] == place else -1
-    s_m = np.array([walks.length_m[walk] - 0.05 if onward > 0 else 0.05])
+    direction = 1 if walks.ends[walk, 1] == place else -1
+    s_m = np.array([walks.length_m[walk] - 0.05 if direction > 0 else 0.05])
     person = draw_people(walks, np.random.default_rng(0), np.array([7]), np.array([walk]), s_m)
-    return dataclasses.replace(person, onward=np.array([onward]), next_walk=np.array([crossing]))
+    return dataclasses.replace(person, direction=np.array([direction]), next_walk=np.array([crossing]))
 
 
 def lone_car(traffic: Traffic, before_m: float, speed_mps: float) -> tuple[Vehicles, int]:
@@ -87,7 +87,7 @@ def test_a_person_waits_for_a_car_that_is_near_and_crosses_behind_it(traffic: Tr
                 person.s_m[0].clip(0, traffic.walks.length_m[person.walk[0]])
             )
             assert person.waited_s[0] > 0
-        cars = drive(cars, np.zeros(1), DT_S)
+        cars = move_vehicles(cars, np.zeros(1), DT_S)
     passed_s = (10.0 + cars.size_lwh[0, 0] + 3.4) / 10.0
     assert crossed_s is not None
     assert 10.0 / 10.0 < crossed_s < passed_s + 1.0

@@ -10,14 +10,14 @@ from PIL import Image
 
 from foredrive.cli.main import main
 from foredrive.recipes import gaussians
-from foredrive.rendering.initial import InitialSize
+from foredrive.rendering.initial import InitialGaussians
 from foredrive.training.rebuilding import RebuildSchedule
 
 
 def test_the_verb_writes_a_picture_and_says_how_good_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    size = InitialSize(
+    size = InitialGaussians(
         lidar_points=1100, unseen_points=400, pixel_points=1000, near_points=0, actor_points=20, features=2
     )
     smallest = dataclasses.replace(

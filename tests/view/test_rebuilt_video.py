@@ -14,9 +14,9 @@ from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
 from foredrive.runs.rebuild import film as rebuilt_film
-from foredrive.runs.rebuild.film import edits_from_words, plan_shooting, shoot
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Rebuilt, reconstruct
+from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames, render_frame
 from foredrive.view import rebuilt_video, video
 
 FRAMES = 5
@@ -25,7 +25,7 @@ ONE_WH = (480 + 2 * 8, 270 - 30 + 8 + 240 + 2 * 26 + 8)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
     folder = tmp_path_factory.mktemp("filmed")
     (log,) = find_logs(world.write(folder, frames=FRAMES))
     recipe = dataclasses.replace(SMALLEST, cameras=("ahead",))
@@ -42,7 +42,7 @@ def film(path: Path) -> list[np.ndarray]:
 
 
 def test_the_verb_films_edited_beside_unedited(
-    run: Rebuilt, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, saved = tmp_path / "new" / "film.webp", tmp_path / "edits.json"
     args = ["render", str(run.folder), "--out", str(out), "--remove", "11", "--shift-left", "1.5"]
@@ -66,7 +66,7 @@ def test_the_verb_films_edited_beside_unedited(
     assert all((a == b).all() for a, b in zip(film(again), frames, strict=True))
 
 
-def test_without_edits_there_is_one_picture(run: Rebuilt, tmp_path: Path) -> None:
+def test_without_edits_there_is_one_picture(run: Reconstruction, tmp_path: Path) -> None:
     """As an MP4, at a rate that is no whole number."""
     out = tmp_path / "film.mp4"
     args = ["render", str(run.folder), "--out", str(out), "--colour", "height"]
@@ -79,11 +79,11 @@ def test_without_edits_there_is_one_picture(run: Rebuilt, tmp_path: Path) -> Non
         assert stream.average_rate == 7.5
 
 
-def test_a_recorded_time_is_filmed_as_it_was_judged(run: Rebuilt) -> None:
+def test_a_recorded_time_is_filmed_as_it_was_judged(run: Reconstruction) -> None:
     opened = open_rebuilt(run.folder)
     judged = run.held_out.cameras[0]
-    shooting = plan_shooting(opened.vehicle, start_s=judged.t_s, seconds=0.0)
-    shot = shoot(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), shooting, 0)
+    plan = plan_frames(opened.vehicle, start_s=judged.t_s, seconds=0.0)
+    shot = render_frame(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), plan, 0)
     with torch.no_grad():
         rgb = run.scene(run.scene.graph, judged).rgb.clamp(0, 1)
     assert torch.allclose(shot.images[0].float(), 255 * rgb, atol=1.0)
@@ -92,31 +92,31 @@ def test_a_recorded_time_is_filmed_as_it_was_judged(run: Rebuilt) -> None:
     assert torch.allclose(shot.boxes.centre[0], there, atol=0.05)
 
 
-def test_another_lidar_is_put_where_the_logs_was(run: Rebuilt) -> None:
+def test_another_lidar_is_put_where_the_logs_was(run: Reconstruction) -> None:
     opened = open_rebuilt(run.folder)
-    shooting = plan_shooting(opened.vehicle, lidar="vlp16", start_s=0.2, seconds=0.0)
-    assert shooting.lidar is not None
-    shot = shoot(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), shooting, 0)
+    plan = plan_frames(opened.vehicle, lidar="vlp16", start_s=0.2, seconds=0.0)
+    assert plan.lidar is not None
+    shot = render_frame(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), plan, 0)
     assert shot.sweep is not None
-    assert len(shot.sweep.beam) == 16 * shooting.lidar.azimuth_steps
+    assert len(shot.sweep.beam) == 16 * plan.lidar.azimuth_steps
     last = shot.sweep.dt_s.abs() < 1e-4
     mounted = torch.tensor(world.LIDAR_EGO_M).float()
     assert torch.allclose(shot.sweep.origin_ego[last], mounted.expand(int(last.sum()), 3), atol=1e-3)
 
 
-def test_times_are_those_that_are_asked_for(run: Rebuilt) -> None:
+def test_times_are_those_that_are_asked_for(run: Reconstruction) -> None:
     vehicle = open_rebuilt(run.folder).vehicle
-    assert plan_shooting(vehicle).t_s == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
-    twice = plan_shooting(vehicle, start_s=0.1, seconds=0.2, rate_hz=20.0)
+    assert plan_frames(vehicle).t_s == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    twice = plan_frames(vehicle, start_s=0.1, seconds=0.2, rate_hz=20.0)
     assert twice.t_s == pytest.approx([0.1, 0.15, 0.2, 0.25, 0.3])
     assert twice.step_s == pytest.approx(0.05)
 
 
-def test_what_is_inserted_has_an_id_of_its_own(run: Rebuilt) -> None:
+def test_what_is_inserted_has_an_id_of_its_own(run: Reconstruction) -> None:
     tracks = run.scene.tracks
-    edits = edits_from_words(tracks, [Insert("a", 1, 30, 7)], 0.0, [7], ["C:/x:7@11", "b:11@7"])
+    edits = edits_from_arguments(tracks, [Insert("a", 1, 30, 7)], 0.0, [7], ["C:/x:7@11", "b:11@7"])
     assert edits == [Insert("C:/x", 7, 31, 11), Insert("b", 11, 32, 7), Remove(7)]
-    own = edits_from_words(tracks, [], 0.0, [11], [f"{run.folder}:7@11"])
+    own = edits_from_arguments(tracks, [], 0.0, [11], [f"{run.folder}:7@11"])
     assert edited_scene(run.scene, own).graph.tracks.track_id.tolist() == [7, 12]
 
 
@@ -141,7 +141,7 @@ def test_captions_say_what_was_changed() -> None:
     ],
 )
 def test_what_cannot_be_filmed_is_one_line(
-    run: Rebuilt, args: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Reconstruction, args: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = [arg.format(tmp=tmp_path, run=run.folder) for arg in args]
     if "--out" not in args:
@@ -154,7 +154,7 @@ def test_what_cannot_be_filmed_is_one_line(
 
 
 def test_an_interrupted_film_leaves_nothing(
-    run: Rebuilt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Ctrl-C while the video is written, over one that is there already."""
 
@@ -170,7 +170,7 @@ def test_an_interrupted_film_leaves_nothing(
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_a_saved_edit_is_not_written_before_it_is_known_to_work(run: Rebuilt, tmp_path: Path) -> None:
+def test_a_saved_edit_is_not_written_before_it_is_known_to_work(run: Reconstruction, tmp_path: Path) -> None:
     save_edits([Remove(3)], tmp_path / "bad.json")
     args = ["render", str(run.folder), "--out", str(tmp_path / "film.webp")]
     assert (

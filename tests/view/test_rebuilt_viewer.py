@@ -17,7 +17,7 @@ from foredrive.errors import InputError
 from foredrive.rendering.edits import Move, Remove, ShiftEgo, load_edits, move_between
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.tracks import states_at
-from foredrive.runs.rebuild.rebuilt_run import OpenRun, open_rebuilt
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.view.background import Background
 from foredrive.view.rebuilt_viewer import RebuiltViewer
@@ -28,7 +28,7 @@ ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> OpenRun:
+def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedReconstruction:
     folder = tmp_path_factory.mktemp("viewed")
     (log,) = find_logs(world.write(folder, frames=5))
     return open_rebuilt(reconstruct(ONE_CAMERA, log, folder / "run").folder)
@@ -46,7 +46,7 @@ class Page(RebuiltViewer):
 
 
 @pytest.fixture
-def page(run: OpenRun, tmp_path: Path) -> Iterator[Page]:
+def page(run: OpenedReconstruction, tmp_path: Path) -> Iterator[Page]:
     page = Page(run, [], tmp_path / "edits.json", "localhost", 0)
     yield page
     page.close()
@@ -61,7 +61,7 @@ def picture(page: RebuiltViewer) -> np.ndarray:
     return page.pictures.images[0].image.astype(int)
 
 
-def test_what_is_drawn_is_where_it_is_then(page: Page, run: OpenRun) -> None:
+def test_what_is_drawn_is_where_it_is_then(page: Page, run: OpenedReconstruction) -> None:
     for t_s in (0.0, 0.3):
         page.show(t_s)
         ego_m = world.EGO_SPEED_MPS * t_s
@@ -114,7 +114,7 @@ def test_an_actor_stays_where_it_is_dragged(page: Page) -> None:
     )
 
 
-def test_copies_are_chosen_and_have_ids_of_their_own(page: Page, run: OpenRun) -> None:
+def test_copies_are_chosen_and_have_ids_of_their_own(page: Page, run: OpenedReconstruction) -> None:
     page.edits.choose(PARKED)
     page.edits._change("duplicate")
     assert page.edits.chosen == MOVING + 1
@@ -128,7 +128,7 @@ def test_copies_are_chosen_and_have_ids_of_their_own(page: Page, run: OpenRun) -
     assert aside == pytest.approx((0, 3, 0), abs=1e-3)
 
 
-def test_saved_edits_begin_another_page_with_the_same_picture(page: Page, run: OpenRun) -> None:
+def test_saved_edits_begin_another_page_with_the_same_picture(page: Page, run: OpenedReconstruction) -> None:
     page.edits.replace([Remove(MOVING), Move(PARKED, (1.0, 0.5, 0.0), 0.4), ShiftEgo((0.0, 1.0, 0.0))])
     page.edits.save()
     file = Path(page.edits.file.value)
@@ -140,7 +140,9 @@ def test_saved_edits_begin_another_page_with_the_same_picture(page: Page, run: O
     again.close()
 
 
-def test_what_cannot_be_done_is_told_and_changes_nothing(page: Page, run: OpenRun, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_told_and_changes_nothing(
+    page: Page, run: OpenedReconstruction, tmp_path: Path
+) -> None:
     file = Path(page.edits.file.value)
     page.edits._change("remove")
     page.edits.replace([Remove(99)])
@@ -208,7 +210,7 @@ def test_of_too_many_splats_those_that_cover_most_are_left() -> None:
     assert thinned(far, 0.5, there).mean_m[:, 0].tolist() == [0, 1]  # the third is 345 m away
 
 
-def test_a_move_is_read_off_two_poses(run: OpenRun) -> None:
+def test_a_move_is_read_off_two_poses(run: OpenedReconstruction) -> None:
     tracks = run.scene.tracks
     before = states_at(tracks, 0.2).T_scene_actor[tracks.index_of(MOVING)].detach()
     move = Move(MOVING, (1.0, -2.0, 0.0), 0.3)
@@ -231,7 +233,7 @@ def test_a_move_is_read_off_two_poses(run: OpenRun) -> None:
     ],
 )
 def test_what_cannot_be_opened_is_one_line(
-    flags: list[str], said: str, run: OpenRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flags: list[str], said: str, run: OpenedReconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "other.json").write_text('[{"kind": "remove", "actor": 99}]')
     assert main(["view", str(run.folder), *(flag.format(tmp=tmp_path) for flag in flags)]) == 2
@@ -240,7 +242,9 @@ def test_what_cannot_be_opened_is_one_line(
     assert said in err
 
 
-def test_an_unfinished_run_is_told(run: OpenRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_run_is_told(
+    run: OpenedReconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
     assert main(["view", str(tmp_path)]) == 2
     assert "not finished; go on with `foredrive reconstruct`" in capsys.readouterr().err

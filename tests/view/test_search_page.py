@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 from html_pages import EVIL, Page, assert_harmless
 from miniature import write_log
@@ -22,7 +23,7 @@ from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
-from foredrive.search.rows import FACTS
+from foredrive.search.rows import FACTS, IndexRow
 from foredrive.view.search_page import SearchPage, query_of
 from foredrive.view.search_sheet import write_search_sheet
 
@@ -133,17 +134,23 @@ def test_a_browser_draws_the_grid(page: SearchPage, tmp_path: Path) -> None:
     assert "svg" not in {tag for tag, _ in shown.tags}
 
 
+def index_row(**columns: str) -> IndexRow:
+    """A row with these columns; most of the others are null."""
+    texts = dict.fromkeys(("key", "log", "folder", "maps_dir", "view"), "-")
+    row = {**texts, "t_s": 1.0, "t_us": 0, "frame": 0, **columns}
+    return IndexRow.all_of(pa.Table.from_pylist([row], schema=FACTS))[0]
+
+
 def test_names_from_outside_run_nothing_on_a_contact_sheet(tmp_path: Path) -> None:
-    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0}
-    facts |= dict.fromkeys(("log", "folder", "maps_dir", "view", "place", "weather", "caption"), EVIL)
+    names = ("log", "folder", "maps_dir", "view", "place", "weather", "caption")
+    row = index_row(**dict.fromkeys(names, EVIL))
     query = Query(text=EVIL, where=EVIL)
-    write_search_sheet(tmp_path / "hits.html", query, [Hit(facts, 0.5, {EVIL: 0.5})])
+    write_search_sheet(tmp_path / "hits.html", query, [Hit(row, 0.5, {EVIL: 0.5})])
     # title and heading (text and condition), and of the hit: log, view, score, place, weather, caption
     assert_harmless((tmp_path / "hits.html").read_text(), times=4 + 6)
 
 
 def test_a_query_with_dollars_is_no_formula(tmp_path: Path) -> None:
-    facts = dict.fromkeys(FACTS.names, None) | {"t_s": 1.0, "frame": 0, "folder": "$\\frac$", "maps_dir": ""}
-    hit = Hit(facts, 0.5, {"$\\x$": 1.0})
+    hit = Hit(index_row(folder="$\\frac$", maps_dir=""), 0.5, {"$\\x$": 1.0})
     write_search_sheet(tmp_path / "hits.png", Query(text="5 $ or $\\frac$"), [hit])
     assert (tmp_path / "hits.png").stat().st_size > 1000

@@ -59,15 +59,15 @@ def render(
 
     from foredrive.rendering.edits import load_edits
     from foredrive.rendering.edits import save_edits as write_edits
-    from foredrive.runs.rebuild.film import edits_from_words, plan_shooting
     from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
+    from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames
     from foredrive.view.rebuilt_video import write_rebuilt_video
 
     opened = open_rebuilt(run)
-    shooting = plan_shooting(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
+    plan = plan_frames(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
     known = [] if edits is None else load_edits(edits)
-    changes = [*known, *edits_from_words(opened.scene.tracks, known, shift_left, remove, insert)]
-    write_rebuilt_video(out, opened, changes, shooting, colour)
+    changes = [*known, *edits_from_arguments(opened.scene.tracks, known, shift_left, remove, insert)]
+    write_rebuilt_video(out, opened, changes, plan, colour)
     if save_edits is not None:
         write_edits(changes, save_edits)
-    print(f"wrote {out}: {len(shooting.t_s)} frames")
+    print(f"wrote {out}: {len(plan.t_s)} frames")

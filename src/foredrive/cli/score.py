@@ -1,16 +1,12 @@
 """`foredrive score`."""
 
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.errors import InputError
-
-if TYPE_CHECKING:
-    from foredrive.evaluation.detections import DetectionSet, FrameScore
 
 Family = Literal["gaussian", "laplace"]
 
@@ -42,59 +38,15 @@ def score(
             raise InputError(f"{path}: No such file or directory")
     check_number("--k", k, low=1)
     check_out_folder(out)
-    if worst < 0:
-        raise InputError(f"--worst is {worst}: a number of frames is not below 0")
+    check_number("--worst", worst, low=0)
 
     from rich.console import Console
 
-    from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
-    from foredrive.evaluation.detections import read_detections, summarise_scores, write_frame_scores
-    from foredrive.view.score_report import score_table, write_score_report
+    from foredrive.runs.score.run import FRAMES, SUMMARY, score_detections
+    from foredrive.view.score_report import REPORT, score_table, write_score_report
     from foredrive.view.table import print_table
 
-    started = time.perf_counter()
-    read = read_detections(results, truth, family)
-    scores = _scored(read, k, results)
-    result = summarise_scores(read, scores)
-    figures = result.figures
-    if against is not None:
-        figures |= _compared(scores, against, truth, family, k)
-    figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
-    figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
-    write_summary(out / "summary.json", figures)
-    write_frame_scores(out / "frames.jsonl", scores)
-    write_score_report(
-        out / "report.html", f"{results.name} and the truth, {truth.name}", read, scores, result, worst
-    )
+    scored, figures = score_detections(results, truth, out, against=against, family=family, k=k)
+    write_score_report(out / REPORT, f"{results.name} and the truth, {truth.name}", scored, figures, worst)
     print_table(score_table(figures), Console())
-    print(f"wrote {out / 'summary.json'}, {out / 'report.html'} and {out / 'frames.jsonl'}")
-
-
-def _compared(
-    scores: "list[FrameScore]", against: Path, truth: Path, family: Family, k: int
-) -> dict[str, Any]:
-    """Return the metrics of the other results, and the difference to them."""
-    from foredrive.evaluation.detections import compare_scores, read_detections, summarise_scores
-
-    other = read_detections(against, truth, family)
-    others = _scored(other, k, against)
-    compared, uncompared = compare_scores(scores, others)
-    theirs = summarise_scores(other, others).figures
-    return {f"against.{key}": value for key, value in theirs.items()} | {
-        "against": str(against),
-        "against.difference": compared.mean,
-        "against.difference_low_95": compared.low,
-        "against.difference_high_95": compared.high,
-        "against.p_value": compared.p_value,
-        "against.frames_not_compared": uncompared,
-    }
-
-
-def _scored(read: "DetectionSet", k: int, path: Path) -> "list[FrameScore]":
-    from rich.progress import Progress
-
-    from foredrive.evaluation.detections import score_frames
-
-    with Progress(transient=True) as progress:
-        task = progress.add_task(path.name, total=len(read.frames))
-        return score_frames(read, k=k, told=lambda done: progress.update(task, completed=done))
+    print(f"wrote {out / SUMMARY}, {out / REPORT} and {out / FRAMES}")

@@ -127,7 +127,7 @@ class Then:
         if self.save is not None:
             save_query(index, self.save, query.to_json())
         if self.tag is not None:
-            add_tag(index, self.tag, [str(hit.facts["key"]) for hit in found.hits])
+            add_tag(index, self.tag, [hit.row.key for hit in found.hits])
         if not found.hits:
             return
         if self.clips is not None:

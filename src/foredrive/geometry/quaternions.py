@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def quaternion_of(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
+def quaternion_from_matrix(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     """Return the quaternion of a rotation matrix. Its largest entry is positive.
 
     The function is differentiable for every rotation. The columns of 4 q qᵀ are sums of entries of R. The
@@ -29,7 +29,7 @@ def quaternion_of(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     return torch.nn.functional.normalize(column, dim=-1)
 
 
-def multiply(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+def multiply_quaternions(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
     """Return the Hamilton product: the rotation b followed by the rotation a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)

@@ -25,7 +25,7 @@ def rotate_vectors(T: Float[Tensor, "*b 4 4"], vectors: Float[Tensor, "*b N 3"])
     return vectors @ T[..., :3, :3].transpose(-1, -2)
 
 
-def yaw_of(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
+def yaw_from_matrix(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
     """Return the heading of the x axis of src in dst, about the z axis of dst, rad in (-π, π]."""
     return torch.atan2(T[..., 1, 0], T[..., 0, 0])
 

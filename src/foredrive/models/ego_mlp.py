@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.geometry.se3 import inverse_se3, yaw_of
+from foredrive.geometry.se3 import inverse_se3, yaw_from_matrix
 from foredrive.scene import Clip, Command, Trajectory
 
 
@@ -26,7 +26,7 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
         raise InputError(f"the ego status needs {past_frames} frames before now, but the clip has {now}")
     frames = slice(now - past_frames, now + 1)
     T_now_ego = inverse_se3(clip.T_world_ego[:, now : now + 1]) @ clip.T_world_ego[:, frames]
-    poses = torch.cat([T_now_ego[..., :2, 3], yaw_of(T_now_ego)[..., None]], dim=-1)[:, :-1]
+    poses = torch.cat([T_now_ego[..., :2, 3], yaw_from_matrix(T_now_ego)[..., None]], dim=-1)[:, :-1]
     return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, frames]
 
 

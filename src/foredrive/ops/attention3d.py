@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.ops.corners import BLOCK
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_supports, triton_supports
 from foredrive.ops.volume_reading import ReadVolume, readers_of
 
 
@@ -43,11 +43,11 @@ def attend_volume(
         shapes = f"values {(*values.shape,)}, points {(*points.shape,)}, weights {(*weights.shape,)}"
         raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
     small = values[:1].numel() < MAX_ITEM_SIZE
-    if small and triton_can(values, points, weights):
+    if small and triton_supports(values, points, weights):
         from foredrive.ops.volume_triton import read_volume_triton  # Triton may be missing
 
         return read_volume_triton(values, points, weights)
-    if not (small and per_head <= BLOCK and numba_can(values, points, weights)):
+    if not (small and per_head <= BLOCK and numba_supports(values, points, weights)):
         return attend_volume_reference(values, points, weights)
     readers = readers_of(heads, values.shape[-1])
     with full_precision(values, points, weights) as (values, points, weights):

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from foredrive.ops.corners import BLOCK
 from foredrive.ops.lifting_kernels import Gradients, Inputs, lift_pairs, lift_pairs_backward
-from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_can, triton_can
+from foredrive.ops.precision import MAX_ITEM_SIZE, full_precision, numba_supports, triton_supports
 from foredrive.ops.threads import in_parallel
 
 MIN_QUERIES = 64
@@ -52,12 +52,12 @@ def lift(
     _check(values, uv, visible, offsets, weights)
     image_size = sum(v.shape[2] * v.shape[3] for v in values) * values[0].shape[4]
     small = image_size < MAX_ITEM_SIZE
-    if small and triton_can(*values, uv, offsets, weights):
+    if small and triton_supports(*values, uv, offsets, weights):
         from foredrive.ops.lifting_triton import lift_triton  # Triton may be missing
 
         return lift_triton(values, uv, visible, offsets, weights)
     points = weights.shape[3] * weights.shape[4]
-    if not (small and points <= BLOCK and numba_can(*values, uv, offsets, weights)):
+    if not (small and points <= BLOCK and numba_supports(*values, uv, offsets, weights)):
         return lift_reference(values, uv, visible, offsets, weights)
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
         joined, sizes = join_levels(values)

@@ -23,13 +23,13 @@ def full_precision(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
         yield tuple(t.to(dtype) for t in tensors)
 
 
-def numba_can(*tensors: Tensor) -> bool:
+def numba_supports(*tensors: Tensor) -> bool:
     """Return whether the CPU kernels apply: all tensors on the CPU, none float64, nothing traced."""
     return _plain(tensors, "cpu")
 
 
-def triton_can(*tensors: Tensor) -> bool:
-    """Return whether the CUDA kernels apply: as `numba_can`, but on a GPU and with Triton installed."""
+def triton_supports(*tensors: Tensor) -> bool:
+    """Return whether the CUDA kernels apply: as `numba_supports`, but on a GPU and with Triton installed."""
     return _plain(tensors, "cuda") and _has_triton()
 
 

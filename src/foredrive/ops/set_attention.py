@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.ops.precision import numba_can
+from foredrive.ops.precision import numba_supports
 from foredrive.ops.set_attention_kernels import attend_sets
 from foredrive.ops.threads import in_parallel
 from foredrive.ops.vectors import ROW
@@ -37,7 +37,7 @@ def attend_within(
     given = (query_key, value)
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in given)
     single = all(t.dtype == torch.float32 for t in given)
-    if wanted or not single or value.shape[1] != heads * ROW or not numba_can(*given, order):
+    if wanted or not single or value.shape[1] != heads * ROW or not numba_supports(*given, order):
         return attend_within_reference(query_key, value, order, counts, heads)
     out = torch.empty_like(value, memory_format=torch.contiguous_format)
     ends = torch.cat([counts.new_zeros(1), counts.cumsum(0)])

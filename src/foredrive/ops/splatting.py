@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.ops.precision import full_precision, numba_can
+from foredrive.ops.precision import full_precision, numba_supports
 from foredrive.ops.splat_points import TiledPoints
 
 MIN_ALPHA = 1 / 255
@@ -120,7 +120,7 @@ def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
 
 
 def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None) -> Composited:
-    if not numba_can(*splats):
+    if not numba_supports(*splats):
         return composite_splats_reference(splats, points, hit_range_m)
     from foredrive.ops.splatting_numba import CompositeSplats  # numba is slow to import
 

@@ -34,7 +34,7 @@ def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> 
         done.result()
 
 
-def one_ahead(items: Iterator[T]) -> Iterator[T]:
+def prefetched(items: Iterator[T]) -> Iterator[T]:
     """Yield the items; another thread prepares the next item meanwhile. With one torch thread it does not."""
     if torch.get_num_threads() == 1:
         yield from items

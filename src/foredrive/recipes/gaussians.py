@@ -8,7 +8,7 @@ from foredrive.errors import InputError
 from foredrive.recipes.config import is_recipe_file, overridden, read_values, validated
 from foredrive.recipes.known import nearest_name
 from foredrive.recipes.old_formats import upgraded_reconstruction
-from foredrive.rendering.initial import InitialSize
+from foredrive.rendering.initial import InitialGaussians
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 
@@ -18,7 +18,7 @@ class RebuildRecipe:
 
     name: str
     image_hw: tuple[int, int]
-    initial: InitialSize
+    initial: InitialGaussians
     schedule: RebuildSchedule
     cameras: tuple[str, ...] | None = None
     """Names of cameras, their own or 123D's; None takes all."""
@@ -43,7 +43,7 @@ def gaussians_tiny() -> RebuildRecipe:
         name="gaussians_tiny",
         about="a log rebuilt from Gaussians in minutes on two CPU cores",
         image_hw=(270, 480),
-        initial=InitialSize(
+        initial=InitialGaussians(
             lidar_points=45_000,
             unseen_points=30_000,
             pixel_points=100_000,
@@ -74,7 +74,7 @@ def gaussians_base() -> RebuildRecipe:
         name="gaussians_base",
         about="SplatAD's sizes, for a GPU",
         image_hw=(1080, 1920),
-        initial=InitialSize(
+        initial=InitialGaussians(
             lidar_points=1_500_000,
             unseen_points=500_000,
             pixel_points=300_000,

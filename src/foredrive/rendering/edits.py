@@ -17,7 +17,7 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.rendering.scene_graph import SceneGraph, joined
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.tracks import ActorTracks
 
 Offset = tuple[float, float, float]
 """Forward, left, up, m."""
@@ -71,7 +71,7 @@ class Insert:
 
 
 @dataclass(frozen=True)
-class Send:
+class DriveStraight:
     """An edit that adds a copy of an actor, which drives straight at constant velocity at all times."""
 
     actor: int
@@ -96,11 +96,11 @@ class ShiftEgo:
     kind: Literal["shift_ego"] = "shift_ego"
 
 
-Edit = Annotated[Move | Remove | Duplicate | Insert | Send | ShiftEgo, Discriminator("kind")]
+Edit = Annotated[Move | Remove | Duplicate | Insert | DriveStraight | ShiftEgo, Discriminator("kind")]
 
 
 @dataclass(frozen=True)
-class Edited:
+class EditedScene:
     """A scene after edits."""
 
     graph: SceneGraph
@@ -111,7 +111,7 @@ class Edited:
 
 def apply_edits(
     graph: SceneGraph, edits: Sequence[Edit], open_run: Callable[[str], SceneGraph] | None = None
-) -> Edited:
+) -> EditedScene:
     """Apply edits in order.
 
     Args:
@@ -133,7 +133,7 @@ def apply_edits(
             graph = dataclasses.replace(graph, tracks=_moved(graph.tracks, row, edit.offset_m, edit.yaw_rad))
         elif isinstance(edit, Duplicate):
             graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, edit.offset_m, edit.yaw_rad)
-        elif isinstance(edit, Send):
+        elif isinstance(edit, DriveStraight):
             graph = _with_sent(graph, edit)
         else:
             if open_run is None:
@@ -144,7 +144,7 @@ def apply_edits(
             graph = _with_copy(
                 graph, source, edit.actor, edit.follows, edit.copy, edit.offset_m, edit.yaw_rad
             )
-    return Edited(graph, T_ego_shifted)
+    return EditedScene(graph, T_ego_shifted)
 
 
 def move_between(
@@ -156,7 +156,7 @@ def move_between(
     return Move(actor, (forward_m, left_m, up_m), math.atan2(change[1][0], change[0][0]))
 
 
-def free_id(graph: SceneGraph) -> int:
+def unused_id(graph: SceneGraph) -> int:
     """Return an id that no actor has, for a copy."""
     return max(graph.tracks.track_id.tolist(), default=0) + 1
 
@@ -196,7 +196,7 @@ def _offset(offset_m: Offset, yaw_rad: float) -> Float[Tensor, "4 4"]:
     return matrix_from_yaw(torch.tensor(yaw_rad), torch.tensor(offset_m))
 
 
-def _moved(tracks: Tracks, row: int, offset_m: Offset, yaw_rad: float) -> Tracks:
+def _moved(tracks: ActorTracks, row: int, offset_m: Offset, yaw_rad: float) -> ActorTracks:
     poses = tracks.T_scene_actor.clone()
     poses[row] = poses[row] @ _offset(offset_m, yaw_rad).to(poses)
     return dataclasses.replace(tracks, T_scene_actor=poses)
@@ -242,7 +242,7 @@ def _with_copy(
     return SceneGraph(
         gaussians=joined([graph.gaussians, own]),
         actor=torch.cat([graph.actor, added]),
-        tracks=Tracks(
+        tracks=ActorTracks(
             track_id=torch.cat([tracks.track_id, tracks.track_id.new_tensor([copy])]),
             category=torch.cat([tracks.category, source.tracks.category[row : row + 1]]),
             size_lwh=torch.cat([tracks.size_lwh, source.tracks.size_lwh[row : row + 1]]),
@@ -253,7 +253,7 @@ def _with_copy(
     )
 
 
-def _with_sent(graph: SceneGraph, edit: Send) -> SceneGraph:
+def _with_sent(graph: SceneGraph, edit: DriveStraight) -> SceneGraph:
     """Add a copy of an actor on a straight path."""
     graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, (0.0, 0.0, 0.0), 0.0)
     tracks, row = graph.tracks, len(graph.tracks) - 1

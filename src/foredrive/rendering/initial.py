@@ -10,21 +10,21 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from foredrive.geometry.quaternions import quaternion_of
+from foredrive.geometry.quaternions import quaternion_from_matrix
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, joined, mirrored
 from foredrive.rendering.seed_points import (
     GREY,
     SeedPoints,
+    colour_from_neighbours,
+    empty_points,
     lidar_points,
-    like_neighbours,
-    no_points,
     points_along_pixels,
-    points_anywhere,
-    some_points,
-    standing_points,
+    points_at_random_ranges,
+    subsample,
+    subsample_static,
 )
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
 _NEIGHBOURS = 3
@@ -35,7 +35,7 @@ _FLATTEST_M = 0.03
 
 
 @dataclass(frozen=True)
-class InitialSize:
+class InitialGaussians:
     """Numbers and appearance of the initial Gaussians of a scene."""
 
     lidar_points: int
@@ -69,15 +69,16 @@ class InitialSize:
 def initial_scene(
     cameras: list[CameraView],
     sweeps: list[SweepView],
-    tracks: Tracks,
-    size: InitialSize,
+    tracks: ActorTracks,
+    size: InitialGaussians,
     generator: torch.Generator,
 ) -> SceneGraph:
     """Build Gaussians at lidar points, coloured by the image nearest in time, and along pixels.
 
     Lidar points that no camera saw are coloured like points near them and lie flat on their surface, because
-    only a few beams would constrain their size in training. Points of symmetric actors (`Tracks.mirrored`)
-    are used on both sides. Without sweeps, points at any range along pixels replace all others.
+    only a few beams would constrain their size in training. Points of symmetric actors
+    (`ActorTracks.mirrored`) are used on both sides. Without sweeps, points at any range along pixels replace
+    all others.
 
     Args:
         cameras: training views, with images.
@@ -87,15 +88,17 @@ def initial_scene(
         generator: random choice of points.
     """
     standing, of_actors = lidar_points(cameras, sweeps, tracks)
-    standing = like_neighbours(standing_points(standing, size.lidar_points, size.unseen_points, generator))
+    standing = colour_from_neighbours(
+        subsample_static(standing, size.lidar_points, size.unseen_points, generator)
+    )
     near, far = (size.near_m, size.far_m), (size.far_from_m, size.far_m)
-    along, anywhere = no_points(), size.near_points
+    along, anywhere = empty_points(), size.near_points
     if sweeps:
         count, scale = size.pixel_points, size.pixel_scale
         along = points_along_pixels(cameras, sweeps, tracks, count, scale, far, generator)
     else:
         anywhere += size.lidar_points + size.unseen_points + size.pixel_points
-    beside = points_anywhere(cameras, anywhere, size.scale, near, generator)
+    beside = points_at_random_ranges(cameras, anywhere, size.scale, near, generator)
     parts = [
         _gaussians(standing[standing.seen], size, size.opacity, by_neighbours=True),
         _patches(standing[~standing.seen], size),
@@ -114,11 +117,11 @@ def _actor(
     points: SeedPoints,
     size_lwh: Float[Tensor, "3"],
     both_sides: bool,
-    size: InitialSize,
+    size: InitialGaussians,
     generator: torch.Generator,
 ) -> Gaussians:
     """Build an actor from its lidar points (on both sides if symmetric) and random points in its box."""
-    points = like_neighbours(some_points(points, size.actor_points_most, generator))
+    points = colour_from_neighbours(subsample(points, size.actor_points_most, generator))
     part = _gaussians(points, size, size.opacity, by_neighbours=True)
     if both_sides:
         part = joined([part, mirrored(part)])
@@ -137,7 +140,7 @@ def _actor(
 
 
 def _gaussians(
-    points: SeedPoints, size: InitialSize, opacity: float, *, by_neighbours: bool = False
+    points: SeedPoints, size: InitialGaussians, opacity: float, *, by_neighbours: bool = False
 ) -> Gaussians:
     count = len(points.xyz_m)
     quaternion = torch.zeros(count, 4)
@@ -154,7 +157,7 @@ def _gaussians(
     )
 
 
-def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
+def _patches(points: SeedPoints, size: InitialGaussians) -> Gaussians:
     """Build Gaussians with the covariance axes of their neighbours: flat where the neighbours are flat."""
     found = _gaussians(points, size, size.opacity)
     if len(points.xyz_m) <= _PATCH:
@@ -165,7 +168,7 @@ def _patches(points: SeedPoints, size: InitialSize) -> Gaussians:
     variance, axes = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread / (_PATCH + 1))
     axes *= np.sign(np.linalg.det(axes))[:, None, None]  # make it a rotation
     scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
-    quaternion, log_scale = quaternion_of(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
+    quaternion, log_scale = quaternion_from_matrix(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
     return dataclasses.replace(found, quaternion=quaternion.float(), log_scale=log_scale.float())
 
 

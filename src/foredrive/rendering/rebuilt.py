@@ -16,21 +16,21 @@ from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors, sensor_
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import composite_splats
 from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
-from foredrive.rendering.gaussians import Gaussians, lidar_points, project_camera, project_lidar
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, place
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.gaussians import Gaussians, project_camera, project_lidar, tiled_lidar_beams
+from foredrive.rendering.scene_graph import STATIC, SceneGraph, place_gaussians
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.sensors import TimedRays
 
 BACKGROUND = 0.5
 """Albedo of the background, where no Gaussian covers a pixel."""
-OF_GAUSSIANS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
+GAUSSIAN_PARAMETERS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
 """Parameters with one row per Gaussian."""
 _LEAST_ALPHA = 1e-6
 
 
 @dataclass(frozen=True)
-class CameraPicture:
+class RenderedImage:
     """A rendered image."""
 
     rgb: Float[Tensor, "3 H W"]
@@ -41,7 +41,7 @@ class CameraPicture:
 
 
 @dataclass(frozen=True)
-class SweepPicture:
+class RenderedSweep:
     """A rendered sweep, beam by beam."""
 
     range_m: Float[Tensor, "P"]
@@ -66,7 +66,7 @@ class SweepPicture:
 
 
 @dataclass(frozen=True)
-class SweepPoints:
+class PreparedSweep:
     """The beams of a sweep in the form needed for compositing: prepared once, used in every step."""
 
     tiles: TiledPoints
@@ -136,9 +136,9 @@ class RebuiltScene(nn.Module):
         return Gaussians(self.mean_m, self.quaternion, self.log_scale, self.opacity_logit, feature)
 
     @property
-    def tracks(self) -> Tracks:
+    def tracks(self) -> ActorTracks:
         """The tracks with learned offsets."""
-        logged = Tracks(
+        logged = ActorTracks(
             self.track_id, self.category, self.size_lwh, self.key_t_s, self.T_scene_actor, self.present
         )
         return logged.moved(self.actor_offset)
@@ -160,34 +160,34 @@ class RebuiltScene(nn.Module):
         except (OSError, SafetensorError) as error:
             raise InputError(f"{file}: weights of a scene cannot be read: {error}") from error
         self.actor = self.actor.new_zeros(count)
-        for name in OF_GAUSSIANS:
+        for name in GAUSSIAN_PARAMETERS:
             old = getattr(self, name)
             setattr(self, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
 
-    def add_standing(self, gaussians: Gaussians) -> None:
+    def add_static(self, gaussians: Gaussians) -> None:
         """Add Gaussians to the static part."""
         added = {
             name: getattr(gaussians, name) for name in ("mean_m", "quaternion", "log_scale", "opacity_logit")
         }
         added |= {"albedo": gaussians.feature[:, :ALBEDO], "feature": gaussians.feature[:, ALBEDO:]}
-        for name in OF_GAUSSIANS:
+        for name in GAUSSIAN_PARAMETERS:
             setattr(self, name, nn.Parameter(torch.cat([getattr(self, name).detach(), added[name].detach()])))
         none = self.actor.new_full((len(gaussians.opacity_logit),), STATIC)
         self.actor = torch.cat([self.actor, none])
 
     def forward(
         self, graph: SceneGraph, view: CameraView, mirror: Bool[Tensor, "A"] | None = None
-    ) -> CameraPicture:
+    ) -> RenderedImage:
         """Render an image.
 
         Args:
             graph: this scene, or an edited version of it.
             view: the camera; its image is not read.
-            mirror: see `place`.
+            mirror: see `place_gaussians`.
         """
         late_s, twist = self.camera_late_s[view.sensor], view.twist_cam + self.camera_twist[view.sensor]
         T_scene_cam = view.T_scene_cam @ exp_se3(self.camera_offset[view.sensor]) @ exp_se3(late_s * twist)
-        placed = place(graph, view.t_s + late_s, mirror)
+        placed = place_gaussians(graph, view.t_s + late_s, mirror)
         splats = project_camera(
             placed.gaussians,
             inverse_se3(T_scene_cam),
@@ -204,7 +204,7 @@ class RebuiltScene(nn.Module):
         rays = pixels_to_rays(pixel_centres(view.size_hw).to(view.K).flatten(0, 1), view.K, view.dist)
         direction = rotate_vectors(view.T_scene_cam, rays)
         alpha = seen.alpha.unflatten(0, view.size_hw)
-        return CameraPicture(
+        return RenderedImage(
             rgb=self.camera_decoder(
                 feature.unflatten(0, view.size_hw), direction.unflatten(0, view.size_hw), view.sensor
             ),
@@ -212,7 +212,7 @@ class RebuiltScene(nn.Module):
             alpha=alpha,
         )
 
-    def prepare_sweep(self, view: SweepView) -> SweepPoints:
+    def prepare_sweep(self, view: SweepView) -> PreparedSweep:
         """Return the beams of a sweep in the lidar's frame: axes of the vehicle, origin at the lidar."""
         beams = view.beams
         rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
@@ -220,11 +220,11 @@ class RebuiltScene(nn.Module):
         if len(beams.dt_s):
             T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
         twist = view.twist_ego
-        tiles = lidar_points(rays, T_ego_lidar, twist)
+        tiles = tiled_lidar_beams(rays, T_ego_lidar, twist)
         if not self.rolling:
             rays = TimedRays(rays.origin_ego, rays.dir_ego, torch.zeros_like(rays.dt_s))
-            tiles = lidar_points(rays, T_ego_lidar, torch.zeros_like(twist))
-        return SweepPoints(
+            tiles = tiled_lidar_beams(rays, T_ego_lidar, torch.zeros_like(twist))
+        return PreparedSweep(
             tiles=tiles,
             dir_scene=rotate_vectors(view.T_scene_ego, beams.dir_ego),
             T_scene_lidar=view.T_scene_ego @ T_ego_lidar,
@@ -234,11 +234,11 @@ class RebuiltScene(nn.Module):
     def sweep(
         self,
         graph: SceneGraph,
-        points: SweepPoints,
+        points: PreparedSweep,
         t_s: float,
         hit_range_m: Float[Tensor, "P"] | None = None,
         mirror: Bool[Tensor, "A"] | None = None,
-    ) -> SweepPicture:
+    ) -> RenderedSweep:
         """Render a sweep.
 
         Args:
@@ -246,9 +246,9 @@ class RebuiltScene(nn.Module):
             points: from `prepare_sweep`.
             t_s: time of the sweep.
             hit_range_m: see `composite_splats`.
-            mirror: see `place`.
+            mirror: see `place_gaussians`.
         """
-        placed = place(graph, t_s, mirror)
+        placed = place_gaussians(graph, t_s, mirror)
         splats = project_lidar(
             placed.gaussians,
             inverse_se3(points.T_scene_lidar.to(placed.velocity_mps)),
@@ -260,7 +260,7 @@ class RebuiltScene(nn.Module):
         intensity, drop_logit = self.lidar_decoder(
             seen.feature, seen.alpha, points.dir_scene.to(seen.feature)
         )
-        return SweepPicture(
+        return RenderedSweep(
             range_m=seen.expected_range_m / seen.alpha.clamp_min(_LEAST_ALPHA),
             median_range_m=seen.median_range_m,
             intensity=intensity,

@@ -10,18 +10,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from foredrive.geometry.quaternions import multiply
+from foredrive.geometry.quaternions import multiply_quaternions
 from foredrive.rendering.gaussians import Gaussians
 
 MIN_OPACITY = 0.005
 """Gaussians with a lower opacity are dead."""
-MOST_COPIES = 51
+MAX_COPIES = 51
 _STEEPNESS = 100.0
 _STAYS = 0.15
 """Opacity above which the walk is less than a millionth of its full size."""
 
 
-def shared_among(
+def split_evenly(
     opacity: Float[Tensor, "N"], copies: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """Return opacity and scale factor of Gaussians split into `copies`, including themselves (eq. 9).
@@ -29,14 +29,14 @@ def shared_among(
     With o' = 1 - (1 - o)^(1/n) the centre keeps its opacity. The scale is divided by Σ_{i=1..n} Σ_{k=0..i-1}
     binom(i-1, k) (-1)^k o'^(k+1) / √(k+1) over o, which keeps the integral of the rendered splat.
     """
-    copies = copies.clamp(1, MOST_COPIES)
+    copies = copies.clamp(1, MAX_COPIES)
     shared = 1 - (1 - opacity.double()) ** (1 / copies)
-    weight = torch.zeros(MOST_COPIES + 1, MOST_COPIES, dtype=torch.float64)
-    for i in range(1, MOST_COPIES + 1):
+    weight = torch.zeros(MAX_COPIES + 1, MAX_COPIES, dtype=torch.float64)
+    for i in range(1, MAX_COPIES + 1):
         for k in range(i):
             weight[i, k] = math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1)
     total = weight.cumsum(0).to(opacity.device)  # sum over i, up to n
-    powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacity.device)
+    powers = shared[:, None] ** torch.arange(1, MAX_COPIES + 1, device=opacity.device)
     integral = (total[copies] * powers).sum(-1)
     return shared.to(opacity), (opacity / integral).to(opacity)
 
@@ -66,4 +66,6 @@ def _turned(
     unit = torch.nn.functional.normalize(quaternion, dim=-1)
     back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
     first, last = (back, unit) if inverse else (unit, back)
-    return multiply(multiply(first, torch.nn.functional.pad(vector, (1, 0))), last)[:, 1:]
+    return multiply_quaternions(multiply_quaternions(first, torch.nn.functional.pad(vector, (1, 0))), last)[
+        :, 1:
+    ]

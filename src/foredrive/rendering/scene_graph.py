@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.geometry.quaternions import multiply, quaternion_of
+from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.rendering.tracks import ActorTracks, states_at
 from foredrive.scene.record import Record
 
 STATIC = -1
@@ -27,7 +27,7 @@ class SceneGraph(Record):
     """Static Gaussians are in the scene's frame, those of actors in the frame of their boxes."""
     actor: Int[Tensor, "N"]
     """Row in `tracks`, or `STATIC`."""
-    tracks: Tracks
+    tracks: ActorTracks
 
     def of_actor(self, row: int) -> Gaussians:
         """Return the Gaussians of an actor in its frame, or the static ones for `STATIC`."""
@@ -35,7 +35,7 @@ class SceneGraph(Record):
 
 
 @dataclass(frozen=True)
-class Placed(Record):
+class PlacedGaussians(Record):
     """M of a scene's Gaussians, placed for one time."""
 
     gaussians: Gaussians
@@ -46,7 +46,9 @@ class Placed(Record):
     """Index of each one in the scene's Gaussians."""
 
 
-def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None) -> Placed:
+def place_gaussians(
+    graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
+) -> PlacedGaussians:
     """Place the static part and every present actor at a time, with poses and velocities.
 
     Args:
@@ -60,7 +62,7 @@ def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | No
     still = (graph.actor < 0).nonzero()[:, 0]
     standing = graph.gaussians[still]
     if len(moving) == 0:
-        return Placed(standing, torch.zeros_like(standing.mean_m), still)
+        return PlacedGaussians(standing, torch.zeros_like(standing.mean_m), still)
     owner = graph.actor[moving]
     own = graph.gaussians[moving]
     if mirror is not None:
@@ -71,10 +73,10 @@ def place(graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | No
     moved = dataclasses.replace(
         own,
         mean_m=T[owner, :3, 3] + arm,
-        quaternion=multiply(quaternion_of(R)[owner], own.quaternion),
+        quaternion=multiply_quaternions(quaternion_from_matrix(R)[owner], own.quaternion),
     )
     velocity = states.velocity_mps[owner] + torch.linalg.cross(states.turn_radps[owner], arm)
-    return Placed(
+    return PlacedGaussians(
         gaussians=joined([standing, moved]),
         velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),
         source=torch.cat([still, moving]),

@@ -12,7 +12,7 @@ from torch import Tensor
 from foredrive.geometry.projection import pixels_to_rays, project
 from foredrive.geometry.se3 import inverse_se3, rotate_vectors, transform_points
 from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.tracks import ActorStates, Tracks, states_at
+from foredrive.rendering.tracks import ActorStates, ActorTracks, states_at
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene.record import Record
 
@@ -44,17 +44,17 @@ class SeedPoints(Record):
 
 
 def lidar_points(
-    cameras: list[CameraView], sweeps: list[SweepView], tracks: Tracks
+    cameras: list[CameraView], sweeps: list[SweepView], tracks: ActorTracks
 ) -> tuple[SeedPoints, list[SeedPoints]]:
     """Return the lidar points of the static part (scene's frame) and of each actor (its own frame)."""
     exposed_s = torch.tensor([view.t_s for view in cameras])
     standing: list[SeedPoints] = []
-    found: list[list[SeedPoints]] = [[no_points()] for _ in range(len(tracks))]
+    found: list[list[SeedPoints]] = [[empty_points()] for _ in range(len(tracks))]
     for sweep in sweeps:
         returned = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, returned.points_ego)
         states = states_at(tracks, sweep.t_s)
-        owner = owners(xyz, returned.dt_s, states, tracks)
+        owner = actor_rows(xyz, returned.dt_s, states, tracks)
         velocity = torch.cat([states.velocity_mps, torch.zeros(1, 3)])[owner]
         points = SeedPoints(
             xyz,
@@ -72,13 +72,13 @@ def lidar_points(
             T_actor_scene, mine = inverse_se3(states.T_scene_actor[row]), owner == row
             own_xyz = transform_points(T_actor_scene, at_sweep[mine])
             found[row].append(dataclasses.replace(points[mine], xyz_m=own_xyz))
-    return all_points([no_points(), *standing]), [all_points(points) for points in found]
+    return all_points([empty_points(), *standing]), [all_points(points) for points in found]
 
 
 def points_along_pixels(
     cameras: list[CameraView],
     sweeps: list[SweepView],
-    tracks: Tracks,
+    tracks: ActorTracks,
     count: int,
     scale: float,
     far_m: tuple[float, float],
@@ -97,14 +97,14 @@ def points_along_pixels(
         far_m: range of points that look upwards with no beam near, uniform in 1/m.
         generator: random choice of pixels.
     """
-    found = [no_points()]
+    found = [empty_points()]
     moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
         sweep = sweeps[int((moments_s - view.t_s).abs().argmin())]
         beams = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, beams.points_ego)
-        standing = owners(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
+        standing = actor_rows(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
         T_cam_scene = inverse_se3(view.T_scene_cam)
         uv_beam, _, inside = project(transform_points(T_cam_scene, xyz), view.K, view.dist, view.size_hw)
         away_m = _even_in_inverse(share, far_m, generator)
@@ -123,7 +123,7 @@ def points_along_pixels(
     return all_points(found)
 
 
-def points_anywhere(
+def points_at_random_ranges(
     cameras: list[CameraView],
     count: int,
     scale: float,
@@ -131,7 +131,7 @@ def points_anywhere(
     generator: torch.Generator,
 ) -> SeedPoints:
     """Return points along random pixels, at ranges uniform in 1/m. See `points_along_pixels`."""
-    found = [no_points()]
+    found = [empty_points()]
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
         away_m = _even_in_inverse(share, range_m, generator)
@@ -140,7 +140,7 @@ def points_anywhere(
     return all_points(found)
 
 
-def standing_points(
+def subsample_static(
     points: SeedPoints, most: int, most_unseen: int, generator: torch.Generator
 ) -> SeedPoints:
     """Choose at most `most` of the points that a camera saw and at most `most_unseen` of the others, evenly.
@@ -165,7 +165,7 @@ def _one_a_cube(points: SeedPoints) -> Int[Tensor, "K"]:
     return torch.from_numpy(np.sort(np.unique(cubes, axis=0, return_index=True)[1]))
 
 
-def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
+def subsample(points: SeedPoints, most: int, generator: torch.Generator) -> SeedPoints:
     """Choose at most `most` points, `SEEN_SHARE` of them seen by a camera if there are enough."""
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]], order[~points.seen[order]]
@@ -174,7 +174,7 @@ def some_points(points: SeedPoints, most: int, generator: torch.Generator) -> Se
     return points[picked]
 
 
-def like_neighbours(points: SeedPoints) -> SeedPoints:
+def colour_from_neighbours(points: SeedPoints) -> SeedPoints:
     """Give unseen points the median colour of their nearest seen neighbours, if there are any."""
     if bool(points.seen.all()) or not bool(points.seen.any()):
         return points
@@ -187,7 +187,7 @@ def like_neighbours(points: SeedPoints) -> SeedPoints:
     return dataclasses.replace(points, rgb=rgb)
 
 
-def no_points() -> SeedPoints:
+def empty_points() -> SeedPoints:
     """Return an empty set."""
     return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0))
 
@@ -198,8 +198,8 @@ def all_points(parts: list[SeedPoints]) -> SeedPoints:
     return SeedPoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
-def owners(
-    xyz: Float[Tensor, "N 3"], dt_s: Float[Tensor, "N"], states: ActorStates, tracks: Tracks
+def actor_rows(
+    xyz: Float[Tensor, "N 3"], dt_s: Float[Tensor, "N"], states: ActorStates, tracks: ActorTracks
 ) -> Int[Tensor, "N"]:
     """Return the actor whose box holds each point at the time of its beam, or `STATIC`."""
     owner = torch.full((len(xyz),), STATIC)

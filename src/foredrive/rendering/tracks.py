@@ -1,4 +1,4 @@
-"""Tracks of actors: key poses, learnable offsets, and motion between key poses."""
+"""ActorTracks of actors: key poses, learnable offsets, and motion between key poses."""
 
 import dataclasses
 import math
@@ -15,22 +15,22 @@ from foredrive.geometry.se3 import (
     log_so3,
     matrix_from_yaw,
     rotate_vectors,
-    yaw_of,
+    yaw_from_matrix,
 )
 from foredrive.scene import Boxes, Category, Clip
 from foredrive.scene.record import Record
 
-MIRRORED = (
+SYMMETRIC_CATEGORIES = (
     *(Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER),
     *(Category.CONSTRUCTION_VEHICLE, Category.MOTORCYCLE, Category.BICYCLE),
 )
 """Categories that are left-right symmetric."""
-LONGEST_STAY_S = 0.5
+MAX_HOLD_S = 0.5
 """Time before and after its key time for which an actor with a single key time is present, s."""
 
 
 @dataclass(frozen=True)
-class Tracks(Record):
+class ActorTracks(Record):
     """A rigid actors at K common key times, in the scene's frame. An actor's frame is that of its box."""
 
     track_id: Int[Tensor, "A"]
@@ -50,7 +50,7 @@ class Tracks(Record):
     @property
     def mirrored(self) -> Bool[Tensor, "A"]:
         """Return which actors are left-right symmetric."""
-        return torch.isin(self.category, torch.tensor(MIRRORED, device=self.category.device))
+        return torch.isin(self.category, torch.tensor(SYMMETRIC_CATEGORIES, device=self.category.device))
 
     def index_of(self, track_id: int) -> int:
         """Return the row of an actor.
@@ -64,7 +64,7 @@ class Tracks(Record):
             raise InputError(f"no actor {track_id}; there are: {known}")
         return int(rows[0])
 
-    def moved(self, offset: Float[Tensor, "A K 6"]) -> "Tracks":
+    def moved(self, offset: Float[Tensor, "A K 6"]) -> "ActorTracks":
         """Return tracks with every key pose changed in the actor's frame by exp(offset): m, then rad."""
         return dataclasses.replace(self, T_scene_actor=self.T_scene_actor @ exp_se3(offset))
 
@@ -81,7 +81,7 @@ class ActorStates(Record):
     present: Bool[Tensor, "A"]
 
 
-def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
+def states_at(tracks: ActorTracks, t_s: float | Tensor) -> ActorStates:
     """Return all actors at a time: positions interpolated linearly, rotations about one axis.
 
     An actor is present between two key times if it is present at both. Before the first and after the last
@@ -91,7 +91,7 @@ def states_at(tracks: Tracks, t_s: float | Tensor) -> ActorStates:
     now_s = float(t_s.detach()) if isinstance(t_s, Tensor) else t_s
     T, velocity_mps, turn_radps = poses_at(tracks.t_s, tracks.T_scene_actor, t_s)
     if len(tracks.t_s) == 1:
-        present = tracks.present[:, 0] & (abs(float(tracks.t_s[0]) - now_s) <= LONGEST_STAY_S)
+        present = tracks.present[:, 0] & (abs(float(tracks.t_s[0]) - now_s) <= MAX_HOLD_S)
     else:
         after = _key_after(tracks.t_s, now_s)
         step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
@@ -130,7 +130,7 @@ def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
 
 
 def boxes_at(
-    tracks: Tracks, T_scene_ego: Float[Tensor, "4 4"], t_s: float, within_m: float = math.inf
+    tracks: ActorTracks, T_scene_ego: Float[Tensor, "4 4"], t_s: float, within_m: float = math.inf
 ) -> Boxes:
     """Return the boxes of actors present at a time, in the ego frame, unbatched."""
     states = states_at(tracks, t_s)
@@ -141,7 +141,7 @@ def boxes_at(
     return Boxes(
         centre=T_ego_actor[near, :3, 3].float(),
         size_lwh=tracks.size_lwh[near],
-        yaw=yaw_of(T_ego_actor)[near].float(),
+        yaw=yaw_from_matrix(T_ego_actor)[near].float(),
         velocity=velocity[near, :2].float(),
         track_id=tracks.track_id[near],
         category=tracks.category[near],
@@ -149,7 +149,7 @@ def boxes_at(
     )
 
 
-def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:
+def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> ActorTracks:
     """Read the tracks of an unbatched clip in the scene's frame. Key times are those of its frames.
 
     Gaps between two detections are filled by interpolation. An actor is kept for one frame before its first
@@ -169,16 +169,16 @@ def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> Tracks:
         poses[a, t], present[a, t] = T_scene_box[t, m], True
         size[a] = boxes.size_lwh[t, m].median(0).values
         category[a] = boxes.category[t, m].mode().values
-    return _filled(Tracks(ids, category, size, clip.t_s, poses, present))
+    return _filled(ActorTracks(ids, category, size, clip.t_s, poses, present))
 
 
-def _filled(tracks: Tracks) -> Tracks:
+def _filled(tracks: ActorTracks) -> ActorTracks:
     """Fill the poses between an actor's detections and at one key time around them."""
     poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()
     for a in range(len(tracks)):
         keys = tracks.present[a].nonzero()[:, 0]
         one = slice(a, a + 1)
-        sightings = Tracks(
+        sightings = ActorTracks(
             tracks.track_id[one],
             tracks.category[one],
             tracks.size_lwh[one],

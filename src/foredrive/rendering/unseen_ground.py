@@ -46,7 +46,7 @@ _OPAQUE, _MOST_M = 0.3, 0.5
 def add_unseen_ground(
     scene: RebuiltScene, T_scene_ego: Float[Tensor, "K 4 4"], views: Sequence[CameraView]
 ) -> None:
-    """Add the Gaussians of `guessed_ground` to a scene, except those that a camera would have seen.
+    """Add the Gaussians of `extrapolated_ground` to a scene, except those that a camera would have seen.
 
     Args:
         scene: a learned scene.
@@ -54,14 +54,14 @@ def add_unseen_ground(
         views: training views; some of each camera are checked.
     """
     graph = scene.graph
-    ground = guessed_ground(graph.of_actor(STATIC), T_scene_ego)
+    ground = extrapolated_ground(graph.of_actor(STATIC), T_scene_ego)
     seen = torch.zeros_like(ground.opacity_logit, dtype=torch.bool)
     for view in _some_views(views):
         seen |= _seen(scene, graph, view.to(seen.device), ground.mean_m)
-    scene.add_standing(ground[~seen])
+    scene.add_static(ground[~seen])
 
 
-def guessed_ground(
+def extrapolated_ground(
     standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"], step_m: float = STEP_M
 ) -> Gaussians:
     """Return flat Gaussians where ground is missing near the driven path; none if no ground is known.

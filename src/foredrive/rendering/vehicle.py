@@ -24,7 +24,7 @@ _SLACK_S = 1e-3
 
 
 @dataclass(frozen=True)
-class EgoMoment(Record):
+class EgoState(Record):
     """The ego vehicle at one time, on its logged path or anywhere else."""
 
     T_scene_ego: Float[Tensor, "4 4"]
@@ -33,19 +33,19 @@ class EgoMoment(Record):
     t_s: float
     """Seconds since the start of the drive; sets the actors' positions."""
 
-    def later(self, dt_s: float) -> "EgoMoment":
+    def later(self, dt_s: float) -> "EgoState":
         """Return the vehicle after `dt_s` of constant motion."""
         T_scene_ego = self.T_scene_ego @ exp_se3(dt_s * self.twist_ego)
-        return EgoMoment(T_scene_ego, self.twist_ego, self.t_s + dt_s)
+        return EgoState(T_scene_ego, self.twist_ego, self.t_s + dt_s)
 
-    def shifted(self, T_ego_shifted: Float[Tensor, "4 4"]) -> "EgoMoment":
-        """Return a vehicle at a fixed pose relative to this one (`Edited.T_ego_shifted`)."""
+    def shifted(self, T_ego_shifted: Float[Tensor, "4 4"]) -> "EgoState":
+        """Return a vehicle at a fixed pose relative to this one (`EditedScene.T_ego_shifted`)."""
         twist = sensor_twist(T_ego_shifted, self.twist_ego)
-        return EgoMoment(self.T_scene_ego @ T_ego_shifted, twist, self.t_s)
+        return EgoState(self.T_scene_ego @ T_ego_shifted, twist, self.t_s)
 
 
 @dataclass(frozen=True)
-class Vehicle(Record):
+class LoggedVehicle(Record):
     """The sensors of a log's vehicle and its poses at K times."""
 
     t_s: Float[Tensor, "K"]
@@ -73,12 +73,12 @@ class Vehicle(Record):
         if not first_s - _SLACK_S <= t_s <= last_s + _SLACK_S:
             raise InputError(f"{t_s:g} s is not in the log, which lasts from {first_s:g} s to {last_s:.1f} s")
 
-    def at(self, t_s: float) -> EgoMoment:
+    def at(self, t_s: float) -> EgoState:
         """Return the vehicle at a time. Before its first and after its last pose the motion continues."""
         T, velocity_mps, turn_radps = poses_at(self.t_s, self.T_scene_ego[None], t_s)
         R_ego_scene = T[0, :3, :3].T
         twist = torch.cat([R_ego_scene @ velocity_mps[0], R_ego_scene @ turn_radps[0]])
-        return EgoMoment(T[0], twist, t_s)
+        return EgoState(T[0], twist, t_s)
 
     def camera(self, name: str) -> int:
         """Return the index of a camera in the rig.
@@ -97,14 +97,14 @@ def read_vehicle(
     lidar: SpinningLidar | None = None,
     T_ego_lidar: Float[Tensor, "4 4"] | None = None,
     reach_m: float = math.inf,
-) -> Vehicle:
+) -> LoggedVehicle:
     """Read the vehicle of a whole drive.
 
     The mount of a camera is the mean over its images, after the ego motion until each exposure is removed.
 
     Args:
         drive: unbatched, with all frames.
-        T_world_scene, lidar, T_ego_lidar, reach_m: see `Vehicle`.
+        T_world_scene, lidar, T_ego_lidar, reach_m: see `LoggedVehicle`.
     """
     T_scene_ego = (inverse_se3(T_world_scene) @ drive.T_world_ego).float()
     rig, cameras = drive.rig, len(drive.rig.names)
@@ -121,7 +121,7 @@ def read_vehicle(
         )
         dt_s[c], some[c] = late_s[frames, c].median(), frames[0]
     one = torch.arange(cameras)
-    return Vehicle(
+    return LoggedVehicle(
         t_s=drive.t_s,
         T_scene_ego=T_scene_ego,
         T_world_scene=T_world_scene,
@@ -140,14 +140,14 @@ def read_vehicle(
     )
 
 
-def save_vehicle(vehicle: Vehicle, path: Path) -> None:
+def save_vehicle(vehicle: LoggedVehicle, path: Path) -> None:
     """Write a vehicle as JSON."""
     reach_m = vehicle.reach_m if math.isfinite(vehicle.reach_m) else None
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps({**_plain(vehicle), "reach_m": reach_m}))
 
 
-def load_vehicle(path: Path) -> Vehicle:
+def load_vehicle(path: Path) -> LoggedVehicle:
     """Read a file written by `save_vehicle`.
 
     Raises:
@@ -157,7 +157,7 @@ def load_vehicle(path: Path) -> Vehicle:
         saved = json.loads(path.read_text())
         rig, lidar, mounted = saved["rig"], saved["lidar"], saved["T_ego_lidar"]
         cameras = len(rig["names"])
-        return Vehicle(
+        return LoggedVehicle(
             t_s=torch.tensor(saved["t_s"]),
             T_scene_ego=torch.tensor(saved["T_scene_ego"]),
             T_world_scene=torch.tensor(saved["T_world_scene"], dtype=torch.float64),

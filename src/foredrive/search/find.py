@@ -14,7 +14,7 @@ from foredrive.search.embedding import mean_direction
 from foredrive.search.index import EXACT_UP_TO, FrameIndex
 from foredrive.search.kept import where_tagged
 from foredrive.search.query import ANY_SECTOR, ANY_VIEW, Query
-from foredrive.search.rows import FACTS
+from foredrive.search.rows import FACTS, IndexRow
 from foredrive.search.tables import quoted
 from foredrive.search.target import Target
 
@@ -31,8 +31,7 @@ SMALLEST_WORTH = 1e-3
 class Hit:
     """A moment with its best matching view."""
 
-    facts: dict[str, object]
-    """Columns of the row, without embeddings."""
+    row: IndexRow
     score: float
     """Score used for ranking."""
     scores: dict[str, float]
@@ -81,9 +80,8 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     if query.diverse is not None:
         order = [order[n] for n in _diverse(rows, order, score, query)]
     kept = rows.take(pa.array(order, pa.int64()))
-    facts, scores = kept.select(FACTS.names).to_pylist(), _scores(kept, target, query)
-    hits = [Hit(*each) for each in zip(facts, score[order].tolist(), scores, strict=True)]
-    return Found(hits, len(rows), exact)
+    hits = map(Hit, IndexRow.all_of(kept), score[order].tolist(), _scores(kept, target, query))
+    return Found(list(hits), len(rows), exact)
 
 
 def collapse(

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from foredrive.search.find import vectors_of
 from foredrive.search.index import FrameIndex
-from foredrive.search.rows import WHOLE
+from foredrive.search.rows import FACTS, WHOLE, IndexRow
 from foredrive.search.tables import quoted
 
 MOST_POINTS = 5000
@@ -19,15 +19,11 @@ class Plane(NamedTuple):
 
     xy: Float[ndarray, "n 2"]
     """The first two principal components, scaled to -1 … 1."""
-    rows: list[dict[str, object]]
-    """The columns `SHOWN` of each scene."""
+    rows: list[IndexRow]
     share: float
     """Share of the variance that the plane shows."""
     total: int
     """Number of all whole scenes. Above `MOST_POINTS`, an even subsample is shown."""
-
-
-SHOWN = ("key", "log", "t_s", "view", "place", "weather", "time_of_day")
 
 
 def project_scenes(index: FrameIndex) -> Plane:
@@ -37,13 +33,13 @@ def project_scenes(index: FrameIndex) -> Plane:
     step = -(-total // MOST_POINTS) if total else 1
     if step > 1:
         where += f" AND frame % {step} = 0"
-    rows = index.select(where, [*SHOWN, "image"])
+    rows = index.select(where, [*FACTS.names, "image"])
     vectors = vectors_of(rows, "image")
     if len(vectors) < 2:
-        return Plane(np.zeros((len(vectors), 2)), rows.select(list(SHOWN)).to_pylist(), 0.0, total)
+        return Plane(np.zeros((len(vectors), 2)), IndexRow.all_of(rows), 0.0, total)
     centred = vectors - vectors.mean(0)
     variance, axes = np.linalg.eigh(centred.T @ centred)
     xy = centred @ axes[:, :-3:-1]
     xy /= np.abs(xy).max(0).clip(min=1e-9)
     share = float(variance[-2:].sum() / max(float(variance.sum()), 1e-12))
-    return Plane(xy, rows.select(list(SHOWN)).to_pylist(), share, total)
+    return Plane(xy, IndexRow.all_of(rows), share, total)

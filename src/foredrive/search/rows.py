@@ -1,5 +1,10 @@
 """Columns of an index. It has one row per moment of a log and view."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
 import pyarrow as pa
 
 from foredrive.scene import Category
@@ -44,3 +49,46 @@ def row_schema(dim: int) -> pa.Schema:
     """Return the columns of an index with embeddings of length `dim`."""
     vector = pa.list_(pa.float32(), dim)
     return pa.schema([*FACTS, *[pa.field(name, vector) for name in EMBEDDINGS]])
+
+
+@dataclass(frozen=True)
+class IndexRow:
+    """A row of an index without its embeddings: one view of a moment. None: the log does not state it."""
+
+    key: str
+    """Key of the moment: LOG@T_US, as in clips."""
+    log: str
+    """Name of the log: SPLIT/NAME."""
+    folder: Path
+    maps_dir: Path
+    frame: int
+    t_us: int
+    """Time of the moment on the log's clock, µs."""
+    t_s: float
+    """Time since the start of the log, s."""
+    view: str
+    azimuth_deg: float | None
+    """Azimuth of the middle of the view; None for the whole scene."""
+    place: str | None
+    ego_speed_mps: float | None
+    time_of_day: str | None
+    weather: str | None
+    caption: str | None
+    counts: Mapping[Category, int]
+    """Number of objects by class, where the log is annotated."""
+
+    @classmethod
+    def all_of(cls, rows: pa.Table) -> "list[IndexRow]":
+        """Return the rows of a table that has the columns `FACTS`."""
+        return [cls._of(row) for row in rows.select(FACTS.names).to_pylist()]
+
+    @classmethod
+    def _of(cls, row: Mapping[str, Any]) -> "IndexRow":
+        same = ("key", "log", "frame", "t_us", "t_s", "view", "azimuth_deg", "place")
+        return cls(
+            **{name: row[name] for name in (*same, "time_of_day", "weather", "caption")},
+            folder=Path(row["folder"]),
+            maps_dir=Path(row["maps_dir"]),
+            ego_speed_mps=row["ego_speed"],
+            counts={kind: row[name] for kind, name in COUNTS.items() if row[name] is not None},
+        )

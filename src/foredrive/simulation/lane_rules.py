@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.scene import BicycleState, Event
 from foredrive.simulation.dynamics import EGO
 from foredrive.towns.map.town_map import StopZoneKind, TownMap
+from foredrive.towns.traffic.lane_index import LEVEL_M, LaneIndex
 from foredrive.towns.traffic.lights import Light
-from foredrive.towns.traffic.near_lanes import LEVEL_M, NearLanes
 from foredrive.towns.traffic.traffic import Traffic
 
 TAIL = 0.8
@@ -91,7 +91,7 @@ class LaneRules:
 
     def __init__(self, town: TownMap, traffic: Traffic) -> None:
         self._lines = stop_lines(town)
-        self._near: NearLanes = traffic.near_lanes
+        self._near: LaneIndex = traffic.lane_index
         self._graph = traffic.lanes
 
     def check(

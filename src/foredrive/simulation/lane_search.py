@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from foredrive.errors import InputError
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.leaders import abreast
+from foredrive.towns.traffic.leaders import project_to_neighbour
 
 ALSO_NEAR, ALSO_NEAR_M, NO_FURTHER_M = 3.0, 1.0, 20.0
 """A waypoint may mean any lane up to `ALSO_NEAR` times as far away as the nearest one, plus `ALSO_NEAR_M`.
@@ -245,7 +245,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
             legs.append(Leg(lane, at_m, to_m, side))
             if changes:
                 side = 1 if graph.left[lane] == stretch[k + 1] else -1
-                at_m = float(abreast(lane, to_m, side, graph.sides))
+                at_m = float(project_to_neighbour(lane, to_m, side, graph.sides))
     return legs
 
 
@@ -253,5 +253,5 @@ def _opposite(graph: LaneGraph, end: Place, lanes: list[int]) -> float:
     """Return the arc length on the first of several lanes side by side, next to the end on the last."""
     at_m = end.s_m
     for lane, before in itertools.pairwise(reversed(lanes)):
-        at_m = abreast(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)
+        at_m = project_to_neighbour(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)
     return float(at_m)

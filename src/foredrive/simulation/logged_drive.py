@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.vehicle import Vehicle
+from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState
 from foredrive.simulation.dynamics import EGO
 
@@ -28,7 +28,7 @@ class LoggedDrive:
         InputError: there are fewer than two poses.
     """
 
-    vehicle: Vehicle
+    vehicle: LoggedVehicle
     T_ego_shifted: Float[Tensor, "4 4"]
     """The offset, as `Edited.T_ego_shifted`."""
 

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.tracks import Tracks, boxes_at
+from foredrive.rendering.tracks import ActorTracks, boxes_at
 from foredrive.scene import BicycleState, Clip, Control, Event, Renderer, Standing, Step
 from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
 from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
@@ -77,7 +77,7 @@ class RebuiltSimulator:
     state: RebuiltState
 
     def __init__(
-        self, renderer: Renderer, tracks: Tracks, drive: LoggedDrive, lanes: LoggedLanes | None = None
+        self, renderer: Renderer, tracks: ActorTracks, drive: LoggedDrive, lanes: LoggedLanes | None = None
     ) -> None:
         self.renderer, self.drive, self._lanes = renderer, drive, lanes
         self._tracks = tracks.map_tensors(lambda tensor: tensor.detach().cpu())

@@ -5,12 +5,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from foredrive.geometry.se3 import rotate_vectors, yaw_of
-from foredrive.rendering.tracks import Tracks, states_at
+from foredrive.geometry.se3 import rotate_vectors, yaw_from_matrix
+from foredrive.rendering.tracks import ActorTracks, states_at
 from foredrive.simulation.road_users import Box, RoadUsers
 
 
-def users_at(tracks: Tracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:
+def users_at(tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:
     """Return all actors at a time, one slot each. The track id of an absent actor is -1."""
     states = states_at(tracks, t_s)
     T_world_actor = T_world_scene @ states.T_scene_actor.double()
@@ -19,7 +19,7 @@ def users_at(tracks: Tracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) 
         track_id=torch.where(states.present, tracks.track_id, -1).numpy(),
         category=tracks.category.numpy(),
         foot_m=(T_world_actor[:, :3, 3] - half_height * T_world_actor[:, :3, 2]).numpy(),
-        yaw=yaw_of(T_world_actor).numpy(),
+        yaw=yaw_from_matrix(T_world_actor).numpy(),
         half_lw=(0.5 * tracks.size_lwh[:, :2]).double().numpy(),
         velocity_mps=rotate_vectors(T_world_scene, states.velocity_mps.double())[:, :2].numpy(),
     )

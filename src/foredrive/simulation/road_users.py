@@ -53,7 +53,7 @@ class Box(NamedTuple):
 
 def road_users(traffic: Traffic, state: TrafficState) -> RoadUsers:
     """Return all road users except vehicle 0."""
-    v, p, strays, poses = state.vehicles, state.people, state.strays, traffic.poses(state)
+    v, p, strays, poses = state.vehicles, state.people, state.scripted_actors, traffic.poses(state)
     forward = poses.forward[1:, :2]
     foot = poses.centre_m[1:] - 0.5 * v.size_lwh[1:, 2:] * [0.0, 0.0, 1.0]
     way = np.array([stray.speed_mps * stray.ahead for stray in strays]).reshape(-1, 2)

@@ -12,7 +12,7 @@ from foredrive.simulation.lane_search import Leg, find_way
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneGraph, build_lane_graph
-from foredrive.towns.traffic.routes import PLANNED_CHANGE_S, SHORTEST_CHANGE_M
+from foredrive.towns.traffic.routes import MIN_CHANGE_M, PLANNED_CHANGE_S
 
 SAMPLE_M, SPACING_M = 0.5, 0.75
 """Spacing at which lanes are sampled, and minimum spacing of the points that are kept, m."""
@@ -168,9 +168,7 @@ def _windows(
     changes = [k for k in run if legs[k].changes]
     on_run = (leg_of >= run[0]) & (leg_of <= run[-1])
     first_m, last_m = float(arc_m[on_run][0]), float(arc_m[on_run][-1])
-    wanted = [
-        max(SHORTEST_CHANGE_M, PLANNED_CHANGE_S * float(graph.limit_mps[legs[k].lane])) for k in changes
-    ]
+    wanted = [max(MIN_CHANGE_M, PLANNED_CHANGE_S * float(graph.limit_mps[legs[k].lane])) for k in changes]
     scale = min(1.0, (last_m - first_m) / sum(wanted)) if wanted else 1.0
     windows, free_m = [], first_m
     room_after = [scale * sum(wanted[j + 1 :]) for j in range(len(wanted))]

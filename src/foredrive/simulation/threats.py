@@ -13,7 +13,7 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.edits import Offset, Send
+from foredrive.rendering.edits import DriveStraight, Offset
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.scene import Category
 from foredrive.simulation.dynamics import EGO
@@ -40,7 +40,7 @@ class Threat(enum.StrEnum):
     """A vehicle crosses from the right."""
 
 
-def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: float) -> Send:
+def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: float) -> DriveStraight:
     """Return the edit that puts a vehicle of the scene in the way of a drive that begins at `start_s`.
 
     Raises:
@@ -62,7 +62,7 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     T_scene_ego = (inverse_se3(drive.vehicle.T_world_scene) @ torch.from_numpy(drive.pose_at(at_s))).numpy()
     way = T_scene_ego[:3, :3] @ [math.cos(heading_rad), math.sin(heading_rad), 0.0]
     speed_mps = 0.0 if threat is Threat.STATIONARY else THREAT_MPS
-    return Send(
+    return DriveStraight(
         actor=int(tracks.track_id[row]),
         copy=threat_id(graph),
         at_m=_offset(T_scene_ego[:3, :3] @ [ahead_m, 0.0, 0.5 * height_m] + T_scene_ego[:3, 3]),

@@ -23,7 +23,7 @@ from foredrive.towns.conditions import Conditions
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import BOXES_WITHIN_M, Crowd, boxes_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.traffic.driven import Driven, find_lane
+from foredrive.towns.traffic.external_ego import EgoPose, find_lane
 from foredrive.towns.traffic.fleet import ego_vehicle
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
@@ -131,7 +131,7 @@ class TownSimulator:
         driven = self._driven(ego, z_m)
         middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
         nowhere = np.zeros(0, dtype=np.int64)
-        found = find_lane(self._traffic.near_lanes, middle, driven.yaw_rad, nowhere, nowhere)
+        found = find_lane(self._traffic.lane_index, middle, driven.yaw_rad, nowhere, nowhere)
         if found is None:
             raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
         row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))
@@ -194,7 +194,7 @@ class TownSimulator:
     def foresight(self) -> Foresight:
         """Return the prediction for now if the traffic decides now, else for its next decision."""
         state = self.state
-        traffic = self._traffic.taken_over(state.decided, self.driven)
+        traffic = self._traffic.with_own_driver(state.decided, self.driven)
         return Foresight(state.t_s, traffic, state.play, state.progress)
 
     def foreseen(self, now: Foresight) -> Foresight:
@@ -209,7 +209,7 @@ class TownSimulator:
         return Foresight(t_s + DECISION_S, after, play, progress)
 
     @property
-    def driven(self) -> Driven:
+    def driven(self) -> EgoPose:
         """Return the current ego vehicle as the traffic sees it."""
         return self._driven(self.state.ego, self.state.z_m)
 
@@ -290,15 +290,15 @@ class TownSimulator:
             ended=ended,
         ), events
 
-    def _driven(self, ego: BicycleState, z_m: float) -> Driven:
+    def _driven(self, ego: BicycleState, z_m: float) -> EgoPose:
         axle = np.array([ego.x_m, ego.y_m, z_m])
-        return Driven(axle, ego.yaw_rad, ego.speed_mps, yaw_rate_radps(ego))
+        return EgoPose(axle, ego.yaw_rad, ego.speed_mps, yaw_rate_radps(ego))
 
     def _pose(self, ego: BicycleState, about_z_m: float) -> Float64[np.ndarray, "4 4"]:
         """Return `T_world_ego` on the road: both axles are at road height, and roll is 0."""
         flat = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
         axles = np.array([ego.x_m, ego.y_m]) + np.array([[0.0], [EGO.wheelbase_m]]) * flat
-        rear_m, front_m = self._traffic.near_lanes.height_m(axles, about_z_m)
+        rear_m, front_m = self._traffic.lane_index.height_m(axles, about_z_m)
         forward = np.array([*(EGO.wheelbase_m * flat), front_m - rear_m])
         forward /= np.linalg.norm(forward)
         left = np.array([-flat[1], flat[0], 0.0])

@@ -18,7 +18,7 @@ from foredrive.scene import Clip, Trajectory
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
 from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator, TownState
-from foredrive.towns.traffic.driven import Driven
+from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
@@ -80,19 +80,19 @@ class TownExpert:
         here, now = simulator.driven, simulator.foresight()
         now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
         self._imagined = [now]
-        if traffic.stands_back(now.traffic) or _is_too_late(traffic, now.traffic):
+        if traffic.waits_at_line(now.traffic) or _is_too_late(traffic, now.traffic):
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
             self._imagined.append(simulator.foreseen(self._imagined[-1]))
         halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
-        if halts and traffic.lacks_room(now.traffic):
+        if halts and traffic.lacks_change_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
         path = np.stack([traffic.poses(then.traffic).axle_xyz[0, :2] for then in self._imagined])
         path = self._not_into_anybody(traffic, _rejoined(path, here.axle_xyz[:2]), here)
         return _in_ego_frame(path[EVERY::EVERY], here)
 
     def _not_into_anybody(
-        self, traffic: Traffic, path: Float64[np.ndarray, "K 2"], here: Driven
+        self, traffic: Traffic, path: Float64[np.ndarray, "K 2"], here: EgoPose
     ) -> Float64[np.ndarray, "K 2"]:
         """Return the simulated path, or a path with braking if it would lead into a road user."""
         v, graph = self._imagined[0].traffic.vehicles, traffic.lanes
@@ -109,7 +109,7 @@ class TownExpert:
         best_m = next(free, options[-1])
         return np.stack([np.interp(best_m, arc_m, axis) for axis in path.T], axis=1)
 
-    def _edged_over(self, traffic: Traffic, here: Driven) -> Float64[np.ndarray, "T 2"]:
+    def _edged_over(self, traffic: Traffic, here: EgoPose) -> Float64[np.ndarray, "T 2"]:
         """Return points that move slowly along the route, one per simulated step.
 
         The motion stops as soon as a road user comes near.
@@ -137,7 +137,7 @@ class TownExpert:
         points += [points[-1]] * (len(self._imagined) - len(points))
         return np.stack(points[1:])
 
-    def _gone_on(self, traffic: Traffic, state: TrafficState, here: Driven) -> TrafficState:
+    def _gone_on(self, traffic: Traffic, state: TrafficState, here: EgoPose) -> TrafficState:
         """Keep the planned path and lane change, if the vehicle is where they lead."""
         known = (then.traffic for then in self._imagined)
         meant = next((then for then in known if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
@@ -155,7 +155,7 @@ class TownExpert:
             wanted.moved(np.array([ahead_m])),
             speed_mps=real.speed_mps,
             granted=real.granted,
-            asked_s=real.asked_s,
+            requested_s=real.requested_s,
             rank=real.rank,
             has_stopped=real.has_stopped,
         )
@@ -171,7 +171,7 @@ def _is_free(
     arc_m: Float64[np.ndarray, "K"],
     way_m: Float64[np.ndarray, "K"],
     users: Sequence[RoadUsers],
-    here: Driven,
+    here: EgoPose,
 ) -> bool:
     """Return whether the vehicle touches no road user on a path, given its distance along it at each step."""
     half, yaw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + NEAR_M, here.yaw_rad
@@ -200,7 +200,7 @@ def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) 
     return path + np.exp(-way_m / REJOINS_M)[:, None] * (here - path[0])
 
 
-def _in_ego_frame(xy_world: Float64[np.ndarray, "T 2"], here: Driven) -> Trajectory:
+def _in_ego_frame(xy_world: Float64[np.ndarray, "T 2"], here: EgoPose) -> Trajectory:
     cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
     xy = (xy_world - here.axle_xyz[:2]) @ np.array([[cos, -sin], [sin, cos]])
     points = torch.tensor(xy, dtype=torch.float32)[None, None]

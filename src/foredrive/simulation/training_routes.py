@@ -17,7 +17,7 @@ from foredrive.simulation.route_sets import SHIPPED, RouteWaypoints, shipped_set
 from foredrive.simulation.routes import DriveRoute, RouteOption, snap_route
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.traffic.fleet import find_starts
+from foredrive.towns.traffic.fleet import find_start_points
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import Route, draw_route
 
@@ -47,7 +47,7 @@ def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
     Turns, straight crossings and lane changes are mixed as evenly as possible.
     """
     graph = build_lane_graph(load_town_map(town))
-    starts, rng = find_starts(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
+    starts, rng = find_start_points(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
     met: Counter[int] = Counter()
     while len(chosen) < kind.per_town:

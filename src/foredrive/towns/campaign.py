@@ -11,14 +11,14 @@ from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.towns.conditions import ANY_CONDITIONS, CONDITIONS, find_conditions
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import FASTEST_HZ, Crowd
-from foredrive.towns.traffic.expert import SETTLE_S, Drive, plan_route
-from foredrive.towns.traffic.fleet import find_starts
+from foredrive.towns.recorder import MAX_RATE_HZ, Crowd
+from foredrive.towns.traffic.expert import SETTLE_S, ExpertDrive, plan_route
+from foredrive.towns.traffic.fleet import find_start_points
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.towns.traffic.traffic import Traffic
 
-SEEDS_PER_DRIVE = 8
-TRIES_PER_DRIVE = 4
+CANDIDATES_PER_DRIVE = 8
+MAX_TRIES_PER_DRIVE = 4
 """Number of routes that are drawn, and maximum number of routes that are driven, for each recorded drive, if
 the campaign chooses the seeds."""
 
@@ -78,14 +78,16 @@ class Campaign:
             raise InputError("there is nothing to record without a town and a seed")
         if not self.seconds > 0:
             raise InputError(f"a recording takes more than 0 s, got {self.seconds:g}")
-        if not 0 < self.rate_hz <= FASTEST_HZ:
-            raise InputError(f"the frame rate lies above 0 and up to {FASTEST_HZ:g} Hz, got {self.rate_hz:g}")
+        if not 0 < self.rate_hz <= MAX_RATE_HZ:
+            raise InputError(
+                f"the frame rate lies above 0 and up to {MAX_RATE_HZ:g} Hz, got {self.rate_hz:g}"
+            )
         if self.conditions != (ANY_CONDITIONS,):
             for name in self.conditions:
                 find_conditions(name)
-        for what, (fewest, most) in (("vehicles", self.vehicles), ("people", self.people)):
-            if not 0 <= fewest <= most:
-                raise InputError(f"{what} range from 0 or more upwards, got {fewest}..{most}")
+        for what, (minimum, maximum) in (("vehicles", self.vehicles), ("people", self.people)):
+            if not 0 <= minimum <= maximum:
+                raise InputError(f"{what} range from 0 or more upwards, got {minimum}..{maximum}")
 
 
 def plan_drives(campaign: Campaign) -> list[DrivePlan]:
@@ -97,11 +99,11 @@ def plan_drives(campaign: Campaign) -> list[DrivePlan]:
     Raises:
         InputError: there is no such town.
     """
-    deck, driven = _deal_conditions(), Counter[Command]()
+    conditions_cycle, counts = _cycle_conditions(), Counter[Command]()
     plans = []
     for town in dict.fromkeys(campaign.towns):
         load_town_map(town)  # raises an error that lists the known towns if it is none of them
-        for conditions, seed in _town_drives(campaign, town, deck, driven):
+        for conditions, seed in _town_drives(campaign, town, conditions_cycle, counts):
             plans.append(_plan_drive(campaign, town, seed, conditions))
     return plans
 
@@ -110,99 +112,101 @@ def _plan_drive(campaign: Campaign, town: str, seed: int, conditions: str | None
     """Plan one drive. Its traffic is the same under all conditions."""
     rng = np.random.default_rng([seed, *town.encode()])
     vehicles, people = (
-        int(rng.integers(fewest, most + 1)) for fewest, most in (campaign.vehicles, campaign.people)
+        int(rng.integers(minimum, maximum + 1)) for minimum, maximum in (campaign.vehicles, campaign.people)
     )
     return DrivePlan(town, seed, conditions, vehicles, people, campaign.seconds, campaign.rate_hz)
 
 
 def _town_drives(
-    campaign: Campaign, town: str, deck: Iterator[str], driven: Counter[Command]
+    campaign: Campaign, town: str, conditions_cycle: Iterator[str], counts: Counter[Command]
 ) -> list[tuple[str | None, int]]:
     """Return the conditions and the seed of each drive in one town.
 
-    If the campaign chooses the seeds, the commands are counted into `driven`.
+    If the campaign chooses the seeds, the commands are counted into `counts`.
     """
-    dealt = campaign.conditions == (ANY_CONDITIONS,)
+    any_conditions = campaign.conditions == (ANY_CONDITIONS,)
     groups: list[str | None] = [None]
-    if campaign.conditions and not dealt:
+    if campaign.conditions and not any_conditions:
         groups = list(dict.fromkeys(campaign.conditions))
     if isinstance(campaign.seeds, int):
         drives = campaign.seeds * len(groups)
-        routes = route_commands(town, campaign.seconds, range(SEEDS_PER_DRIVE * drives))
-        chosen = choose_balanced(
-            routes, drives, driven, lambda seed: commands_met(_plan_drive(campaign, town, seed, None))
+        routes = count_route_commands(town, campaign.seconds, range(CANDIDATES_PER_DRIVE * drives))
+        chosen = select_balanced(
+            routes, drives, counts, lambda seed: driven_commands(_plan_drive(campaign, town, seed, None))
         )
         for commands in chosen.values():
-            driven.update(commands)
+            counts.update(commands)
         found = [(groups[i % len(groups)], seed) for i, seed in enumerate(chosen)]
     else:
         found = [(group, seed) for group in groups for seed in dict.fromkeys(campaign.seeds)]
-    if dealt:
-        found = [(next(deck), seed) for _, seed in found]
-    return sorted(found, key=lambda drive: (groups.index(drive[0]) if not dealt else 0, drive[1]))
+    if any_conditions:
+        found = [(next(conditions_cycle), seed) for _, seed in found]
+    return sorted(found, key=lambda drive: (groups.index(drive[0]) if not any_conditions else 0, drive[1]))
 
 
-def _deal_conditions() -> Iterator[str]:
+def _cycle_conditions() -> Iterator[str]:
     """Yield all conditions in random order, again and again."""
     for round_ in itertools.count():
         order = np.random.default_rng(round_).permutation(len(CONDITIONS))
         yield from (list(CONDITIONS)[i] for i in order)
 
 
-def route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Counter[Command]]:
+def count_route_commands(town: str, seconds: float, seeds: Sequence[int]) -> list[Counter[Command]]:
     """Return the approximate counts of the commands on the recorded part of a route, for each seed.
 
     Takes some milliseconds for each seed.
     """
     lanes = build_lane_graph(load_town_map(town))
-    starts = find_starts(lanes)
+    starts = find_start_points(lanes)
     routes = (plan_route(lanes, starts, seed, seconds) for seed in seeds)
     window_s = SETTLE_S, SETTLE_S + seconds
     return [
         Counter(route.commands(lanes, until_m, from_m))
         for route in routes
-        for from_m, until_m in [(route.driven_m(lanes, s) for s in window_s)]
+        for from_m, until_m in [(route.distance_m(lanes, s) for s in window_s)]
     ]
 
 
-def commands_met(plan: DrivePlan) -> Counter[Command]:
+def driven_commands(plan: DrivePlan) -> Counter[Command]:
     """Return the counts of the expert's commands at the forks that it passes during a recorded drive."""
-    drive = Drive(Traffic(load_town_map(plan.town), plan.seed, plan.vehicles + 1, plan.people), plan.seconds)
-    for _ in drive.moments(plan.frames, 1 / plan.rate_hz):
+    drive = ExpertDrive(
+        Traffic(load_town_map(plan.town), plan.seed, plan.vehicles + 1, plan.people), plan.seconds
+    )
+    for _ in drive.snapshots(plan.frames, 1 / plan.rate_hz):
         pass
-    return Counter(drive.commands_met())
+    return Counter(drive.driven_commands())
 
 
-def choose_balanced(
+def select_balanced(
     routes: Sequence[Counter[Command]],
     count: int,
-    so_far: Counter[Command],
-    met: Callable[[int], Counter[Command]],
+    counts: Counter[Command],
+    drive_route: Callable[[int], Counter[Command]],
 ) -> dict[int, Counter[Command]]:
     """Choose `count` routes whose commands, together with those so far, are balanced.
 
     Returns the indices of the routes, each with the commands that were met on it. The choice is greedy: the
     next route maximises the number of commands minus the sum of their squared differences from their mean.
     The commands that are met on a route are requested only when the route would be chosen, for at most
-    `TRIES_PER_DRIVE` routes per drive. Then its commands are known, and another route may be better. A
+    `MAX_TRIES_PER_DRIVE` routes per drive. Then its commands are known, and another route may be better. A
     command that no route has is ignored.
     """
-    kinds = list(Command)
-    times = np.array([[route[kind] for kind in kinds] for route in routes])
-    total = np.array([so_far[kind] for kind in kinds], dtype=np.int64)
-    left, tries, known = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
+    commands = list(Command)
+    times = np.array([[route[kind] for kind in commands] for route in routes])
+    total = np.array([counts[kind] for kind in commands], dtype=np.int64)
+    available, tries, known = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
     chosen: dict[int, Counter[Command]] = {}
     while len(chosen) < count:
         after = (total + times)[:, times.any(axis=0)]
         number, mean = after.sum(axis=1), after.mean(axis=1, keepdims=True) if after.size else 0.0
-        gain = np.where(left, number - np.sum((after - mean) ** 2, axis=1), -np.inf)
-        if tries == TRIES_PER_DRIVE:
+        gain = np.where(available, number - np.sum((after - mean) ** 2, axis=1), -np.inf)
+        if tries == MAX_TRIES_PER_DRIVE:
             gain[[i for i in range(len(routes)) if i not in known]] = -np.inf
         best = int(gain.argmax())
         if best not in known:
-            known[best], tries = met(best), tries + 1
-            times[best] = [known[best][kind] for kind in kinds]
+            known[best], tries = drive_route(best), tries + 1
+            times[best] = [known[best][kind] for kind in commands]
         else:
-            chosen[best], left[best], tries = known[best], False, 0
+            chosen[best], available[best], tries = known[best], False, 0
             total = total + times[best]
     return chosen

@@ -17,7 +17,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
-from foredrive.ops.threads import one_ahead
+from foredrive.ops.threads import prefetched
 from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.towns.actors import ActorState
 from foredrive.towns.conditions import Conditions
@@ -35,7 +35,7 @@ from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.expert import Drive, Moment
+from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
@@ -45,7 +45,7 @@ FIRST_TIME_US = 1_577_836_800_000_000
 BOXES_WITHIN_M = 80.0
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
 """Grid of NeMo."""
-FASTEST_HZ = 100.0
+MAX_RATE_HZ = 100.0
 STATUS_OF_LIGHT = {
     Light.RED: TrafficLightStatus.RED,
     Light.YELLOW: TrafficLightStatus.YELLOW,
@@ -122,8 +122,8 @@ def record(
     """
     if not seconds > 0:
         raise InputError(f"a recording takes more than 0 s, got {seconds:g}")
-    if not 0 < rate_hz <= FASTEST_HZ:
-        raise InputError(f"the frame rate lies above 0 and up to {FASTEST_HZ:g} Hz, got {rate_hz:g}")
+    if not 0 < rate_hz <= MAX_RATE_HZ:
+        raise InputError(f"the frame rate lies above 0 and up to {MAX_RATE_HZ:g} Hz, got {rate_hz:g}")
     if seed < 0:
         raise InputError(f"a seed is 0 or more, got {seed}")
     town_map = load_town_map(town)
@@ -132,11 +132,11 @@ def record(
     labels = labels or LabelKinds()
     world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
-    drive = Drive(traffic, seconds)
+    drive = ExpertDrive(traffic, seconds)
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
-    sensed = one_ahead(_sensed(world, drive.moments(count, 1 / rate_hz), sensors, seed))
+    sensed = prefetched(_sensed(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
         for moment in track(sensed, description=f"recording {name}", total=count):
@@ -179,14 +179,14 @@ def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, Tr
 class SensedMoment(NamedTuple):
     """A moment of a drive with its sensor data."""
 
-    moment: Moment
+    moment: DriveSnapshot
     seen: SensorFrame
     seed: int
     """Seed of the random parts of the frame."""
 
 
 def _sensed(
-    world: World, moments: Iterator[Moment], sensors: SensorSuite, seed: int
+    world: World, moments: Iterator[DriveSnapshot], sensors: SensorSuite, seed: int
 ) -> Iterator[SensedMoment]:
     for index, moment in enumerate(moments):
         seen = world.render(
@@ -284,7 +284,7 @@ def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> In
     return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
 
 
-def _distance_m(actor: ActorState, moment: Moment) -> float:
+def _distance_m(actor: ActorState, moment: DriveSnapshot) -> float:
     return float(np.linalg.norm(actor.centre_m - moment.T_world_ego[:3, 3]))
 
 

@@ -262,7 +262,7 @@ class World:
         actors: list[ActorState],
         lights: Int[np.ndarray, "Z"] | None,
         T_world_ego: Float64[np.ndarray, "4 4"],
-    ) -> capture.Moment:
+    ) -> capture.DriveSnapshot:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
@@ -280,7 +280,7 @@ class World:
         light = self.light
         if is_dark(self.conditions):
             light = light._replace(lamps=gather_lamps(self.static.lamps.xyz, actors, T_world_ego))
-        return capture.Moment(scene, raycast.Surroundings(self._scene, placed), light)
+        return capture.DriveSnapshot(scene, raycast.Surroundings(self._scene, placed), light)
 
     def _through_air_and_lens(
         self, images: UInt8[np.ndarray, "C H W 3"], sensors: SensorSuite, noise_seed: int

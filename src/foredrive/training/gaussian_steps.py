@@ -5,8 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from foredrive.rendering.rebuilt import OF_GAUSSIANS, RebuiltScene
-from foredrive.rendering.relocation import MIN_OPACITY, MOST_COPIES, shared_among
+from foredrive.rendering.rebuilt import GAUSSIAN_PARAMETERS, RebuiltScene
+from foredrive.rendering.relocation import MAX_COPIES, MIN_OPACITY, split_evenly
 
 
 @torch.no_grad()
@@ -22,7 +22,7 @@ def relocate(scene: RebuiltScene, optimizer: Optimizer, generator: torch.Generat
         return 0
     chosen = alive[_drawn(opacity[alive], len(dead), generator)]
     _share(scene, chosen)
-    for name in OF_GAUSSIANS:
+    for name in GAUSSIAN_PARAMETERS:
         parameter = getattr(scene, name)
         parameter[dead] = parameter[chosen]
         _forget(optimizer, parameter, torch.cat([dead, chosen]))
@@ -43,7 +43,7 @@ def grow(
         return 0
     chosen = _drawn(scene.opacity_logit.sigmoid(), count, generator)
     _share(scene, chosen)
-    for name in OF_GAUSSIANS:
+    for name in GAUSSIAN_PARAMETERS:
         old = getattr(scene, name)
         new = nn.Parameter(torch.cat([old, old[chosen]]))
         _forget(optimizer, old, chosen)
@@ -63,7 +63,7 @@ def _drawn(weight: Float[Tensor, "N"], count: int, generator: torch.Generator) -
 def _share(scene: RebuiltScene, chosen: Int[Tensor, "count"]) -> None:
     """Lower opacity and scale of the chosen Gaussians, so that with their copies they render as before."""
     rows, copies = chosen.unique(return_counts=True)
-    opacity, scale = shared_among(scene.opacity_logit[rows].sigmoid(), (copies + 1).clamp_max(MOST_COPIES))
+    opacity, scale = split_evenly(scene.opacity_logit[rows].sigmoid(), (copies + 1).clamp_max(MAX_COPIES))
     scene.opacity_logit[rows] = opacity.clamp(MIN_OPACITY, 1 - 1e-6).logit()
     scene.log_scale[rows] += scale.log()[:, None]
 

@@ -20,7 +20,7 @@ from foredrive.losses.rendering import (
     photometric_loss,
     range_loss,
 )
-from foredrive.rendering.rebuilt import RebuiltScene, SweepPoints
+from foredrive.rendering.rebuilt import PreparedSweep, RebuiltScene
 from foredrive.rendering.relocation import random_walk_m
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
@@ -101,14 +101,14 @@ class RebuildSchedule:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SensorViews:
     """The training data."""
 
     cameras: Sequence[CameraView]
     sweeps: Sequence[SweepView]
 
 
-def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: Path) -> None:
+def rebuild(scene: RebuiltScene, views: SensorViews, schedule: RebuildSchedule, folder: Path) -> None:
     """Train `scene`, continuing from a checkpoint in `folder` if there is one.
 
     Writes `folder/metrics.jsonl` and `folder/checkpoints/step_N`. An interrupted run that is resumed gives
@@ -118,7 +118,7 @@ def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: 
     Raises:
         InputError: there are neither images nor sweeps, or a loss is not finite.
     """
-    if not seen.cameras and not seen.sweeps:
+    if not views.cameras and not views.sweeps:
         raise InputError("there is nothing to learn from: neither images nor sweeps")
     checkpoints = folder / "checkpoints"
     found = latest_checkpoint(checkpoints)
@@ -131,7 +131,7 @@ def rebuild(scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, folder: 
     if done >= schedule.steps:
         return
     log = MetricsLog(folder / "metrics.jsonl", done)
-    trainer = _Trainer(scene, seen, schedule, optimizer)
+    trainer = _Trainer(scene, views, schedule, optimizer)
     with hold_interrupts() as interrupted, _progress() as progress:
         task = progress.add_task(folder.name, total=schedule.steps, completed=done, note="")
         shown_db: float | None = None
@@ -178,9 +178,11 @@ def _progress() -> Progress:
 class _Trainer:
     """A trainer that runs one step at a time."""
 
-    def __init__(self, scene: RebuiltScene, seen: Seen, schedule: RebuildSchedule, optimizer: Adam) -> None:
-        self.scene, self.seen, self.schedule, self.optimizer = scene, seen, schedule, optimizer
-        self.sweeps: dict[int, tuple[SweepView, SweepPoints]] = {}
+    def __init__(
+        self, scene: RebuiltScene, views: SensorViews, schedule: RebuildSchedule, optimizer: Adam
+    ) -> None:
+        self.scene, self.views, self.schedule, self.optimizer = scene, views, schedule, optimizer
+        self.sweeps: dict[int, tuple[SweepView, PreparedSweep]] = {}
 
     def step(self, step: int) -> dict[str, Tensor]:
         schedule = self.schedule
@@ -192,7 +194,7 @@ class _Trainer:
         mirrored = torch.rand(len(self.scene.track_id), generator=generator) < schedule.mirror_share
         mirror = mirrored.to(self.scene.actor.device) & self.scene.tracks.mirrored
         if kind == "image":
-            losses = self._image(self.seen.cameras[number].shrunk(schedule.shrink_at(step)), mirror)
+            losses = self._image(self.views.cameras[number].shrunk(schedule.shrink_at(step)), mirror)
         else:
             losses = self._sweep(number, mirror)
         losses["loss"] = losses["loss"] + self._regularisers()
@@ -207,7 +209,7 @@ class _Trainer:
 
     def _item(self, step: int) -> tuple[Literal["image", "sweep"], int]:
         """Choose the item of a step: one sweep after every few images, each in a new order per epoch."""
-        images, sweeps = len(self.seen.cameras), len(self.seen.sweeps)
+        images, sweeps = len(self.views.cameras), len(self.views.sweeps)
         turn = self.schedule.images_per_sweep + 1
         if not images or (sweeps and step % turn == turn - 1):
             return "sweep", self._shuffled(step // turn if images else step, sweeps, 1)
@@ -230,23 +232,23 @@ class _Trainer:
     def _sweep(self, number: int, mirror: Tensor) -> dict[str, Tensor]:
         if number not in self.sweeps:
             stride = self.schedule.beam_stride
-            view = self.seen.sweeps[number]
+            view = self.views.sweeps[number]
             view = dataclasses.replace(view, beams=view.beams[number % stride :: stride])
             self.sweeps[number] = (view, self.scene.prepare_sweep(view))
         view, points = self.sweeps[number]
         beams = view.beams.to(self.scene.actor.device)
         hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
-        seen = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
-        assert seen.alpha_before_hit is not None
+        rendered = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
+        assert rendered.alpha_before_hit is not None
         losses = {
             "depth": range_loss(
-                seen.range_m, beams.range_m, beams.returned, self.schedule.weights.depth_quantile
+                rendered.range_m, beams.range_m, beams.returned, self.schedule.weights.depth_quantile
             ),
-            "intensity": intensity_loss(seen.intensity, beams.intensity, beams.returned),
-            "line_of_sight": line_of_sight_loss(seen.alpha_before_hit, beams.returned),
+            "intensity": intensity_loss(rendered.intensity, beams.intensity, beams.returned),
+            "line_of_sight": line_of_sight_loss(rendered.alpha_before_hit, beams.returned),
         }
         if view.misses_known:
-            losses["drop"] = drop_loss(seen.drop_logit, beams.returned)
+            losses["drop"] = drop_loss(rendered.drop_logit, beams.returned)
         loss = torch.stack([getattr(self.schedule.weights, name) * value for name, value in losses.items()])
         return {"loss": loss.sum(), **losses}
 

@@ -14,15 +14,15 @@ from foredrive.errors import InputError
 from foredrive.rendering.edits import (
     Duplicate,
     Edit,
-    Edited,
+    EditedScene,
     Insert,
     Remove,
     ShiftEgo,
     apply_edits,
-    free_id,
     load_edits,
     move_between,
     save_edits,
+    unused_id,
 )
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import states_at
@@ -64,7 +64,7 @@ class EditPanel:
         self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_rebuilt(Path(run)).scene.graph)
         self._changing = threading.RLock()
         self.edits: list[Edit] = []
-        self.edited: Edited = apply_edits(graph, [])
+        self.edited: EditedScene = apply_edits(graph, [])
         self._t_s = 0.0
         self._add_controls(server.gui, file)
         self.gizmo = server.scene.add_transform_controls(
@@ -184,13 +184,13 @@ class EditPanel:
         elif how == "remove":
             self.add(Remove(self.chosen))
         else:
-            self._copied(Duplicate(self.chosen, free_id(self.edited.graph), BESIDE_M))
+            self._copied(Duplicate(self.chosen, unused_id(self.edited.graph), BESIDE_M))
 
     def _insert(self) -> None:
         if self.chosen is None:
             self._tell("choose the actor beside which the new one is to drive first")
             return
-        copy, actor = free_id(self.edited.graph), int(self.source_id.value)
+        copy, actor = unused_id(self.edited.graph), int(self.source_id.value)
         self._copied(Insert(self.source.value, actor, copy, follows=self.chosen, offset_m=BESIDE_M))
 
     def _copied(self, edit: Duplicate | Insert) -> None:

@@ -14,7 +14,6 @@ from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.scene import Category, LidarSweep
 from foredrive.search.find import Hit
-from foredrive.search.rows import COUNTS
 from foredrive.view import palette
 
 HEIGHT_PX, WIDTH_PX = 198, 352
@@ -32,19 +31,19 @@ def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
     canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
     canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
     canvas.paste(palette.PANEL, (WIDTH_PX + GAP_PX, 0, canvas.width, HEIGHT_PX))
-    folder, frame = Path(str(hit.facts["folder"])), int(str(hit.facts["frame"]))
+    row = hit.row
     try:
-        log = _opened(folder, Path(str(hit.facts["maps_dir"])))
-        picture, sweep = _camera(log, frame, str(hit.facts["view"])), read_sweep(log, frame)
+        log = _opened(row.folder, row.maps_dir)
+        picture, sweep = _camera(log, row.frame, row.view), read_sweep(log, row.frame)
     except InputError:
-        ImageDraw.Draw(canvas).text((12, 12), f"{folder} cannot be read", fill=palette.FAINT)
+        ImageDraw.Draw(canvas).text((12, 12), f"{row.folder} cannot be read", fill=palette.FAINT)
         return np.asarray(canvas)
     if picture is not None:
         canvas.paste(picture, ((WIDTH_PX - picture.width) // 2, (HEIGHT_PX - picture.height) // 2))
     if sweep is not None:
         above = Image.fromarray(lidar_from_above(sweep[0], HEIGHT_PX))
-        if hit.facts["azimuth_deg"] is not None:
-            _point(above, float(str(hit.facts["azimuth_deg"])))
+        if row.azimuth_deg is not None:
+            _point(above, row.azimuth_deg)
         canvas.paste(above, (WIDTH_PX + GAP_PX, 0))
     return np.asarray(canvas)
 
@@ -69,7 +68,7 @@ def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 
 
 def hit_name(hit: Hit) -> str:
     """Return the name of the hit in the format of `--like`: LOG@12.5s/VIEW."""
-    return f"{hit.facts['log']}@{float(str(hit.facts['t_s'])):.2f}s/{hit.facts['view']}"
+    return f"{hit.row.log}@{hit.row.t_s:.2f}s/{hit.row.view}"
 
 
 def why_matched(hit: Hit) -> str:
@@ -79,16 +78,16 @@ def why_matched(hit: Hit) -> str:
 
 def what_is_there(hit: Hit) -> str:
     """Return place, weather, speed and objects as text, as far as they are known."""
-    facts = hit.facts
-    told = [str(facts[name]) for name in ("place", "time_of_day", "weather") if facts[name] is not None]
-    if facts["ego_speed"] is not None:
-        told.append(f"{float(str(facts['ego_speed'])):.1f} m/s")
+    row = hit.row
+    known = [fact for fact in (row.place, row.time_of_day, row.weather) if fact is not None]
+    if row.ego_speed_mps is not None:
+        known.append(f"{row.ego_speed_mps:.1f} m/s")
     objects = [
-        _counted(int(str(facts[name])), palette.label(category))
-        for category, name in COUNTS.items()
-        if facts[name] and category in (Category.CAR, Category.TRUCK, Category.BUS, Category.PEDESTRIAN)
+        _counted(count, palette.label(category))
+        for category, count in row.counts.items()
+        if count and category in (Category.CAR, Category.TRUCK, Category.BUS, Category.PEDESTRIAN)
     ]
-    return ", ".join([*told, *objects])
+    return ", ".join([*known, *objects])
 
 
 def _point(above: Image.Image, azimuth_deg: float) -> None:

@@ -11,10 +11,10 @@ from jaxtyping import UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
-from foredrive.rendering.edits import Edited
-from foredrive.rendering.free_views import free_camera
-from foredrive.runs.rebuild.film import Shooting, Shot, shoot
-from foredrive.runs.rebuild.rebuilt_run import OpenRun
+from foredrive.rendering.edits import EditedScene
+from foredrive.rendering.novel_views import novel_camera_view
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction
+from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_frame
 from foredrive.view import palette
 from foredrive.view.background import Background
 from foredrive.view.model_panel import pinhole
@@ -30,7 +30,7 @@ LIDAR, CAMERAS = "/lidar", "/cameras"
 class Moment:
     """An edited scene at one time."""
 
-    edited: Edited
+    edited: EditedScene
     t_s: float
 
 
@@ -43,7 +43,7 @@ class RebuiltPictures:
         background: thread that renders everything.
     """
 
-    def __init__(self, server: viser.ViserServer, run: OpenRun, background: Background) -> None:
+    def __init__(self, server: viser.ViserServer, run: OpenedReconstruction, background: Background) -> None:
         self._server, self._run, self._background = server, run, background
         self._moment: Moment | None = None
         self.layers = {"lidar": True, "cameras": True}
@@ -57,7 +57,7 @@ class RebuiltPictures:
             self.images = [gui.add_image(blank, label=name, jpeg_quality=85) for name in rig.names]
         self.colour.on_update(lambda _: self._ask_lidar())
 
-    def show(self, edited: Edited, t_s: float) -> None:
+    def show(self, edited: EditedScene, t_s: float) -> None:
         """Request pictures of a moment; queued requests of earlier moments are dropped."""
         self._moment = Moment(edited, t_s)
         self._ask_lidar()
@@ -78,12 +78,12 @@ class RebuiltPictures:
         if self._moment is not None and self._run.vehicle.lidar is not None:
             self._background.ask(LIDAR, partial(self._show_lidar, self._moment))
 
-    def _shot(self, moment: Moment, shooting: Shooting) -> Shot:
-        return shoot(self._run.scene, self._run.vehicle, moment.edited, shooting, 0)
+    def _shot(self, moment: Moment, plan: RenderPlan) -> RenderedFrame:
+        return render_frame(self._run.scene, self._run.vehicle, moment.edited, plan, 0)
 
     def _show_camera(self, camera: int, moment: Moment) -> None:
         rig = self._run.vehicle.rig
-        shot = self._shot(moment, Shooting((moment.t_s,), 1.0, (camera,), None))
+        shot = self._shot(moment, RenderPlan((moment.t_s,), 1.0, (camera,), None))
         rgb = shot.images[0].permute(1, 2, 0).numpy()
         self.images[camera].image = rgb
         pose = rig.T_ego_cam[camera].double().numpy()
@@ -102,7 +102,7 @@ class RebuiltPictures:
         )
 
     def _show_lidar(self, moment: Moment) -> None:
-        sweep = self._shot(moment, Shooting((moment.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
+        sweep = self._shot(moment, RenderPlan((moment.t_s,), 1.0, (), self._run.vehicle.lidar)).sweep
         assert sweep is not None
         returned = sweep[sweep.returned]
         if len(returned.range_m) == 0:
@@ -126,7 +126,7 @@ class RebuiltPictures:
         ego = self._run.vehicle.at(moment.t_s).shifted(moment.edited.T_ego_shifted.cpu())
         scene = self._run.scene
         with torch.no_grad():
-            view = free_camera(rig, 0, ego, sensor=0).to(scene.actor.device)
+            view = novel_camera_view(rig, 0, ego, sensor=0).to(scene.actor.device)
             rgb = _bytes(scene(moment.edited.graph, view).rgb)
         client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)
 

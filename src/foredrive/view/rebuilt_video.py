@@ -12,9 +12,9 @@ from rich.progress import track
 
 from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
-from foredrive.rendering.edits import Duplicate, Edit, Insert, Move, Remove, Send, apply_edits
-from foredrive.runs.rebuild.film import Shooting, Shot, shoot
-from foredrive.runs.rebuild.rebuilt_run import OpenRun, edited_scene
+from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, Insert, Move, Remove, apply_edits
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, edited_scene
+from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_frame
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
@@ -39,7 +39,7 @@ MOST_EDITS = 3
 
 
 def write_rebuilt_video(
-    path: Path, run: OpenRun, edits: list[Edit], shooting: Shooting, colour: Colour
+    path: Path, run: OpenedReconstruction, edits: list[Edit], plan: RenderPlan, colour: Colour
 ) -> None:
     """Write a video of a run in real time, beside the run after edits if there are any.
 
@@ -51,21 +51,23 @@ def write_rebuilt_video(
     if edits:
         takes.append((caption_of(edits), edited_scene(run.scene, edits)))
     make_folder(path.parent)
-    rig, chosen = run.vehicle.rig, list(shooting.cameras)
+    rig, chosen = run.vehicle.rig, list(plan.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
     frames = (
         draw_shots(
-            [(name, shoot(run.scene, run.vehicle, edited, shooting, k)) for name, edited in takes],
+            [(name, render_frame(run.scene, run.vehicle, edited, plan, k)) for name, edited in takes],
             rig,
             run.folder.name,
             colour,
         )
-        for k in track(range(len(shooting.t_s)), description=f"filming {run.folder.name}")
+        for k in track(range(len(plan.t_s)), description=f"filming {run.folder.name}")
     )
-    write_video(path, frames, shooting.step_s)
+    write_video(path, frames, plan.step_s)
 
 
-def draw_shots(shots: Sequence[tuple[str, Shot]], rig: CameraRig, name: str, colour: Colour) -> Image.Image:
+def draw_shots(
+    shots: Sequence[tuple[str, RenderedFrame]], rig: CameraRig, name: str, colour: Colour
+) -> Image.Image:
     """Draw a frame: shots of the same time side by side, each under its caption.
 
     Args:
@@ -100,7 +102,7 @@ def words_of(edit: Edit) -> str:
         return f"without {edit.actor}"
     if isinstance(edit, Move):
         return f"{edit.actor} moved"
-    if isinstance(edit, Duplicate | Send):
+    if isinstance(edit, Duplicate | DriveStraight):
         return f"{edit.copy} like {edit.actor}"
     if isinstance(edit, Insert):
         return f"{edit.copy} inserted on the way of {edit.follows}"
@@ -110,7 +112,7 @@ def words_of(edit: Edit) -> str:
     return " ".join(part for part in (aside, ahead) if part) or "ego vehicle turned"
 
 
-def _column(shot: Shot, rig: CameraRig, colour: Colour) -> Image.Image:
+def _column(shot: RenderedFrame, rig: CameraRig, colour: Colour) -> Image.Image:
     rows = camera_rows(rig) if rig.names else []
     longest = max((len(row) for row in rows), default=1)
     each_px = ONE_CAMERA_PX if longest == 1 else CAMERA_PX

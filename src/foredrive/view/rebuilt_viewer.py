@@ -8,7 +8,7 @@ from pathlib import Path
 import viser
 
 from foredrive.rendering.edits import Edit
-from foredrive.runs.rebuild.rebuilt_run import OpenRun
+from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction
 from foredrive.view.background import Background
 from foredrive.view.edit_panel import EditPanel
 from foredrive.view.page import close_page, open_page, page_url
@@ -42,7 +42,9 @@ class RebuiltViewer:
         InputError: the page cannot be served there.
     """
 
-    def __init__(self, run: OpenRun, edits: Sequence[Edit], file: Path, host: str, port: int) -> None:
+    def __init__(
+        self, run: OpenedReconstruction, edits: Sequence[Edit], file: Path, host: str, port: int
+    ) -> None:
         self.run = run
         self.server = open_page(run.folder.name, host, port)
         self.server.initial_camera.far = FAR_M

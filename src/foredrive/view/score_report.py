@@ -1,16 +1,17 @@
 """The report on a file of detections: metrics, reliability, and the frames that lost most likelihood."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
-from foredrive.evaluation.detections import DetectionSet, FrameScore, ScoreSummary
+from foredrive.evaluation.detections import FrameScore
 from foredrive.evaluation.detections.score import PARTS
+from foredrive.runs.score.run import ScoredDetections
 from foredrive.view.frame_of_detections import draw_frame
 from foredrive.view.html import inline_svg, write_page
 from foredrive.view.reliability_diagram import draw_reliability
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import Column, Summary, Table, number, simple_table, words
 
+REPORT = "report.html"
 SHOWN = {
     "frames": "Frames",
     "objects": "Objects",
@@ -53,25 +54,26 @@ def score_table(figures: Summary) -> Table:
 
 
 def write_score_report(
-    path: Path, title: str, read: DetectionSet, scores: Sequence[FrameScore], result: ScoreSummary, worst: int
+    path: Path, title: str, scored: ScoredDetections, figures: Summary, worst: int
 ) -> None:
     """Write the page about a file of detections.
 
     Args:
+        figures: the summary, with the figures of the other file if there is one.
         worst: number of frames to draw: those that lost most likelihood.
     """
-    ranked = sorted(range(len(scores)), key=lambda n: -scores[n].nll)[:worst]
+    ranked = sorted(zip(scored.detections.frames, scored.frames, strict=True), key=lambda pair: -pair[1].nll)
     write_page(
         path,
         "score_report.html.j2",
         title=title,
-        table=score_table(result.figures),
-        diagrams=[inline_svg(draw_reliability(*diagram)) for diagram in result.diagrams.items()],
+        table=score_table(figures),
+        diagrams=[inline_svg(draw_reliability(*each)) for each in scored.summary.diagrams.items()],
         frames=[
-            (inline_svg(draw_frame(read.frames[n], scores[n], read.upright)), _caption(scores[n]))
-            for n in ranked
+            (inline_svg(draw_frame(frame, score, scored.detections.upright)), _caption(score))
+            for frame, score in ranked[:worst]
         ],
-        every_figure=full_table(result.figures),
+        every_figure=full_table(figures),
     )
 
 

@@ -20,7 +20,7 @@ from foredrive.search.index import FrameIndex
 from foredrive.search.kept import add_tag, save_query, saved_queries
 from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
-from foredrive.search.rows import FACTS
+from foredrive.search.rows import FACTS, IndexRow
 from foredrive.search.tables import quoted_list
 from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
 from foredrive.view.html import render_page
@@ -46,9 +46,7 @@ class ShownHit:
     def of(cls, hit: Hit) -> "ShownHit":
         """Return the shown values of a hit."""
         why = why_matched(hit) if hit.scores else ""
-        caption = hit.facts["caption"]
-        told = None if caption is None else str(caption)
-        return cls(_key(hit.facts), hit_name(hit), why, what_is_there(hit), told)
+        return cls(_key(hit.row), hit_name(hit), why, what_is_there(hit), hit.row.caption)
 
 
 @dataclass(frozen=True)
@@ -74,11 +72,10 @@ class Point:
     time_of_day: str | None
 
     @classmethod
-    def of(cls, xy: Sequence[float], row: Mapping[str, Any]) -> "Point":
+    def of(cls, xy: Sequence[float], row: IndexRow) -> "Point":
         """Return the point of a row of the index."""
-        name = f"{row['log']}@{row['t_s']:.1f}s"
-        facts = (row["log"], row["place"], row["weather"], row["time_of_day"])
-        return cls(xy[0], xy[1], _key(row), row["key"], name, *facts)
+        facts = (row.log, row.place, row.weather, row.time_of_day)
+        return cls(xy[0], xy[1], _key(row), row.key, f"{row.log}@{row.t_s:.1f}s", *facts)
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,7 @@ class SearchPage:
         if not keys:
             raise InputError("nothing is chosen")
         where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
-        rows = {_key(row): row for row in self._index.select(where, FACTS.names).to_pylist()}
+        rows = {_key(row): row for row in IndexRow.all_of(self._index.select(where, FACTS.names))}
         return [Hit(rows["|".join(key)], 0.0, {}) for key in keys]
 
 
@@ -227,8 +224,8 @@ def page_html() -> str:
     return render_page("search_page.html.j2", title="Foredrive search")
 
 
-def _key(row: Mapping[str, object]) -> str:
-    return f"{row['key']}|{row['view']}"
+def _key(row: IndexRow) -> str:
+    return f"{row.key}|{row.view}"
 
 
 def _parse_key(key: str) -> Key:

@@ -99,5 +99,4 @@ def hits_table(hits: Sequence[Hit]) -> Table:
 
 
 def _told(hit: Hit) -> list[str]:
-    caption = hit.facts["caption"]
-    return [what_is_there(hit)] + ([] if caption is None else [str(caption)])
+    return [what_is_there(hit)] + ([] if hit.row.caption is None else [hit.row.caption])

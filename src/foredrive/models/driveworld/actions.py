@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from foredrive.geometry.se3 import inverse_se3, yaw_of
+from foredrive.geometry.se3 import inverse_se3, yaw_from_matrix
 from foredrive.scene import Clip, Frames
 
 WHEELBASE_M = 2.86
@@ -42,7 +42,7 @@ def actions_between(
     way_m = T_step[..., :2, 3].norm(dim=-1)
     dt_s = torch.diff(t_s, dim=1).to(way_m)
     speed = torch.where(speed_valid[:, :-1], speed_mps[:, :-1].to(way_m), way_m / dt_s)
-    curvature = yaw_of(T_step) / way_m.clamp_min(1e-3)
+    curvature = yaw_from_matrix(T_step) / way_m.clamp_min(1e-3)
     steering = torch.where(way_m > SLOW_MPS * dt_s, torch.atan(WHEELBASE_M * curvature), 0.0)
     done = torch.stack([speed, steering], dim=-1).float()
     return torch.cat([done, torch.zeros_like(done[:, :1])], dim=1)

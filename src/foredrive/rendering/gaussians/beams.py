@@ -9,7 +9,7 @@ from foredrive.ops.splat_points import TiledPoints, beam_points
 from foredrive.sensors import TimedRays
 
 
-def lidar_points(
+def tiled_lidar_beams(
     rays: TimedRays,
     T_ego_lidar: Float[Tensor, "4 4"],
     twist_ego: Float[Tensor, "6"],

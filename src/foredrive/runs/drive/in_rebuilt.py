@@ -15,11 +15,11 @@ from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs.drive.agents import make_driver, needs_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
 from foredrive.runs.rebuild.rebuilt_run import (
-    OpenRun,
+    OpenedReconstruction,
+    camera_indices,
     edited_scene,
     open_rebuilt,
     open_run_log,
-    rebuilt_cameras,
 )
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.drive import Drive
@@ -108,7 +108,7 @@ class RebuiltRoutes:
 
 
 @functools.lru_cache(maxsize=1)  # consecutive drives share one scene
-def _opened(run: str) -> OpenRun:
+def _opened(run: str) -> OpenedReconstruction:
     return open_rebuilt(Path(run))
 
 
@@ -147,7 +147,7 @@ def _driver(driver: str, simulator: RebuiltSimulator) -> Agent:
     agent = make_driver(driver, lambda: simulator.state.t_s)
     there = [name.lower() for name in simulator.renderer.rig.names]
     wanted = [name.lower() for name in needs_of(driver).camera_names or there]
-    return _Through(agent, rebuilt_cameras(there, wanted)) if wanted != there else agent
+    return _Through(agent, camera_indices(there, wanted)) if wanted != there else agent
 
 
 def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatMet:

@@ -28,8 +28,8 @@ from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.views import CameraView
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log, rebuilt_cameras
-from foredrive.runs.rebuild.reconstruct import read_material
+from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt, open_run_log
+from foredrive.runs.rebuild.reconstruct import read_reconstruction_data
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip, Example, VoxelGrid
 
@@ -60,8 +60,8 @@ def measure_gap(
         InputError: a camera was not reconstructed, or no clip lies at a held-out time.
     """
     scene, (recipe, log) = open_rebuilt(rebuilt).scene, open_run_log(rebuilt)
-    material = read_material(recipe, log, (rebuilt / "cache").absolute())
-    views = [*material.learned.cameras, *material.held_out.cameras]
+    data = read_reconstruction_data(recipe, log, (rebuilt / "cache").absolute())
+    views = [*data.train.cameras, *data.held_out.cameras]
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     config = dataclasses.replace(
@@ -69,8 +69,8 @@ def measure_gap(
     )
     dataset = open_clips([log], config, rebuilt / "cache")
     opened = Log(log)
-    names = (_own_names(opened, names) for names in (material.vehicle.rig.names, dataset.camera_names))
-    cameras, t_us, every = rebuilt_cameras(*names), opened.t_us, recipe.hold_out_every
+    names = (_own_names(opened, names) for names in (data.vehicle.rig.names, dataset.camera_names))
+    cameras, t_us, every = camera_indices(*names), opened.t_us, recipe.hold_out_every
     held_us = set(t_us[every - 1 :: every].tolist()) if every else set()
     moments = [k for k in range(len(dataset)) if dataset.now_us(k) in held_us]
     if not moments:

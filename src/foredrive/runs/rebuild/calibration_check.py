@@ -4,31 +4,29 @@ import math
 from collections.abc import Mapping, Sequence
 
 from foredrive.rendering.calibration import (
-    Fit,
-    Glance,
+    CalibrationView,
+    OffsetFit,
     agreement,
-    camera_turn,
-    glances,
-    lidar_move,
-    with_images_of,
+    best_camera_rotation,
+    best_lidar_translation,
+    calibration_views,
+    with_images_from,
 )
-from foredrive.rendering.tracks import Tracks
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
-LARGE_RAD, LARGE_M = math.radians(0.7), 0.15
-"""Minimum rotation (rad) and shift (m) that are reported."""
-_GAIN, _AGREED = 0.03, 0.8
-"""An offset is accepted if it raises the agreement by at least `_GAIN`, and does so in at least the share
-`_AGREED` of the views.
-"""
-_POOR, _CLEARLY = 0.5, 0.3
-"""Images are assigned to another camera if their own agreement is below `_POOR` and the other's is higher by
-more than `_CLEARLY`.
+MIN_ROTATION_RAD, MIN_TRANSLATION_M = math.radians(0.7), 0.15
+"""Minimum rotation (rad) and translation (m) that are reported."""
+_MIN_GAIN, _MIN_IMPROVED_SHARE = 0.03, 0.8
+"""An offset is accepted if it raises the agreement by at least this much, in at least this share of views."""
+_MAX_OWN_AGREEMENT, _MIN_DIFFERENCE = 0.5, 0.3
+"""Images are assigned to another camera if their agreement with their own camera is below the first number
+and that with the other camera is higher by more than the second.
 """
 
 
-def calibration_doubts(
-    names: Sequence[str], cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: Tracks
+def calibration_findings(
+    names: Sequence[str], cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: ActorTracks
 ) -> list[str]:
     """Return a sentence for each sensor whose pose does not agree with its calibration; none if all agree.
 
@@ -40,65 +38,78 @@ def calibration_doubts(
         sweeps: lidar sweeps of the same drive.
         tracks: tracks of the moving actors.
     """
-    views = {name: [v for v in cameras if v.sensor == number] for number, name in enumerate(names)}
-    seen = {name: glances(of_one, sweeps, tracks) for name, of_one in views.items()}
-    exchanged = {name: other for name in names if (other := _whose_images(name, views, seen, sweeps, tracks))}
-    doubts = [f"camera {name}: its images fit the place of {other}" for name, other in exchanged.items()]
-    rest = {name: of_one for name, of_one in seen.items() if name not in exchanged}
-    turns = {name: fit for name, of_one in rest.items() if (fit := camera_turn(of_one)) is not None}
-    turned = {name: fit for name, fit in turns.items() if _believed(fit, LARGE_RAD)}
-    moved = lidar_move([glance for of_one in rest.values() for glance in of_one])
-    if moved is not None and _believed(moved, LARGE_M) and _gain(moved) > _gain(*turns.values()):
-        forward_m, left_m, up_m = moved.offset.tolist()
+    by_camera = {name: [v for v in cameras if v.sensor == number] for number, name in enumerate(names)}
+    pairs = {name: calibration_views(views, sweeps, tracks) for name, views in by_camera.items()}
+    exchanged = {
+        name: other for name in names if (other := _exchanged_camera(name, by_camera, pairs, sweeps, tracks))
+    }
+    findings = [f"the images of camera {name} fit the pose of {other}" for name, other in exchanged.items()]
+    rest = {name: views for name, views in pairs.items() if name not in exchanged}
+    rotations = {name: fit for name, views in rest.items() if (fit := best_camera_rotation(views))}
+    translation = best_lidar_translation([view for views in rest.values() for view in views])
+    if (
+        translation is not None
+        and _is_significant(translation, MIN_TRANSLATION_M)
+        and _mean_gain(translation) > _mean_gain(*rotations.values())
+    ):
+        forward_m, left_m, up_m = translation.offset.tolist()
         return [
-            *doubts,
-            f"the lidar: it fits the images better {_way(forward_m, 'm forward', 'm back')}, "
-            f"{_way(left_m, 'm to the left', 'm to the right')} and {_way(up_m, 'm up', 'm down')} "
-            f"(agreement {moved.best:.2f} instead of {moved.given:.2f})",
+            *findings,
+            "the lidar fits the images better if it is moved "
+            f"{_directed(forward_m, ' m', 'forward', 'back')}, "
+            f"{_directed(left_m, ' m', 'to the left', 'to the right')} and "
+            f"{_directed(up_m, ' m', 'up', 'down')} {_scores(translation)}",
         ]
-    return doubts + [f"camera {name}: {_turned(fit)}" for name, fit in turned.items()]
+    return findings + [
+        f"camera {name} {_rotation(fit)}"
+        for name, fit in rotations.items()
+        if _is_significant(fit, MIN_ROTATION_RAD)
+    ]
 
 
-def _turned(fit: Fit) -> str:
+def _rotation(fit: OffsetFit) -> str:
     up, right, clockwise = (math.degrees(angle) for angle in fit.offset.tolist())
     return (
-        f"it fits the lidar better turned {_way(up, '° up', '° down')}, "
-        f"{_way(right, '° to the right', '° to the left')} and "
-        f"{_way(clockwise, '° clockwise', '° counter-clockwise')} "
-        f"(agreement {fit.best:.2f} instead of {fit.given:.2f})"
+        f"fits the lidar better if it is turned {_directed(up, '°', 'up', 'down')}, "
+        f"{_directed(right, '°', 'to the right', 'to the left')} and "
+        f"{_directed(clockwise, '°', 'clockwise', 'counter-clockwise')} {_scores(fit)}"
     )
 
 
-def _way(value: float, ahead: str, back: str) -> str:
+def _directed(value: float, unit: str, positive: str, negative: str) -> str:
     """Return the value with its direction, such as "0.25° up" or "0.25° down"."""
-    unit = ahead if value >= 0 else back
-    return f"{abs(value):.2f}{unit}" if unit.startswith("°") else f"{abs(value):.2f} {unit}"
+    return f"{abs(value):.2f}{unit} {positive if value >= 0 else negative}"
 
 
-def _believed(fit: Fit, large: float) -> bool:
-    return float(fit.offset.norm()) >= large and _gain(fit) >= _GAIN and fit.agreed >= _AGREED
+def _scores(fit: OffsetFit) -> str:
+    return f"(agreement {fit.score_after:.2f} instead of {fit.score_before:.2f})"
 
 
-def _gain(*fits: Fit) -> float:
+def _is_significant(fit: OffsetFit, min_offset: float) -> bool:
+    large = float(fit.offset.norm()) >= min_offset
+    return large and _mean_gain(fit) >= _MIN_GAIN and fit.improved_share >= _MIN_IMPROVED_SHARE
+
+
+def _mean_gain(*fits: OffsetFit) -> float:
     """Return the mean increase of agreement."""
-    return sum(fit.best - fit.given for fit in fits) / max(len(fits), 1)
+    return sum(fit.score_after - fit.score_before for fit in fits) / max(len(fits), 1)
 
 
-def _whose_images(
+def _exchanged_camera(
     name: str,
-    views: Mapping[str, Sequence[CameraView]],
-    seen: Mapping[str, Sequence[Glance]],
+    by_camera: Mapping[str, Sequence[CameraView]],
+    pairs: Mapping[str, Sequence[CalibrationView]],
     sweeps: Sequence[SweepView],
-    tracks: Tracks,
+    tracks: ActorTracks,
 ) -> str | None:
     """Return the camera whose pose fits a camera's images clearly better; None if there is none."""
-    own = agreement(seen[name])
-    if own is None or own >= _POOR:
+    own = agreement(pairs[name])
+    if own is None or own >= _MAX_OWN_AGREEMENT:
         return None
-    there = {
-        other: agreement(glances(with_images_of(views[other], views[name]), sweeps, tracks)) or 0.0
-        for other in views
-        if other != name and views[other]
+    scores = {
+        other: agreement(calibration_views(with_images_from(views, by_camera[name]), sweeps, tracks)) or 0.0
+        for other, views in by_camera.items()
+        if other != name and views
     }
-    best = max(there, key=lambda other: there[other], default=None)
-    return best if best is not None and there[best] > own + _CLEARLY else None
+    best = max(scores, key=lambda other: scores[other], default=None)
+    return best if best is not None and scores[best] > own + _MIN_DIFFERENCE else None

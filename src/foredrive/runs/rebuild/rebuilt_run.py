@@ -11,27 +11,27 @@ from safetensors.torch import load_file
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
-from foredrive.rendering.edits import Edit, Edited, apply_edits
+from foredrive.rendering.edits import Edit, EditedScene, apply_edits
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import Tracks
-from foredrive.rendering.vehicle import Vehicle, load_vehicle
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.vehicle import LoggedVehicle, load_vehicle
 from foredrive.runs.folder import CONFIG, LOG, WEIGHTS
 from foredrive.runs.rebuild.reconstruct import VEHICLE
 from foredrive.training.checkpoints import load_weights
 
 
 @dataclass(frozen=True)
-class OpenRun:
+class OpenedReconstruction:
     """A scene without edits, and the vehicle that recorded it."""
 
     folder: Path
     scene: RebuiltScene
-    vehicle: Vehicle
+    vehicle: LoggedVehicle
 
 
-def open_rebuilt(folder: Path) -> OpenRun:
+def open_rebuilt(folder: Path) -> OpenedReconstruction:
     """Open a reconstruction.
 
     Raises:
@@ -51,10 +51,10 @@ def open_rebuilt(folder: Path) -> OpenRun:
         raise InputError(f"{folder / WEIGHTS}: not the weights of a scene: {error}") from error
     scene = RebuiltScene(graph, cameras, recipe.rolling, recipe.decoder_width, vehicle.reach_m)
     load_weights(scene, folder / WEIGHTS)
-    return OpenRun(folder, scene, vehicle)
+    return OpenedReconstruction(folder, scene, vehicle)
 
 
-def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> Edited:
+def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> EditedScene:
     """Apply edits to a scene; open the runs that inserted actors come from."""
     return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
 
@@ -70,7 +70,7 @@ def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
         saved["opacity_logit"],
         saved["albedo"].new_zeros(len(saved["albedo"]), features),
     )
-    tracks = Tracks(
+    tracks = ActorTracks(
         saved["track_id"],
         saved["category"],
         saved["size_lwh"],
@@ -99,7 +99,7 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
     return load_rebuild_recipe(folder / CONFIG), path
 
 
-def rebuilt_cameras(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def camera_indices(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Return the index of the reconstructed camera for each camera that an agent requires.
 
     Raises:

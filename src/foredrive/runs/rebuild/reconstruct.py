@@ -24,17 +24,17 @@ from foredrive.rendering.initial import initial_scene
 from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.tracks import Tracks, read_tracks
+from foredrive.rendering.tracks import ActorTracks, read_tracks
 from foredrive.rendering.unseen_ground import add_unseen_ground
-from foredrive.rendering.vehicle import Vehicle, read_vehicle, save_vehicle
+from foredrive.rendering.vehicle import LoggedVehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.runs.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
-from foredrive.runs.rebuild.calibration_check import calibration_doubts
+from foredrive.runs.rebuild.calibration_check import calibration_findings
 from foredrive.scene import Clip
-from foredrive.sensors.measured_lidar import measure_lidar
+from foredrive.sensors.lidar_estimation import estimate_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
 from foredrive.training.loop import read_metrics
-from foredrive.training.rebuilding import Seen, rebuild
+from foredrive.training.rebuilding import SensorViews, rebuild
 
 VEHICLE = "vehicle.json"
 """File of the vehicle's path and sensors, which are needed to render a scene without its log."""
@@ -54,29 +54,31 @@ _BEAMS_A_SWEEP = 120_000
 
 
 @dataclass(frozen=True)
-class Material:
+class ReconstructionData:
     """The training frames and the held-out frames of a drive."""
 
-    learned: Seen
-    held_out: Seen
-    tracks: Tracks
-    vehicle: Vehicle
+    train: SensorViews
+    held_out: SensorViews
+    tracks: ActorTracks
+    vehicle: LoggedVehicle
 
 
 @dataclass(frozen=True)
-class Rebuilt:
+class Reconstruction:
     """A reconstruction on disk, and its scene."""
 
     folder: Path
     recipe: RebuildRecipe
     summary: dict[str, float | int | str | None]
     scene: RebuiltScene
-    learned: Seen
-    held_out: Seen
+    train: SensorViews
+    held_out: SensorViews
     """The held-out frames on which the scene was evaluated."""
 
 
-def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None) -> Rebuilt:
+def reconstruct(
+    recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None
+) -> Reconstruction:
     """Reconstruct a log, and evaluate the scene on held-out frames.
 
     It continues where an earlier call with the same recipe and log stopped.
@@ -94,35 +96,35 @@ def reconstruct(recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: P
     claim = _folder_of(recipe, path, folder)
     claim.check()
     check_memory(recipe, path)
-    material = read_material(recipe, path, (cache_dir or folder / "cache").absolute())
+    data = read_reconstruction_data(recipe, path, (cache_dir or folder / "cache").absolute())
     with claim.claimed():
-        return _rebuild(recipe, path, folder, material)
+        return _rebuild(recipe, path, folder, data)
 
 
-def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, material: Material) -> Rebuilt:
+def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, data: ReconstructionData) -> Reconstruction:
     """Do the steps of a reconstruction that are not done yet."""
-    save_vehicle(material.vehicle, folder / VEHICLE)
-    scene = begin(recipe, material)
+    save_vehicle(data.vehicle, folder / VEHICLE)
+    scene = initial_model(recipe, data)
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
     weights = folder / WEIGHTS
     if not weights.is_file():
-        seen, names = material.learned, material.vehicle.rig.names
-        for doubt in calibration_doubts(names, seen.cameras, seen.sweeps, material.tracks):
-            _log.warning("%s: is the calibration right? %s", path.folder, doubt)
-        rebuild(scene, material.learned, recipe.schedule, folder)
-        add_unseen_ground(scene, material.vehicle.T_scene_ego, material.learned.cameras)
+        train, names = data.train, data.vehicle.rig.names
+        for finding in calibration_findings(names, train.cameras, train.sweeps, data.tracks):
+            _log.warning("%s: the calibration may be wrong: %s", path.folder, finding)
+        rebuild(scene, data.train, recipe.schedule, folder)
+        add_unseen_ground(scene, data.vehicle.T_scene_ego, data.train.cameras)
         with atomic_path(weights) as temporary:
             save_weights(scene, temporary)
     scene.resize(weights)
     load_weights(scene, weights)
     if not (folder / SUMMARY).is_file():
-        write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, material))
+        write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, data))
     if not (folder / GAUSSIANS).is_file():
         write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
-    return Rebuilt(folder, recipe, read_summary(folder / SUMMARY), scene, material.learned, material.held_out)
+    return Reconstruction(folder, recipe, read_summary(folder / SUMMARY), scene, data.train, data.held_out)
 
 
-def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Material:
+def read_reconstruction_data(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> ReconstructionData:
     """Read a log's frames and split them into training and held-out frames; warn if sensors are missing."""
     drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
     if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
@@ -142,43 +144,43 @@ def read_material(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> Mate
             _log.warning("%s: %s", path.folder, what)
     if not recipe.actors:
         tracks = tracks_without_actors(tracks)
-    learned = _seen(known, T_world_scene)
-    return Material(
-        learned=learned,
-        held_out=_seen(drive.frames(frames[held].tolist()), T_world_scene),
+    train = _sensor_views(known, T_world_scene)
+    return ReconstructionData(
+        train=train,
+        held_out=_sensor_views(drive.frames(frames[held].tolist()), T_world_scene),
         tracks=tracks,
-        vehicle=_vehicle(Log(path), drive, learned.sweeps),
+        vehicle=_vehicle(Log(path), drive, train.sweeps),
     )
 
 
-def begin(recipe: RebuildRecipe, material: Material) -> RebuiltScene:
+def initial_model(recipe: RebuildRecipe, data: ReconstructionData) -> RebuiltScene:
     """Return the scene before training."""
     generator = torch.Generator().manual_seed(recipe.schedule.seed)
     graph = initial_scene(
-        list(material.learned.cameras),
-        list(material.learned.sweeps),
-        material.tracks,
+        list(data.train.cameras),
+        list(data.train.sweeps),
+        data.tracks,
         recipe.initial,
         generator,
     )
     torch.manual_seed(recipe.schedule.seed)  # the decoders' weights
     return RebuiltScene(
         graph,
-        len(material.vehicle.rig.names),
+        len(data.vehicle.rig.names),
         recipe.rolling,
         recipe.decoder_width,
-        material.vehicle.reach_m,
+        data.vehicle.reach_m,
     )
 
 
-def tracks_without_actors(tracks: Tracks) -> Tracks:
+def tracks_without_actors(tracks: ActorTracks) -> ActorTracks:
     """Return tracks with the same key times and no actors."""
-    nobody = {
+    empty = {
         field.name: getattr(tracks, field.name)[:0]
         for field in dataclasses.fields(tracks)
         if field.name != "t_s"
     }
-    return dataclasses.replace(tracks, **nobody)
+    return dataclasses.replace(tracks, **empty)
 
 
 def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
@@ -220,7 +222,7 @@ def _free_memory_gib() -> float:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1024**3
 
 
-def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> Vehicle:
+def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> LoggedVehicle:
     """Return the vehicle of a drive. Its lidar is the data set's model, or is estimated from the sweeps."""
     T_world_scene = drive.T_world_ego[0]
     seen = [view for view in sweeps if bool(view.beams.returned.any())]
@@ -230,33 +232,33 @@ def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> Vehicle:
     beams, T_ego_lidar = fullest.beams, torch.eye(4)
     T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
     farthest_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
-    lidar = lidar_of(log.metadata.dataset, T_ego_lidar) or measure_lidar(
+    lidar = lidar_of(log.metadata.dataset, T_ego_lidar) or estimate_lidar(
         beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m
     )
     reach_m = farthest_m if lidar is None else lidar.max_range_m
     return read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
 
 
-def _seen(clip: Clip, T_world_scene: torch.Tensor) -> Seen:
+def _sensor_views(clip: Clip, T_world_scene: torch.Tensor) -> SensorViews:
     cameras: list[CameraView] = [view for views in camera_views(clip, T_world_scene) for view in views]
     sweeps: list[SweepView] = sweep_views(clip, T_world_scene)
-    return Seen(cameras, sweeps)
+    return SensorViews(cameras, sweeps)
 
 
 def _summary(
-    recipe: RebuildRecipe, path: LogPath, folder: Path, scene: RebuiltScene, material: Material
+    recipe: RebuildRecipe, path: LogPath, folder: Path, scene: RebuiltScene, data: ReconstructionData
 ) -> dict[str, float | int | str | None]:
     steps = read_metrics(folder / "metrics.jsonl")
-    held = material.held_out
+    held = data.held_out
     return {
         "recipe": recipe.name,
         "log": path.name,
         "gaussians": len(scene.actor),
-        "actors": len(material.tracks),
+        "actors": len(data.tracks),
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
         "peak_memory_gib": peak_rss_gib(),
-        **judge_cameras(scene, held.cameras, material.learned.cameras),
+        **judge_cameras(scene, held.cameras, data.train.cameras),
         **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
         **collect_provenance(),
     }

@@ -1,7 +1,6 @@
 """Query an index with the towers that made it."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from foredrive.data.clip_list import ListedClip, clip_list
 from foredrive.runs.search.towers import find_towers
@@ -40,8 +39,8 @@ def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[s
     """
     clips, notes = [], []
     for hit in hits:
-        t_s = float(str(hit.facts["t_s"]))
-        folder, maps_dir = Path(str(hit.facts["folder"])), Path(str(hit.facts["maps_dir"]))
-        clips.append(ListedClip(folder, maps_dir, max(0.0, t_s - before_s), t_s + after_s))
-        notes.append({"log": hit.facts["log"], "t_s": t_s, "view": hit.facts["view"], "score": hit.score})
+        row = hit.row
+        start_s, end_s = max(0.0, row.t_s - before_s), row.t_s + after_s
+        clips.append(ListedClip(row.folder, row.maps_dir, start_s, end_s))
+        notes.append({"log": row.log, "t_s": row.t_s, "view": row.view, "score": hit.score})
     return clip_list(clips, notes)

@@ -8,8 +8,8 @@ from foredrive.simulation.scenarios.cast import RUN_UP_M, is_let_go
 from foredrive.simulation.scenarios.kinds import ENDS_BEFORE, MEETINGS, ScenarioKind
 from foredrive.simulation.scenarios.kinematics import SPARE_M, arrival_s, cruise_mps, stopping_m
 from foredrive.simulation.scenarios.scene import STANDS_MPS, Play, Scene
-from foredrive.towns.traffic.guests import granted_through
 from foredrive.towns.traffic.lane_changes import change_length_m
+from foredrive.towns.traffic.scenario_vehicles import grant_junction
 
 MOVES_MPS = 1.0
 """Oncoming and crossing vehicles react to the ego vehicle only if it is slower than this, m/s, and in the
@@ -126,7 +126,7 @@ def _lead(scene: Scene, lead_m: float, dt_s: float) -> Scene:
     if play.since_s is not None:
         if ego.t_s - play.since_s > BRAKES_S:
             return _over(scene)
-        scene.orders.most_mps2[slot] = -BRAKES_MPS2
+        scene.orders.max_mps2[slot] = -BRAKES_MPS2
         return scene
     gap_m, lead_mps = _gap_m(scene, lead_m), scene.speed_mps(slot)
     _cruise_ahead(scene, gap_m)
@@ -135,7 +135,7 @@ def _lead(scene: Scene, lead_m: float, dt_s: float) -> Scene:
     least_m = ego.stopping_m() - lead_mps**2 / (2 * BRAKES_MPS2)
     soon_m = least_m + SPARE_M + ego.speed_mps * dt_s
     if _follows(scene, gap_m) and gap_m >= least_m and (gap_m < soon_m or play.waited_s > FOLLOWED_S):
-        scene.orders.most_mps2[slot] = -BRAKES_MPS2
+        scene.orders.max_mps2[slot] = -BRAKES_MPS2
         return _begun(scene)
     return scene
 
@@ -152,7 +152,7 @@ def _block(scene: Scene) -> Scene:
         scene = _begun(scene)
     if play.waited_s > STANDS_S or (play.since_s is not None and ego.t_s - play.since_s > BLOCKS_S):
         return _over(scene)
-    scene.orders.most_mps2[slot] = -BRAKES_MPS2
+    scene.orders.max_mps2[slot] = -BRAKES_MPS2
     return scene
 
 
@@ -213,7 +213,7 @@ def _meet(scene: Scene, lead_m: float) -> Scene:
     scenario, play, ego, slot = scene.scenario, scene.play, scene.ego, scene.play.cast[0]
     runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
     line_m, room_m = scene.way.line_m - lead_m - scene.half_m(slot), ego.front_gap_m(scenario.at_m - ROOM_M)
-    scene.orders.blind[list(play.cast)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
+    scene.orders.ignores_ego[list(play.cast)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
     comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
     if play.since_s is not None:
         if runs:
@@ -267,11 +267,11 @@ def _wait(scene: Scene, slot: int, to_go_m: float) -> None:
 
 
 def _run(scene: Scene, slot: int, line_m: float) -> Scene:
-    scene.orders.runs[slot] = True
+    scene.orders.runs_lights[slot] = True
     if line_m > RESERVES_M:
         return scene
     lane = next(n for n in scene.way.lanes if scene.traffic.lanes.contested[n] and _begins_m(scene, n) >= 0.0)
-    return scene._replace(state=granted_through(scene.traffic, scene.state, slot, lane))
+    return scene._replace(state=grant_junction(scene.traffic, scene.state, slot, lane))
 
 
 def _begins_m(scene: Scene, lane: int) -> float:

@@ -8,9 +8,9 @@ from jaxtyping import Float64
 from foredrive.simulation.scenarios.ground import Ground
 from foredrive.simulation.scenarios.kinds import MEETINGS, ScenarioKind, Way
 from foredrive.simulation.scenarios.scene import Scene
-from foredrive.towns.traffic.guests import cleared, invited, points_on
 from foredrive.towns.traffic.lights import Light
-from foredrive.towns.traffic.turnover import BORN_BEYOND_M
+from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, points_along
+from foredrive.towns.traffic.spawning import SPAWN_MIN_M
 
 EARLY_M = 170.0
 """No vehicle is placed for a scenario further than this along the route, m."""
@@ -35,7 +35,7 @@ def can_stand(ground: Ground, at_m: float) -> bool:
     """Return whether a standing vehicle can be placed at a point of a route unseen."""
     if at_m < EARLY_M:
         return True
-    away_m = np.arange(BORN_BEYOND_M, EARLY_M, SAMPLES_M)
+    away_m = np.arange(SPAWN_MIN_M, EARLY_M, SAMPLES_M)
     return _is_far(ground, np.full(len(away_m), at_m), at_m - away_m)
 
 
@@ -50,11 +50,11 @@ def can_drive_ahead(ground: Ground, from_m: float, to_m: float) -> bool:
 def _is_far(ground: Ground, ahead_m: Float64[np.ndarray, "n"], behind_m: Float64[np.ndarray, "n"]) -> bool:
     """Return whether at least one of some pairs of points on a route is too far apart for sight.
 
-    Two points cannot be seen from each other if they are further apart than `BORN_BEYOND_M`.
+    Two points cannot be seen from each other if they are further apart than `SPAWN_MIN_M`.
     """
     xy, arc_m = ground.route.xyz.T[:2], ground.route.arc_m
     there, here = (np.stack([np.interp(m, arc_m, axis) for axis in xy]) for m in (ahead_m, behind_m))
-    return bool((np.hypot(*(there - here)) > BORN_BEYOND_M).any())
+    return bool((np.hypot(*(there - here)) > SPAWN_MIN_M).any())
 
 
 def call(scene: Scene, at_start: bool) -> Scene:
@@ -98,7 +98,7 @@ def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float 
 
 def is_let_go(scene: Scene, after_s: float) -> bool:
     """Return whether the ego vehicle will have no red light at the scenario's junction."""
-    shows = scene.traffic.signals.shows(scene.state.time_s + after_s)
+    shows = scene.traffic.signals.light_states(scene.state.time_s + after_s)
     return bool(shows[scene.scenario.ego_lane] != Light.RED)
 
 
@@ -107,19 +107,21 @@ def _called(scene: Scene, number: int, begin_m: float, speed_mps: float, at_star
     count = STREAM if kind is ScenarioKind.ONCOMING_TRAFFIC else 1
     begins_m = [begin_m - k * STREAM_APART_M for k in range(count)]
     begins_m = [m for m in begins_m if m >= BEGIN_M]
-    places = points_on(traffic.lanes, way.lanes, np.array(begins_m))
-    if not at_start and np.linalg.norm(places - scene.ego.centre_m, axis=1).min() < BORN_BEYOND_M:
+    places = points_along(traffic.lanes, way.lanes, np.array(begins_m))
+    if not at_start and np.linalg.norm(places - scene.ego.centre_m, axis=1).min() < SPAWN_MIN_M:
         return None
     until_m = way.meet_m if kind is ScenarioKind.RED_LIGHT_RUNNER else begin_m + 2 * SAMPLES_M
     from_m = begins_m[-1] - 2 * SAMPLES_M
     if kind in (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN) and at_start:
         from_m = begin_m - AHEAD_AT_START_M + 2 * SAMPLES_M
-    room = points_on(traffic.lanes, way.lanes, np.arange(max(from_m, 0.0), until_m, SAMPLES_M))
-    state = cleared(traffic, scene.state, room, 0.0 if at_start else BORN_BEYOND_M - 5.0)
-    free = [] if state is None else [slot for slot in traffic.guest_slots if not state.vehicles.active[slot]]
+    room = points_along(traffic.lanes, way.lanes, np.arange(max(from_m, 0.0), until_m, SAMPLES_M))
+    state = clear_area(traffic, scene.state, room, 0.0 if at_start else SPAWN_MIN_M - 5.0)
+    free = (
+        [] if state is None else [slot for slot in traffic.scenario_slots if not state.vehicles.active[slot]]
+    )
     if state is None or len(free) < len(begins_m):
         return None
     for slot, along_m in zip(free, begins_m, strict=False):
-        state = invited(traffic, state, slot, way.lanes, along_m, speed_mps)
+        state = add_vehicle(traffic, state, slot, way.lanes, along_m, speed_mps)
     play = dataclasses.replace(scene.play, cast=tuple(free[: len(begins_m)]), way=number)
     return scene._replace(state=state, play=play)

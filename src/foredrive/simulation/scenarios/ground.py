@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from foredrive.simulation.lane_search import Leg
 from foredrive.simulation.routes import DriveRoute
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.near_lanes import NearLanes
+from foredrive.towns.traffic.lane_index import LaneIndex
 from foredrive.towns.world import World
 
 AROUND_M = 25.0
@@ -30,7 +30,7 @@ class Ground(NamedTuple):
 
     route: DriveRoute
     graph: LaneGraph
-    near: NearLanes
+    near: LaneIndex
     world: World
 
 

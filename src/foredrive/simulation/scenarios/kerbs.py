@@ -10,7 +10,7 @@ from foredrive.simulation.collisions import SOLID
 from foredrive.simulation.scenarios.ground import Ground, pose
 from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
 from foredrive.towns.actors import ActorState
-from foredrive.towns.traffic.strays import FIRST_TRACK_ID, Stray
+from foredrive.towns.traffic.scripted_actors import FIRST_TRACK_ID, ScriptedActor
 from foredrive.towns.world import World
 
 STEP_M, OFF_LANES_M = 0.5, 1.0
@@ -57,7 +57,7 @@ def crossing(
         return
     kind = ScenarioKind.CROSSING_CYCLIST if cycles else ScenarioKind.CROSSING_PEDESTRIAN
     size = np.array(CYCLIST_LWH if cycles else PEDESTRIAN_LWH)
-    stray = Stray(FIRST_TRACK_ID, category, 0, size, way)
+    stray = ScriptedActor(FIRST_TRACK_ID, category, 0, size, way)
     yield Scenario(kind, at_m, limit_mps, stray=stray, meet_m=start_m)
 
 
@@ -102,7 +102,7 @@ def _before_car(ground: Ground, car: ActorState, at_m: float) -> Scenario | None
     if not _is_clear(ground.world, start, out):
         return None
     limit = float(ground.graph.limit_mps[_lane_at(ground, at_m)])
-    stray = Stray(
+    stray = ScriptedActor(
         FIRST_TRACK_ID, Category.PEDESTRIAN, 0, np.array(PEDESTRIAN_LWH), np.stack([start, out, start])
     )
     return Scenario(ScenarioKind.DOOR_ZONE, at_m, limit, stray=stray, meet_m=aside_m - INTO_LANE_M)

@@ -8,7 +8,7 @@ import enum
 import math
 from dataclasses import dataclass
 
-from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.scripted_actors import ScriptedActor
 
 
 class ScenarioKind(enum.StrEnum):
@@ -66,7 +66,7 @@ class Scenario:
     """Side to which a vehicle cuts in (0 left, 1 right)."""
     ego_lane: int = -1
     """Lane of the ego vehicle in the junction, whose light it has. -1 outside of junctions."""
-    stray: Stray | None = None
+    stray: ScriptedActor | None = None
     """The crossing road user in its waiting state, if there is one."""
     meet_m: float = 0.0
     """Distance along the crossing road user's way at which it meets the route, m."""

@@ -16,9 +16,9 @@ from foredrive.simulation.scenarios.kerbs import beside_parked, crossing
 from foredrive.simulation.scenarios.kinds import ENDS_BEFORE, Scenario, ScenarioKind, Way
 from foredrive.simulation.scenarios.kinematics import SPARE_M, stopping_m
 from foredrive.towns.traffic.lane_graph import TURN_RAD, build_lane_graph
-from foredrive.towns.traffic.leaders import abreast
-from foredrive.towns.traffic.near_lanes import near_lanes_of
-from foredrive.towns.traffic.strays import FIRST_TRACK_ID
+from foredrive.towns.traffic.lane_index import build_lane_index
+from foredrive.towns.traffic.leaders import project_to_neighbour
+from foredrive.towns.traffic.scripted_actors import FIRST_TRACK_ID
 from foredrive.towns.world import World
 
 FIRST_M, CLEAR_OF_END_M = 28.0, 8.0
@@ -57,7 +57,7 @@ def possible_scenarios(route: DriveRoute, world: World, rng: np.random.Generator
     Places and kinds of crossings are drawn at random.
     """
     graph = build_lane_graph(world.town)
-    ground = Ground(route, graph, near_lanes_of(graph), world)
+    ground = Ground(route, graph, build_lane_index(graph), world)
     stretches = stretches_of(ground)
     possible = [*at_junctions(ground, stretches), *_on_stretches(ground, stretches, rng)]
     possible += beside_parked(ground)
@@ -143,6 +143,6 @@ def _lead_and_cut_in(ground: Ground, stretch: Stretch) -> Iterator[Scenario]:
         beside = int(graph.sides.lane[side, lane])
         if beside < 0 or not graph.may_cross[1 - side, beside] or graph.contested[beside]:
             continue
-        meet_m = float(abreast(lane, leg.to_m, 1 if side == 0 else -1, graph.sides))
+        meet_m = float(project_to_neighbour(lane, leg.to_m, 1 if side == 0 else -1, graph.sides))
         way = Way((beside, *onward(graph, beside)), meet_m)
         yield Scenario(ScenarioKind.CUT_IN, to_m, limit, ways=(way,), side=1 - side)

@@ -35,7 +35,7 @@ class Director:
         All crossing road users wait at their places, and the vehicles of a near scenario are on the road.
         """
         play = Play(pace_mps=(0.0,) * len(self._strays))
-        state = dataclasses.replace(state, strays=self._strays)
+        state = dataclasses.replace(state, scripted_actors=self._strays)
         play, state, _ = self.direct(play, state, ego, dt_s, at_start=True)
         return play, state
 
@@ -55,11 +55,11 @@ class Director:
                 scene = Scene(self._traffic, scenario, play, state, ego, orders)
                 scene = act(scene if play.cast else call(scene, at_start), dt_s)
                 play, state, orders = scene.play, scene.state, scene.orders
-        return play, state, dataclasses.replace(orders, pace_mps=self._paces(play, state, ego))
+        return play, state, dataclasses.replace(orders, scripted_mps=self._paces(play, state, ego))
 
     def _cross(self, play: Play, scenario: Scenario, state: TrafficState, ego: Ego) -> Play:
         index = self._numbers.index(play.number)
-        stray = state.strays[index]
+        stray = state.scripted_actors[index]
         if ego.front_gap_m(scenario.at_m) < -PASSED_M or stray.s_m >= stray.length_m:
             return play.after()
         pace = pace_to_begin(scenario, stray, ego) if play.since_s is None else None
@@ -71,7 +71,7 @@ class Director:
     def _paces(self, play: Play, state: TrafficState, ego: Ego) -> tuple[float, ...]:
         """Return the current speed of each stray, m/s."""
         begun, paces, boxes = dict(play.begun), list(play.pace_mps), None
-        for index, (number, stray) in enumerate(zip(self._numbers, state.strays, strict=True)):
+        for index, (number, stray) in enumerate(zip(self._numbers, state.scripted_actors, strict=True)):
             if paces[index] == 0.0 or stray.s_m >= stray.length_m:
                 continue
             boxes = boxes or vehicle_boxes(self._traffic, state, ego)

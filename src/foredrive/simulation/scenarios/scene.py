@@ -142,4 +142,4 @@ class Scene(NamedTuple):
     def towards_mps(self, slot: int, wanted_mps: float) -> None:
         """Order a vehicle to drive no faster than a speed, reached within `SOON_S`."""
         wanted = (wanted_mps - self.speed_mps(slot)) / SOON_S
-        self.orders.most_mps2[slot] = min(max(wanted, -TO_SPEED_MPS2), TO_SPEED_MPS2)
+        self.orders.max_mps2[slot] = min(max(wanted, -TO_SPEED_MPS2), TO_SPEED_MPS2)

@@ -9,8 +9,8 @@ from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
 from foredrive.simulation.scenarios.kinematics import SPARE_M, cruise_mps
 from foredrive.simulation.scenarios.scene import Ego
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
+from foredrive.towns.traffic.scripted_actors import ACCELERATION_MPS2, ScriptedActor
 from foredrive.towns.traffic.state import TrafficState
-from foredrive.towns.traffic.strays import ACCELERATION_MPS2, Stray
 from foredrive.towns.traffic.traffic import Traffic
 
 SLOWEST_EGO_MPS = 1.5
@@ -29,7 +29,7 @@ BACK_MPS = -0.8
 BESIDE_M = 0.4
 
 
-def pace_to_begin(scenario: Scenario, stray: Stray, ego: Ego) -> float | None:
+def pace_to_begin(scenario: Scenario, stray: ScriptedActor, ego: Ego) -> float | None:
     """Return the speed at which a stray starts now to meet the ego vehicle, m/s.
 
     Returns None if it is too early, or no longer fair.
@@ -49,13 +49,13 @@ def pace_to_begin(scenario: Scenario, stray: Stray, ego: Ego) -> float | None:
     return min(max(pace, SLOWEST_MPS), FASTEST_MPS[stray.category])
 
 
-def is_on_the_spot(scenario: Scenario, stray: Stray, since_s: float) -> bool:
+def is_on_the_spot(scenario: Scenario, stray: ScriptedActor, since_s: float) -> bool:
     """Return whether a stray waits where it is: a pedestrian that has stepped out before a parked car."""
     waits = scenario.kind is ScenarioKind.DOOR_ZONE and since_s < STAYS_S
     return waits and stray.s_m >= scenario.meet_m - NEARLY_M
 
 
-def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
+def walks_into(stray: ScriptedActor, pace_mps: float, others: MovingBoxes) -> bool:
     """Return whether a stray that goes on hits a vehicle that it would not hit if it stood still."""
     to_go_m = stray.length_m - stray.s_m if pace_mps > 0 else stray.s_m
     left_s = to_go_m / abs(pace_mps)
@@ -64,7 +64,7 @@ def walks_into(stray: Stray, pace_mps: float, others: MovingBoxes) -> bool:
     return bool(goes < min(left_s, SAFE_S) and stands > goes)
 
 
-def pace_among(stray: Stray, pace_mps: float, others: MovingBoxes) -> float:
+def pace_among(stray: ScriptedActor, pace_mps: float, others: MovingBoxes) -> float:
     """Return the speed of a stray among vehicles, m/s.
 
     It waits for vehicles that approach, and steps back from vehicles that block its way.
@@ -91,7 +91,7 @@ def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxe
     return MovingBoxes(*(np.concatenate(pair) for pair in zip(boxes, own, strict=True)))
 
 
-def _box(stray: Stray, pace_mps: float) -> MovingBoxes:
+def _box(stray: ScriptedActor, pace_mps: float) -> MovingBoxes:
     size = stray.size_lwh[:2] + 2 * BESIDE_M
     velocity = pace_mps * stray.ahead
     return MovingBoxes(stray.xyz[None, :2], size[None], np.array([stray.yaw_rad]), velocity[None])

@@ -14,7 +14,7 @@ from foredrive.towns.conditions import Conditions
 from foredrive.towns.labels.captions import SEEN, Situation, Thing
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
-from foredrive.towns.traffic.expert import Moment
+from foredrive.towns.traffic.expert import DriveSnapshot
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.routes import Route
@@ -97,7 +97,7 @@ class Narrator:
 
     def situation(
         self,
-        moment: Moment,
+        moment: DriveSnapshot,
         actors: Sequence[ActorState],
         visibility: Float[np.ndarray, "M"],
         sees: Callable[[Float64[np.ndarray, "3"]], bool],
@@ -159,17 +159,19 @@ class Narrator:
         best = int(np.where(candidate, ahead_m, np.inf).argmin())
         return actors[best], float(ahead_m[best])
 
-    def _aside_speed(self, moment: Moment) -> float:
+    def _aside_speed(self, moment: DriveSnapshot) -> float:
         """Return the speed of the vehicle to the left of its route, m/s; 0 at the first moment."""
         before, self._aside = self._aside, (moment.t_s, self._aside_m(moment))
         return 0.0 if before is None else (self._aside[1] - before[1]) / (moment.t_s - before[0])
 
-    def _aside_m(self, moment: Moment) -> float:
+    def _aside_m(self, moment: DriveSnapshot) -> float:
         k = min(self._passed, len(self._line) - 2)
         ahead, offset = self._line[k + 1] - self._line[k], moment.T_world_ego[:3, 3] - self._line[k]
         return float(ahead[0] * offset[1] - ahead[1] * offset[0]) / float(np.hypot(*ahead[:2]))
 
-    def _doing(self, moment: Moment, leader: ActorState | None, gap_m: float, aside_mps: float) -> Doing:
+    def _doing(
+        self, moment: DriveSnapshot, leader: ActorState | None, gap_m: float, aside_mps: float
+    ) -> Doing:
         speed, turn_rate = float(moment.twist_ego[0]), float(moment.twist_ego[5])
         if speed < STANDING_MPS:
             return Doing.WAITS
@@ -188,7 +190,7 @@ class Narrator:
 
     def _light(
         self,
-        moment: Moment,
+        moment: DriveSnapshot,
         T_ego_world: Float64[np.ndarray, "4 4"],
         sees: Callable[[Float64[np.ndarray, "3"]], bool],
     ) -> LightColour | None:

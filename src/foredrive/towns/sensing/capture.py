@@ -109,7 +109,7 @@ class EgoMotion:
 
 
 @dataclass(frozen=True)
-class Moment:
+class DriveSnapshot:
     """A town with its road users at their positions at one time, and their motion around that time."""
 
     scene: shading.Scene
@@ -213,7 +213,7 @@ class Film:
 
 
 def see(
-    moment: Moment, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
+    moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
     """Render images of all cameras.
 
@@ -231,7 +231,7 @@ def see(
     return film.develop(rng).reshape(*shape, 3), seen
 
 
-def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+def _see_sharp(moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
     """Render one ray per pixel, then several rays for pixels on outlines."""
     count, samples = len(seen.look), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
@@ -268,7 +268,7 @@ def _see_sharp(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film,
     in_parallel(closer_look, len(pixels), PIXEL_GRAIN // samples)
 
 
-def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+def _see_blurred(moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
     """Render the mean of the light at several instants, each through a different part of the pixel."""
     optics, samples = sensors.optics, sensors.samples_per_outline_pixel
 
@@ -291,7 +291,7 @@ def _see_blurred(moment: Moment, sensors: SensorSuite, ego: EgoMotion, film: Fil
 
 
 def sweep(
-    moment: Moment, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
+    moment: DriveSnapshot, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
 ) -> tuple[LidarSweep, Seen]:
     """Simulate one revolution of the lidar, and return the sweep and the hits of its beams.
 

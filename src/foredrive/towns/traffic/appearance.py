@@ -6,7 +6,7 @@ from jaxtyping import Bool
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.traffic.pedestrians import Pedestrians
-from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.scripted_actors import ScriptedActor
 from foredrive.towns.traffic.vehicles import MOTION_S, Poses, Vehicles
 
 BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
@@ -61,16 +61,16 @@ def people_actors(p: Pedestrians) -> list[ActorState]:
     ]
 
 
-def stray_actor(stray: Stray) -> ActorState:
-    """Return the actor of a stray."""
+def scripted_actor_state(actor: ScriptedActor) -> ActorState:
+    """Return the state of a scripted actor for the renderer."""
     return ActorState(
-        track_id=stray.track_id,
-        category=stray.category,
-        centre_m=stray.xyz + np.array([0.0, 0.0, 0.5 * stray.size_lwh[2]]),
-        yaw=stray.yaw_rad,
+        track_id=actor.track_id,
+        category=actor.category,
+        centre_m=actor.xyz + np.array([0.0, 0.0, 0.5 * actor.size_lwh[2]]),
+        yaw=actor.yaw_rad,
         pitch=0.0,
-        size_lwh=stray.size_lwh,
-        velocity_mps=np.append(stray.speed_mps * stray.ahead, 0.0),
-        style=stray.style,
+        size_lwh=actor.size_lwh,
+        velocity_mps=np.append(actor.speed_mps * actor.ahead, 0.0),
+        style=actor.style,
         parked=False,
     )

@@ -5,7 +5,7 @@ from jaxtyping import Float64
 
 EXPONENT = 4.0
 SLOWING_TIME_S = 0.5
-HARDEST_BRAKING_MPS2 = 8.0
+MAX_BRAKING_MPS2 = 8.0
 JERK_UP_MPS3 = 3.0
 JERK_DOWN_MPS3 = 5.0
 JERK_EMERGENCY_MPS3 = 40.0
@@ -18,7 +18,7 @@ EMERGENCY_MPS2 = 3.5
 
 def free_acceleration(
     speed_mps: Float64[np.ndarray, "*n"],
-    wanted_mps: Float64[np.ndarray, "*n"],
+    desired_mps: Float64[np.ndarray, "*n"],
     accel_mps2: Float64[np.ndarray, "*n"],
     decel_mps2: Float64[np.ndarray, "*n"],
 ) -> Float64[np.ndarray, "*n"]:
@@ -29,10 +29,10 @@ def free_acceleration(
     twice the comfortable deceleration, because the wanted speed falls before curves and drivers have to
     follow it.
     """
-    wanted = np.maximum(wanted_mps, 0.1)
-    below = accel_mps2 * (1 - (np.minimum(speed_mps, wanted) / wanted) ** EXPONENT)
-    above = -np.minimum((speed_mps - wanted) / SLOWING_TIME_S, 2 * decel_mps2)
-    return np.where(speed_mps <= wanted, below, above)
+    desired = np.maximum(desired_mps, 0.1)
+    below = accel_mps2 * (1 - (np.minimum(speed_mps, desired) / desired) ** EXPONENT)
+    above = -np.minimum((speed_mps - desired) / SLOWING_TIME_S, 2 * decel_mps2)
+    return np.where(speed_mps <= desired, below, above)
 
 
 def follow_acceleration(
@@ -58,8 +58,8 @@ def follow_acceleration(
     dynamic = speed_mps * time_gap_s + speed_mps * closing_mps / (2 * np.sqrt(accel_mps2 * decel_mps2))
     z = (standstill_m + np.maximum(0.0, dynamic)) / np.maximum(gap_m, 0.05)
     eager = np.maximum(free_mps2, 1e-3)
-    too_near = accel_mps2 * (1 - z**2)
+    closer = accel_mps2 * (1 - z**2)
     closing_in = free_mps2 * (1 - np.minimum(z, 1) ** (2 * accel_mps2 / eager))
-    below_wanted = np.where(z >= 1, too_near, closing_in)
-    above_wanted = np.where(z >= 1, free_mps2 + too_near, free_mps2)
+    below_wanted = np.where(z >= 1, closer, closing_in)
+    above_wanted = np.where(z >= 1, free_mps2 + closer, free_mps2)
     return np.where(free_mps2 > 0, below_wanted, above_wanted)

@@ -16,10 +16,10 @@ LATERAL_MPS2 = 2.0
 """Comfortable lateral acceleration in curves, m/s²."""
 SLOWING_MPS2 = 1.5
 """Comfortable deceleration before a curve or a lower limit, m/s²."""
-ASIDE_M = 0.02
+MIN_OFFSET_M = 0.02
 
 
-def joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
+def join_centrelines(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray, "_ 3"]]:
     """Return centrelines without gaps: each begins where the last lane ends and ends where the next lane
     begins.
 
@@ -27,26 +27,26 @@ def joined(lanes: list[Lane], index: dict[str, int]) -> list[Float64[np.ndarray,
     """
     lines = [lane.centreline_xyz for lane in lanes]
     for i, lane in enumerate(lanes):
-        lines[i] = _led_over(lines[i], [lines[index[name]][0] for name in lane.successor_ids])
+        lines[i] = _bent_to(lines[i], [lines[index[name]][0] for name in lane.successor_ids])
     for i, lane in enumerate(lanes):
-        lines[i] = _led_over(lines[i][::-1], [lines[index[name]][-1] for name in lane.predecessor_ids])[::-1]
+        lines[i] = _bent_to(lines[i][::-1], [lines[index[name]][-1] for name in lane.predecessor_ids])[::-1]
     return lines
 
 
-def _led_over(
+def _bent_to(
     line: Float64[np.ndarray, "n 3"], beginnings: list[Float64[np.ndarray, "3"]]
 ) -> Float64[np.ndarray, "_ 3"]:
     """Bend a line so that it ends in the nearest of some points."""
-    aside = min((begin - line[-1] for begin in beginnings), key=np.linalg.norm, default=np.zeros(3))
-    if np.linalg.norm(aside) < ASIDE_M:
+    offset = min((begin - line[-1] for begin in beginnings), key=np.linalg.norm, default=np.zeros(3))
+    if np.linalg.norm(offset) < MIN_OFFSET_M:
         return line
     x = np.linspace(0.0, 1.0, 2 * len(line))[:, None]
     every = np.linspace(0.0, len(line) - 1.0, len(x))
     fine = np.stack([np.interp(every, np.arange(len(line)), c) for c in line.T], axis=1)
-    return fine + x**3 * (10 - 15 * x + 6 * x**2) * aside
+    return fine + x**3 * (10 - 15 * x + 6 * x**2) * offset
 
 
-def resampled(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
+def resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
     """Sample a line evenly, at most `SAMPLE_M` apart, and smooth it. Its ends do not move."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
@@ -65,7 +65,7 @@ def headings(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "_"]:
     return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
 
 
-def bends(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+def curvatures(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
     """Return the curvature at each sample, 1/m, averaged over some metres because the maps' polylines have
     corners."""
     if len(line) < 3:
@@ -77,11 +77,11 @@ def bends(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
 
 
 def speed_profile(
-    bend: Float64[np.ndarray, "n"], limit_mps: Float64[np.ndarray, "n"], length_m: float
+    curvature: Float64[np.ndarray, "n"], limit_mps: Float64[np.ndarray, "n"], length_m: float
 ) -> Float64[np.ndarray, "n"]:
     """Return the driving speed at each sample, m/s: v² ≤ a_lateral / |curvature|, then v² ≤ v_next² + 2 b ds
     backwards."""
-    step_m = length_m / (len(bend) - 1)
-    square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(bend).clip(1e-6))
-    to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(bend))
+    step_m = length_m / (len(curvature) - 1)
+    square = np.minimum(limit_mps**2, LATERAL_MPS2 / np.abs(curvature).clip(1e-6))
+    to_end = 2 * SLOWING_MPS2 * step_m * np.arange(len(curvature))
     return np.sqrt(np.minimum.accumulate((square + to_end)[::-1])[::-1] - to_end)

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.towns.actors import ActorState
-from foredrive.towns.traffic.fleet import Starts, ego_vehicle
+from foredrive.towns.traffic.fleet import StartPoints, ego_vehicle
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.recovery import Sway, step_sway
+from foredrive.towns.traffic.recovery import PathDeviation, step_deviation
 from foredrive.towns.traffic.routes import Route, draw_route
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import (
@@ -30,17 +30,17 @@ from foredrive.towns.traffic.vehicles import (
     vehicle_poses,
 )
 
-LONGEST_STEP_S = 0.1
+MAX_STEP_S = 0.1
 SETTLE_S = 6.0
-LONGEST_SETTLE_S = 30.0
+MAX_SETTLE_S = 30.0
 MOVING_MPS = 3.0
 """Conditions for the start of a drive: traffic has left its unrealistic initial state, and the ego vehicle
 moves."""
-BEYOND_M = 60.0
+ROUTE_MARGIN_M = 60.0
 
 
 @dataclass(frozen=True)
-class Moment:
+class DriveSnapshot:
     """The state of the world at one time of a drive."""
 
     t_s: float
@@ -59,7 +59,7 @@ class Moment:
     """`Light` of each of the town's stop zones."""
 
 
-class Drive:
+class ExpertDrive:
     """One drive of the expert in one town: a route and the moments along it.
 
     `state` is the present traffic.
@@ -83,38 +83,40 @@ class Drive:
         ego = ego_vehicle(traffic.lanes, first, start_m)
         self.state = traffic.start(ego, self._planned.lanes)
         while not self._is_settled():
-            self.state = traffic.step(self.state, LONGEST_STEP_S)
+            self.state = traffic.step(self.state, MAX_STEP_S)
         self.route, self._passed = self._remaining(), self.state.route_passed
-        self._steering_noise, self._sway = steering_noise, Sway()
+        self._steering_noise, self._deviation = steering_noise, PathDeviation()
         self._rng = np.random.default_rng((traffic.seed, 4))
 
-    def moments(self, count: int, dt_s: float) -> Iterator[Moment]:
+    def snapshots(self, count: int, dt_s: float) -> Iterator[DriveSnapshot]:
         """Yield `count` moments of the drive, `dt_s` apart."""
-        steps = max(1, int(np.ceil(dt_s / LONGEST_STEP_S - 1e-9)))
+        steps = max(1, int(np.ceil(dt_s / MAX_STEP_S - 1e-9)))
         for index in range(count):
             if index:
                 for _ in range(steps):
                     self.step(dt_s / steps)
-            yield self._moment(index * dt_s)
+            yield self._snapshot(index * dt_s)
 
     def step(self, dt_s: float) -> None:
-        """Drive on for at most `LONGEST_STEP_S`."""
+        """Drive on for at most `MAX_STEP_S`."""
         self.state = self._traffic.step(self.state, dt_s)
         if self._steering_noise > 0:
             speed, wheelbase = (float(x[0]) for x in (self._ego.speed_mps, self._ego.wheelbase_m))
-            self._sway = step_sway(self._sway, speed, wheelbase, self._steering_noise, dt_s, self._rng)
+            self._deviation = step_deviation(
+                self._deviation, speed, wheelbase, self._steering_noise, dt_s, self._rng
+            )
 
     def poses(self) -> Poses:
         """Return the poses of all vehicles of `state`, with the steering disturbance applied to the ego
         vehicle."""
         poses, ego = self._traffic.poses(self.state), self._ego
-        T_world_ego = _axle_pose(poses) @ _beside(self._sway)
+        T_world_ego = _axle_pose(poses) @ _T_path_ego(self._deviation)
         to_centre_ego = [float(ego.axle_to_centre_m[0]), 0.0, 0.5 * ego.size_lwh[0, 2], 1.0]
         poses.axle_xyz[0], poses.forward[0] = T_world_ego[:3, 3], T_world_ego[:3, 0]
         poses.centre_m[0] = T_world_ego[:3] @ to_centre_ego
         return poses
 
-    def commands_met(self) -> list[Command]:
+    def driven_commands(self) -> list[Command]:
         """Return the commands at the forks that were passed since the drive began."""
         return self.route.commands_on(self._traffic.lanes, 0, self.state.route_passed - self._passed)
 
@@ -124,7 +126,7 @@ class Drive:
 
     def _is_settled(self) -> bool:
         moving = self.state.vehicles.speed_mps[0] > MOVING_MPS
-        return self.state.time_s > (SETTLE_S if moving else LONGEST_SETTLE_S)
+        return self.state.time_s > (SETTLE_S if moving else MAX_SETTLE_S)
 
     def _remaining(self) -> Route:
         """Return the route from the present position of the ego vehicle."""
@@ -137,11 +139,11 @@ class Drive:
     def _is_on_route(self) -> bool:
         return bool(self.state.vehicles.lane[0] == self._planned.lanes[self.state.route_passed])
 
-    def _moment(self, t_s: float) -> Moment:
+    def _snapshot(self, t_s: float) -> DriveSnapshot:
         ego = self._ego
-        T_world_ego = _axle_pose(vehicle_poses(self._traffic.lanes, ego)) @ _beside(self._sway)
+        T_world_ego = _axle_pose(vehicle_poses(self._traffic.lanes, ego)) @ _T_path_ego(self._deviation)
         twist = self._twist(T_world_ego)
-        return Moment(
+        return DriveSnapshot(
             t_s=t_s,
             T_world_ego=T_world_ego,
             twist_ego=twist,
@@ -156,23 +158,23 @@ class Drive:
         if half_m == 0:
             return np.zeros(6)
         paths = zip(motion(self._traffic.lanes, self._ego), (-half_m, half_m), strict=True)
-        before, after = (_axle_pose(poses) @ _beside(self._sway.moved(d)) for poses, d in paths)
+        before, after = (_axle_pose(poses) @ _T_path_ego(self._deviation.moved(d)) for poses, d in paths)
         moved_ego = T_world_ego[:3, :3].T @ (after[:3, 3] - before[:3, 3])
         turned = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
         return np.concatenate([moved_ego, turned]) / MOTION_S
 
 
-def plan_route(lanes: LaneGraph, starts: Starts, seed: int, seconds: float) -> Route:
+def plan_route(lanes: LaneGraph, starts: StartPoints, seed: int, seconds: float) -> Route:
     """Plan the route of a drive. It depends on the arguments alone."""
     rng = np.random.default_rng((seed, 3))
-    fastest_m = lanes.limit_mps.max() * (seconds + LONGEST_SETTLE_S) + BEYOND_M
-    return draw_route(lanes, starts, rng, fastest_m, SETTLE_S, SETTLE_S + seconds)
+    max_length_m = lanes.limit_mps.max() * (seconds + MAX_SETTLE_S) + ROUTE_MARGIN_M
+    return draw_route(lanes, starts, rng, max_length_m, SETTLE_S, SETTLE_S + seconds)
 
 
-def _beside(sway: Sway) -> Float64[np.ndarray, "4 4"]:
+def _T_path_ego(deviation: PathDeviation) -> Float64[np.ndarray, "4 4"]:
     """Return the pose of the ego frame in the frame of the path."""
-    T, cos, sin = np.eye(4), np.cos(sway.yaw_rad), np.sin(sway.yaw_rad)
-    T[:2, :2], T[1, 3] = [[cos, -sin], [sin, cos]], sway.aside_m
+    T, cos, sin = np.eye(4), np.cos(deviation.yaw_rad), np.sin(deviation.yaw_rad)
+    T[:2, :2], T[1, 3] = [[cos, -sin], [sin, cos]], deviation.lateral_m
     return T
 
 

@@ -20,13 +20,13 @@ BRAKING_MPS2 = 2.0
 
 
 @dataclass(frozen=True)
-class Kind:
+class VehicleKind:
     """A kind of vehicle. Sizes and top speeds are drawn uniformly from their ranges."""
 
     category: Category
     share: float
-    smallest_lwh: tuple[float, float, float]
-    largest_lwh: tuple[float, float, float]
+    min_lwh: tuple[float, float, float]
+    max_lwh: tuple[float, float, float]
     accel_mps2: float
     decel_mps2: float
     wheelbase: float = 0.6
@@ -34,18 +34,40 @@ class Kind:
     top_speed_mps: tuple[float, float] = (36.0, 44.0)
     is_large: bool = False
     """Whether it keeps to lanes without tight curves."""
-    aside_m: float = 0.0
+    right_m: float = 0.0
     """Offset to the right of the centreline, m."""
 
 
-_HEAVY_MPS = (22.0, 24.0)
+HEAVY_MPS = (22.0, 24.0)
 KINDS = (
-    Kind(Category.CAR, 0.64, (3.9, 1.7, 1.4), (4.9, 1.9, 1.7), 1.6, 1.9),
-    Kind(Category.CAR, 0.12, (5.1, 1.95, 2.0), (5.9, 2.05, 2.5), 1.4, 1.8),
-    Kind(Category.TRUCK, 0.07, (6.5, 2.3, 2.8), (8.0, 2.45, 3.3), 1.0, 1.6, 0.55, _HEAVY_MPS, is_large=True),
-    Kind(Category.BUS, 0.04, (9.0, 2.4, 2.9), (10.5, 2.5, 3.2), 1.0, 1.5, 0.52, _HEAVY_MPS, is_large=True),
-    Kind(Category.MOTORCYCLE, 0.06, (2.0, 0.7, 1.4), (2.2, 0.85, 1.6), 2.0, 2.0, 0.65),
-    Kind(Category.BICYCLE, 0.07, (1.65, 0.55, 1.6), (1.85, 0.7, 1.8), 1.0, 1.8, 0.6, (4.5, 7.0), aside_m=0.9),
+    VehicleKind(Category.CAR, 0.64, (3.9, 1.7, 1.4), (4.9, 1.9, 1.7), 1.6, 1.9),
+    VehicleKind(Category.CAR, 0.12, (5.1, 1.95, 2.0), (5.9, 2.05, 2.5), 1.4, 1.8),
+    VehicleKind(
+        Category.TRUCK,
+        0.07,
+        (6.5, 2.3, 2.8),
+        (8.0, 2.45, 3.3),
+        1.0,
+        1.6,
+        0.55,
+        HEAVY_MPS,
+        is_large=True,
+    ),
+    VehicleKind(
+        Category.BUS,
+        0.04,
+        (9.0, 2.4, 2.9),
+        (10.5, 2.5, 3.2),
+        1.0,
+        1.5,
+        0.52,
+        HEAVY_MPS,
+        is_large=True,
+    ),
+    VehicleKind(Category.MOTORCYCLE, 0.06, (2.0, 0.7, 1.4), (2.2, 0.85, 1.6), 2.0, 2.0, 0.65),
+    VehicleKind(
+        Category.BICYCLE, 0.07, (1.65, 0.55, 1.6), (1.85, 0.7, 1.8), 1.0, 1.8, 0.6, (4.5, 7.0), right_m=0.9
+    ),
 )
 """Cars, vans, trucks, buses, motorcycles and bicycles with their riders. Accelerations are those of city
 drivers (Treiber & Kesting 2013, table 11.2 gives 1.0 and 1.5 m/s²), slightly higher for cars."""
@@ -68,12 +90,12 @@ def draw_fleet(
     weight = share * (for_large[:, None] | ~large) * (for_bicycles[:, None] | ~bicycle)
     cumulated = np.cumsum(weight, axis=1)
     kinds = np.argmax(cumulated > rng.random((count, 1)) * cumulated[:, -1:], axis=1)
-    low = np.array([[*kind.smallest_lwh, kind.top_speed_mps[0]] for kind in KINDS])[kinds]
-    high = np.array([[*kind.largest_lwh, kind.top_speed_mps[1]] for kind in KINDS])[kinds]
+    low = np.array([[*kind.min_lwh, kind.top_speed_mps[0]] for kind in KINDS])[kinds]
+    high = np.array([[*kind.max_lwh, kind.top_speed_mps[1]] for kind in KINDS])[kinds]
     u = np.repeat(rng.random((count, 2)), [3, 1], axis=1)  # long vehicles are also wide and high
     drawn = low + u * (high - low)
     wheelbase = np.array([kind.wheelbase for kind in KINDS])[kinds] * drawn[:, 0]
-    aside = np.array([kind.aside_m for kind in KINDS])[kinds]
+    right_m = np.array([kind.right_m for kind in KINDS])[kinds]
     empty = empty_slots(count)
     return Vehicles(
         **{
@@ -85,9 +107,9 @@ def draw_fleet(
             "size_lwh": drawn[:, :3],
             "wheelbase_m": wheelbase,
             "axle_to_centre_m": 0.5 * wheelbase,
-            "lateral_m": np.clip(rng.normal(0.0, 0.1, count), -0.2, 0.2) - aside,
+            "lateral_m": np.clip(rng.normal(0.0, 0.1, count), -0.2, 0.2) - right_m,
             "top_speed_mps": drawn[:, 3],
-            "haste": rng.uniform(0.82, 1.0, count),
+            "speed_factor": rng.uniform(0.82, 1.0, count),
             "time_gap_s": rng.uniform(1.0, 1.6, count),
             "accel_mps2": np.array([kind.accel_mps2 for kind in KINDS])[kinds]
             * rng.uniform(0.85, 1.15, count),
@@ -103,7 +125,7 @@ def is_large(vehicles: Vehicles) -> Bool[np.ndarray, "N"]:
 
 
 @dataclass(frozen=True)
-class Starts:
+class StartPoints:
     """Points of lanes outside junctions where a vehicle may start."""
 
     lane: Int[np.ndarray, "K"]
@@ -112,7 +134,7 @@ class Starts:
     forward: Float64[np.ndarray, "K 3"]
 
 
-def find_starts(graph: LaneGraph) -> Starts:
+def find_start_points(graph: LaneGraph) -> StartPoints:
     """Find all starts of a town, `START_SPACING_M` apart."""
     lanes, along = [], []
     for lane in np.flatnonzero((graph.junction < 0) & ~graph.contested):
@@ -122,10 +144,10 @@ def find_starts(graph: LaneGraph) -> Starts:
     at_lane, at_m = np.concatenate(lanes), np.concatenate(along)
     xyz = graph.position(at_lane, at_m)
     ahead = graph.position(at_lane, at_m + 1.0) - xyz
-    return Starts(at_lane, at_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+    return StartPoints(at_lane, at_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
 
 
-def place(
+def place_vehicles(
     graph: LaneGraph, vehicles: Vehicles, lane: Int[np.ndarray, "k"], s_m: Float64[np.ndarray, "k"]
 ) -> Vehicles:
     """Place vehicles on lanes at the driving speed, but slow enough to stop at the end of the lane.
@@ -137,7 +159,7 @@ def place(
     for column in range(BEHIND - 1, -1, -1):
         path[:, column] = np.where(path[:, column + 1] >= 0, graph.predecessors[path[:, column + 1], 0], -1)
     to_end = np.maximum(graph.length_m[lane] - s_m - 0.5 * vehicles.size_lwh[:, 0] - 2.0, 0.0)
-    speed = vehicles.haste * np.minimum(graph.speed(lane, s_m), vehicles.top_speed_mps)
+    speed = vehicles.speed_factor * np.minimum(graph.speed(lane, s_m), vehicles.top_speed_mps)
     speed = np.minimum(speed, np.sqrt(2 * BRAKING_MPS2 * to_end))
     return Vehicles(**{**vars(vehicles), "path": path, "s_m": s_m.astype(np.float64), "speed_mps": speed})
 
@@ -152,9 +174,9 @@ def ego_vehicle(graph: LaneGraph, lane: Int[np.ndarray, "1"], s_m: Float64[np.nd
         wheelbase_m=np.array([EGO_VEHICLE.wheel_base]),
         axle_to_centre_m=np.array([EGO_VEHICLE.rear_axle_to_center_longitudinal]),
         top_speed_mps=np.array([30.0]),
-        haste=np.array([0.97]),
+        speed_factor=np.array([0.97]),
         time_gap_s=np.array([1.4]),
         accel_mps2=np.array([1.5]),
         decel_mps2=np.array([1.8]),
     )
-    return place(graph, driver, lane, s_m)
+    return place_vehicles(graph, driver, lane, s_m)

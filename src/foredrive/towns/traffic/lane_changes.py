@@ -8,9 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.traffic.car_following import free_acceleration
-from foredrive.towns.traffic.drivers import Situation, behind
+from foredrive.towns.traffic.drivers import DrivingContext, following_acceleration
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
-from foredrive.towns.traffic.leaders import LOOK_M, Ahead, abreast, lane_beside, link_occupants, motion_of
+from foredrive.towns.traffic.leaders import (
+    LOOKAHEAD_M,
+    Leaders,
+    link_occupants,
+    motion_arrays,
+    neighbour_lane,
+    project_to_neighbour,
+)
 from foredrive.towns.traffic.vehicles import BEHIND, CLEAR_OF_LANE, WINDOW, Vehicles, path_starts
 
 LEFT, RIGHT = 0, 1
@@ -20,7 +27,7 @@ SAFE_BRAKING_MPS2 = 3.0
 KEEP_RIGHT_MPS2 = 0.3
 """Bias on motorways for the right lane and against the left lane, m/s²."""
 CHANGE_S = 3.5
-SHORTEST_CHANGE_M = 16.0
+MIN_CHANGE_M = 16.0
 STOPPING_MPS2 = 2.5
 """Deceleration of a gentle stop, m/s². A vehicle that need not change lanes does so only where there is room
 for such a stop afterwards."""
@@ -32,23 +39,22 @@ STANDS_MPS = 0.5
 COURTEOUS_GAP_M = 1.0
 """Additional gap to the vehicle that is let in, m, compared with the gap to a leader in the driver's own
 lane."""
-SETTLED_M = 60.0
+CHANGE_SPACING_M = 60.0
 """Minimum distance between two lane changes, m, unless a vehicle has to change."""
-LONGEST_STRETCH_M = 600.0
+MAX_ROOM_M = 600.0
 URGENT_S = 12.0
-"""Time before the end of a lane, in addition to `SETTLED_M`, at which a vehicle that has to leave it wants to
-do so, s."""
-HAS_TO_MPS2 = 4.0
-LIKES_TO_MPS2 = 0.5
-"""Value of being in the lane of the route, m/s²: towards the lane's end, and far from it."""
+"""Time before the end of a lane, in addition to `CHANGE_SPACING_M`, at which a mandatory change begins, s."""
+MANDATORY_MPS2 = 4.0
+DISCRETIONARY_MPS2 = 0.5
+"""Bonus of the lane of the route, m/s²: towards the lane's end, and far from it."""
 FLAT_M = 0.3
 """Height difference above which lanes are not side by side, m."""
-TIGHTEST_M = 30.0
+MIN_RADIUS_M = 30.0
 """Smallest radius of the two lanes of a lane change, m. In tighter curves neighbouring lanes differ in
 length."""
 
 
-class Stretches(NamedTuple):
+class ChangeRanges(NamedTuple):
     """For the left and the right side of L lanes, the distance in which a lane change is possible."""
 
     target: Int[np.ndarray, "2 L"]
@@ -56,11 +62,11 @@ class Stretches(NamedTuple):
     room_m: Float64[np.ndarray, "2 L"]
     """Distance from the start of the lane to the last possible change, m, across the ends of lanes; 0 if none
     is possible."""
-    goes_back: Bool[np.ndarray, "2 L"]
+    continues: Bool[np.ndarray, "2 L"]
     """Whether the two lanes continue two other lanes that lie side by side."""
 
 
-class Gaps(NamedTuple):
+class LaneGaps(NamedTuple):
     """The vehicles ahead and behind that N vehicles would have in another lane (-1 for none), and the gaps,
     m."""
 
@@ -70,7 +76,7 @@ class Gaps(NamedTuple):
     follower_gap_m: Float64[np.ndarray, "N"]
 
 
-def find_stretches(graph: LaneGraph) -> Stretches:
+def find_change_ranges(graph: LaneGraph) -> ChangeRanges:
     """Find where lane changes are possible.
 
     They are possible outside of junctions and tight curves, over lines that may be crossed, with room to
@@ -78,11 +84,11 @@ def find_stretches(graph: LaneGraph) -> Stretches:
     """
     sides = graph.sides.lane
     level = np.abs(graph.xyz[graph.first, 2] - graph.xyz[graph.first[sides], 2]) < FLAT_M
-    possible = ~graph.contested & (graph.tightest_m >= TIGHTEST_M)
+    possible = ~graph.contested & (graph.min_radius_m >= MIN_RADIUS_M)
     open_to = graph.may_cross & (sides >= 0) & possible & possible[sides] & level
     target = np.where(open_to, sides, -1)
     room = np.where(open_to, graph.length_m, 0.0)
-    goes_back = np.zeros(room.shape, dtype=np.bool_)
+    continues = np.zeros(room.shape, dtype=np.bool_)
     pairs = [
         (side, lane, after)
         for side, lane in np.argwhere(open_to).tolist()
@@ -90,29 +96,29 @@ def find_stretches(graph: LaneGraph) -> Stretches:
         if open_to[side, after] and target[side, after] in graph.successors[target[side, lane]]
     ]
     for side, _, after in pairs:
-        goes_back[side, after] = True
+        continues[side, after] = True
     changed = True
     while changed:
         changed = False
         for side, lane, after in pairs:
-            longer = min(graph.length_m[lane] + room[side, after], LONGEST_STRETCH_M)
+            longer = min(graph.length_m[lane] + room[side, after], MAX_ROOM_M)
             if longer > room[side, lane] + 1e-6:
                 room[side, lane], changed = longer, True
-    return Stretches(target, room, goes_back)
+    return ChangeRanges(target, room, continues)
 
 
 def change_length_m(vehicles: Vehicles) -> Float64[np.ndarray, "N"]:
     """Return the length of a lane change, m: `CHANGE_S` at the present speed, but at least
-    `SHORTEST_CHANGE_M` so that steering stays gentle."""
-    return np.maximum(CHANGE_S * vehicles.speed_mps, SHORTEST_CHANGE_M)
+    `MIN_CHANGE_M` so that steering stays gentle."""
+    return np.maximum(CHANGE_S * vehicles.speed_mps, MIN_CHANGE_M)
 
 
-def who_may_change(
+def lane_change_allowed(
     graph: LaneGraph,
-    stretches: Stretches,
+    change_ranges: ChangeRanges,
     vehicles: Vehicles,
     fits: Bool[np.ndarray, "N L"],
-    has_to: Bool[np.ndarray, "2 N"],
+    mandatory: Bool[np.ndarray, "2 N"],
 ) -> Bool[np.ndarray, "2 N"]:
     """Return which vehicles may change to the left and to the right, judged by the road alone.
 
@@ -121,14 +127,14 @@ def who_may_change(
     v, lane = vehicles, vehicles.lane
     need = change_length_m(v) + v.wheelbase_m + v.axle_to_centre_m
     stops = v.speed_mps**2 / (2 * STOPPING_MPS2)
-    settled = v.changed_m > v.change_length_m + np.where(has_to, 0.0, SETTLED_M)
-    target = stretches.target[:, lane]
-    begun = (v.rear_m > 0) | stretches.goes_back[:, lane]
+    settled = v.changed_m > v.change_length_m + np.where(mandatory, 0.0, CHANGE_SPACING_M)
+    target = change_ranges.target[:, lane]
+    begun = (v.rear_m > 0) | change_ranges.continues[:, lane]
     ahead = v.path[:, BEHIND:]
-    onward = (ahead >= 0) & (stretches.target[:, ahead] >= 0)
-    onward[:, :, 1:] &= stretches.goes_back[:, ahead[:, 1:]]
+    onward = (ahead >= 0) & (change_ranges.target[:, ahead] >= 0)
+    onward[:, :, 1:] &= change_ranges.continues[:, ahead[:, 1:]]
     room_m = np.sum(np.logical_and.accumulate(onward, axis=2) * graph.length_m[ahead], axis=2)
-    goes_on = room_m > v.s_m + need + np.where(has_to, NEAREST_M, stops)
+    goes_on = room_m > v.s_m + need + np.where(mandatory, NEAREST_M, stops)
     fitting = (target >= 0) & fits[np.arange(len(lane)), target]
     return v.active & begun & goes_on & fitting & ((v.shift_m == 0) | settled)
 
@@ -139,13 +145,13 @@ def find_gaps(
     starts_m: Float64[np.ndarray, "N W"],
     target: Int[np.ndarray, "N"],
     side: int,
-) -> Gaps:
+) -> LaneGaps:
     """Find the vehicles ahead and behind in the lanes `target` (-1: not requested).
 
     Overlapping vehicles have a negative gap.
     """
     lanes = (graph.length_m, graph.sides, graph.successors)
-    return Gaps(*_find_gaps(motion_of(vehicles, starts_m), lanes, target, side))
+    return LaneGaps(*_find_gaps(motion_arrays(vehicles, starts_m), lanes, target, side))
 
 
 @numba.njit(cache=True)
@@ -163,7 +169,9 @@ def _find_gaps(motion, lanes, target, side):
         if target[i] < 0:
             continue
         half = 0.5 * (front[i] - rear[i])
-        centre = abreast(path[i, BEHIND], 0.5 * (front[i] + rear[i]), 1 if side == LEFT else -1, sides)
+        centre = project_to_neighbour(
+            path[i, BEHIND], 0.5 * (front[i] + rear[i]), 1 if side == LEFT else -1, sides
+        )
         lane, start = target[i], 0.0
         for k in range(BEHIND + 1, WINDOW):
             entry = on.head[lane]
@@ -174,7 +182,7 @@ def _find_gaps(motion, lanes, target, side):
                 if j != i and is_ahead and rear_j - centre - half < leader_gap[i]:
                     leader[i], leader_gap[i] = j, rear_j - centre - half
             start += length[lane]
-            if path[i, k] < 0 or start - centre - half > min(leader_gap[i], LOOK_M):
+            if path[i, k] < 0 or start - centre - half > min(leader_gap[i], LOOKAHEAD_M):
                 break
             beside, ahead = sides.lane[side, path[i, k]], successors[lane]
             lane = beside if beside >= 0 and (ahead == beside).any() else ahead[0]
@@ -185,17 +193,19 @@ def _find_gaps(motion, lanes, target, side):
                 continue
             for k in range(BEHIND, WINDOW):
                 lane_j = path[j, k]
-                if lane_j < 0 or starts[j, k] - front[j] > LOOK_M:
+                if lane_j < 0 or starts[j, k] - front[j] > LOOKAHEAD_M:
                     break
                 front_j = front[j] - starts[j, k]
                 if lane_j != target[i]:
                     over = k > BEHIND and -front_j > motion.to_clear_m[j]
-                    if over or lane_beside(lane_j, motion.beside[j], sides) != target[i]:
+                    if over or neighbour_lane(lane_j, motion.beside[j], sides) != target[i]:
                         continue
                     # Measured from its rear, as above. Otherwise in a curve no vehicle would be ahead of it
                     # or behind it.
                     length_j = front[j] - rear[j]
-                    front_j = abreast(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
+                    front_j = (
+                        project_to_neighbour(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
+                    )
                 is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
                 if is_behind and centre - half - front_j < follower_gap[i]:
                     follower[i], follower_gap[i] = j, centre - half - front_j
@@ -204,7 +214,7 @@ def _find_gaps(motion, lanes, target, side):
 
 
 def incentive(
-    vehicles: Vehicles, now: Situation, gaps: Gaps, free_mps2: Float64[np.ndarray, "N"]
+    vehicles: Vehicles, context: DrivingContext, gaps: LaneGaps, free_mps2: Float64[np.ndarray, "N"]
 ) -> Float64[np.ndarray, "N"]:
     """Return the MOBIL gain, m/s², of N vehicles and, weighted by politeness, of their followers; -inf where
     unsafe.
@@ -216,30 +226,32 @@ def incentive(
         free_mps2: acceleration on an open road in the new lane.
     """
     v, every, length = vehicles, np.arange(len(free_mps2)), vehicles.size_lwh[:, 0]
-    ahead, n, o = now.ahead, gaps.follower, _followers(now.ahead)
-    wanted, halt, free = now.wanted_mps2(v), now.halt_mps2, now.free_mps2
-    own = behind(v, every, free_mps2, gaps.leader, gaps.leader_gap_m)
-    new = behind(v, n, free[n], np.where(n >= 0, every, -1), gaps.follower_gap_m)
-    old = behind(v, o, free[o], ahead.leader, ahead.leader_gap_m[o] + length + ahead.leader_gap_m)
-    gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - wanted[n], 0.0)
-    gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - wanted[o], 0.0)
-    gain = np.minimum(own, halt) - wanted + POLITENESS * (gain_n + gain_o)
+    leaders, n, o = context.leaders, gaps.follower, _followers(context.leaders)
+    desired, halt, free = context.desired_mps2(v), context.halt_mps2, context.free_mps2
+    own = following_acceleration(v, every, free_mps2, gaps.leader, gaps.leader_gap_m)
+    new = following_acceleration(v, n, free[n], np.where(n >= 0, every, -1), gaps.follower_gap_m)
+    old = following_acceleration(
+        v, o, free[o], leaders.leader, leaders.leader_gap_m[o] + length + leaders.leader_gap_m
+    )
+    gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - desired[n], 0.0)
+    gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - desired[o], 0.0)
+    gain = np.minimum(own, halt) - desired + POLITENESS * (gain_n + gain_o)
     near = (gaps.leader_gap_m < NEAREST_M) | (gaps.follower_gap_m < NEAREST_M)
     unsafe = (own < -SAFE_BRAKING_MPS2) | ((n >= 0) & (new < -SAFE_BRAKING_MPS2))
     return np.where(near | unsafe, -np.inf, gain)
 
 
-def _followers(ahead: Ahead) -> Int[np.ndarray, "N"]:
+def _followers(leaders: Leaders) -> Int[np.ndarray, "N"]:
     """Return the nearest follower of each vehicle, -1 for none."""
-    follower = np.full(len(ahead.leader), -1)
-    led = np.flatnonzero(ahead.leader >= 0)
-    led = led[np.argsort(-ahead.leader_gap_m[led], kind="stable")]  # the nearest is written last
-    follower[ahead.leader[led]] = led
+    follower = np.full(len(leaders.leader), -1)
+    led = np.flatnonzero(leaders.leader >= 0)
+    led = led[np.argsort(-leaders.leader_gap_m[led], kind="stable")]  # the nearest is written last
+    follower[leaders.leader[led]] = led
     return follower
 
 
 def room_to_change_m(
-    graph: LaneGraph, stretches: Stretches, vehicles: Vehicles, lane: int
+    graph: LaneGraph, change_ranges: ChangeRanges, vehicles: Vehicles, lane: int
 ) -> tuple[int, float] | None:
     """Return the side to which vehicle 0 has to go to reach `lane`, and the distance in which it has to
     begin, m.
@@ -252,18 +264,18 @@ def room_to_change_m(
         while beside >= 0 and beside != lane:
             beside = int(graph.sides.lane[side, beside])
         if beside == lane and beside != here:
-            need = SHORTEST_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + NEAREST_M
-            return side, float(stretches.room_m[side, here] - vehicles.s_m[0] - need)
+            need = MIN_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + NEAREST_M
+            return side, float(change_ranges.room_m[side, here] - vehicles.s_m[0] - need)
     return None
 
 
 def choose_change(
     graph: LaneGraph,
-    stretches: Stretches,
+    change_ranges: ChangeRanges,
     vehicles: Vehicles,
-    now: Situation,
+    context: DrivingContext,
     may: Bool[np.ndarray, "2 N"],
-    urge_mps2: Float64[np.ndarray, "2 N"],
+    bonus_mps2: Float64[np.ndarray, "2 N"],
 ) -> tuple[int, int] | None:
     """Return the vehicle that gains most from a lane change, and the side; None if no gain is large enough.
 
@@ -278,30 +290,32 @@ def choose_change(
     v = vehicles
     starts_m = path_starts(graph, v.path)
     reach = CLEAR_OF_LANE * change_length_m(v) + v.wheelbase_m
-    leader = now.ahead.leader
+    leader = context.leaders.leader
     moves_on = np.where(leader >= 0, v.speed_mps[leader], 0.0) * reach / np.maximum(v.speed_mps, 1.0)
-    can_pull_out = now.ahead.leader_gap_m + moves_on > reach
-    best, least = None, THRESHOLD_MPS2
+    can_pull_out = context.leaders.leader_gap_m + moves_on > reach
+    best, threshold = None, THRESHOLD_MPS2
     for side in (LEFT, RIGHT):
-        target = np.where(may[side] & can_pull_out, stretches.target[side, v.lane], -1)
+        target = np.where(may[side] & can_pull_out, change_ranges.target[side, v.lane], -1)
         if not (target >= 0).any():
             continue
         gaps = find_gaps(graph, v, starts_m, target, side)
-        wanted = v.haste * np.minimum(v.top_speed_mps, graph.speed(target, v.s_m))
-        free = np.minimum(now.free_mps2, free_acceleration(v.speed_mps, wanted, v.accel_mps2, v.decel_mps2))
+        desired = v.speed_factor * np.minimum(v.top_speed_mps, graph.speed(target, v.s_m))
+        free = np.minimum(
+            context.free_mps2, free_acceleration(v.speed_mps, desired, v.accel_mps2, v.decel_mps2)
+        )
         motorway = graph.limit_mps[v.lane] > MOTORWAY_LIMIT_MPS
         bias = np.where(motorway, KEEP_RIGHT_MPS2 if side == RIGHT else -KEEP_RIGHT_MPS2, 0.0)
-        gain = np.where(target >= 0, incentive(v, now, gaps, free) + bias + urge_mps2[side], -np.inf)
-        if gain.max() > least:
-            best, least = (int(np.argmax(gain)), side), float(gain.max())
+        gain = np.where(target >= 0, incentive(v, context, gaps, free) + bias + bonus_mps2[side], -np.inf)
+        if gain.max() > threshold:
+            best, threshold = (int(np.argmax(gain)), side), float(gain.max())
     return best
 
 
-def let_in(
+def courtesy_limits(
     graph: LaneGraph,
     vehicles: Vehicles,
     starts_m: Float64[np.ndarray, "N W"],
-    now: Situation,
+    context: DrivingContext,
     target: Int[np.ndarray, "N"],
     side: int,
 ) -> Float64[np.ndarray, "N"]:
@@ -315,9 +329,11 @@ def let_in(
     gaps = find_gaps(graph, vehicles, starts_m, target, side)
     who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= NEAREST_M))
     n = gaps.follower[who]
-    wanted = behind(vehicles, n, now.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M)
-    hardest = np.where(vehicles.speed_mps[who] < STANDS_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2)
-    np.minimum.at(limit, n, np.maximum(wanted, -hardest))
+    desired = following_acceleration(
+        vehicles, n, context.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M
+    )
+    max_braking = np.where(vehicles.speed_mps[who] < STANDS_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2)
+    np.minimum.at(limit, n, np.maximum(desired, -max_braking))
     return limit
 
 
@@ -338,7 +354,7 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
         if beside < 0 or beside not in graph.successors[path[column - 1]]:
             break
         path[column] = beside
-    s_m = abreast(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
+    s_m = project_to_neighbour(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
     here = graph.position(old[BEHIND : BEHIND + 1], v.s_m[row])[0]
     there = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]
     apart_m = float(np.hypot(*(here - there)[:2]))
@@ -346,7 +362,7 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
         "path": path,
         "s_m": s_m,
         "granted": 0,
-        "asked_s": np.inf,
+        "requested_s": np.inf,
         "has_stopped": False,
         "shift_m": apart_m if side == RIGHT else -apart_m,
         "change_length_m": change_length_m(v)[who],

@@ -13,8 +13,14 @@ from scipy.spatial import cKDTree
 
 from foredrive.scene import Command
 from foredrive.towns.map.town_map import Lane, MarkingKind, StopZoneKind, TownMap
-from foredrive.towns.traffic.centrelines import bends, headings, joined, resampled, speed_profile
-from foredrive.towns.traffic.meetings import Meetings, find_meetings
+from foredrive.towns.traffic.centrelines import (
+    curvatures,
+    headings,
+    join_centrelines,
+    resample,
+    speed_profile,
+)
+from foredrive.towns.traffic.lane_overlaps import LaneOverlaps, find_overlaps
 
 TURN_RAD = np.deg2rad(30.0)
 CITY_SPEED_MPS = 13.9
@@ -26,7 +32,7 @@ BEFORE_LIGHT_M = 40.0
 """Distance before a light in which traffic drives at most `CITY_SPEED_MPS`, m. A faster vehicle could neither
 stop for the light nor pass it while it is yellow."""
 WAITING_ROOM_M = 12.0
-NARROWEST_M = 2.8
+MIN_OPEN_WIDTH_M = 2.8
 CROSSABLE = (
     MarkingKind.NONE,
     MarkingKind.BROKEN,
@@ -52,12 +58,12 @@ CONTROL_OF_ZONE = {
 }
 
 
-class Sides(NamedTuple):
+class Neighbours(NamedTuple):
     """Left and right neighbours, as arguments of compiled functions."""
 
     lane: Int[np.ndarray, "2 L"]
     """Neighbour, -1 for none."""
-    abreast_m: Float64[np.ndarray, "2 P"]
+    neighbour_s_m: Float64[np.ndarray, "2 P"]
     """Arc length on the neighbour of the point beside each sample of a lane, m."""
     first: Int[np.ndarray, "L"]
     sample_count: Int[np.ndarray, "L"]
@@ -82,7 +88,7 @@ class LaneGraph:
     limit_mps: Float64[np.ndarray, "L"]
     """Speed limit that traffic obeys, m/s (see `CITY_SPEED_MPS`)."""
     width_m: Float64[np.ndarray, "L"]
-    tightest_m: Float64[np.ndarray, "L"]
+    min_radius_m: Float64[np.ndarray, "L"]
     """Smallest radius of the centreline, m."""
     turn_rad: Float64[np.ndarray, "L"]
     """Change of the heading over the lane, rad, positive to the left."""
@@ -93,7 +99,7 @@ class LaneGraph:
     left: Int[np.ndarray, "L"]
     """Left neighbour of the same direction, -1 for none; `right` likewise."""
     right: Int[np.ndarray, "L"]
-    sides: Sides
+    sides: Neighbours
     may_cross: Bool[np.ndarray, "2 L"]
     """Whether a vehicle may change to the left and the right neighbour: not over solid lines, not in
     junctions."""
@@ -103,9 +109,9 @@ class LaneGraph:
     """`Control` at the start of the lane."""
     zone: Int[np.ndarray, "L"]
     """Index of the stop zone that guards the lane, -1 for none."""
-    siblings: Meetings
+    siblings: LaneOverlaps
     """Lanes that part from a common start. A vehicle ahead on a sibling stays a leader until it is clear."""
-    conflicts: Meetings
+    conflicts: LaneOverlaps
     """Lanes that cross or merge. Only one vehicle at a time may use such a place."""
 
     contested: Bool[np.ndarray, "L"]
@@ -145,11 +151,11 @@ class LaneGraph:
 @lru_cache(maxsize=1)  # several drives in a row are often in one town
 def build_lane_graph(town: TownMap) -> LaneGraph:
     """Build the lane graph of a town."""
-    lanes, index = _whole_connectors(town.lanes)
-    lines = [resampled(line) for line in joined(lanes, index)]
+    lanes, index = _merge_connectors(town.lanes)
+    lines = [resample(line) for line in join_centrelines(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
-    curves = [bends(line) for line in lines]
-    control, zone = _guards(town, index, len(lanes))
+    curves = [curvatures(line) for line in lines]
+    control, zone = _lane_controls(town, index, len(lanes))
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
     count = np.array([len(line) for line in lines])
     successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
@@ -159,7 +165,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
     junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
     groups = [lane.group_id for lane in lanes]
-    siblings, conflicts = find_meetings(lines, length, successors, predecessors, junction, groups)
+    siblings, conflicts = find_overlaps(lines, length, successors, predecessors, junction, groups)
     beside = np.array([[index.get(i or "", -1) for i in (lane.left_id, lane.right_id)] for lane in lanes]).T
     return LaneGraph(
         ids=tuple(lane.lane_id for lane in lanes),
@@ -171,7 +177,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         length_m=length,
         limit_mps=limit,
         width_m=np.array([lane.width_m for lane in lanes]),
-        tightest_m=np.array([1 / np.abs(at).max().clip(1e-6) for at in curves]),
+        min_radius_m=np.array([1 / np.abs(at).max().clip(1e-6) for at in curves]),
         turn_rad=np.array([headings(line)[-1] - headings(line)[0] for line in lines]),
         successors=_padded(successors),
         successor_count=np.array([len(row) for row in successors]),
@@ -195,7 +201,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     )
 
 
-def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, int]]:
+def _merge_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, int]]:
     """Join the pieces of each path through a junction into one lane.
 
     Also return the new index of every original lane. Maps cut lanes where the cross-section of the road
@@ -223,15 +229,15 @@ def _whole_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
             dataclasses.replace(
                 lane,
                 successor_ids=pieces[-1].successor_ids,
-                centreline_xyz=_chained([piece.centreline_xyz for piece in pieces]),
-                left_boundary_xyz=_chained([piece.left_boundary_xyz for piece in pieces]),
-                right_boundary_xyz=_chained([piece.right_boundary_xyz for piece in pieces]),
+                centreline_xyz=_concatenated([piece.centreline_xyz for piece in pieces]),
+                left_boundary_xyz=_concatenated([piece.left_boundary_xyz for piece in pieces]),
+                right_boundary_xyz=_concatenated([piece.right_boundary_xyz for piece in pieces]),
             )
         )
     return whole, index
 
 
-def _chained(lines: list[Float64[np.ndarray, "_ 3"]]) -> Float64[np.ndarray, "_ 3"]:
+def _concatenated(lines: list[Float64[np.ndarray, "_ 3"]]) -> Float64[np.ndarray, "_ 3"]:
     """Join lines that continue each other into one."""
     return np.concatenate([lines[0]] + [line[1:] for line in lines[1:]])
 
@@ -292,7 +298,7 @@ def _limits(
     return np.where(before_light, min(limit_mps, CITY_SPEED_MPS), limit_mps)
 
 
-def _guards(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.ndarray, np.ndarray]:
+def _lane_controls(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.ndarray, np.ndarray]:
     control = np.full(lane_count, int(Control.NONE))
     zone = np.full(lane_count, -1)
     for i, stop in enumerate(town.stop_zones):
@@ -302,8 +308,8 @@ def _guards(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.n
     return control, zone
 
 
-def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m: np.ndarray) -> Sides:
-    abreast = np.zeros((2, count.sum()))
+def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m: np.ndarray) -> Neighbours:
+    neighbour_s_m = np.zeros((2, count.sum()))
     first = np.cumsum(count) - count
     for side, a in np.argwhere(lane >= 0).tolist():
         b = lane[side, a]
@@ -312,8 +318,8 @@ def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m:
         ahead = lines[b][np.minimum(near + 1, len(lines[b]) - 1)] - lines[b][np.maximum(near - 1, 0)]
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
         along = near * step_m[b] + np.sum((lines[a] - lines[b][near]) * ahead, axis=1)
-        abreast[side, first[a] : first[a] + count[a]] = along
-    return Sides(lane.astype(np.int64), abreast, first, count, step_m)
+        neighbour_s_m[side, first[a] : first[a] + count[a]] = along
+    return Neighbours(lane.astype(np.int64), neighbour_s_m, first, count, step_m)
 
 
 def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
@@ -326,7 +332,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
         if ends is None or marking not in CROSSABLE:
             return False
         gaps = [np.linalg.norm(lane.centreline_xyz[i] - end) for i, end in zip((0, -1), ends, strict=True)]
-        return bool(min(gaps) > NARROWEST_M)  # lanes that begin or end there grow from zero width
+        return bool(min(gaps) > MIN_OPEN_WIDTH_M)  # lanes that begin or end there grow from zero width
 
     return np.array(
         [
@@ -338,7 +344,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
 
 def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:
     """Return the lanes from which a vehicle can drive on for ever without a curve tighter than a radius."""
-    kept = graph.tightest_m >= min_radius_m
+    kept = graph.min_radius_m >= min_radius_m
     while True:
         onward = (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)
         if not (kept & ~onward).any():

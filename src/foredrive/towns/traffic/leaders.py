@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
-LOOK_M = 150.0
+LOOKAHEAD_M = 150.0
 PASSING_M = 2.0
 STANDSTILL_M = 2.0
 
 
-class Ahead(NamedTuple):
+class Leaders(NamedTuple):
     """The vehicles ahead of N vehicles on their paths: indices (-1 for none) and gaps from bumper to
     bumper."""
 
@@ -27,7 +27,7 @@ class Ahead(NamedTuple):
     limiting_gap_m: Float64[np.ndarray, "N"]
 
 
-class Motion(NamedTuple):
+class MotionArrays(NamedTuple):
     """Positions of N vehicles on their paths, as arguments of compiled functions.
 
     Arc lengths are as in `Vehicles`.
@@ -59,9 +59,9 @@ class Occupants(NamedTuple):
     """Number of entries."""
 
 
-def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motion:
+def motion_arrays(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> MotionArrays:
     """Return the motion of vehicles as arguments of compiled functions."""
-    return Motion(
+    return MotionArrays(
         active=vehicles.active,
         path=vehicles.path,
         starts_m=starts_m,
@@ -73,7 +73,7 @@ def motion_of(vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Motio
     )
 
 
-def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Ahead:
+def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]) -> Leaders:
     """Find the vehicle ahead on each path.
 
     Vehicles that have just turned off onto a sibling lane count as long as they block the path. A vehicle
@@ -81,8 +81,8 @@ def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndar
     reach before it has left that lane.
     """
     driver = (vehicles.time_gap_s, 2 * np.sqrt(vehicles.accel_mps2 * vehicles.decel_mps2))
-    motion = motion_of(vehicles, starts_m)
-    return Ahead(*_find_leaders(motion, driver, graph.length_m, graph.sides, graph.siblings))
+    motion = motion_arrays(vehicles, starts_m)
+    return Leaders(*_find_leaders(motion, driver, graph.length_m, graph.sides, graph.siblings))
 
 
 @numba.njit(cache=True)
@@ -103,16 +103,16 @@ def link_occupants(motion, length, sides, granted):
             on_it = start < motion.front_m[i] and start + length[lane] > motion.rear_m[i]
             if on_it or BEHIND < k <= BEHIND + granted[i]:
                 add_occupant(occupants, lane, i, k, motion.rear_m[i] - start)
-            old = lane_beside(lane, motion.beside[i], sides)
+            old = neighbour_lane(lane, motion.beside[i], sides)
             if on_it and old >= 0:
-                rear = abreast(lane, motion.rear_m[i] - start, motion.beside[i], sides)
+                rear = project_to_neighbour(lane, motion.rear_m[i] - start, motion.beside[i], sides)
                 add_occupant(occupants, old, i, k, rear)
     return occupants
 
 
 @numba.njit(cache=True)
 @no_type_check
-def lane_beside(lane, beside, sides):
+def neighbour_lane(lane, beside, sides):
     """Return the left (beside 1) or the right neighbour (-1) of a lane; -1 if there is none or beside is
     0."""
     return -1 if beside == 0 else sides.lane[0 if beside > 0 else 1, lane]
@@ -120,12 +120,15 @@ def lane_beside(lane, beside, sides):
 
 @numba.njit(cache=True)
 @no_type_check
-def abreast(lane, s, beside, sides):
+def project_to_neighbour(lane, s, beside, sides):
     """Return the arc length on the neighbour of the point beside `s`, continued straight beyond the ends."""
     side = 0 if beside > 0 else 1
     steps = s / sides.step_m[lane]
     i = min(max(int(steps), 0), sides.sample_count[lane] - 2)
-    a, b = sides.abreast_m[side, sides.first[lane] + i], sides.abreast_m[side, sides.first[lane] + i + 1]
+    a, b = (
+        sides.neighbour_s_m[side, sides.first[lane] + i],
+        sides.neighbour_s_m[side, sides.first[lane] + i + 1],
+    )
     return a + (steps - i) * (b - a)
 
 
@@ -151,13 +154,13 @@ def _find_leaders(motion, driver, length, sides, siblings):
     for i in range(count):
         if not active[i]:
             continue
-        centre, most = 0.5 * (front[i] + rear[i]), 0.0
+        centre, max_braking = 0.5 * (front[i] + rear[i]), 0.0
         for k in range(BEHIND, WINDOW):
             lane = path[i, k]
-            if lane < 0 or starts[i, k] - front[i] > min(gap[i], LOOK_M):
+            if lane < 0 or starts[i, k] - front[i] > min(gap[i], LOOKAHEAD_M):
                 break
             first = siblings.first[lane]
-            old = lane_beside(lane, motion.beside[i], sides)
+            old = neighbour_lane(lane, motion.beside[i], sides)
             for m in range(first - 2, siblings.first[lane + 1]):  # before the siblings: the old lane, itself
                 is_old, itself = m == first - 2, m == first - 1
                 if is_old and old < 0:
@@ -167,7 +170,7 @@ def _find_leaders(motion, driver, length, sides, siblings):
                     j, rear_j = on.who[entry], on.rear_m[entry]
                     entry = on.following[entry]
                     if is_old:
-                        rear_j = abreast(old, rear_j, -motion.beside[i], sides)
+                        rear_j = project_to_neighbour(old, rear_j, -motion.beside[i], sides)
                     if j == i or not (is_old or itself or rear_j < siblings.other_clear_m[m]):
                         continue
                     centre_j = starts[i, k] + rear_j + 0.5 * (front[j] - rear[j])
@@ -179,8 +182,8 @@ def _find_leaders(motion, driver, length, sides, siblings):
                     if gap_j < gap[i]:
                         leader[i], gap[i] = j, gap_j
                     braking = _desired_gap_m(i, j, motion.speed_mps, driver) / max(gap_j, 0.05)
-                    if braking > most:
-                        limiting[i], limiting_gap[i], most = j, gap_j, braking
+                    if braking > max_braking:
+                        limiting[i], limiting_gap[i], max_braking = j, gap_j, braking
     return leader, gap, limiting, limiting_gap
 
 

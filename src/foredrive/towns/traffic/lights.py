@@ -34,7 +34,7 @@ class SignalPlan:
     green_from_s: Float64[np.ndarray, "L"]
     cycle_s: Float64[np.ndarray, "L"]
 
-    def shows(self, time_s: float) -> Int[np.ndarray, "L"]:
+    def light_states(self, time_s: float) -> Int[np.ndarray, "L"]:
         """Return the `Light` at the start of each lane."""
         into_s = (time_s - self.green_from_s) % self.cycle_s
         light = np.where(

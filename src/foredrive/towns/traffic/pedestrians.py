@@ -10,12 +10,12 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.leaders import LOOK_M, motion_of
+from foredrive.towns.traffic.leaders import LOOKAHEAD_M, motion_arrays
 from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 from foredrive.towns.traffic.walkways import WalkGraph
 
-CATCH_UP = 1.3
+MAX_CATCH_UP = 1.3
 """Maximum speed where people cut the corner between two walks, as a multiple of their walking speed."""
 ACCEPTED_BRAKING_MPS2 = 2.0
 REACTION_S = 1.0
@@ -35,11 +35,11 @@ BEYOND_LIGHT_M = 8.0
 """Maximum distance of a crossing behind the line of a light, m, for the crossing to depend on that light."""
 PATIENCE_S = 25.0
 """Waiting time after which people walk elsewhere, s."""
-HESITATE_S = 0.4
+STOP_EARLY_S = 0.4
 """Time, s, by which people stop early before they would step in front of a vehicle that is driven from
 outside."""
 
-Danger = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
+DangerTest = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class Pedestrians:
     track_id: Int[np.ndarray, "N"]
     style: Int[np.ndarray, "N"]
     size_lwh: Float64[np.ndarray, "N 3"]
-    pace_mps: Float64[np.ndarray, "N"]
-    aside: Float64[np.ndarray, "N"]
+    walking_mps: Float64[np.ndarray, "N"]
+    lateral: Float64[np.ndarray, "N"]
     """Lateral position to the right of a walk's middle, as a fraction (0 to 1) of the half width."""
     walk: Int[np.ndarray, "N"]
     s_m: Float64[np.ndarray, "N"]
-    onward: Int[np.ndarray, "N"]
+    direction: Int[np.ndarray, "N"]
     """Direction of walking: 1 along the walk, -1 against it."""
     next_walk: Int[np.ndarray, "N"]
     waited_s: Float64[np.ndarray, "N"]
@@ -73,11 +73,11 @@ class Pedestrians:
         return Pedestrians(**changed)
 
 
-def empty_pavement(count: int) -> Pedestrians:
+def empty_pedestrians(count: int) -> Pedestrians:
     """Return `count` empty slots."""
     values = {field.name: np.zeros(count) for field in dataclasses.fields(Pedestrians)}
     values["active"] = np.zeros(count, dtype=np.bool_)
-    for name in ("track_id", "style", "walk", "onward", "next_walk"):
+    for name in ("track_id", "style", "walk", "direction", "next_walk"):
         values[name] = np.zeros(count, dtype=np.int64)
     for name in ("size_lwh", "xyz", "velocity_mps"):
         values[name] = np.zeros((count, 3))
@@ -95,22 +95,22 @@ def draw_people(
     count = len(track_ids)
     height = np.clip(rng.normal(1.7, 0.1, count), 1.3, 1.95)
     size = np.stack([rng.uniform(0.4, 0.6, count), rng.uniform(0.45, 0.65, count), height], axis=1)
-    onward = rng.choice([-1, 1], count)
+    direction = rng.choice([-1, 1], count)
     people = dataclasses.replace(
-        empty_pavement(count),
+        empty_pedestrians(count),
         active=np.ones(count, dtype=np.bool_),
         track_id=track_ids,
         style=rng.integers(0, 2**31, count),
         size_lwh=size,
-        pace_mps=np.clip(rng.normal(1.35, 0.2, count), 0.8, 1.9),
-        aside=rng.uniform(0.0, 1.0, count),
+        walking_mps=np.clip(rng.normal(1.35, 0.2, count), 0.8, 1.9),
+        lateral=rng.uniform(0.0, 1.0, count),
         walk=walk,
         s_m=s_m,
-        onward=onward,
-        next_walk=_choose_next(graph, walk, onward, rng.random(count)),
+        direction=direction,
+        next_walk=_choose_next(graph, walk, direction, rng.random(count)),
     )
-    xyz = _way(graph, people)
-    ahead = _way(graph, dataclasses.replace(people, s_m=s_m + 0.1 * onward)) - xyz
+    xyz = _target_xyz(graph, people)
+    ahead = _target_xyz(graph, dataclasses.replace(people, s_m=s_m + 0.1 * direction)) - xyz
     return dataclasses.replace(people, xyz=xyz, yaw=np.arctan2(ahead[:, 1], ahead[:, 0]))
 
 
@@ -122,7 +122,7 @@ def step_pedestrians(
     light: Int[np.ndarray, "L"],
     dt_s: float,
     rng: np.random.Generator,
-    danger: Danger | None = None,
+    danger: DangerTest | None = None,
 ) -> Pedestrians:
     """Return the people one time step later.
 
@@ -133,11 +133,11 @@ def step_pedestrians(
     """
     if not len(people.active) or not len(graph.length_m):
         return people
-    s = people.s_m + people.onward * people.pace_mps * dt_s
+    s = people.s_m + people.direction * people.walking_mps * dt_s
     s = np.where(_walks_into_vehicle(graph, people, vehicles, starts_m), people.s_m, s)
     if danger is not None:
-        soon = dataclasses.replace(people, s_m=s + people.onward * people.pace_mps * HESITATE_S)
-        waits = danger(_way(graph, soon)[:, :2]) & ~danger(people.xyz[:, :2])
+        soon = dataclasses.replace(people, s_m=s + people.direction * people.walking_mps * STOP_EARLY_S)
+        waits = danger(_target_xyz(graph, soon)[:, :2]) & ~danger(people.xyz[:, :2])
         s = np.where(waits, people.s_m, s)
     over = np.maximum(-s, s - graph.length_m[people.walk])
     leaving = people.active & (over >= 0)
@@ -145,29 +145,31 @@ def step_pedestrians(
     blocked = wants_to_cross & ~_may_cross(graph, people.next_walk, wants_to_cross, vehicles, starts_m, light)
     impatient = blocked & (people.waited_s > PATIENCE_S)
     leaving &= ~blocked
-    place = graph.ends[people.walk, (people.onward > 0).astype(np.int64)]
+    place = graph.ends[people.walk, (people.direction > 0).astype(np.int64)]
     entry = np.where(leaving, people.next_walk, people.walk)
     at_start = graph.ends[entry, 0] == place
     turned = leaving & (entry == people.walk)
-    onward = np.where(turned, -people.onward, np.where(leaving, np.where(at_start, 1, -1), people.onward))
-    begun = np.where(onward > 0, over, graph.length_m[entry] - over)
+    direction = np.where(
+        turned, -people.direction, np.where(leaving, np.where(at_start, 1, -1), people.direction)
+    )
+    begun = np.where(direction > 0, over, graph.length_m[entry] - over)
     s = np.where(leaving, begun, np.clip(s, 0.0, graph.length_m[entry]))
-    chosen = _choose_next(graph, entry, onward, rng.random(len(s)))
+    chosen = _choose_next(graph, entry, direction, rng.random(len(s)))
     moved = dataclasses.replace(
         people,
         walk=entry,
         s_m=s,
-        onward=onward,
+        direction=direction,
         next_walk=np.where(leaving | impatient, chosen, people.next_walk),
         waited_s=np.where(blocked & ~impatient, people.waited_s + dt_s, 0.0),
     )
-    return _follow_way(graph, moved, dt_s)
+    return _step_to_target(graph, moved, dt_s)
 
 
-def _follow_way(graph: WalkGraph, people: Pedestrians, dt_s: float) -> Pedestrians:
-    to_go = _way(graph, people) - people.xyz
+def _step_to_target(graph: WalkGraph, people: Pedestrians, dt_s: float) -> Pedestrians:
+    to_go = _target_xyz(graph, people) - people.xyz
     distance = np.linalg.norm(to_go[:, :2], axis=1)
-    reach = CATCH_UP * people.pace_mps * dt_s
+    reach = MAX_CATCH_UP * people.walking_mps * dt_s
     step = to_go * np.minimum(1.0, reach / distance.clip(1e-9))[:, None]
     step[~people.active] = 0.0
     moving = np.linalg.norm(step[:, :2], axis=1) > 0.1 * dt_s
@@ -179,9 +181,9 @@ def _follow_way(graph: WalkGraph, people: Pedestrians, dt_s: float) -> Pedestria
     )
 
 
-def _way(graph: WalkGraph, people: Pedestrians) -> Float64[np.ndarray, "N 3"]:
+def _target_xyz(graph: WalkGraph, people: Pedestrians) -> Float64[np.ndarray, "N 3"]:
     """Return the positions where people want to walk: to the right of the middle, in their direction."""
-    offset = people.onward * people.aside * graph.half_width_m[people.walk]
+    offset = people.direction * people.lateral * graph.half_width_m[people.walk]
     middle = graph.position(people.walk, people.s_m)
     return middle + offset[:, None] * graph.right_of(people.walk, people.s_m)
 
@@ -189,14 +191,14 @@ def _way(graph: WalkGraph, people: Pedestrians) -> Float64[np.ndarray, "N 3"]:
 def _choose_next(
     graph: WalkGraph,
     walk: Int[np.ndarray, "n"],
-    onward: Int[np.ndarray, "n"],
+    direction: Int[np.ndarray, "n"],
     u: Float64[np.ndarray, "n"],
 ) -> Int[np.ndarray, "n"]:
     """Choose a walk that leaves the place ahead.
 
     It is the walk on which people arrive only if there is no other.
     """
-    options = graph.incident[graph.ends[walk, (onward > 0).astype(np.int64)]]
+    options = graph.incident[graph.ends[walk, (direction > 0).astype(np.int64)]]
     allowed = (options >= 0) & (options != walk[:, None])
     allowed[~allowed.any(axis=1), 0] = True  # dead end: turn back
     pick = (u * allowed.sum(axis=1)).astype(np.int64)
@@ -213,15 +215,20 @@ def crossing_gap(
         return np.full(len(vehicles.active), np.inf)
     passing = (graph.lane, graph.crossing, graph.lane_span_m, graph.walk_span_m)
     walking = np.flatnonzero(people.active & graph.is_crossing[people.walk])
-    crossers = (people.walk[walking], people.s_m[walking], people.onward[walking], people.pace_mps[walking])
-    return _crossing_gap(motion_of(vehicles, starts_m), passing, crossers)
+    crossers = (
+        people.walk[walking],
+        people.s_m[walking],
+        people.direction[walking],
+        people.walking_mps[walking],
+    )
+    return _crossing_gap(motion_arrays(vehicles, starts_m), passing, crossers)
 
 
 @numba.njit(cache=True)
 @no_type_check
 def _crossing_gap(motion, passing, crossers):
     lanes, crossings, lane_span, walk_span = passing
-    walk, s, onward, pace = crossers
+    walk, s, direction, pace = crossers
     gap = np.full(len(motion.active), np.inf)
     for i in range(len(motion.active)):
         if not motion.active[i]:
@@ -231,7 +238,7 @@ def _crossing_gap(motion, passing, crossers):
         too_sudden = speed**2 / (2 * YIELD_BRAKING_MPS2) + YIELD_S * speed
         for k in range(BEHIND, WINDOW):
             lane, start = motion.path[i, k], motion.starts_m[i, k] - motion.front_m[i]
-            if lane < 0 or start > LOOK_M:
+            if lane < 0 or start > LOOKAHEAD_M:
                 break
             for m in range(np.searchsorted(lanes, lane), np.searchsorted(lanes, lane + 1)):
                 to_go = start + lane_span[m, 0]
@@ -240,7 +247,7 @@ def _crossing_gap(motion, passing, crossers):
                 cleared_s = (to_go + length + ALONG_CROSSING_M) / max(speed, SLOW_MPS)
                 for p in range(len(walk)):
                     near, far = walk_span[m, 0] - s[p], walk_span[m, 1] - s[p]
-                    if onward[p] < 0:
+                    if direction[p] < 0:
                         near, far = -far, -near
                     comes = near <= 0 or (to_go >= too_sudden and near < pace[p] * (cleared_s + SPARE_S))
                     if walk[p] == crossings[m] and far > 0 and comes:
@@ -280,7 +287,7 @@ def _walks_into_vehicle(
     stop."""
     blocked = np.zeros(len(people.active), dtype=np.bool_)
     for i in np.flatnonzero(people.active & graph.is_crossing[people.walk]):
-        ahead = people.onward[i] * (graph.walk_span_m - people.s_m[i])
+        ahead = people.direction[i] * (graph.walk_span_m - people.s_m[i])
         about = (graph.crossing == people.walk[i]) & (ahead.min(axis=1) > 0) & (ahead.min(axis=1) < AT_LANE_M)
         for m in np.flatnonzero(about):
             there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])

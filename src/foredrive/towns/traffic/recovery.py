@@ -10,26 +10,26 @@ from dataclasses import dataclass
 import numpy as np
 
 CORRELATION_S = 0.8
-DISTURBED_S = 1.6
+DISTURBANCE_S = 1.6
 RECOVERY_S = 5.0
 """Minimum time from the end of one disturbance to the next, s. The mean is twice as long."""
 RETURN_M, RETURN_S = 4.0, 0.8
 """Length scale of the return to the path: `RETURN_M` (m), plus the distance that is driven in `RETURN_S`
 (s)."""
-STEEPEST_PER_M = 0.12
+MAX_CURVATURE_PER_M = 0.12
 """Maximum curvature that steering adds, 1/m."""
 LATERAL_MPS2 = 2.5
-DISTURBING = 0.4
+DISTURBANCE_SHARE = 0.4
 """Maximum curvature of the disturbance, as a fraction of the maximum curvature of the steering back."""
-FARTHEST_M = 0.8
+MAX_OFFSET_M = 0.8
 """Predicted offset at which the expert takes over from the disturbance, m."""
 
 
 @dataclass(frozen=True)
-class Sway:
+class PathDeviation:
     """The deviation of the vehicle from its path, and the disturbance."""
 
-    aside_m: float = 0.0
+    lateral_m: float = 0.0
     """Offset of the rear axle to the left of the path, m."""
     yaw_rad: float = 0.0
     """Heading to the left of the path's heading, rad."""
@@ -40,17 +40,22 @@ class Sway:
     next_s: float = 2.0
     """Time until the next disturbance begins, s; negative during a disturbance."""
 
-    def moved(self, distance_m: float) -> "Sway":
+    def moved(self, distance_m: float) -> "PathDeviation":
         """Return the deviation after a distance at the present steering; a negative distance moves
         backwards."""
         yaw_rad = self.yaw_rad + distance_m * self.curvature
-        aside_m = self.aside_m + distance_m * float(np.sin(0.5 * (self.yaw_rad + yaw_rad)))
-        return dataclasses.replace(self, aside_m=aside_m, yaw_rad=yaw_rad)
+        lateral_m = self.lateral_m + distance_m * float(np.sin(0.5 * (self.yaw_rad + yaw_rad)))
+        return dataclasses.replace(self, lateral_m=lateral_m, yaw_rad=yaw_rad)
 
 
-def step_sway(
-    sway: Sway, speed_mps: float, wheelbase_m: float, noise_rad: float, dt_s: float, rng: np.random.Generator
-) -> Sway:
+def step_deviation(
+    deviation: PathDeviation,
+    speed_mps: float,
+    wheelbase_m: float,
+    noise_rad: float,
+    dt_s: float,
+    rng: np.random.Generator,
+) -> PathDeviation:
     """Return the deviation one step later: a kinematic bicycle that is steered by feedback of offset and
     heading.
 
@@ -61,19 +66,23 @@ def step_sway(
     Args:
         noise_rad: standard deviation σ of the disturbance, rad.
     """
-    next_s = sway.next_s - dt_s if speed_mps > 1.0 or sway.next_s < 0 else sway.next_s
-    if next_s < -DISTURBED_S:
+    next_s = deviation.next_s - dt_s if speed_mps > 1.0 or deviation.next_s < 0 else deviation.next_s
+    if next_s < -DISTURBANCE_S:
         next_s = RECOVERY_S + float(rng.exponential(RECOVERY_S))
-    kept = np.exp(-dt_s / CORRELATION_S)
-    kick = noise_rad * np.sqrt(1 - kept**2) * float(rng.standard_normal())
-    noise = float(sway.noise * kept + (kick if next_s < 0 else 0.0))
+    decay = np.exp(-dt_s / CORRELATION_S)
+    innovation = noise_rad * np.sqrt(1 - decay**2) * float(rng.standard_normal())
+    noise = float(deviation.noise * decay + (innovation if next_s < 0 else 0.0))
     length = RETURN_M + RETURN_S * speed_mps
-    most = min(STEEPEST_PER_M, LATERAL_MPS2 / max(speed_mps, 1.0) ** 2)
-    if next_s < 0 and abs(sway.aside_m + length * sway.yaw_rad) < FARTHEST_M:
-        wanted = np.clip(np.tan(noise) / wheelbase_m, -DISTURBING * most, DISTURBING * most)
+    max_curvature = min(MAX_CURVATURE_PER_M, LATERAL_MPS2 / max(speed_mps, 1.0) ** 2)
+    if next_s < 0 and abs(deviation.lateral_m + length * deviation.yaw_rad) < MAX_OFFSET_M:
+        target = np.clip(
+            np.tan(noise) / wheelbase_m, -DISTURBANCE_SHARE * max_curvature, DISTURBANCE_SHARE * max_curvature
+        )
     else:
-        wanted = -sway.aside_m / length**2 - 2 * sway.yaw_rad / length
+        target = -deviation.lateral_m / length**2 - 2 * deviation.yaw_rad / length
     # The wheel turns over some tenths of a second.
-    curvature = sway.curvature + (np.clip(wanted, -most, most) - sway.curvature) * (1 - np.exp(-dt_s / 0.2))
-    steered = dataclasses.replace(sway, curvature=float(curvature), noise=noise, next_s=next_s)
+    curvature = deviation.curvature + (
+        np.clip(target, -max_curvature, max_curvature) - deviation.curvature
+    ) * (1 - np.exp(-dt_s / 0.2))
+    steered = dataclasses.replace(deviation, curvature=float(curvature), noise=noise, next_s=next_s)
     return steered.moved(speed_mps * dt_s)

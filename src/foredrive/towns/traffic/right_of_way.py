@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
-from foredrive.towns.traffic.leaders import STANDSTILL_M, Ahead, add_occupant, link_occupants, motion_of
+from foredrive.towns.traffic.leaders import STANDSTILL_M, Leaders, add_occupant, link_occupants, motion_arrays
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
 EARLY_M = 12.0
@@ -47,11 +47,10 @@ PATIENCE_S = 15.0
 
 @dataclass(frozen=True)
 class RightOfWay:
-    """The result for N vehicles: the new `granted`, `asked_s` and `rank`, and the points where they have to
-    wait."""
+    """The new `granted`, `requested_s` and `rank` of N vehicles, and the points where they have to wait."""
 
     granted: Int[np.ndarray, "N"]
-    asked_s: Float64[np.ndarray, "N"]
+    requested_s: Float64[np.ndarray, "N"]
     rank: Float64[np.ndarray, "N"]
     line_gap_m: Float64[np.ndarray, "N"]
     """Gap from the front bumper to the line of the next junction, m; infinite if it may be passed."""
@@ -64,10 +63,10 @@ def claim_junctions(
     graph: LaneGraph,
     vehicles: Vehicles,
     starts_m: Float64[np.ndarray, "N W"],
-    ahead: Ahead,
+    leaders: Leaders,
     green: Bool[np.ndarray, "L"],
     time_s: float,
-    may_ask: Bool[np.ndarray, "N"] | None = None,
+    may_request: Bool[np.ndarray, "N"] | None = None,
     runs: Bool[np.ndarray, "N"] | None = None,
 ) -> RightOfWay:
     """Serve the requests for right of way.
@@ -85,22 +84,22 @@ def claim_junctions(
     cut_off = inside & _is_cut_off(graph, vehicles, kept, column)
     at_light = cut_off & (graph.control[lane] == Control.LIGHT)
     goes_on = cut_off & ~at_light
-    leader = ahead.leader
-    queued = (leader >= 0) & (ahead.leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
+    leader = leaders.leader
+    queued = (leader >= 0) & (leaders.leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
     reach = vehicles.speed_mps**2 / (2 * PLANNED_BRAKING_MPS2) + EARLY_M
     near = vehicles.active & (line_gap < reach) & ((~queued & (~inside | at_light)) | goes_on)
-    if may_ask is not None:
-        near &= may_ask
+    if may_request is not None:
+        near &= may_request
     stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
     let_go = runs | _is_green(graph, vehicles.path, column, green)
-    asks = near & ((let_go & stop_made) | goes_on)
-    asked_s = np.where(near, np.minimum(vehicles.asked_s, time_s), np.inf)
+    requests = near & ((let_go & stop_made) | goes_on)
+    requested_s = np.where(near, np.minimum(vehicles.requested_s, time_s), np.inf)
     turn = graph.turn_rad[lane]
     waits = np.where(turn > TURN_RAD, LEFT_WAITS_S, np.where(turn < -TURN_RAD, RIGHT_WAITS_S, 0.0))
-    order = np.argsort(np.where(goes_on, -np.inf, asked_s + waits), kind="stable")
-    order = order[asks[order]]
-    impatient = asks & (time_s - asked_s > PATIENCE_S)
-    motion = motion_of(vehicles, starts_m)
+    order = np.argsort(np.where(goes_on, -np.inf, requested_s + waits), kind="stable")
+    order = order[requests[order]]
+    impatient = requests & (time_s - requested_s > PATIENCE_S)
+    motion = motion_arrays(vehicles, starts_m)
     lanes = (graph.length_m, graph.sides, graph.contested, graph.conflicts)
     granted = _serve(motion, lanes, kept, order, column, goes_on, impatient)
     served = granted > kept
@@ -109,7 +108,7 @@ def claim_junctions(
     rank[enters] = time_s + 1e-6 * np.arange(len(enters))
     return RightOfWay(
         granted=granted,
-        asked_s=np.where(served, np.inf, asked_s),
+        requested_s=np.where(served, np.inf, requested_s),
         rank=rank,
         line_gap_m=np.where(served, np.inf, line_gap),
         inside_gap_m=_inside_gap(motion, lanes, granted, rank),

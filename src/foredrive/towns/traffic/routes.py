@@ -8,20 +8,20 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from foredrive.scene import Command
-from foredrive.towns.traffic.fleet import Starts
-from foredrive.towns.traffic.lane_changes import Stretches, find_stretches
+from foredrive.towns.traffic.fleet import StartPoints
+from foredrive.towns.traffic.lane_changes import ChangeRanges, find_change_ranges
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.leaders import abreast
+from foredrive.towns.traffic.leaders import project_to_neighbour
 
 CANDIDATES = 48
 ROUTE_SPACING_M = 1.0
-PLANNED_CHANGE_S, SHORTEST_CHANGE_M = 4.0, 45.0
+PLANNED_CHANGE_S, MIN_CHANGE_M = 4.0, 45.0
 """Duration (s) and minimum length (m) of a lane change on a route. On a shorter way a shift of 3.5 m would
 look like a turn."""
 CHANGE_ROOM_M = 30.0
 CHANGE_ROOM_S = 5.0
 """Minimum length of a lane in which a route may change lanes: this distance plus this driving time."""
-BUSY = 1.3
+TRAFFIC_FACTOR = 1.3
 LIGHT_S, GIVE_WAY_S = 15.0, 6.0
 """Factor of other traffic on the driving time, and the additional time per light and per sign, s. These are
 means over hours in all towns, which range from 30 % less (Town02) to 60 % more (Town05)."""
@@ -55,10 +55,10 @@ class Route:
             old = int(self.entered[at[k]])
             beside = 1 if graph.left[lane[k]] == old else -1
             before = graph.position(
-                np.array([old]), np.array([abreast(lane[k], along[k], beside, graph.sides)])
+                np.array([old]), np.array([project_to_neighbour(lane[k], along[k], beside, graph.sides)])
             )
             from_m = self.start_m if at[k] == 0 else 0.0
-            over_m = max(SHORTEST_CHANGE_M, PLANNED_CHANGE_S * graph.limit_mps[old])
+            over_m = max(MIN_CHANGE_M, PLANNED_CHANGE_S * graph.limit_mps[old])
             over_m = min(over_m, graph.length_m[lane[k]] - from_m)
             x = np.clip((along[k] - from_m) / over_m, 0.0, 1.0)
             points[k] += (1 - x**3 * (10 - 15 * x + 6 * x**2)) * (before[0] - points[k])
@@ -79,7 +79,7 @@ class Route:
             if graph.successor_count[before] > 1 or graph.command(int(lane)) != Command.STRAIGHT
         ]
 
-    def driven_m(self, graph: LaneGraph, seconds: float) -> float:
+    def distance_m(self, graph: LaneGraph, seconds: float) -> float:
         """Return the approximate distance that is driven in a time, m, with delays by other traffic and
         lights."""
         pace_s = np.add.reduceat(1 / graph.speed_mps, graph.first) / graph.count
@@ -87,14 +87,19 @@ class Route:
         length[0] -= self.start_m
         waits_s = np.array([0.0, LIGHT_S, GIVE_WAY_S, GIVE_WAY_S])[graph.control[self.lanes]]
         waits_s[0] = 0.0
-        steps_s = np.stack([waits_s, BUSY * pace_s[self.lanes] * length], axis=1)
+        steps_s = np.stack([waits_s, TRAFFIC_FACTOR * pace_s[self.lanes] * length], axis=1)
         steps_m = np.stack([np.zeros(len(length)), length], axis=1)
         at_s, at_m = (np.append(0.0, np.cumsum(steps)) for steps in (steps_s, steps_m))
         return float(np.interp(seconds, at_s, at_m))
 
 
 def draw_route(
-    graph: LaneGraph, starts: Starts, rng: np.random.Generator, length_m: float, from_s: float, until_s: float
+    graph: LaneGraph,
+    starts: StartPoints,
+    rng: np.random.Generator,
+    length_m: float,
+    from_s: float,
+    until_s: float,
 ) -> Route:
     """Draw a random route of at least `length_m`.
 
@@ -103,25 +108,27 @@ def draw_route(
     there is none, the route with the most different commands is taken. Ties go to routes that contain a
     command drawn at random, then to routes with more turns.
     """
-    best, most = None, (-1, False, -1)
+    best, best_key = None, (-1, False, -1)
     wanted = rng.choice(list(Command))
-    stretches = find_stretches(graph)
+    change_ranges = find_change_ranges(graph)
     for start in rng.choice(len(starts.lane), CANDIDATES):
-        route = _roll_out(graph, stretches, int(starts.lane[start]), float(starts.s_m[start]), rng, length_m)
-        from_m, until_m = route.driven_m(graph, from_s), route.driven_m(graph, until_s)
+        route = _extend(
+            graph, change_ranges, int(starts.lane[start]), float(starts.s_m[start]), rng, length_m
+        )
+        from_m, until_m = route.distance_m(graph, from_s), route.distance_m(graph, until_s)
         commands = route.commands(graph, until_m, from_m)
-        turns, ways = len(commands) - commands.count(Command.STRAIGHT), len(set(commands))
-        if turns and ways >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
+        turns, options = len(commands) - commands.count(Command.STRAIGHT), len(set(commands))
+        if turns and options >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
             return route
-        if (ways, wanted in commands, turns) > most:
-            best, most = route, (ways, wanted in commands, turns)
+        if (options, wanted in commands, turns) > best_key:
+            best, best_key = route, (options, wanted in commands, turns)
     assert best is not None
     return best
 
 
-def _roll_out(
+def _extend(
     graph: LaneGraph,
-    stretches: Stretches,
+    change_ranges: ChangeRanges,
     lane: int,
     start_m: float,
     rng: np.random.Generator,
@@ -132,24 +139,26 @@ def _roll_out(
     lanes, entered, to_go = [lane], [lane], length_m + start_m - graph.length_m[lane]
     taken: Counter[Command] = Counter()
     while to_go > 0:
-        ways = _ways_on(graph, stretches, lanes[-1], may_change=len(lanes) > 1)
-        if not ways:
+        options = _options(graph, change_ranges, lanes[-1], may_change=len(lanes) > 1)
+        if not options:
             break
-        commands = [graph.command(onward) for _, onward in ways]
-        fewest = min(taken[command] for command in commands)
-        least = [i for i, command in enumerate(commands) if taken[command] == fewest]
-        straight_on = [i for i in least if ways[i][0] == lanes[-1]]
-        choice = int(rng.choice(straight_on or least))
-        if len(ways) > 1:
+        commands = [graph.command(onward) for _, onward in options]
+        min_count = min(taken[command] for command in commands)
+        least_taken = [i for i, command in enumerate(commands) if taken[command] == min_count]
+        straight_on = [i for i in least_taken if options[i][0] == lanes[-1]]
+        choice = int(rng.choice(straight_on or least_taken))
+        if len(options) > 1:
             taken[commands[choice]] += 1
-        lanes[-1], onward = ways[choice]
+        lanes[-1], onward = options[choice]
         lanes.append(onward)
         entered.append(onward)
         to_go -= graph.length_m[onward]
     return Route(np.array(lanes), start_m, np.array(entered))
 
 
-def _ways_on(graph: LaneGraph, stretches: Stretches, lane: int, may_change: bool) -> list[tuple[int, int]]:
+def _options(
+    graph: LaneGraph, change_ranges: ChangeRanges, lane: int, may_change: bool
+) -> list[tuple[int, int]]:
     """Return pairs of a lane at the end of the stretch and a successor of it.
 
     Before junctions the neighbouring lanes count as well.
@@ -158,5 +167,5 @@ def _ways_on(graph: LaneGraph, stretches: Stretches, lane: int, may_change: bool
     onward = graph.successors[lane, : graph.successor_count[lane]]
     enough_m = CHANGE_ROOM_M + CHANGE_ROOM_S * graph.limit_mps[lane]
     if may_change and len(onward) and (graph.junction[onward] >= 0).all() and graph.length_m[lane] > enough_m:
-        ends += stretches.target[stretches.target[:, lane] >= 0, lane].tolist()
+        ends += change_ranges.target[change_ranges.target[:, lane] >= 0, lane].tolist()
     return [(end, int(n)) for end in ends for n in graph.successors[end, : graph.successor_count[end]]]

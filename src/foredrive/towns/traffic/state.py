@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from foredrive.towns.traffic.pedestrians import Pedestrians
-from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.scripted_actors import ScriptedActor
 from foredrive.towns.traffic.vehicles import Vehicles
 
 
@@ -24,5 +24,5 @@ class TrafficState:
     turns like the others."""
     route_passed: int
     """Number of stretches of the route that lie behind."""
-    strays: tuple[Stray, ...] = ()
-    """People and cyclists that move off the walkways."""
+    scripted_actors: tuple[ScriptedActor, ...] = ()
+    """People and cyclists that move on given paths, off the walkways."""

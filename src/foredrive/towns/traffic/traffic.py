@@ -9,33 +9,39 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.scene import Category
 from foredrive.towns.actors import ActorState
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.appearance import people_actors, stray_actor, vehicle_actors
-from foredrive.towns.traffic.driven import AT_LINE_M, Driven, SeenDriven, see_driven, stray_shadows
-from foredrive.towns.traffic.drivers import Choice, Situation, drive, see_ahead
-from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, Starts, find_starts, is_large
+from foredrive.towns.traffic.appearance import people_actors, scripted_actor_state, vehicle_actors
+from foredrive.towns.traffic.drivers import Decision, DrivingContext, driving_context, move_vehicles
+from foredrive.towns.traffic.external_ego import (
+    AT_LINE_M,
+    EgoPose,
+    PerceivedEgo,
+    perceive_ego,
+    scripted_actor_shadows,
+)
+from foredrive.towns.traffic.fleet import LARGE_RADIUS_M, StartPoints, find_start_points, is_large
 from foredrive.towns.traffic.lane_changes import (
-    HAS_TO_MPS2,
-    LIKES_TO_MPS2,
-    SETTLED_M,
+    CHANGE_SPACING_M,
+    DISCRETIONARY_MPS2,
+    MANDATORY_MPS2,
     URGENT_S,
     begin_change,
     choose_change,
-    find_stretches,
-    let_in,
+    courtesy_limits,
+    find_change_ranges,
+    lane_change_allowed,
     room_to_change_m,
-    who_may_change,
 )
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.traffic.lane_index import LaneIndex, build_lane_index
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
-from foredrive.towns.traffic.near_lanes import NearLanes, near_lanes_of
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.paths import extend_paths
-from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pavement, step_pedestrians
+from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pedestrians, step_pedestrians
 from foredrive.towns.traffic.right_of_way import claim_junctions
+from foredrive.towns.traffic.scripted_actors import step_scripted_actors
+from foredrive.towns.traffic.spawning import Spawner
 from foredrive.towns.traffic.state import TrafficState
-from foredrive.towns.traffic.strays import moved_strays
-from foredrive.towns.traffic.turnover import Turnover
 from foredrive.towns.traffic.vehicles import (
     BEHIND,
     Poses,
@@ -51,7 +57,7 @@ HALT_MPS = 0.4
 """Speed below which a vehicle near a line waits there, m/s. A faster vehicle is still approaching."""
 STOPPED_MPS = 0.1
 """Speed below which a vehicle counts as stopped at a stop sign, m/s, as in the rules of leaderboards."""
-LACKS_ROOM_M = 1.0
+MIN_CHANGE_ROOM_M = 1.0
 """Minimum distance in which vehicle 0 can still begin a lane change, m. With less, it has no room for the
 change."""
 
@@ -71,25 +77,25 @@ class Traffic:
     """
 
     def __init__(
-        self, town: TownMap, seed: int, vehicle_count: int, people_count: int, guest_count: int = 0
+        self, town: TownMap, seed: int, vehicle_count: int, people_count: int, scenario_slot_count: int = 0
     ) -> None:
         self.seed = seed
         self.lanes: LaneGraph = build_lane_graph(town)
         self.walks: WalkGraph = build_walk_graph(town, self.lanes)
         self.signals: SignalPlan = plan_signals(self.lanes, np.random.default_rng((seed, 0)))
-        self.starts: Starts = find_starts(self.lanes)
+        self.starts: StartPoints = find_start_points(self.lanes)
         self._zone_count = len(town.stop_zones)
-        self._stretches = find_stretches(self.lanes)
+        self._change_ranges = find_change_ranges(self.lanes)
         self._for_large = lanes_for(self.lanes, LARGE_RADIUS_M)
-        self._slot_count = vehicle_count + guest_count
-        self.guest_slots = range(vehicle_count, self._slot_count)
+        self._slot_count = vehicle_count + scenario_slot_count
+        self.scenario_slots = range(vehicle_count, self._slot_count)
         self._people_count = people_count if len(self.walks.length_m) else 0
-        self._turnover = Turnover(self.lanes, self.walks, self.starts, self._for_large, vehicle_count)
+        self._spawner = Spawner(self.lanes, self.walks, self.starts, self._for_large, vehicle_count)
 
     @cached_property
-    def near_lanes(self) -> NearLanes:
+    def lane_index(self) -> LaneIndex:
         """Return the town's lanes, searchable by position."""
-        return near_lanes_of(self.lanes)
+        return build_lane_index(self.lanes)
 
     def start(self, ego: Vehicles | None = None, route: Int[np.ndarray, "R"] | None = None) -> TrafficState:
         """Return the initial state, with vehicles and people placed.
@@ -105,7 +111,7 @@ class Traffic:
             time_s=0.0,
             step_index=0,
             vehicles=empty_slots(self._slot_count),
-            people=empty_pavement(self._people_count),
+            people=empty_pedestrians(self._people_count),
             next_track_id=1,
             route=lanes,
             route_passed=0,
@@ -113,11 +119,11 @@ class Traffic:
         if ego is not None:
             vehicles = state.vehicles.replace_rows(np.array([0]), ego)
             state = dataclasses.replace(state, vehicles=vehicles, route=lanes if len(lanes) else ego.lane)
-            state = self._know_path(state, rng)
-        return self._turnover.fill(state, rng)
+            state = self._extend_paths(state, rng)
+        return self._spawner.spawn_all(state, rng)
 
     def step(
-        self, state: TrafficState, dt_s: float, ego: Driven | None = None, orders: Orders | None = None
+        self, state: TrafficState, dt_s: float, ego: EgoPose | None = None, orders: Orders | None = None
     ) -> TrafficState:
         """Return the state one time step later. Equal arguments give equal results.
 
@@ -125,58 +131,58 @@ class Traffic:
             ego: the pose and motion of vehicle 0 at the time of `state` if it is driven from outside, on the
                 road or off it. All others react to it, and its motion is not decided here. None: it drives by
                 the same rules as the others.
-            orders: orders for some of the other road users. None: no orders, and strays stand still.
+            orders: orders for some of the other road users. None: no orders, and scripted actors stand still.
         """
         rng = np.random.default_rng((self.seed, 2, state.step_index))
-        driven = None if ego is None else self._see_driven(state, ego)
-        may_ask = None if driven is None else driven.may_ask
-        if driven is not None:
-            route_passed = driven.route_passed
-            state = dataclasses.replace(state, vehicles=driven.everyone, route_passed=route_passed)
+        perceived = None if ego is None else self._perceive_ego(state, ego)
+        may_request = None if perceived is None else perceived.may_request
+        if perceived is not None:
+            route_passed = perceived.route_passed
+            state = dataclasses.replace(state, vehicles=perceived.vehicles, route_passed=route_passed)
         known = len(state.vehicles.active)
-        if state.strays:
-            shadows = stray_shadows(self.lanes, self.near_lanes, state.strays)
-            state = dataclasses.replace(state, vehicles=state.vehicles.and_more(shadows))
-            if may_ask is not None:
-                may_ask = np.pad(may_ask, (0, len(shadows.active)), constant_values=True)
+        if state.scripted_actors:
+            shadows = scripted_actor_shadows(self.lanes, self.lane_index, state.scripted_actors)
+            state = dataclasses.replace(state, vehicles=state.vehicles.appended(shadows))
+            if may_request is not None:
+                may_request = np.pad(may_request, (0, len(shadows.active)), constant_values=True)
         starts_m = path_starts(self.lanes, state.vehicles.path)
         orders = (orders or Orders.none(self._slot_count)).padded(len(state.vehicles.active))
-        light = self.signals.shows(state.time_s)
-        choice = self._choose(state, starts_m, light, may_ask, orders.runs)
-        if orders.blind.any():
+        light = self.signals.light_states(state.time_s)
+        decision = self._decide(state, starts_m, light, may_request, orders.runs_lights)
+        if orders.ignores_ego.any():
             active = state.vehicles.active.copy()
             active[[0, *range(self._slot_count, known)]] = False
             unseen = dataclasses.replace(state, vehicles=dataclasses.replace(state.vehicles, active=active))
-            blindly = self._choose(unseen, starts_m, light, may_ask, orders.runs)
-            choice = choice.where(orders.blind, blindly)
-        v = dataclasses.replace(state.vehicles, **choice.standing)
-        danger = None if driven is None else driven.danger
+            blindly = self._decide(unseen, starts_m, light, may_request, orders.runs_lights)
+            decision = decision.where(orders.ignores_ego, blindly)
+        v = dataclasses.replace(state.vehicles, **decision.right_of_way)
+        danger = None if perceived is None else perceived.is_endangered
         state = dataclasses.replace(
             state,
             time_s=state.time_s + dt_s,
             step_index=state.step_index + 1,
             vehicles=v,
             people=step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng, danger),
-            strays=moved_strays(state.strays, orders.pace_mps, dt_s),
+            scripted_actors=step_scripted_actors(state.scripted_actors, orders.scripted_mps, dt_s),
         )
-        changed = self._begin_change(state, choice.situation, driven, orders)
-        wanted_mps2 = np.minimum(choice.wanted_mps2, orders.most_mps2)
-        moved = drive(state.vehicles if changed is None else changed, wanted_mps2, dt_s)
-        vehicles = moved.first(self._slot_count) if driven is None else driven.without_shadows(moved)
+        changed = self._begin_change(state, decision.context, perceived, orders)
+        desired_mps2 = np.minimum(decision.desired_mps2, orders.max_mps2)
+        moved = move_vehicles(state.vehicles if changed is None else changed, desired_mps2, dt_s)
+        vehicles = moved.first(self._slot_count) if perceived is None else perceived.without_shadows(moved)
         state = dataclasses.replace(state, vehicles=vehicles)
         if changed is not None:
-            state = self._know_path(state, rng)
+            state = self._extend_paths(state, rng)
         state = self._change_lanes_at_ends(state, rng)
-        return self._turnover.renew(state, rng, None if driven is None else driven.centre_m)
+        return self._spawner.update(state, rng, None if perceived is None else perceived.centre_m)
 
-    def taken_over(self, state: TrafficState, ego: Driven) -> TrafficState:
+    def with_own_driver(self, state: TrafficState, ego: EgoPose) -> TrafficState:
         """Return the state in which vehicle 0, driven from outside until now, drives itself again from
         there."""
-        seen = self._see_driven(state, ego)
-        vehicles = seen.without_shadows(seen.everyone)
+        seen = self._perceive_ego(state, ego)
+        vehicles = seen.without_shadows(seen.vehicles)
         return dataclasses.replace(state, vehicles=vehicles, route_passed=seen.route_passed)
 
-    def stands_back(self, state: TrafficState) -> bool:
+    def waits_at_line(self, state: TrafficState) -> bool:
         """Return whether vehicle 0 stands at a line without right of way."""
         v = state.vehicles
         if v.speed_mps[0] > HALT_MPS or v.granted[0] > 0:
@@ -186,10 +192,10 @@ class Traffic:
         gap_m = path_starts(self.lanes, v.path[:1])[0, BEHIND + 1 :] - v.front_m[0]
         return bool((contested & (gap_m < AT_LINE_M)).any()) and not self.lanes.contested[v.lane[0]]
 
-    def lacks_room(self, state: TrafficState) -> bool:
+    def lacks_change_room(self, state: TrafficState) -> bool:
         """Return whether vehicle 0 needs another lane for its route where a lane change no longer fits."""
-        to_route = self._to_route(state)
-        return to_route is not None and to_route[1] < LACKS_ROOM_M
+        change_to_route = self._change_to_route(state)
+        return change_to_route is not None and change_to_route[1] < MIN_CHANGE_ROOM_M
 
     def to_light_m(self, state: TrafficState, in_s: float = 0.0) -> float:
         """Return the distance of vehicle 0 to the next junction of its route, m.
@@ -199,51 +205,51 @@ class Traffic:
         """
         v, ahead = state.vehicles, state.route[state.route_passed :]
         on_it = np.flatnonzero(self.lanes.contested[ahead])
-        shows = self.signals.shows(state.time_s + in_s)
+        shows = self.signals.light_states(state.time_s + in_s)
         closed = len(on_it) > 0 and shows[ahead[on_it[0]]] not in (Light.NONE, Light.GREEN)
         if not closed or self.lanes.contested[v.lane[0]]:
             return np.inf
         return float(path_starts(self.lanes, v.path[:1])[0, BEHIND + 1] - v.front_m[0])
 
-    def _choose(
+    def _decide(
         self,
         state: TrafficState,
         starts_m: Float64[np.ndarray, "M W"],
         light: Int[np.ndarray, "L"],
-        may_ask: Bool[np.ndarray, "M"] | None,
+        may_request: Bool[np.ndarray, "M"] | None,
         runs: Bool[np.ndarray, "M"],
-    ) -> Choice:
-        """Choose the acceleration and the right of way of all vehicles from their situations."""
+    ) -> Decision:
+        """Decide the acceleration and the right of way of all vehicles."""
         v = state.vehicles
-        ahead = find_leaders(self.lanes, v, starts_m)
+        leaders = find_leaders(self.lanes, v, starts_m)
         green = (light == Light.NONE) | (light == Light.GREEN)
-        way = claim_junctions(self.lanes, v, starts_m, ahead, green, state.time_s, may_ask, runs)
+        way = claim_junctions(self.lanes, v, starts_m, leaders, green, state.time_s, may_request, runs)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
-        to_route = self._to_route(state)
-        if to_route is not None:
-            halt_gap[0] = min(halt_gap[0], max(to_route[1], 0.0))
-        situation = see_ahead(self.lanes, v, starts_m, ahead, halt_gap)
-        courtesy_mps2 = self._courtesy_mps2(v, to_route, situation, starts_m)
-        wanted_mps2 = np.minimum(situation.wanted_mps2(v), courtesy_mps2)
+        change_to_route = self._change_to_route(state)
+        if change_to_route is not None:
+            halt_gap[0] = min(halt_gap[0], max(change_to_route[1], 0.0))
+        context = driving_context(self.lanes, v, starts_m, leaders, halt_gap)
+        courtesy_mps2 = self._courtesy_limits(v, change_to_route, context, starts_m)
+        desired_mps2 = np.minimum(context.desired_mps2(v), courtesy_mps2)
         halted = (v.speed_mps < STOPPED_MPS) & (way.line_gap_m < AT_LINE_M)
-        standing = {
+        right_of_way = {
             "granted": way.granted,
-            "asked_s": way.asked_s,
+            "requested_s": way.requested_s,
             "rank": way.rank,
             "has_stopped": v.has_stopped | halted,
         }
-        return Choice(standing, wanted_mps2, situation)
+        return Decision(right_of_way, desired_mps2, context)
 
-    def _see_driven(self, state: TrafficState, ego: Driven) -> SeenDriven:
+    def _perceive_ego(self, state: TrafficState, ego: EgoPose) -> PerceivedEgo:
         known = state.route, state.route_passed, state.time_s
-        return see_driven(self.lanes, self.near_lanes, state.vehicles, ego, *known)
+        return perceive_ego(self.lanes, self.lane_index, state.vehicles, ego, *known)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """Return the `Light` of each of the town's stop zones."""
         guarded = np.flatnonzero(self.signals.guarded)
         lights = np.full(self._zone_count, int(Light.NONE))
-        lights[self.lanes.zone[guarded]] = self.signals.shows(time_s)[guarded]
+        lights[self.lanes.zone[guarded]] = self.signals.light_states(time_s)[guarded]
         return lights
 
     def poses(self, state: TrafficState) -> Poses:
@@ -258,11 +264,11 @@ class Traffic:
         return [
             *vehicle_actors(v, self.poses(state), motion(self.lanes, v), kept),
             *people_actors(state.people),
-            *map(stray_actor, state.strays),
+            *map(scripted_actor_state, state.scripted_actors),
         ]
 
     def _begin_change(
-        self, state: TrafficState, situation: Situation, driven: SeenDriven | None, orders: Orders
+        self, state: TrafficState, context: DrivingContext, perceived: PerceivedEgo | None, orders: Orders
     ) -> Vehicles | None:
         """Begin the lane change of the one vehicle that has to change or gains most.
 
@@ -272,12 +278,12 @@ class Traffic:
         if orders.change is not None:
             return begin_change(self.lanes, v, *orders.change)
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
-        urge = self._route_urge(state)
-        may = who_may_change(self.lanes, self._stretches, v, fits, urge >= HAS_TO_MPS2)
-        may &= np.isinf(orders.most_mps2)
+        bonus = self._route_bonus(state)
+        may = lane_change_allowed(self.lanes, self._change_ranges, v, fits, bonus >= MANDATORY_MPS2)
+        may &= np.isinf(orders.max_mps2)
         may[:, self._slot_count :] = False  # shadows
-        may[:, 0] &= driven is None
-        change = choose_change(self.lanes, self._stretches, v, situation, may, urge)
+        may[:, 0] &= perceived is None
+        change = choose_change(self.lanes, self._change_ranges, v, context, may, bonus)
         if change is None:
             return None
         begun = begin_change(self.lanes, v, *change)
@@ -285,46 +291,46 @@ class Traffic:
             begun.path[0, BEHIND + 1 :] = -1  # the route decides where to go from the new lane
         return begun
 
-    def _route_urge(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
+    def _route_bonus(self, state: TrafficState) -> Float64[np.ndarray, "2 N"]:
         """Return the value of lane changes to the left and to the right for the route of vehicle 0, m/s²."""
-        v, urge = state.vehicles, np.zeros((2, len(state.vehicles.active)))
+        v, bonus = state.vehicles, np.zeros((2, len(state.vehicles.active)))
         if state.route_passed >= len(state.route):
-            return urge
-        enough_m = SETTLED_M + URGENT_S * v.speed_mps[0]
-        to_route = self._to_route(state)
-        if to_route is not None:
-            side, room_m = to_route
-            urge[side, 0] = LIKES_TO_MPS2 if room_m > enough_m else HAS_TO_MPS2
-            urge[1 - side, 0] = -np.inf
+            return bonus
+        enough_m = CHANGE_SPACING_M + URGENT_S * v.speed_mps[0]
+        change_to_route = self._change_to_route(state)
+        if change_to_route is not None:
+            side, room_m = change_to_route
+            bonus[side, 0] = DISCRETIONARY_MPS2 if room_m > enough_m else MANDATORY_MPS2
+            bonus[1 - side, 0] = -np.inf
         else:
-            room_m = self._stretches.room_m[:, v.lane[0]] - v.s_m[0]
-            urge[:, 0] = np.where(room_m > 2 * enough_m, 0.0, -np.inf)
-        return urge
+            room_m = self._change_ranges.room_m[:, v.lane[0]] - v.s_m[0]
+            bonus[:, 0] = np.where(room_m > 2 * enough_m, 0.0, -np.inf)
+        return bonus
 
-    def _courtesy_mps2(
+    def _courtesy_limits(
         self,
         v: Vehicles,
-        to_route: tuple[int, float] | None,
-        situation: Situation,
+        change_to_route: tuple[int, float] | None,
+        context: DrivingContext,
         starts_m: Float64[np.ndarray, "N W"],
     ) -> Float64[np.ndarray, "N"]:
         """Return upper limits of the accelerations that let vehicle 0 change lanes where it soon has to,
         m/s²."""
-        if to_route is None or to_route[1] > SETTLED_M + URGENT_S * v.speed_mps[0]:
+        if change_to_route is None or change_to_route[1] > CHANGE_SPACING_M + URGENT_S * v.speed_mps[0]:
             return np.full(len(v.active), np.inf)
-        side, target = to_route[0], np.full(len(v.active), -1)
-        target[0] = self._stretches.target[side, v.lane[0]]
-        return let_in(self.lanes, v, starts_m, situation, target, side)
+        side, target = change_to_route[0], np.full(len(v.active), -1)
+        target[0] = self._change_ranges.target[side, v.lane[0]]
+        return courtesy_limits(self.lanes, v, starts_m, context, target, side)
 
-    def _to_route(self, state: TrafficState) -> tuple[int, float] | None:
+    def _change_to_route(self, state: TrafficState) -> tuple[int, float] | None:
         """Return the side to which vehicle 0 has to change for its route, and the distance in which it can
         still begin."""
         if state.route_passed >= len(state.route) or not state.vehicles.active[0]:
             return None
         wanted = int(state.route[state.route_passed])
-        return room_to_change_m(self.lanes, self._stretches, state.vehicles, wanted)
+        return room_to_change_m(self.lanes, self._change_ranges, state.vehicles, wanted)
 
-    def _know_path(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+    def _extend_paths(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Fill in the lanes ahead that are not known yet."""
         to_come = state.route[state.route_passed :]
         vehicles = extend_paths(self.lanes, self._for_large, state.vehicles, to_come, rng)
@@ -348,4 +354,4 @@ class Traffic:
             )
             passed = state.route_passed + bool(over[0])
             state = dataclasses.replace(state, vehicles=moved, route_passed=passed)
-            state = self._know_path(state, rng)
+            state = self._extend_paths(state, rng)

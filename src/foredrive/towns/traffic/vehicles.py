@@ -40,7 +40,7 @@ class Vehicles:
     lateral_m: Float64[np.ndarray, "N"]
     """Lateral offset of the whole path, m, positive to the left of the centreline."""
     top_speed_mps: Float64[np.ndarray, "N"]
-    haste: Float64[np.ndarray, "N"]
+    speed_factor: Float64[np.ndarray, "N"]
     """Factor on the driving speed."""
     time_gap_s: Float64[np.ndarray, "N"]
     accel_mps2: Float64[np.ndarray, "N"]
@@ -53,7 +53,7 @@ class Vehicles:
     acceleration_mps2: Float64[np.ndarray, "N"]
     granted: Int[np.ndarray, "N"]
     """Number of lanes ahead for which right of way has been granted."""
-    asked_s: Float64[np.ndarray, "N"]
+    requested_s: Float64[np.ndarray, "N"]
     """Time since which right of way has been requested, s; infinite without a request."""
     rank: Float64[np.ndarray, "N"]
     """Time at which right of way was granted, s. In a junction the lower rank goes first."""
@@ -94,7 +94,7 @@ class Vehicles:
         return np.where(self.shift_m != 0, np.maximum(to_go, 0.0), 0.0)
 
     @property
-    def steerable_mps(self) -> Float64[np.ndarray, "N"]:
+    def change_max_mps(self) -> Float64[np.ndarray, "N"]:
         """Return the maximum speed in the present lane change, given its length, m/s; infinite without one.
 
         The quintic of `offset_m` has its maximum curvature, 10 / √3 shift / length², at (3 - √3) / 6 of its
@@ -122,7 +122,7 @@ class Vehicles:
         """Return the first `count` vehicles."""
         return Vehicles(**{name: value[:count] for name, value in vars(self).items()})
 
-    def and_more(self, more: "Vehicles") -> "Vehicles":
+    def appended(self, more: "Vehicles") -> "Vehicles":
         """Return the vehicles with those of `more` appended."""
         return Vehicles(
             **{name: np.concatenate([value, getattr(more, name)]) for name, value in vars(self).items()}
@@ -169,10 +169,10 @@ def empty_slots(count: int) -> Vehicles:
         values[name] = np.zeros(count, dtype=np.bool_)
     for name in ("track_id", "category", "style", "granted"):
         values[name] = np.zeros(count, dtype=np.int64)
-    for name in ("wheelbase_m", "accel_mps2", "decel_mps2", "haste", "change_length_m"):
+    for name in ("wheelbase_m", "accel_mps2", "decel_mps2", "speed_factor", "change_length_m"):
         values[name] = np.ones(count)
     values["path"] = np.full((count, WINDOW), -1)
-    values["asked_s"] = np.full(count, np.inf)
+    values["requested_s"] = np.full(count, np.inf)
     return Vehicles(**values)
 
 
@@ -186,7 +186,7 @@ def path_starts(graph: LaneGraph, path: Int[np.ndarray, "N W"]) -> Float64[np.nd
     return start
 
 
-def along_path(
+def points_on_paths(
     graph: LaneGraph,
     path: Int[np.ndarray, "N W"],
     starts_m: Float64[np.ndarray, "N W"],
@@ -221,8 +221,8 @@ def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
     path = vehicles.path[live]
     starts = path_starts(graph, path)
     axle_s = vehicles.s_m[live] - vehicles.axle_to_centre_m[live]
-    rear = along_path(graph, path, starts, axle_s)
-    front = along_path(graph, path, starts, axle_s + vehicles.wheelbase_m[live])
+    rear = points_on_paths(graph, path, starts, axle_s)
+    front = points_on_paths(graph, path, starts, axle_s + vehicles.wheelbase_m[live])
     left = _left_of(front - rear)
     axle = rear + vehicles.offset_m(np.zeros(len(vehicles.active)))[live, None] * left
     forward = front + vehicles.offset_m(vehicles.wheelbase_m)[live, None] * left - axle
@@ -261,7 +261,7 @@ def _up_of(
     return np.stack([-fz * ly, fz * lx, fx * ly - fy * lx], axis=1)
 
 
-def speed_to_drive(
+def desired_speed(
     graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndarray, "N W"]
 ) -> Float64[np.ndarray, "N"]:
     """Return the wanted speed, m/s: the speed profile at the vehicle, lowered in time for the lanes ahead.
@@ -274,5 +274,5 @@ def speed_to_drive(
     entry = np.where(ahead >= 0, graph.speed_mps[graph.first[ahead]], np.inf)
     to_go = starts_m[:, BEHIND + 1 :] - soon_m[:, None]
     in_time = np.sqrt(entry**2 + 2 * SLOWING_MPS2 * np.maximum(to_go, 0.0)).min(axis=1)
-    wanted = np.minimum(vehicles.top_speed_mps, vehicles.haste * np.minimum(here, in_time))
-    return np.minimum(wanted, vehicles.steerable_mps)
+    wanted = np.minimum(vehicles.top_speed_mps, vehicles.speed_factor * np.minimum(here, in_time))
+    return np.minimum(wanted, vehicles.change_max_mps)

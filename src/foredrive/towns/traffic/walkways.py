@@ -21,9 +21,9 @@ REACH_M = 7.0
 """Maximum distance from the end of a crosswalk to a walkway, m."""
 MARKED_NEARBY_M = 15.0
 PAST_LINE_M = 1.5
-LONGEST_CROSSING_M = 28.0
-NEAREST_KERB_M = 1.0
-SHORTEST_WALK_M = 0.5
+MAX_CROSSING_M = 28.0
+MIN_KERB_M = 1.0
+MIN_WALK_M = 0.5
 ALONG_LANE_M = 1.7
 """Half the length of lane that people on a crossing may occupy, m."""
 ACROSS_LANE_M = 2.2
@@ -97,7 +97,7 @@ def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
     strips = [s for s in town.strips_of(StripKind.SIDEWALK) if len(s.left_xyz) > 1]
     walks = [0.5 * (s.left_xyz + s.right_xyz) + [0.0, 0.0, WALKWAY_RAISE_M] for s in strips]
     widths = [float(np.linalg.norm(s.left_xyz - s.right_xyz, axis=1).min()) for s in strips]
-    kept = [i for i, walk in enumerate(walks) if _length(walk) > SHORTEST_WALK_M and widths[i] > 0.8]
+    kept = [i for i, walk in enumerate(walks) if _length(walk) > MIN_WALK_M and widths[i] > 0.8]
     walks, widths = [walks[i] for i in kept], [widths[i] for i in kept]
     crossings = _crossings(town, lanes, walks, widths)
     cuts: list[list[float]] = [[] for _ in walks]
@@ -110,7 +110,7 @@ def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
     is_crossing = np.arange(len(every)) >= len(pieces)
     counts = np.array([len(line) for line in every], dtype=np.int64)
     ends, incident = _join(every)
-    meeting = _lane_meetings(every, is_crossing, lanes)
+    meeting = _crossed_lanes(every, is_crossing, lanes)
     return WalkGraph(
         xyz=np.concatenate(every) if every else np.zeros((0, 3)),
         along_m=np.concatenate([_along(line) for line in every]) if every else np.zeros(0),
@@ -156,7 +156,7 @@ def _crossings(
         if a is None or b is None or a[0] == b[0]:
             continue
         xyz = np.stack([a[1], chord[0], chord[1], b[1]])
-        if _length(xyz) < LONGEST_CROSSING_M:
+        if _length(xyz) < MAX_CROSSING_M:
             found.append(_Crossing(_without_repeats(xyz), (a, b)))
     return found
 
@@ -183,12 +183,12 @@ def _perpendicular(
     ahead = (lane[1] - lane[0])[:2] / np.linalg.norm((lane[1] - lane[0])[:2])
     here, ends = shapely.Point(start[:2]), []
     for side in (np.array([-ahead[1], ahead[0]]), np.array([ahead[1], -ahead[0]])):
-        ray = shapely.LineString([start[:2], start[:2] + LONGEST_CROSSING_M * side])
+        ray = shapely.LineString([start[:2], start[:2] + MAX_CROSSING_M * side])
         to_kerb = [
             here.distance(ray.intersection(walkways.geometries[i])) - 0.5 * widths_m[i]
             for i in walkways.query(ray, predicate="intersects")
         ]
-        if min(to_kerb, default=0.0) < NEAREST_KERB_M:
+        if min(to_kerb, default=0.0) < MIN_KERB_M:
             return None
         ends.append(np.append(start[:2] + min(to_kerb) * side, start[2]))
     return np.stack(ends)
@@ -255,7 +255,7 @@ def _join(walks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return place.reshape(-1, 2).astype(np.int64), incident
 
 
-def _lane_meetings(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: LaneGraph) -> np.ndarray:
+def _crossed_lanes(walks: list[np.ndarray], is_crossing: np.ndarray, lanes: LaneGraph) -> np.ndarray:
     """Return rows of crossing, lane, range on the lane and range on the crossing, sorted by lane."""
     rows = []
     lines = [shapely.LineString(lanes.samples(i)[:, :2]) for i in range(len(lanes.ids))]

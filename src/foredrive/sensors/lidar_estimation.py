@@ -15,7 +15,7 @@ _MOST_SPREAD_RAD = math.radians(0.25)
 channel, or the lidar is tilted."""
 
 
-def measure_lidar(
+def estimate_lidar(
     sweep: LidarSweep, twist_ego: Float[Tensor, "6"], *, period_s: float, reach_m: float
 ) -> SpinningLidar | None:
     """Estimate channels, columns, rate and position of the lidar that fired a sweep.

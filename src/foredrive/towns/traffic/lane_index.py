@@ -15,7 +15,7 @@ HEIGHT_SAMPLES = 8
 
 
 @dataclass(frozen=True)
-class NearLanes:
+class LaneIndex:
     """The P samples of a town's centrelines."""
 
     xyz: Float64[np.ndarray, "P 3"]
@@ -49,14 +49,14 @@ class NearLanes:
         return np.where(level.any(axis=1), z, about_m)
 
 
-def near_lanes_of(graph: LaneGraph) -> NearLanes:
+def build_lane_index(graph: LaneGraph) -> LaneIndex:
     """Build the search for the samples of a graph's lanes."""
     lane = np.repeat(np.arange(len(graph.ids)), graph.count)
     at = np.arange(len(lane))
     last = at == (graph.first + graph.count - 1)[lane]
     step = graph.xyz[np.where(last, at, at + 1)] - graph.xyz[np.where(last, at - 1, at)]
     flat_m = np.hypot(step[:, 0], step[:, 1]).clip(1e-9)
-    return NearLanes(
+    return LaneIndex(
         xyz=graph.xyz,
         lane=lane,
         along_m=(at - graph.first[lane]) * graph.step_m[lane],

@@ -1,4 +1,4 @@
-"""Meetings of two lanes: lanes that part from a common start, cross, or merge."""
+"""Overlaps of two lanes: lanes that part from a common start, cross, or merge."""
 
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ OVERPASS_M = 3.0
 """Height difference above which lanes do not meet, m."""
 
 
-class Meetings(NamedTuple):
-    """The lanes that each lane meets, in compressed rows: lane i has first[i]:first[i+1]."""
+class LaneOverlaps(NamedTuple):
+    """The lanes that each lane overlaps, in compressed rows: lane i has first[i]:first[i+1]."""
 
     first: Int[np.ndarray, "L_1"]
     other: Int[np.ndarray, "M"]
@@ -28,14 +28,14 @@ class Meetings(NamedTuple):
     """Arc length on the other lane from which its traffic is out of the way, m; infinite: at its end."""
 
 
-def find_meetings(
+def find_overlaps(
     lines: list[Float64[np.ndarray, "_ 3"]],
     lengths_m: Float64[np.ndarray, "L"],
     successors: list[list[int]],
     predecessors: list[list[int]],
     junction: Int[np.ndarray, "L"],
     groups: list[str],
-) -> tuple[Meetings, Meetings]:
+) -> tuple[LaneOverlaps, LaneOverlaps]:
     """Find siblings (lanes that part from a common start) and conflicts (lanes that cross or merge).
 
     Lanes meet within a junction, or outside of junctions where they share an end. Lanes that follow each
@@ -76,7 +76,7 @@ def _first_stretch(near: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
 
 
 class _Rows:
-    """Meetings under construction."""
+    """Overlaps under construction."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, int, float, float, float]] = []
@@ -92,11 +92,11 @@ class _Rows:
         enter_b, clear_b = _span_m(near_b, lengths_m[b])
         self._rows += [(a, b, enter_a, enter_b, clear_b), (b, a, enter_b, enter_a, clear_a)]
 
-    def compressed(self, lane_count: int) -> Meetings:
+    def compressed(self, lane_count: int) -> LaneOverlaps:
         """Return the rows sorted by lane."""
         table = np.array(sorted(self._rows)).reshape(-1, 5)
         counts = np.bincount(table[:, 0].astype(np.int64), minlength=lane_count)
-        return Meetings(
+        return LaneOverlaps(
             np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
             table[:, 1].astype(np.int64),
             *(np.ascontiguousarray(column) for column in table[:, 2:].T),

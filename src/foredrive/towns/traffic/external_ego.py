@@ -15,44 +15,44 @@ from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene import Category
 from foredrive.towns.traffic.lane_graph import LaneGraph
-from foredrive.towns.traffic.near_lanes import NearLanes
+from foredrive.towns.traffic.lane_index import LaneIndex
 from foredrive.towns.traffic.paths import towards
-from foredrive.towns.traffic.strays import Stray
+from foredrive.towns.traffic.scripted_actors import ScriptedActor
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts
 
 LANE_REACH_M = 2.5
-MOST_TURNED_RAD = np.deg2rad(60.0)
-TURNED_M = 2.0
+MAX_HEADING_ERROR_RAD = np.deg2rad(60.0)
+HEADING_ERROR_M = 2.0
 """Lateral distance that counts as much as a heading error of one radian, m."""
-KNOWN_M = 0.6
+KNOWN_LANE_BONUS_M = 0.6
 """Bonus for lanes of the known path, m: they count as this much closer."""
-KNOWN_INSIDE_M, MOST_TURNED_INSIDE_RAD = 3.0, np.deg2rad(90.0)
+KNOWN_CONNECTOR_BONUS_M, MAX_HEADING_ERROR_INSIDE_RAD = 3.0, np.deg2rad(90.0)
 """The same bonus (m) and the maximum heading error (rad) inside junctions. They are larger, so that a vehicle
 that turns in wide is not assigned another path."""
 PATH_LOOK = 4
 HALF_CORRIDOR_M = 1.3
 """Half the width of the corridor around the middle of a lane, m. Anything inside it blocks the lane."""
-SOON_S = 1.0
+LOOKAHEAD_S = 1.0
 """Time ahead, s, at which drivers see that a vehicle comes into their lane (outside of junctions)."""
-STRAYS_SOON_S = (1.0, 2.0, 3.0)
+SCRIPTED_LOOKAHEAD_S = (1.0, 2.0, 3.0)
 """The same for people on foot or on a bicycle, s."""
-SLOWEST_MPS = 0.5
+MIN_MOVING_MPS = 0.5
 HARD_BRAKING_MPS2, REACTION_S = 6.0, 0.2
 """Deceleration and reaction time of hard braking. A vehicle that cannot stop for a line even so is considered
 to enter the junction, whatever the light shows."""
-COMES_MPS, COMES_WITHIN_S = 1.0, 4.0
+APPROACH_MPS, APPROACH_S = 1.0, 4.0
 """Minimum speed and maximum time to the line at which vehicle 0 counts as approaching. The others yield only
 to an approaching vehicle or to one that waits at the line."""
-AT_LINE_M, TURN_S, MISSED_S = 4.0, 8.0, 4.0
+AT_LINE_M, TURN_S, MISSED_TURN_S = 4.0, 8.0, 4.0
 """Maximum distance to the line at which vehicle 0 counts as waiting, m, and the length of its turn, s. It may
-not want to go: if it does not use its turn within `TURN_S`, it gets the next one only after `MISSED_S`."""
-RUN_OVER_S = 1.5
-BESIDE_M = 0.5
+not want to go: if it does not use its turn within `TURN_S`, it gets the next only after `MISSED_TURN_S`."""
+DANGER_S = 1.5
+DANGER_MARGIN_M = 0.5
 """Time (s) and lateral margin (m) of the region around a vehicle that people do not step into."""
 
 
 @dataclass(frozen=True)
-class Driven:
+class EgoPose:
     """The present pose and motion of vehicle 0."""
 
     axle_xyz: Float64[np.ndarray, "3"]
@@ -67,7 +67,7 @@ class Driven:
         """Return the unit heading, seen from above."""
         return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad), 0.0])
 
-    def later(self, seconds: float) -> "Driven":
+    def extrapolated(self, seconds: float) -> "EgoPose":
         """Return the pose after a time (s) at this speed and turn rate."""
         turned = self.turn_radps * seconds
         along = self.yaw_rad + 0.5 * turned
@@ -76,82 +76,82 @@ class Driven:
 
 
 @dataclass(frozen=True)
-class SeenDriven:
+class PerceivedEgo:
     """Vehicle 0 as the other road users see it."""
 
-    driven: Driven
-    everyone: Vehicles
+    ego: EgoPose
+    vehicles: Vehicles
     """All vehicles, then the shadows. Vehicle 0 is on the lane it follows, and not active if it follows
     none."""
     count: int
     """Number of vehicles without the shadows."""
     route_passed: int
-    may_ask: Bool[np.ndarray, "M"]
+    may_request: Bool[np.ndarray, "M"]
     """Vehicles whose requests for right of way count. Those of vehicle 0 count only while it approaches or
     waits at the line."""
 
     @property
     def centre_m(self) -> Float64[np.ndarray, "3"]:
         """Return the middle of vehicle 0 on the ground, m."""
-        return self.driven.axle_xyz + self.everyone.axle_to_centre_m[0] * self.driven.forward
+        return self.ego.axle_xyz + self.vehicles.axle_to_centre_m[0] * self.ego.forward
 
-    def danger(self, xy: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    def is_endangered(self, xy: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
         """Return for each point whether vehicle 0 is there or soon will be."""
-        forward, offset = self.driven.forward[:2], xy - self.centre_m[:2]
+        forward, offset = self.ego.forward[:2], xy - self.centre_m[:2]
         aside = np.abs(offset @ [-forward[1], forward[0]])
-        half_length, half_width = 0.5 * self.everyone.size_lwh[0, :2]
-        ahead = half_length + BESIDE_M + RUN_OVER_S * self.driven.speed_mps
+        half_length, half_width = 0.5 * self.vehicles.size_lwh[0, :2]
+        ahead = half_length + DANGER_MARGIN_M + DANGER_S * self.ego.speed_mps
         along = offset @ forward
-        return np.asarray((along > -half_length) & (along < ahead) & (aside < half_width + BESIDE_M))
+        return np.asarray((along > -half_length) & (along < ahead) & (aside < half_width + DANGER_MARGIN_M))
 
     def without_shadows(self, moved: Vehicles) -> Vehicles:
         """Return the vehicles without the shadows after all have moved.
 
         Vehicle 0 stays in its slot, wherever it is.
         """
-        return _replaced(moved.first(self.count), active=True)
+        return _with_ego(moved.first(self.count), active=True)
 
 
-def see_driven(
+def perceive_ego(
     graph: LaneGraph,
-    near: NearLanes,
+    near: LaneIndex,
     vehicles: Vehicles,
-    driven: Driven,
+    ego: EgoPose,
     route: Int[np.ndarray, "R"],
     route_passed: int,
     time_s: float,
-) -> SeenDriven:
+) -> PerceivedEgo:
     """Return the view of vehicle 0 at the pose to which it has been driven from outside.
 
     Args:
         route: as in `TrafficState`. Off its route, vehicle 0 is assumed to go as straight as it can.
     """
-    centre = driven.axle_xyz + vehicles.axle_to_centre_m[0] * driven.forward
+    centre = ego.axle_xyz + vehicles.axle_to_centre_m[0] * ego.forward
     known = vehicles.path[0, BEHIND : BEHIND + PATH_LOOK]
-    found = find_lane(near, centre, driven.yaw_rad, known, known[graph.junction[known] >= 0])
+    found = find_lane(near, centre, ego.yaw_rad, known, known[graph.junction[known] >= 0])
     if found is None:
-        placed = _replaced(vehicles, active=False, speed_mps=0.0, granted=0)
+        placed = _with_ego(vehicles, active=False, speed_mps=0.0, granted=0)
     else:
         lane, s_m = found
-        route_passed, to_come = _route_from(graph, route, route_passed, lane)
-        path, passed = _path_on(graph, vehicles.path[0], lane, to_come)
-        placed = _replaced(
+        route_passed, to_come = _remaining_route(graph, route, route_passed, lane)
+        path, passed = _path_from(graph, vehicles.path[0], lane, to_come)
+        placed = _with_ego(
             vehicles,
             path=path,
             s_m=min(s_m, float(graph.length_m[lane])),
-            speed_mps=driven.speed_mps,
+            speed_mps=ego.speed_mps,
             acceleration_mps2=0.0,
             granted=max(0, int(vehicles.granted[0]) - passed),
             has_stopped=bool(vehicles.has_stopped[0]) and passed == 0,
             shift_m=0.0,
         )
     own = placed.path[0, BEHIND - 1 : BEHIND + 2] if placed.active[0] else np.zeros(0, dtype=np.int64)
-    beside = _shadows(near, graph, driven, placed.axle_to_centre_m[0], placed.size_lwh[0], own)
-    everyone, may_ask = _on_its_way(graph, placed.and_more(beside), time_s)
-    return SeenDriven(driven, everyone, len(vehicles.active), route_passed, may_ask)
+    beside = _shadows(near, graph, ego, placed.axle_to_centre_m[0], placed.size_lwh[0], own)
+    with_shadows, may_request = _grant_committed(graph, placed.appended(beside), time_s)
+    return PerceivedEgo(ego, with_shadows, len(vehicles.active), route_passed, may_request)
 
 
-def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
+def _with_ego(vehicles: Vehicles, **changes: object) -> Vehicles:
     """Return the vehicles with other values for the first one."""
     values = {}
     for name, value in changes.items():
@@ -161,7 +161,7 @@ def _replaced(vehicles: Vehicles, **changes: object) -> Vehicles:
 
 
 def find_lane(
-    near: NearLanes,
+    near: LaneIndex,
     centre: Float64[np.ndarray, "3"],
     yaw_rad: float,
     known: Int[np.ndarray, "k"],
@@ -177,21 +177,23 @@ def find_lane(
         inside: those of the known lanes that are in junctions.
     """
     samples = near.within(centre, LANE_REACH_M)
-    turned = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
+    heading_error = np.abs((yaw_rad - near.heading[samples] + np.pi) % (2 * np.pi) - np.pi)
     surely = (near.lane[samples, None] == inside).any(axis=1)
-    may = turned < np.where(surely, MOST_TURNED_INSIDE_RAD, MOST_TURNED_RAD)
-    samples, turned, surely = samples[may], turned[may], surely[may]
+    may = heading_error < np.where(surely, MAX_HEADING_ERROR_INSIDE_RAD, MAX_HEADING_ERROR_RAD)
+    samples, heading_error, surely = samples[may], heading_error[may], surely[may]
     if not len(samples):
         return None
     offset = centre[:2] - near.xyz[samples, :2]
-    cost = np.hypot(offset[:, 0], offset[:, 1]) + TURNED_M * turned
-    cost -= np.where(surely, KNOWN_INSIDE_M, KNOWN_M * (near.lane[samples, None] == known).any(axis=1))
+    cost = np.hypot(offset[:, 0], offset[:, 1]) + HEADING_ERROR_M * heading_error
+    cost -= np.where(
+        surely, KNOWN_CONNECTOR_BONUS_M, KNOWN_LANE_BONUS_M * (near.lane[samples, None] == known).any(axis=1)
+    )
     best = int(np.argmin(cost))
     along_m = float(offset[best] @ near.ahead[samples[best]])
     return int(near.lane[samples[best]]), max(0.0, float(near.along_m[samples[best]]) + along_m)
 
 
-def _route_from(
+def _remaining_route(
     graph: LaneGraph, route: Int[np.ndarray, "R"], passed: int, lane: int
 ) -> tuple[int, Int[np.ndarray, "_"]]:
     """Return how many stretches of the route lie behind vehicle 0, and the stretches from the current one on.
@@ -210,7 +212,7 @@ def _route_from(
     return passed, route[:0]
 
 
-def _path_on(
+def _path_from(
     graph: LaneGraph, path: Int[np.ndarray, "W"], lane: int, to_come: Int[np.ndarray, "R"]
 ) -> tuple[Int[np.ndarray, "W"], int]:
     """Return the path of a vehicle that has come to a lane, and the number of lanes it has advanced."""
@@ -234,42 +236,42 @@ def _path_on(
     return path, passed
 
 
-def stray_shadows(graph: LaneGraph, near: NearLanes, strays: Sequence[Stray]) -> Vehicles:
-    """Return shadow vehicles on the lanes that moving strays block or soon will block."""
-    shadows, nobodys = empty_slots(0), np.zeros(0, dtype=np.int64)
-    for stray in strays:
-        if stray.is_under_way:
-            as_driven = Driven(stray.xyz, stray.yaw_rad, stray.speed_mps)
-            size = stray.size_lwh
-            shadows = shadows.and_more(_shadows(near, graph, as_driven, 0.0, size, nobodys, STRAYS_SOON_S))
+def scripted_actor_shadows(graph: LaneGraph, near: LaneIndex, actors: Sequence[ScriptedActor]) -> Vehicles:
+    """Return shadow vehicles on the lanes that moving scripted actors block or soon will block."""
+    shadows, no_lanes = empty_slots(0), np.zeros(0, dtype=np.int64)
+    for actor in actors:
+        if actor.is_under_way:
+            pose = EgoPose(actor.xyz, actor.yaw_rad, actor.speed_mps)
+            size = actor.size_lwh
+            shadows = shadows.appended(_shadows(near, graph, pose, 0.0, size, no_lanes, SCRIPTED_LOOKAHEAD_S))
     return shadows
 
 
 def _shadows(
-    near: NearLanes,
+    near: LaneIndex,
     graph: LaneGraph,
-    driven: Driven,
+    ego: EgoPose,
     axle_to_centre_m: float,
     size_lwh: Float64[np.ndarray, "3"],
     own: Int[np.ndarray, "k"],
-    soon_s: tuple[float, ...] = (SOON_S,),
+    soon_s: tuple[float, ...] = (LOOKAHEAD_S,),
 ) -> Vehicles:
     """Return shadow vehicles on the lanes that a vehicle blocks, without its own lanes."""
     half = 0.5 * size_lwh[:2]
     rows: dict[int, tuple[float, float, float]] = {}
-    times_s = (0.0, *soon_s) if driven.speed_mps > SLOWEST_MPS else (0.0,)
+    times_s = (0.0, *soon_s) if ego.speed_mps > MIN_MOVING_MPS else (0.0,)
     for time_s in times_s:
-        then = driven.later(time_s)
+        then = ego.extrapolated(time_s)
         centre = then.axle_xyz + axle_to_centre_m * then.forward
         samples = near.within(centre, float(np.hypot(*half)) + HALF_CORRIDOR_M)
         lane = near.lane[samples]
         wanted = (lane[:, None] != own).all(axis=1) & ((graph.junction[lane] < 0) if time_s else True)
         samples = samples[wanted]
-        samples = samples[_is_crossed(near, samples, centre, then.yaw_rad, half)]
+        samples = samples[_blocks_corridor(near, samples, centre, then.yaw_rad, half)]
         for here in np.unique(near.lane[samples]).tolist():
             on_it = samples[near.lane[samples] == here]
             first, last = near.along_m[on_it[0]], near.along_m[on_it[-1]]
-            mps = float(driven.speed_mps * np.cos(then.yaw_rad - near.heading[on_it[0]]))
+            mps = float(ego.speed_mps * np.cos(then.yaw_rad - near.heading[on_it[0]]))
             if here not in rows:  # placed where it would be now if it were in that lane already
                 rows[here] = float(first) - mps * time_s, float(last) - mps * time_s, mps
     one = empty_slots(len(rows))
@@ -290,8 +292,8 @@ def _shadows(
     )
 
 
-def _is_crossed(
-    near: NearLanes,
+def _blocks_corridor(
+    near: LaneIndex,
     samples: Int[np.ndarray, "n"],
     centre: Float64[np.ndarray, "3"],
     yaw_rad: float,
@@ -313,28 +315,28 @@ def _is_crossed(
     return np.asarray(enters <= leaves)
 
 
-def _on_its_way(
-    graph: LaneGraph, everyone: Vehicles, time_s: float
+def _grant_committed(
+    graph: LaneGraph, vehicles: Vehicles, time_s: float
 ) -> tuple[Vehicles, Bool[np.ndarray, "M"]]:
     """Grant vehicle 0 the junction that it drives through or can no longer stop for.
 
     Also return which vehicles may request right of way.
     """
-    may_ask = np.ones(len(everyone.active), dtype=np.bool_)
-    speed, path = float(everyone.speed_mps[0]), everyone.path[0]
+    may_request = np.ones(len(vehicles.active), dtype=np.bool_)
+    speed, path = float(vehicles.speed_mps[0]), vehicles.path[0]
     contested = graph.contested[path] & (path >= 0)
     inside = bool(contested[BEHIND])
     first = BEHIND + 1 + (0 if inside else int(np.argmax(contested[BEHIND + 1 :])))
-    if not everyone.active[0] or not contested[first]:
-        return everyone, may_ask
-    gap_m = float(path_starts(graph, path[None])[0, first] - everyone.front_m[0])
-    comes = speed > COMES_MPS and gap_m < COMES_WITHIN_S * speed
-    granted_s = float(everyone.rank[0])  # time at which its last turn began; 0 if it has had none
-    has_missed = granted_s > 0 and TURN_S <= time_s - granted_s < TURN_S + MISSED_S
-    may_ask[0] = comes or (speed <= COMES_MPS and gap_m < AT_LINE_M and not has_missed)
-    if not may_ask[0]:
-        return _replaced(everyone, granted=0), may_ask
+    if not vehicles.active[0] or not contested[first]:
+        return vehicles, may_request
+    gap_m = float(path_starts(graph, path[None])[0, first] - vehicles.front_m[0])
+    comes = speed > APPROACH_MPS and gap_m < APPROACH_S * speed
+    granted_s = float(vehicles.rank[0])  # time at which its last turn began; 0 if it has had none
+    has_missed = granted_s > 0 and TURN_S <= time_s - granted_s < TURN_S + MISSED_TURN_S
+    may_request[0] = comes or (speed <= APPROACH_MPS and gap_m < AT_LINE_M and not has_missed)
+    if not may_request[0]:
+        return _with_ego(vehicles, granted=0), may_request
     if inside or (comes and gap_m < speed**2 / (2 * HARD_BRAKING_MPS2) + REACTION_S * speed):
         end = first + int(np.argmin(np.append(contested[first:], False)))
-        return _replaced(everyone, granted=end - 1 - BEHIND), may_ask
-    return everyone, may_ask
+        return _with_ego(vehicles, granted=end - 1 - BEHIND), may_request
+    return vehicles, may_request

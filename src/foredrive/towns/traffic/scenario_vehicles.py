@@ -1,4 +1,4 @@
-"""Guests: vehicles that a caller places on the road for a purpose."""
+"""Vehicles that a scenario adds to the traffic, and the right of way that it grants them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.scene import Category
-from foredrive.towns.traffic.fleet import draw_fleet, place
+from foredrive.towns.traffic.fleet import draw_fleet, place_vehicles
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.paths import extend_paths
 from foredrive.towns.traffic.state import TrafficState
@@ -15,27 +15,27 @@ from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.traffic.vehicles import AHEAD, BEHIND
 
 CANDIDATES = 16
-ACCELERATION_MPS2, TIME_GAP_S, HASTE = 3.0, 1.0, 1.1
-"""Values of a guest's driver, so that it reaches a wanted place in time."""
+ACCELERATION_MPS2, TIME_GAP_S, SPEED_FACTOR = 3.0, 1.0, 1.1
+"""Values of an added vehicle's driver, so that it reaches a wanted place in time."""
 CLEAR_M = 7.0
 
 
-def point_on(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[int, float]:
+def point_along(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[int, float]:
     """Return the index of the lane at a distance along a row of lanes, and the arc length on it, m."""
     starts_m = np.append(0.0, np.cumsum(graph.length_m[list(lanes)]))
     at = min(max(int(np.searchsorted(starts_m, along_m, side="right")) - 1, 0), len(lanes) - 1)
     return at, along_m - float(starts_m[at])
 
 
-def points_on(
+def points_along(
     graph: LaneGraph, lanes: Sequence[int], along_m: Float64[np.ndarray, "n"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Return points at distances along a row of lanes."""
-    at = [point_on(graph, lanes, m) for m in along_m.tolist()]
+    at = [point_along(graph, lanes, m) for m in along_m.tolist()]
     return graph.position(np.array([lanes[k] for k, _ in at]), np.array([s for _, s in at]))
 
 
-def invited(
+def add_vehicle(
     traffic: Traffic, state: TrafficState, slot: int, lanes: Sequence[int], along_m: float, speed_mps: float
 ) -> TrafficState:
     """Return the state with a car in a slot, at a distance along a row of lanes that it will follow."""
@@ -45,8 +45,8 @@ def invited(
     drawn = draw_fleet(rng, np.full(CANDIDATES, state.next_track_id), no, no)
     car = int(np.argmax((drawn.category == Category.CAR) & (drawn.size_lwh[:, 0] < 5.0)))
     one = dataclasses.replace(drawn, **{name: value[[car]] for name, value in vars(drawn).items()})
-    at, s_m = point_on(graph, lanes, along_m)
-    one = place(graph, one, np.array([lanes[at]]), np.array([s_m]))
+    at, s_m = point_along(graph, lanes, along_m)
+    one = place_vehicles(graph, one, np.array([lanes[at]]), np.array([s_m]))
     path = one.path.copy()
     onward = list(lanes[at + 1 : at + 1 + AHEAD])
     path[0, BEHIND + 1 : BEHIND + 1 + len(onward)] = onward
@@ -56,7 +56,7 @@ def invited(
         speed_mps=np.array([speed_mps]),
         accel_mps2=np.array([ACCELERATION_MPS2]),
         time_gap_s=np.array([TIME_GAP_S]),
-        haste=np.array([HASTE]),
+        speed_factor=np.array([SPEED_FACTOR]),
     )
     vehicles = state.vehicles.replace_rows(np.array([slot]), one)
     everywhere, nowhere = np.ones(len(graph.ids), dtype=np.bool_), np.zeros(0, dtype=np.int64)
@@ -64,7 +64,7 @@ def invited(
     return dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + 1)
 
 
-def cleared(
+def clear_area(
     traffic: Traffic, state: TrafficState, xyz: Float64[np.ndarray, "n 3"], seen_within_m: float
 ) -> TrafficState | None:
     """Return the state without the vehicles near some points; None if one of them could be seen to vanish.
@@ -79,7 +79,7 @@ def cleared(
     return dataclasses.replace(state, vehicles=dataclasses.replace(v, active=v.active & ~near))
 
 
-def granted_through(traffic: Traffic, state: TrafficState, slot: int, lane: int) -> TrafficState:
+def grant_junction(traffic: Traffic, state: TrafficState, slot: int, lane: int) -> TrafficState:
     """Grant a vehicle right of way before all others, up to a lane of its path and out of that junction."""
     v, graph = state.vehicles, traffic.lanes
     ahead = v.path[slot, BEHIND:]

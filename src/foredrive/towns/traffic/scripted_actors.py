@@ -1,4 +1,4 @@
-"""Strays: people and cyclists on paths of their own, off walkways and across lanes.
+"""Scripted actors: people and cyclists on paths of their own, off walkways and across lanes.
 
 The caller sets their speed.
 """
@@ -13,18 +13,18 @@ from foredrive.scene import Category
 
 ACCELERATION_MPS2 = 4.0
 FIRST_TRACK_ID = 40_000
-"""First track id of strays. Neither traffic nor parked cars use ids from here on."""
+"""First track id of scripted actors. Neither traffic nor parked cars use ids from here on."""
 
 
 @dataclass(frozen=True, eq=False)
-class Stray:
+class ScriptedActor:
     """A person or a cyclist on a path of its own. Equal paths and speeds give equal motion."""
 
     track_id: int
     category: Category
     style: int
     size_lwh: Float64[np.ndarray, "3"]
-    way_xyz: Float64[np.ndarray, "W 3"]
+    path_xyz: Float64[np.ndarray, "W 3"]
     """Points of the path, world frame, m, on the ground. No two points coincide."""
     s_m: float = 0.0
     """Distance along the path, seen from above, m."""
@@ -33,7 +33,7 @@ class Stray:
     @property
     def arc_m(self) -> Float64[np.ndarray, "W"]:
         """Return the arc length of the path's points, m."""
-        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.way_xyz[:, :2], axis=0).T)))
+        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.path_xyz[:, :2], axis=0).T)))
 
     @property
     def length_m(self) -> float:
@@ -48,14 +48,14 @@ class Stray:
     @property
     def xyz(self) -> Float64[np.ndarray, "3"]:
         """Return the position of the feet, m."""
-        return np.array([np.interp(self.s_m, self.arc_m, axis) for axis in self.way_xyz.T])
+        return np.array([np.interp(self.s_m, self.arc_m, axis) for axis in self.path_xyz.T])
 
     @property
     def ahead(self) -> Float64[np.ndarray, "2"]:
         """Return the unit heading, seen from above."""
         arc_m = self.arc_m
         leg = min(int(np.searchsorted(arc_m, self.s_m, side="right")), len(arc_m) - 1)
-        step = (self.way_xyz[leg] - self.way_xyz[leg - 1])[:2]
+        step = (self.path_xyz[leg] - self.path_xyz[leg - 1])[:2]
         return np.asarray(step / np.hypot(*step))
 
     @property
@@ -63,20 +63,22 @@ class Stray:
         """Return the heading about z, rad."""
         return float(np.arctan2(*self.ahead[::-1]))
 
-    def moved(self, pace_mps: float, dt_s: float) -> "Stray":
-        """Return the stray one time step later, with its speed changed towards `pace_mps`.
+    def moved(self, target_mps: float, dt_s: float) -> "ScriptedActor":
+        """Return the actor one time step later, with its speed changed towards `target_mps`.
 
         A negative speed moves it backwards. It stands at the ends of its path.
         """
-        most = ACCELERATION_MPS2 * dt_s
-        speed = min(max(pace_mps, self.speed_mps - most), self.speed_mps + most)
+        max_change = ACCELERATION_MPS2 * dt_s
+        speed = min(max(target_mps, self.speed_mps - max_change), self.speed_mps + max_change)
         s_m = self.s_m + 0.5 * (self.speed_mps + speed) * dt_s
         if not 0.0 < s_m < self.length_m:
             s_m, speed = min(max(s_m, 0.0), self.length_m), 0.0
         return dataclasses.replace(self, s_m=s_m, speed_mps=speed)
 
 
-def moved_strays(strays: tuple[Stray, ...], pace_mps: tuple[float, ...], dt_s: float) -> tuple[Stray, ...]:
-    """Return all strays one time step later. Without speeds they stand."""
-    paces = pace_mps or (0.0,) * len(strays)
-    return tuple(stray.moved(pace, dt_s) for stray, pace in zip(strays, paces, strict=True))
+def step_scripted_actors(
+    actors: tuple[ScriptedActor, ...], target_mps: tuple[float, ...], dt_s: float
+) -> tuple[ScriptedActor, ...]:
+    """Return all scripted actors one time step later. Without speeds they stand."""
+    targets = target_mps or (0.0,) * len(actors)
+    return tuple(actor.moved(target, dt_s) for actor, target in zip(actors, targets, strict=True))

@@ -8,11 +8,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.edits import Duplicate, Edit, Edited, Insert, Remove, Send, ShiftEgo
-from foredrive.rendering.free_views import free_camera, free_sweep, rendered_sweep
+from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, EditedScene, Insert, Remove, ShiftEgo
+from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
 from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.tracks import Tracks, boxes_at
-from foredrive.rendering.vehicle import Vehicle
+from foredrive.rendering.tracks import ActorTracks, boxes_at
+from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import Boxes, LidarSweep
 from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
 
@@ -26,7 +26,7 @@ _LEAST_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Shooting:
+class RenderPlan:
     """The plan of a film: its times and its sensors."""
 
     t_s: tuple[float, ...]
@@ -37,7 +37,7 @@ class Shooting:
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderedFrame:
     """The sensor data of one time."""
 
     t_s: float
@@ -48,15 +48,15 @@ class Shot:
     """Boxes of the actors, in the ego frame."""
 
 
-def plan_shooting(
-    vehicle: Vehicle,
+def plan_frames(
+    vehicle: LoggedVehicle,
     cameras: Sequence[str] = (),
     lidar: str | None = None,
     *,
     start_s: float = 0.0,
     seconds: float | None = None,
     rate_hz: float | None = None,
-) -> Shooting:
+) -> RenderPlan:
     """Plan the times and the sensors of a film.
 
     Args:
@@ -90,11 +90,13 @@ def plan_shooting(
     if not (step_s >= _LEAST_STEP_S and end_s >= start_s):
         raise InputError(f"{rate_hz or 0:g} times a second over {end_s - start_s:g} s cannot be filmed")
     count = int((end_s - start_s) / step_s + _LEAST_STEP_S) + 1
-    return Shooting(tuple(min(start_s + k * step_s, last_s) for k in range(count)), step_s, chosen, beams)
+    return RenderPlan(tuple(min(start_s + k * step_s, last_s) for k in range(count)), step_s, chosen, beams)
 
 
 @torch.no_grad()
-def shoot(scene: RebuiltScene, vehicle: Vehicle, edited: Edited, shooting: Shooting, number: int) -> Shot:
+def render_frame(
+    scene: RebuiltScene, vehicle: LoggedVehicle, edited: EditedScene, plan: RenderPlan, number: int
+) -> RenderedFrame:
     """Render all sensors at one of the times.
 
     Each camera keeps its exposure delay from the log; the lidar's revolution ends at the time itself.
@@ -103,26 +105,30 @@ def shoot(scene: RebuiltScene, vehicle: Vehicle, edited: Edited, shooting: Shoot
         scene: scene of a run.
         vehicle: vehicle of the run.
         edited: the scene's graph after edits, or without edits (`apply_edits(graph, [])`).
-        shooting: from `plan_shooting`.
+        plan: from `plan_frames`.
         number: index of the time.
     """
-    t_s, rig = shooting.t_s[number], vehicle.rig
-    images = torch.zeros(len(shooting.cameras), 3, *rig.size_hw, dtype=torch.uint8)
+    t_s, rig = plan.t_s[number], vehicle.rig
+    images = torch.zeros(len(plan.cameras), 3, *rig.size_hw, dtype=torch.uint8)
     assert rig.exposed_dt_s is not None
-    for place, camera in enumerate(shooting.cameras):
-        moment = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
-        view = free_camera(rig, camera, moment).to(scene.actor.device)
+    for place, camera in enumerate(plan.cameras):
+        ego = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
+        view = novel_camera_view(rig, camera, ego).to(scene.actor.device)
         rgb = scene(edited.graph, view).rgb
         images[place] = (255 * rgb.clamp(0, 1)).round().to(torch.uint8).cpu()
-    moment, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
-    if shooting.lidar is not None:
-        beams = free_sweep(shooting.lidar, moment)
+    ego, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
+    if plan.lidar is not None:
+        beams = novel_sweep_view(plan.lidar, ego)
         sweep = rendered_sweep(beams, scene.sweep(edited.graph, scene.prepare_sweep(beams), t_s))
-    return Shot(t_s, images, sweep, boxes_at(edited.graph.tracks, moment.T_scene_ego, t_s))
+    return RenderedFrame(t_s, images, sweep, boxes_at(edited.graph.tracks, ego.T_scene_ego, t_s))
 
 
-def edits_from_words(
-    tracks: Tracks, known: Sequence[Edit], shift_left_m: float, remove: Sequence[int], insert: Sequence[str]
+def edits_from_arguments(
+    tracks: ActorTracks,
+    known: Sequence[Edit],
+    shift_left_m: float,
+    remove: Sequence[int],
+    insert: Sequence[str],
 ) -> list[Edit]:
     """Return the edits of the command line.
 
@@ -137,7 +143,7 @@ def edits_from_words(
         InputError: an entry of `insert` has another format.
     """
     edits: list[Edit] = []
-    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert | Send)]
+    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert | DriveStraight)]
     copy = max([*tracks.track_id.tolist(), *copies], default=0) + 1
     for number, text in enumerate(insert):
         source, _, rest = text.rpartition(":")

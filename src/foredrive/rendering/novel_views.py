@@ -3,41 +3,41 @@
 import torch
 
 from foredrive.geometry.se3 import sensor_twist
-from foredrive.rendering.rebuilt import SweepPicture
-from foredrive.rendering.vehicle import EgoMoment
+from foredrive.rendering.rebuilt import RenderedSweep
+from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import SpinningLidar
 
 
-def free_camera(rig: CameraRig, camera: int, moment: EgoMoment, sensor: int | None = None) -> CameraView:
-    """Return a camera whose middle row is exposed at a given moment.
+def novel_camera_view(rig: CameraRig, camera: int, ego: EgoState, sensor: int | None = None) -> CameraView:
+    """Return a camera whose middle row is exposed at a given ego.
 
     For the view recorded at a frame, use `vehicle.at(t_s + rig.exposed_dt_s[camera])`.
 
     Args:
         rig: [C]; the vehicle's own, or one with other intrinsics, size and places.
         camera: index in the rig.
-        moment: pose and time of the vehicle.
+        ego: pose and time of the vehicle.
         sensor: index of the learned camera whose colours and corrections are used. None: `camera`, as in the
             vehicle's own rig.
     """
-    T_ego_cam = rig.T_ego_cam[camera].to(moment.T_scene_ego)
+    T_ego_cam = rig.T_ego_cam[camera].to(ego.T_scene_ego)
     return CameraView(
         K=rig.K[camera],
         dist=rig.dist[camera],
-        T_scene_cam=moment.T_scene_ego @ T_ego_cam,
-        twist_cam=sensor_twist(T_ego_cam, moment.twist_ego),
-        t_s=moment.t_s,
+        T_scene_cam=ego.T_scene_ego @ T_ego_cam,
+        twist_cam=sensor_twist(T_ego_cam, ego.twist_ego),
+        t_s=ego.t_s,
         readout_s=float(rig.readout_s[camera]),
         size_hw=rig.size_hw,
         sensor=camera if sensor is None else sensor,
     )
 
 
-def free_sweep(lidar: SpinningLidar, moment: EgoMoment) -> SweepView:
-    """Return all beams of the revolution that ends at a moment, without ranges."""
-    twist = moment.twist_ego.cpu()
+def novel_sweep_view(lidar: SpinningLidar, ego: EgoState) -> SweepView:
+    """Return all beams of the revolution that ends at a ego, without ranges."""
+    twist = ego.twist_ego.cpu()
     rays = lidar.beams(twist)
     zero = torch.zeros_like(rays.dt_s)
     beams = LidarSweep(
@@ -50,10 +50,10 @@ def free_sweep(lidar: SpinningLidar, moment: EgoMoment) -> SweepView:
         beam=lidar.channel,
         valid=torch.ones_like(zero, dtype=torch.bool),
     )
-    return SweepView(beams, True, moment.T_scene_ego.cpu(), twist, moment.t_s)
+    return SweepView(beams, True, ego.T_scene_ego.cpu(), twist, ego.t_s)
 
 
-def rendered_sweep(view: SweepView, picture: SweepPicture) -> LidarSweep:
+def rendered_sweep(view: SweepView, picture: RenderedSweep) -> LidarSweep:
     """Return the beams of a view with rendered ranges and intensities, in the ego frame at its time."""
     beams, returned = view.beams, picture.returned.cpu()
     return LidarSweep(

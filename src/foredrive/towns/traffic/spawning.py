@@ -1,45 +1,44 @@
-"""Turnover of traffic: vehicles and people appear and disappear out of the ego vehicle's sight."""
+"""Spawning: vehicles and people appear and disappear out of the ego vehicle's sight."""
 
 import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.drivers import see_ahead
-from foredrive.towns.traffic.fleet import Starts, draw_fleet, place
+from foredrive.towns.traffic.drivers import driving_context
+from foredrive.towns.traffic.fleet import StartPoints, draw_fleet, place_vehicles
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
 from foredrive.towns.traffic.leaders import STANDSTILL_M, find_leaders
 from foredrive.towns.traffic.paths import extend_paths
 from foredrive.towns.traffic.pedestrians import draw_people
 from foredrive.towns.traffic.state import TrafficState
-from foredrive.towns.traffic.vehicles import Vehicles, path_starts, speed_to_drive, vehicle_poses
+from foredrive.towns.traffic.vehicles import Vehicles, desired_speed, path_starts, vehicle_poses
 from foredrive.towns.traffic.walkways import WalkGraph
 
-BORN_BEYOND_M = 95.0
-BORN_WITHIN_M = 140.0
-GONE_BEYOND_M = 160.0
-PEOPLE_BORN_BEYOND_M = 82.0
-PEOPLE_BORN_WITHIN_M = 95.0
-PEOPLE_GONE_BEYOND_M = 110.0
+SPAWN_MIN_M = 95.0
+SPAWN_MAX_M = 140.0
+DESPAWN_M = 160.0
+PEOPLE_SPAWN_MIN_M = 82.0
+PEOPLE_SPAWN_MAX_M = 95.0
+PEOPLE_DESPAWN_M = 110.0
 CLEAR_M = 10.0
 CLEAR_S = 3.5
 """Minimum distances of a new vehicle: `CLEAR_M` to all others, and `CLEAR_S` more to those ahead and
 behind."""
 TRIES = 12
-NEWCOMER_BRAKING_MPS2 = 1.0
+SPAWN_BRAKING_MPS2 = 1.0
 """Maximum deceleration, m/s², of a new vehicle and of the one behind it. A vehicle does not start where one
 of them would have to brake harder."""
 
 
-class Turnover:
-    """The turnover of a town's traffic: it fills free slots, of the vehicle slots only the first
-    `vehicle_count`."""
+class Spawner:
+    """The spawning of traffic in free slots; of the vehicle slots only the first `vehicle_count` are used."""
 
     def __init__(
         self,
         lanes: LaneGraph,
         walks: WalkGraph,
-        starts: Starts,
+        starts: StartPoints,
         for_large: Bool[np.ndarray, "L"],
         vehicle_count: int,
     ) -> None:
@@ -49,13 +48,13 @@ class Turnover:
         walkable = np.where(walks.is_crossing, 0.0, walks.length_m)
         self._walk_weight = walkable / max(walkable.sum(), 1e-9)
 
-    def fill(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+    def spawn_all(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
         """Place vehicles and people in all free slots, as far as there is room."""
         ego_m = vehicle_poses(self._lanes, state.vehicles).centre_m[0] if len(state.route) else None
-        state = self._put_vehicles(state, 0.0, len(state.vehicles.active), rng, ego_m)
-        return self._put_people(state, 0.0, len(state.people.active), rng, ego_m)
+        state = self._spawn_vehicles(state, 0.0, len(state.vehicles.active), rng, ego_m)
+        return self._spawn_people(state, 0.0, len(state.people.active), rng, ego_m)
 
-    def renew(
+    def update(
         self,
         state: TrafficState,
         rng: np.random.Generator,
@@ -74,38 +73,37 @@ class Turnover:
         centre_m = vehicle_poses(self._lanes, state.vehicles).centre_m
         if ego_m is not None:
             centre_m[0] = ego_m
-        far = np.linalg.norm(centre_m - centre_m[0], axis=1) > GONE_BEYOND_M
-        far_off = np.linalg.norm(state.people.xyz - centre_m[0], axis=1) > PEOPLE_GONE_BEYOND_M
+        far = np.linalg.norm(centre_m - centre_m[0], axis=1) > DESPAWN_M
+        far_off = np.linalg.norm(state.people.xyz - centre_m[0], axis=1) > PEOPLE_DESPAWN_M
         vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
         people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
         state = dataclasses.replace(state, vehicles=vehicles, people=people)
-        state = self._put_vehicles(state, BORN_BEYOND_M, 1, rng, centre_m[0])
-        return self._put_people(state, PEOPLE_BORN_BEYOND_M, 1, rng, centre_m[0])
+        state = self._spawn_vehicles(state, SPAWN_MIN_M, 1, rng, centre_m[0])
+        return self._spawn_people(state, PEOPLE_SPAWN_MIN_M, 1, rng, centre_m[0])
 
-    def _put_vehicles(
+    def _spawn_vehicles(
         self,
         state: TrafficState,
         beyond_m: float,
-        most: int,
+        max_count: int,
         rng: np.random.Generator,
         ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
-        """Place new vehicles in up to `most` free slots, at least `beyond_m` from the ego vehicle, if there
-        is one."""
-        rows = np.flatnonzero(~state.vehicles.active[: self._vehicle_count])[:most]
+        """Place new vehicles in up to `max_count` free slots, at least `beyond_m` from an ego vehicle."""
+        rows = np.flatnonzero(~state.vehicles.active[: self._vehicle_count])[:max_count]
         places = np.arange(len(self._starts.lane))
         if ego_m is not None and len(rows):
             distance = np.linalg.norm(self._starts.xyz - ego_m, axis=1)
-            places = np.flatnonzero((distance >= beyond_m) & (distance <= BORN_WITHIN_M))
+            places = np.flatnonzero((distance >= beyond_m) & (distance <= SPAWN_MAX_M))
         if not len(rows) or not len(places):
             return state
         vehicles = state.vehicles
         for k, row in enumerate(rows.tolist()):
             tries = rng.choice(places, TRIES)
             for start in tries[self._is_free(vehicles, tries)].tolist():
-                joined = self._join(vehicles, row, start, state.next_track_id + k, rng)
-                if joined is not None:
-                    vehicles = joined
+                spawned = self._try_spawn(vehicles, row, start, state.next_track_id + k, rng)
+                if spawned is not None:
+                    vehicles = spawned
                     break
         return dataclasses.replace(state, vehicles=vehicles, next_track_id=state.next_track_id + len(rows))
 
@@ -116,13 +114,13 @@ class Turnover:
         offset = centres[None] - self._starts.xyz[starts][:, None]
         forward = self._starts.forward[starts][:, None]
         along = np.sum(offset * forward, axis=2)
-        aside = np.linalg.norm(offset - along[..., None] * forward, axis=2)
+        lateral = np.linalg.norm(offset - along[..., None] * forward, axis=2)
         speed = self._lanes.speed(self._starts.lane[starts], self._starts.s_m[starts])
         reach = CLEAR_M + CLEAR_S * speed[:, None]
-        clear = (np.hypot(along, aside) >= CLEAR_M) & ((np.abs(along) >= reach) | (aside >= 3.0))
+        clear = (np.hypot(along, lateral) >= CLEAR_M) & ((np.abs(along) >= reach) | (lateral >= 3.0))
         return np.asarray(clear.all(axis=1))
 
-    def _join(
+    def _try_spawn(
         self, vehicles: Vehicles, row: int, start: int, track_id: int, rng: np.random.Generator
     ) -> Vehicles | None:
         """Return the vehicles with a new one in a slot, slow enough that it can brake for the vehicle ahead
@@ -132,36 +130,36 @@ class Turnover:
         """
         lane = self._starts.lane[[start]]
         one = draw_fleet(rng, np.array([track_id]), self._for_large[lane], self._for_bicycles[lane])
-        one = place(self._lanes, one, lane, self._starts.s_m[[start]])
+        one = place_vehicles(self._lanes, one, lane, self._starts.s_m[[start]])
         v = vehicles.replace_rows(np.array([row]), one)
         nowhere = np.zeros(0, dtype=np.int64)
         v = extend_paths(self._lanes, self._for_large, v, nowhere, rng)
         starts_m = path_starts(self._lanes, v.path)
-        ahead = find_leaders(self._lanes, v, starts_m)
+        leaders = find_leaders(self._lanes, v, starts_m)
         speed = v.speed_mps.copy()
-        speed[row] = min(speed[row], speed_to_drive(self._lanes, v, starts_m)[row])
-        if ahead.leader[row] >= 0:
-            room_m = max(ahead.leader_gap_m[row] - STANDSTILL_M, 0.0)
-            leader_mps = v.speed_mps[ahead.leader[row]]
-            speed[row] = min(speed[row], np.sqrt(leader_mps**2 + 2 * NEWCOMER_BRAKING_MPS2 * room_m))
+        speed[row] = min(speed[row], desired_speed(self._lanes, v, starts_m)[row])
+        if leaders.leader[row] >= 0:
+            room_m = max(leaders.leader_gap_m[row] - STANDSTILL_M, 0.0)
+            leader_mps = v.speed_mps[leaders.leader[row]]
+            speed[row] = min(speed[row], np.sqrt(leader_mps**2 + 2 * SPAWN_BRAKING_MPS2 * room_m))
         v = dataclasses.replace(v, speed_mps=speed)
-        ahead = find_leaders(self._lanes, v, starts_m)  # the leaders of the others depend on its speed
+        leaders = find_leaders(self._lanes, v, starts_m)  # the leaders of the others depend on its speed
         no_halt = np.full(len(speed), np.inf)
-        wanted = see_ahead(self._lanes, v, starts_m, ahead, no_halt).wanted_mps2(v)
-        concerned = ((ahead.leader == row) | (ahead.limiting == row)) & v.active
+        wanted = driving_context(self._lanes, v, starts_m, leaders, no_halt).desired_mps2(v)
+        concerned = ((leaders.leader == row) | (leaders.limiting == row)) & v.active
         concerned[row] = True
-        return v if wanted[concerned].min() > -NEWCOMER_BRAKING_MPS2 else None
+        return v if wanted[concerned].min() > -SPAWN_BRAKING_MPS2 else None
 
-    def _put_people(
+    def _spawn_people(
         self,
         state: TrafficState,
         beyond_m: float,
-        most: int,
+        max_count: int,
         rng: np.random.Generator,
         ego_m: Float64[np.ndarray, "3"] | None,
     ) -> TrafficState:
-        """Place people in up to `most` free slots."""
-        rows = np.flatnonzero(~state.people.active)[:most]
+        """Place people in up to `max_count` free slots."""
+        rows = np.flatnonzero(~state.people.active)[:max_count]
         if not len(rows):
             return state
         tries = rng.choice(len(self._walk_weight), size=(len(rows), TRIES), p=self._walk_weight)
@@ -170,7 +168,7 @@ class Turnover:
         ok = np.ones(tries.shape, dtype=np.bool_)
         if ego_m is not None:
             distance = np.linalg.norm(xyz - ego_m, axis=2)
-            ok = (distance >= beyond_m) & (distance <= PEOPLE_BORN_WITHIN_M)
+            ok = (distance >= beyond_m) & (distance <= PEOPLE_SPAWN_MAX_M)
         chosen = np.argmax(ok, axis=1)
         found = ok.any(axis=1)
         each = np.arange(len(rows))

@@ -1,0 +1,88 @@
+"""Score a file of detections into a folder of results, alone or against another file."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import Progress
+
+from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
+from foredrive.evaluation.detections import (
+    DetectionSet,
+    FrameScore,
+    ScoreSummary,
+    compare_scores,
+    read_detections,
+    score_frames,
+    summarise_scores,
+    write_frame_scores,
+)
+from foredrive.evaluation.detections.frames import Family
+from foredrive.evaluation.detections.summary import Summary
+
+SUMMARY, FRAMES = "summary.json", "frames.jsonl"
+
+
+@dataclass(frozen=True)
+class ScoredDetections:
+    """The detections of one file, the scores of their frames, and the figures over all frames."""
+
+    detections: DetectionSet
+    frames: list[FrameScore]
+    summary: ScoreSummary
+
+
+def score_detections(
+    results: Path,
+    truth: Path,
+    out: Path,
+    *,
+    against: Path | None = None,
+    family: Family = "gaussian",
+    k: int = 25,
+) -> tuple[ScoredDetections, Summary]:
+    """Score detections; write `out/summary.json` and `out/frames.jsonl`.
+
+    Args:
+        results, truth: files or folders of one format, see `read_detections`.
+        against: other results on the same frames; their figures and the difference are in the summary too.
+        family: family of the box densities.
+        k: number of best associations to sum if there are too many to sum all.
+
+    Returns:
+        the scores, and the summary as it was written.
+
+    Raises:
+        InputError: a file cannot be read, or the two results are not on the same frames.
+    """
+    started = time.perf_counter()
+    scored = _score(results, truth, family, k)
+    figures = dict(scored.summary.figures)
+    if against is not None:
+        figures |= _compare(scored, _score(against, truth, family, k), against)
+    figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
+    figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
+    write_summary(out / SUMMARY, figures)
+    write_frame_scores(out / FRAMES, scored.frames)
+    return scored, figures
+
+
+def _score(results: Path, truth: Path, family: Family, k: int) -> ScoredDetections:
+    detections = read_detections(results, truth, family)
+    with Progress(transient=True) as progress:
+        task = progress.add_task(results.name, total=len(detections.frames))
+        frames = score_frames(detections, k=k, told=lambda done: progress.update(task, completed=done))
+    return ScoredDetections(detections, frames, summarise_scores(detections, frames))
+
+
+def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Summary:
+    """Return the other file's figures, and the difference to them."""
+    difference, uncompared = compare_scores(scored.frames, other.frames)
+    return {f"against.{key}": value for key, value in other.summary.figures.items()} | {
+        "against": str(against),
+        "against.difference": difference.mean,
+        "against.difference_low_95": difference.low,
+        "against.difference_high_95": difference.high,
+        "against.p_value": difference.p_value,
+        "against.frames_not_compared": uncompared,
+    }
