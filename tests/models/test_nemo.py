@@ -13,7 +13,7 @@ from foredrive.models.bev import BevConfig
 from foredrive.models.lifting import project_to_cameras
 from foredrive.models.nemo import RendererConfig, VolumeRenderer
 from foredrive.recipes.nemo import NemoRecipe, nemo_base, nemo_tiny
-from foredrive.recipes.nemo_rows import nemo_rows
+from foredrive.recipes.nemo_ablations import nemo_ablations
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Command, Example, VoxelSpec
 from foredrive.training import NemoStage
@@ -166,7 +166,7 @@ def test_an_unknown_command_is_not_taken_for_a_known_one(agent: PlanningAgent, e
     assert not any(torch.allclose(unknown[0], plan) for plan in plans.values())
 
 
-ROWS = nemo_rows(small_recipe(), BevConfig(width=24, heads=4, points=2, pillars=2, layers=1))
+ROWS = nemo_ablations(small_recipe(), BevConfig(width=24, heads=4, points=2, pillars=2, layers=1))
 
 
 @pytest.mark.parametrize("row", ROWS)

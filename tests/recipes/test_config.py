@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES, find_recipe, labelled_by
+from foredrive.recipes import RECIPES, find_recipe, with_occupancy_source
 from foredrive.recipes.config import load_recipe, save_recipe
 from foredrive.recipes.gaussians import find_rebuild_recipe, load_rebuild_recipe
 
@@ -24,8 +24,8 @@ def test_a_recipe_survives_writing_and_reading(name: str, tmp_path: Path) -> Non
 
 def test_a_recipe_may_take_its_labels_from_recordings(tmp_path: Path) -> None:
     plain = find_recipe("nemo_tiny")
-    recorded = labelled_by(plain, "recorded")
-    assert labelled_by(plain, "lidar") == plain
+    recorded = with_occupancy_source(plain, "recorded")
+    assert with_occupancy_source(plain, "lidar") == plain
     assert recorded.clips.occupancy_source == "recorded"
     assert recorded.name == "nemo_tiny (recorded occupancy)"
     save_recipe(recorded, tmp_path / "config.yaml")

@@ -22,7 +22,7 @@ from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.driveworld_rows import driveworld_rows
+from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import Needs, needs_of
@@ -157,9 +157,9 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     assert start.shape == end.shape
 
 
-@pytest.mark.parametrize("row", driveworld_rows(miniature_driveworld()))
+@pytest.mark.parametrize("row", driveworld_ablations(miniature_driveworld()))
 def test_every_row_trains(row: str, run: Run, example: Example) -> None:
-    recipe = driveworld_rows(miniature_driveworld())[row]
+    recipe = driveworld_ablations(miniature_driveworld())[row]
     torch.manual_seed(0)
     agent = build_agent(recipe)
     for stage in (recipe.pretrain, recipe.finetune):

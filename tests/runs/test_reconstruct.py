@@ -30,7 +30,7 @@ from foredrive.runs.rebuild.reconstruct import (
     read_reconstruction_data,
     reconstruct,
 )
-from foredrive.training import rebuilding
+from foredrive.training import loop
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 STEPS = 40
@@ -102,7 +102,7 @@ def test_an_interrupted_run_comes_to_the_same(
 ) -> None:
     """Stopped after the first checkpoint, when Gaussians have been added and moved."""
 
-    save = rebuilding.save_checkpoint
+    save = loop.save_checkpoint
 
     def save_and_stop(*args):  # type: ignore[no-untyped-def]
         save(*args)
@@ -111,7 +111,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
     folder = tmp_path / "halves"
     with monkeypatch.context() as patched:
-        patched.setattr(rebuilding, "save_checkpoint", save_and_stop)
+        patched.setattr(loop, "save_checkpoint", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(recipe(), log, folder)
     reconstruct(recipe(), log, folder)

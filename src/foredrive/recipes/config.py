@@ -51,7 +51,20 @@ def rescheduled(stage: S, **changes: Any) -> S:
     return replace(stage, schedule=replace(stage.schedule, **changes))  # type: ignore[attr-defined, type-var]
 
 
-def labelled_by(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
+def named_after(full: R, rows: Mapping[str, tuple[R, str]]) -> dict[str, R]:
+    """Return a recipe under its name, and its ablations under FULL_ROW.
+
+    Args:
+        rows: recipe and description of each ablation.
+    """
+    recipes = {full.name: full}
+    for row, (recipe, about) in rows.items():
+        name = f"{full.name}_{row}"
+        recipes[name] = replace(recipe, name=name, about=f"{full.name}: {about}")
+    return recipes
+
+
+def with_occupancy_source(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
     """Return the recipe with voxel labels of another source, which is added to its name."""
     if occupancy_source == recipe.clips.occupancy_source:
         return recipe
