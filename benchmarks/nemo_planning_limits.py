@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.batches import stack_records
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_motion

@@ -28,7 +28,8 @@ import torch
 from benchmarks.common.measuring import held_mib, measure
 from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
-from foredrive.evaluation import Benchmark, peak_rss_gib
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.indexing import IndexWriter

@@ -11,7 +11,7 @@ import resource
 import subprocess
 import sys
 
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 
 REPETITIONS = 3
 NOWHERE = "/nonexistent"
@@ -29,7 +29,7 @@ LINES = {
 }
 IMPORTS = {
     "import torch": "torch",
-    "begin: view": "foredrive.view.log_sheet, foredrive.view.log_times",
+    "begin: view": "foredrive.view.log_sheet, foredrive.view.log_frames",
     "begin: convert": "foredrive.data.convert",
     "begin: record": "foredrive.runs.drive.recording, foredrive.towns.campaign",
     "begin: train": "foredrive.recipes, foredrive.runs.train.run",

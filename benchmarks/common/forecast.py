@@ -6,7 +6,7 @@ from dataclasses import replace
 from torch.utils.data import DataLoader
 
 from foredrive.data import LogPath, collate
-from foredrive.evaluation import evaluate
+from foredrive.evaluation.run import evaluate
 from foredrive.recipes.config import Recipe
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.evaluate.run import FUTURES

@@ -14,7 +14,7 @@ from transformers import BertConfig, BertModel, BertTokenizerFast
 from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.models.driveworld import DriveWorld
 from foredrive.models.driveworld.planes import VectorToPlaneConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
@@ -23,18 +23,17 @@ from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe, save_recipe
 from foredrive.recipes.driveworld_ablations import driveworld_ablations
-from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
+from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import Needs, needs_of
+from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
-from foredrive.runs.evaluate.vision import Observer
 from foredrive.runs.export import export_run
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
 from foredrive.training import DriveWorldObjective, load_weights, read_metrics, save_weights
 from foredrive.view.imagination_video import write_imagination_video
-from foredrive.view.report import write_report
-from foredrive.view.run_report import report_on_run
+from foredrive.view.run_report import report_on_run, write_run_report
 
 FUTURES = 2
 
@@ -97,9 +96,9 @@ def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     assert "occupancy.iou_now.copy" not in summary
     assert "flow.epe_moving_now_mps" in summary
     assert "image.psnr_db" not in summary
-    report = report_on_run(run, [log], result.summary, inspect_run(run, [log], 1), result.failures)
-    write_report(tmp_path / "report.html", report)
-    assert "carried copy" in (tmp_path / "report.html").read_text()
+    report = report_on_run(run, [log], result.summary, predict_examples(run, [log], 1), result.failures)
+    write_run_report(tmp_path / "report.html", report)
+    assert "ego-compensated persistence" in (tmp_path / "report.html").read_text()
 
 
 def test_what_a_log_was_trained_on_is_not_what_a_forecast_is_judged_by(
@@ -151,7 +150,7 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     agent = load_agent(run)
     observed = collate([ClipDataset(run.logs, run.recipe.clips, run.cache_dir)[0]]).clip.observed()
     assert agent.act(observed).xy.shape == (1, 1, 6, 2)
-    seen = Observer(agent, 2).look(observed)
+    seen = DisplayPredictor(agent, 2).predict(observed)
     assert seen.flow_m.shape == (2, 3, *run.recipe.clips.voxels.shape_zyx)
     start, end = seen.movement_m(1, run.recipe.clips.voxels)
     assert start.shape == end.shape

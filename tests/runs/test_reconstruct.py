@@ -1,6 +1,7 @@
 """A log is rebuilt in seconds: whole, interrupted, and without what logs may lack."""
 
 import dataclasses
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -12,9 +13,11 @@ import torch
 from plyfile import PlyData
 from safetensors.torch import load_file
 
+from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.recipes.config import save_recipe
 from foredrive.recipes.gaussians import (
     RebuildRecipe,
     find_rebuild_recipe,
@@ -83,11 +86,11 @@ def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: L
     summary = reconstruct(recipe(), log, run).summary  # is there already
     assert summary["images"] == summary["sweeps"] == 4
     assert summary["actors"] == 2
-    assert summary["gaussians"] > 2200  # those that learning may make, and ground that empty saw
+    assert summary["gaussians"] > 2200  # those that learning may make, and ground without observations
     data = read_reconstruction_data(recipe(), log, run / "cache")
     scene = initial_model(recipe(), data)
-    before = judge_cameras(scene, data.held_out.cameras, data.train.cameras)
-    before |= judge_sweeps(scene, data.held_out.sweeps)
+    before = evaluate_cameras(scene, data.held_out.cameras, data.train.cameras)
+    before |= evaluate_sweeps(scene, data.held_out.sweeps)
     after = {name: value for name, value in summary.items() if isinstance(value, float)}
     assert after["psnr_db"] > before["psnr_db"] + 2
     assert after["ssim"] > before["ssim"]
@@ -185,3 +188,14 @@ def test_named_recipes() -> None:
         find_rebuild_recipe("gaussians_huge")
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
+
+
+def test_a_log_of_one_frame_is_said_not_to_be_evaluated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (single,) = find_logs(world.write(tmp_path, frames=1))
+    save_recipe(recipe(1), tmp_path / "recipe.yaml")
+    line = ["reconstruct", str(single.folder), "--out", str(tmp_path / "run")]
+    assert main([*line, "--recipe", str(tmp_path / "recipe.yaml")]) == 0
+    assert "no frame was held out, so the scene is not evaluated" in capsys.readouterr().out
+    assert "psnr_db" not in json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -7,7 +7,7 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.evaluation import ConstantVelocity
+from foredrive.evaluation.baselines import ConstantVelocity
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.training import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
 

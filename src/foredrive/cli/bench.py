@@ -10,7 +10,7 @@ import tyro
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.evaluation import Benchmark
+    from foredrive.evaluation.bench import Benchmark
 
 
 def bench(
@@ -27,7 +27,7 @@ def bench(
         folder: Folder of the benchmarks. Each benchmark is a Python file that defines BENCHMARK; its file
             name has _ in place of -.
     """
-    from foredrive.evaluation import run_benchmark
+    from foredrive.evaluation.bench import run_benchmark
 
     files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:
@@ -53,7 +53,7 @@ def bench(
 
 def _load(path: Path) -> "Benchmark | None":
     """Load the BENCHMARK of a file; return None if the file defines none."""
-    from foredrive.evaluation import Benchmark
+    from foredrive.evaluation.bench import Benchmark
 
     module_name = f"benchmarks.{path.stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)

@@ -49,10 +49,9 @@ def evaluate(
 
     from rich.console import Console
 
-    from foredrive.evaluation import read_summary
-    from foredrive.runs import evaluate_run, inspect_run, open_run
-    from foredrive.view.report import write_report
-    from foredrive.view.run_report import report_on_run
+    from foredrive.evaluation.summary import read_summary
+    from foredrive.runs import evaluate_run, open_run, predict_examples
+    from foredrive.view.run_report import report_on_run, write_run_report
     from foredrive.view.summary_tables import print_summary
 
     trained = open_run(run)
@@ -61,9 +60,9 @@ def evaluate(
     result = evaluate_run(trained, chosen, folder, batch_size)
     summary = read_summary(folder / "summary.json")
     print_summary(summary, Console(), trained.recipe.name)
-    inspections = inspect_run(trained, chosen, examples)
-    report = report_on_run(trained, chosen, summary, inspections, result.failures)
-    write_report(folder / "report.html", report)
+    predictions = predict_examples(trained, chosen, examples)
+    report = report_on_run(trained, chosen, summary, predictions, result.failures)
+    write_run_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
 
 

@@ -58,7 +58,7 @@ def reconstruct(
         title = f"{found.name}, frames that were held out"
         write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
     if not run.held_out.cameras and not run.held_out.sweeps:
-        print(f"{found.name} is too short for a frame to be held out: the scene is judged on nothing")
+        print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
     print(f"rebuilt {found.name} by {method}: {out}")
     for name in (
         *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),

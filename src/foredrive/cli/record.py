@@ -138,7 +138,7 @@ def _seeds(text: str) -> tuple[int, ...] | int:
 
 def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
     """Check the names of conditions and return them; "none" alone gives no names."""
-    from foredrive.towns.conditions import ANY_CONDITIONS, find_conditions
+    from foredrive.scene.conditions import ANY_CONDITIONS, find_conditions
 
     if names in ((NO_CONDITIONS,), (ANY_CONDITIONS,)):
         return () if names == (NO_CONDITIONS,) else names

@@ -60,22 +60,22 @@ def view(
     if run is not None:
         check_run(run)
 
+    from foredrive.view.log_frames import LogFrames
     from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
-    from foredrive.view.log_times import LogTimes
 
-    times = LogTimes(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
-    index = times.nearest(t)
+    frames = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    index = frames.nearest(t)
     if save is not None:
-        title = f"{times.name}    t = {times.t_s[index]:.2f} s"
-        write_log_sheet(save, times.clip(index), title, reach)
+        title = f"{frames.name}    t = {frames.t_s[index]:.2f} s"
+        write_log_sheet(save, frames.clip(index), title, reach)
         print(f"wrote {save}")
         return
     from foredrive.view.viewer import Viewer
 
-    viewer = Viewer(times, host, port)
+    viewer = Viewer(frames, host, port)
     try:
         viewer.show(index)
-        print(f"{times.name} is at {viewer.url} until you press Ctrl-C")
+        print(f"{frames.name} is at {viewer.url} until you press Ctrl-C")
         viewer.play()
     finally:
         viewer.close()

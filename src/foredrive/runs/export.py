@@ -16,7 +16,7 @@ from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance
+from foredrive.evaluation.provenance import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent

@@ -143,7 +143,7 @@ def _range_bar(ax: Axes) -> None:
     shown = LinearSegmentedColormap.from_list(
         "range", palette.RANGE_MAP(np.linspace(*palette.RANGE_SPAN, 64))
     )
-    scale = ScalarMappable(LogNorm(palette.NEAREST_M, palette.FARTHEST_M), shown)
+    scale = ScalarMappable(LogNorm(palette.MIN_RANGE_M, palette.MAX_RANGE_M), shown)
     bar = ax.figure.colorbar(scale, cax=ax, orientation="horizontal")
     bar.set_ticks([3, 10, 30, 80], labels=["3", "10", "30", "80 m"])
     bar.ax.minorticks_off()

@@ -15,8 +15,9 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.evaluation.summary import read_summary, write_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.config import save_recipe
 from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
@@ -258,8 +259,8 @@ def _summary(
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
         "peak_memory_gib": peak_rss_gib(),
-        **judge_cameras(scene, held.cameras, data.train.cameras),
-        **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
+        **evaluate_cameras(scene, held.cameras, data.train.cameras),
+        **evaluate_sweeps(scene, held.sweeps, drop=recipe.drop),
         **collect_provenance(),
     }
 

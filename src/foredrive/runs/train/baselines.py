@@ -9,8 +9,8 @@ from typing import Any
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.evaluation import labels_from_now
-from foredrive.metrics import OccupancyPrior
+from foredrive.evaluation.metric import labels_from_now
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.recipes.config import Recipe
 from foredrive.scene import Clip, Example
