@@ -47,7 +47,7 @@ def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float
     """
     clips = run.recipe.clips
     dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)
-    prior, _ = fit_baselines(run.logs, clips, run.cache_dir, clips.past_frames)
+    prior, _ = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
     summary = evaluate(
         AgentPredictor(load_agent(run), clips.future_frames, 0, FUTURES),
         DataLoader(dataset, batch_size=BATCH, collate_fn=collate),

@@ -16,12 +16,13 @@ from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.models.driveworld import DriveWorld
+from foredrive.models.driveworld.planes import VectorToPlaneConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.driveworld_rows import driveworld_rows
+from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import Needs, needs_of
@@ -155,14 +156,14 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     assert start.shape == end.shape
 
 
-@pytest.mark.parametrize("row", driveworld_rows(miniature_driveworld()))
+@pytest.mark.parametrize("row", driveworld_ablations(miniature_driveworld()))
 def test_every_row_trains(row: str, run: Run, example: Example) -> None:
-    recipe = driveworld_rows(miniature_driveworld())[row]
+    recipe = driveworld_ablations(miniature_driveworld())[row]
     torch.manual_seed(0)
     agent = build_agent(recipe)
     for stage in (recipe.pretrain, recipe.finetune):
         if stage is not None:
-            objective = DriveWorldObjective(agent, stage.weights, steps=2, temporal=stage.temporal)
+            objective = DriveWorldObjective(agent, stage, steps=2)
             objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     assert agent.act(example.clip.observed()).xy.isfinite().all()
 
@@ -177,14 +178,16 @@ def test_the_plane_may_come_from_deformable_lifting(example: Example) -> None:
     recipe = miniature_driveworld()
     lifting = PooledLiftingConfig(LiftingConfig(heads=2, points=2, layers=1))
     agent = build_agent(dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, encoder=lifting)))
-    objective = DriveWorldObjective(agent, recipe.pretrain.weights, steps=2)
+    objective = DriveWorldObjective(agent, recipe.pretrain, steps=2)
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     assert agent.world_model.encoder.fold.weight.grad.abs().sum() > 0
 
 
 def prompted(text_encoder: Path) -> Recipe:
     recipe = miniature_driveworld()
-    prompt = PromptConfig(widths=(8, 4), encoding=16, text_encoder=str(text_encoder))
+    prompt = PromptConfig(
+        expand=VectorToPlaneConfig(widths=(8, 4)), encoding=16, text_encoder=str(text_encoder)
+    )
     return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
 
 
@@ -200,7 +203,7 @@ def test_a_trained_model_needs_no_text_encoder(tmp_path: Path, example: Example)
     agent = build_agent(prompted(folder))
     world = agent.world_model
     assert isinstance(world, DriveWorld)
-    objective = DriveWorldObjective(agent, prompted(folder).finetune.weights, steps=2)
+    objective = DriveWorldObjective(agent, prompted(folder).finetune, steps=2)
     before = world.prompt.encodings.clone()
     optimizer = torch.optim.AdamW(objective.parameters(), 0.1)
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()

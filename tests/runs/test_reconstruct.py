@@ -17,8 +17,14 @@ from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
-from foredrive.recipes.config import load_values, save_recipe
-from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
+from foredrive.recipes.config import save_recipe
+from foredrive.recipes.gaussians import (
+    RebuildRecipe,
+    find_rebuild_recipe,
+    gaussians_base,
+    gaussians_tiny,
+    load_rebuild_recipe,
+)
 from foredrive.rendering.initial import InitialGaussians
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.runs.rebuild.reconstruct import (
@@ -27,7 +33,7 @@ from foredrive.runs.rebuild.reconstruct import (
     read_reconstruction_data,
     reconstruct,
 )
-from foredrive.training import rebuilding
+from foredrive.training import loop
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 STEPS = 40
@@ -49,7 +55,7 @@ def recipe(steps: int = STEPS) -> RebuildRecipe:
         ),
         schedule=RebuildSchedule(
             steps=steps,
-            most_gaussians=2200,
+            max_gaussians=2200,
             rates=LearningRates(mean_m=1e-3, albedo=1e-2),
             images_per_sweep=2,
             beam_stride=2,
@@ -99,7 +105,7 @@ def test_an_interrupted_run_comes_to_the_same(
 ) -> None:
     """Stopped after the first checkpoint, when Gaussians have been added and moved."""
 
-    save = rebuilding.save_checkpoint
+    save = loop.save_checkpoint
 
     def save_and_stop(*args):  # type: ignore[no-untyped-def]
         save(*args)
@@ -108,7 +114,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
     folder = tmp_path / "halves"
     with monkeypatch.context() as patched:
-        patched.setattr(rebuilding, "save_checkpoint", save_and_stop)
+        patched.setattr(loop, "save_checkpoint", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(recipe(), log, folder)
     reconstruct(recipe(), log, folder)
@@ -117,7 +123,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
-    assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+    assert load_rebuild_recipe(run / "config.yaml") == recipe()
 
 
 def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
@@ -169,7 +175,7 @@ def test_too_little_memory_is_said_before(
     log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     huge = dataclasses.replace(
-        recipe(), schedule=dataclasses.replace(recipe().schedule, most_gaussians=10**12)
+        recipe(), schedule=dataclasses.replace(recipe().schedule, max_gaussians=10**12)
     )
     with pytest.raises(InputError, match=r"smallest needs about \d+\.\d GiB .* GiB are free"):
         reconstruct(huge, log, tmp_path / "huge")

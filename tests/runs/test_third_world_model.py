@@ -17,7 +17,7 @@ from foredrive.losses import waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
-from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
+from foredrive.recipes.world_models import WORLD_MODELS, WorldModelEntry
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.route_source import job_of
@@ -116,7 +116,7 @@ def recipe() -> Recipe[FrozenConfig, FrozenStage]:
 def known() -> Iterator[None]:
     """The one row that a new world model adds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(WORLD_MODELS, "frozen", WorldModelKind(FrozenConfig, FrozenStage, build, objective))
+        patch.setitem(WORLD_MODELS, "frozen", WorldModelEntry(FrozenConfig, FrozenStage, build, objective))
         yield
 
 

@@ -38,10 +38,10 @@ def train(
     found = find_all_logs(logs)
 
     with importing():
-        from foredrive.recipes import find_recipe, labelled_by
+        from foredrive.recipes import find_recipe, with_occupancy_source
         from foredrive.runs import train_run
 
-    chosen = labelled_by(find_recipe(recipe, set), occupancy)
+    chosen = with_occupancy_source(find_recipe(recipe, set), occupancy)
     run = train_run(chosen, found, out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

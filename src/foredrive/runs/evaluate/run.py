@@ -97,9 +97,7 @@ def evaluate_run(
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)
-    prior, ego_mlp = fit_baselines(
-        run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.planner.target
-    )
+    prior, ego_mlp = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)
