@@ -44,3 +44,4 @@ test-slow: install
 
 clean:
 	rm -rf .venv runs build dist
+	find src tests benchmarks -name '*.nb[ic]' -delete

@@ -18,12 +18,12 @@ from jaxtyping import Float, UInt8
 from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.convert import convert
 from foredrive.errors import InputError
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.scene import LidarSweep, VoxelSpec
-from foredrive.towns.conditions import CONDITIONS
+from foredrive.scene.conditions import CONDITIONS
+from foredrive.sensors.vehicle import camera_rig, find_lidar
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, find_lidar
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.common.study import work_folder
 from foredrive.errors import InputError
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import DriveSuite, drive_suite

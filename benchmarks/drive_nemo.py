@@ -13,7 +13,8 @@ from pathlib import Path
 from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import Benchmark, read_summary
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.summary import read_summary
 from foredrive.recipes import find_recipe
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import record_drives

@@ -16,10 +16,12 @@ import torch
 from benchmarks.common.measuring import held_mib
 from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent
 from foredrive.scene import Clip
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
@@ -28,11 +30,9 @@ from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import snap_route
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.simulation.town_expert import TownExpert
-from foredrive.towns.recorder import Crowd
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
-CROWD = Crowd(vehicles=40, people=20)
+TRAFFIC = BackgroundTraffic(vehicles=40, pedestrians=20)
 ROUTES = "town05-long"
 SECONDS, HOUR_S, WARM_UP_S = 60.0, 3600.0, 300.0
 PLANS = 20
@@ -47,7 +47,7 @@ def _steps(seed: int, sensors: SensorSuite | None, seconds: float) -> Iterator[t
     simulator, left_s = TownSimulator(), seconds
     for waypoints in cycle(load_route_set(ROUTES)):
         route = snap_route(waypoints)
-        scenario = TownScenario(route.town, route.xyz, seed, route.lanes, CROWD, sensors=sensors)
+        scenario = TownScenario(route.town, route.xyz, seed, TRAFFIC, lanes=route.lanes, sensors=sensors)
         clip, following, expert, done = simulator.reset(scenario), Following(), TownExpert(simulator), False
         while not done:
             t_s = simulator.state.t_s

@@ -19,7 +19,7 @@ from benchmarks.common.study import (
     shortened,
     work_folder,
 )
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import RECIPES
 
 WORK = work_folder(Path("runs/nemo_study"))

@@ -18,7 +18,7 @@ from benchmarks.common.study import (
     shortened,
     work_folder,
 )
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import RECIPES
 from foredrive.runs.train.run import train_run
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.common.forecast import forecasting, judge_forecast
 from benchmarks.common.study import StudyTowns, record_study, seeded, shortened, work_folder
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import RECIPES
 from foredrive.recipes.config import Recipe
 from foredrive.runs.train.run import train_run

@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.common.measuring import Took, forget_peak, measure, peak_mib
 from foredrive.data import collate
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import RECIPES, Recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.drive.recording import record_drives

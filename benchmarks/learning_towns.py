@@ -20,11 +20,11 @@ from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.scene import CameraRig
+from foredrive.scene.conditions import BackgroundTraffic, find_conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.campaign import ANY_CONDITIONS, Campaign, DrivePlan, plan_drives
-from foredrive.towns.conditions import find_conditions
-from foredrive.towns.recorder import Crowd, record, split_of
+from foredrive.towns.recorder import record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 TRAIN_TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town06", "Town07", "Town10HD")
 TEST_TOWNS = ("Town05",)
@@ -90,7 +90,7 @@ def main() -> None:
             out,
             plan.rate_hz,
             SensorSuite(rig_of(plan), roof_lidar()),
-            Crowd(plan.vehicles, plan.people),
+            BackgroundTraffic(plan.vehicles, plan.people),
             conditions=None if plan.conditions is None else find_conditions(plan.conditions),
             log_name=plan.log_name,
         )

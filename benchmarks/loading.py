@@ -14,7 +14,7 @@ from pathlib import Path
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, collate
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
 from foredrive.scene import Example
 from foredrive.towns.recorder import record

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.common.study import StudyTowns, record_study, run_arm, seeded, work_folder
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import RECIPES
 
 WORK = work_folder(Path("runs/nemo_study"))

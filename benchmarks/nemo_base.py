@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from benchmarks.common.measuring import forget_peak, in_a_process, measure, peak_mib
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.models import lifting
 from foredrive.models.nemo import rendering

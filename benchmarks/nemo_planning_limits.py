@@ -19,14 +19,14 @@ from torch import Tensor, nn
 from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.batches import stack_records
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss
-from foredrive.models.ego_mlp import EgoMLP, ego_motion
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_motion
 from foredrive.models.planner import PathCorrectionConfig, VolumePlanner
 from foredrive.recipes import find_recipe
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
-from foredrive.training import fit_ego_mlp, read_status
+from foredrive.training import EgoMLPFit, fit_ego_mlp, read_status
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()
@@ -123,7 +123,8 @@ def scenes() -> tuple[Scenes, Scenes, EgoMLP]:
     logs = record_study(TOWNS, WORK / "towns", workers=2)
     train, test = read_scenes(logs.train, "demonstrations"), read_scenes(logs.test, "tests")
     past_frames, dt_s = RECIPE.planner.history, RECIPE.clips.horizon_dt_s
-    fitted = fit_ego_mlp(read_status([train.clip], past_frames), past_frames=past_frames, dt_s=dt_s, seed=0)
+    status = read_status([train.clip], past_frames)
+    fitted = fit_ego_mlp(EgoMLPConfig(), status, EgoMLPFit(), past_frames=past_frames, dt_s=dt_s)
     return train, test, fitted
 
 

@@ -19,7 +19,7 @@ from benchmarks.common.study import (
     share_of,
     work_folder,
 )
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.models.averaging import AveragingConfig
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import Recipe

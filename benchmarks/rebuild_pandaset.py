@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.common.study import pandaset_log, work_folder
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
 from foredrive.runs.rebuild.reconstruct import reconstruct
 

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
-from foredrive.evaluation import Benchmark
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
@@ -121,8 +121,8 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
 def judge(run: Reconstruction, views: Sequence[TrueViews], graph: SceneGraph) -> dict[str, float]:
     """Return all metrics of views, over all their pixels and beams."""
     cameras = [camera for view in views for camera in view.cameras]
-    found = judge_cameras(run.scene, cameras, run.train.cameras, graph)
-    found |= judge_sweeps(run.scene, [view.sweep for view in views], graph=graph)
+    found = evaluate_cameras(run.scene, cameras, run.train.cameras, graph)
+    found |= evaluate_sweeps(run.scene, [view.sweep for view in views], graph=graph)
     return {name: found[name] for name in OF_IMAGES + OF_SWEEPS}
 
 
@@ -136,9 +136,9 @@ def judge_changed(run: Reconstruction, name: str, graph: SceneGraph) -> dict[str
     found = {}
     for prefix, shown in (("changed.", graph), ("unedited.changed.", run.scene.graph)):
         cameras, where = zip(*pixels, strict=True)
-        figures = judge_cameras(run.scene, cameras, run.train.cameras, shown, where)
+        figures = evaluate_cameras(run.scene, cameras, run.train.cameras, shown, where)
         sweeps, which = zip(*beams, strict=True)
-        figures |= judge_sweeps(run.scene, sweeps, graph=shown, where=which)
+        figures |= evaluate_sweeps(run.scene, sweeps, graph=shown, where=which)
         found |= named(f"{name}.{prefix}", {key: figures[key] for key in OF_IMAGES + OF_SWEEPS})
     return found
 

@@ -28,11 +28,11 @@ import torch
 from benchmarks.common.measuring import held_mib, measure
 from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
-from foredrive.evaluation import Benchmark, peak_rss_gib
-from foredrive.models.lidar_clip import PointCloud
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.provenance import peak_rss_gib
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.indexing import IndexWriter
-from foredrive.search.embedded import LidarSize, build_lidar_tower
 from foredrive.search.embedding import read_views
 from foredrive.search.find import find
 from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, Making, Part
@@ -220,10 +220,10 @@ def lidar_tower(seed: int) -> dict[str, float]:
         frames = range(len(log.t_us))
         read = [read_views(log, frame, 128, with_lidar=True) for frame in frames]
     sectors = [[views[name].sweep for views in read] for name in read[0]]
-    clouds = [PointCloud.of_sweeps(stack_records(those)) for those in sectors]
+    clouds = [PointCloud.from_sweeps(stack_records(those)) for those in sectors]
     cores = os.cpu_count() or 1
     torch.manual_seed(seed)
-    tower = build_lidar_tower(LidarSize(), DIM).eval()
+    tower = LidarEncoder(LidarEncoderConfig(), dim=DIM).eval()
 
     @torch.inference_mode()
     def embed(_: int) -> None:

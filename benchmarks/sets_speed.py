@@ -16,8 +16,11 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.evaluation import Benchmark, peak_rss_gib
-from foredrive.evaluation.detections import read_detections, score_frames, summarise_scores
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.detections.files import read_detections
+from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.summary import summarise_scores
+from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.sets import (
     BoxDensity,
     LabelledBoxes,

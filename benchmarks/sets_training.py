@@ -10,10 +10,10 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.common.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.runs.demo import camera_rig, roof_lidar
 from foredrive.scene import VoxelSpec
-from foredrive.towns.recorder import LabelKinds, record
+from foredrive.towns.recorder import LabelOptions, record
 from foredrive.towns.sensing.capture import SensorSuite
 
 SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.0), voxel_m=1.0, shape_zyx=(4, 64, 64))
@@ -35,7 +35,7 @@ def split() -> DetectionSplit:
 
 def samples(towns: tuple[str, ...], seeds: tuple[int, ...]) -> list[DetectionSample]:
     sensors = SensorSuite(camera_rig(IMAGE_HW), roof_lidar())
-    labels = LabelKinds(occupancy=None, visibility=False, captions=False)
+    labels = LabelOptions(occupancy=None, visibility=False, captions=False)
     with tempfile.TemporaryDirectory() as folder:
         return [
             sample

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from benchmarks.common.measuring import in_a_process
 from benchmarks.common.measuring import measure as time_of
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import (

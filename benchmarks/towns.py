@@ -16,11 +16,12 @@ from types import FrameType
 
 import torch
 
-from foredrive.evaluation import Benchmark
+from foredrive.evaluation.bench import Benchmark
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd, record
+from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
@@ -107,7 +108,9 @@ def _record(seed: int, frames: int) -> float:
     """Return the time of a recording, s."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        record(TOWN, frames / RATE_HZ, seed, Path(folder), RATE_HZ, _suite(), Crowd(VEHICLES, PEOPLE))
+        record(
+            TOWN, frames / RATE_HZ, seed, Path(folder), RATE_HZ, _suite(), BackgroundTraffic(VEHICLES, PEOPLE)
+        )
     return time.perf_counter() - started
 
 

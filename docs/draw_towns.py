@@ -10,10 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import LidarSweep
-from foredrive.towns.conditions import CONDITIONS, Conditions
+from foredrive.scene.conditions import CONDITIONS, Conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
@@ -56,7 +56,7 @@ def sheet(cells: Sequence[tuple[str, np.ndarray]], columns: int) -> Image.Image:
     return page
 
 
-def from_above(sweep: LidarSweep, side_px: int) -> np.ndarray:
+def draw_from_above(sweep: LidarSweep, side_px: int) -> np.ndarray:
     """Returns from above, by intensity; forward is up."""
     xyz = (sweep.origin_ego + sweep.range_m[:, None] * sweep.dir_ego)[sweep.returned].numpy()
     colour = _colours(np.sqrt(np.minimum(sweep.intensity[sweep.returned].numpy() * BRIGHTER, 1.0)))
@@ -110,7 +110,7 @@ def main() -> None:
         HERE / "towns_conditions.jpg", quality=88
     )
     side = 2 * SIZE_HW[0] + GAP
-    views = [(name, from_above(frames[name].sweep, side)) for name in ("clear", "rain", "fog")]
+    views = [(name, draw_from_above(frames[name].sweep, side)) for name in ("clear", "rain", "fog")]
     sheet(views, 3).save(HERE / "towns_lidar.png")
     clear = frames["clear"]
     width = 3 * side + 2 * GAP

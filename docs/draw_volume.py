@@ -12,7 +12,7 @@ from foredrive.data import find_logs
 from foredrive.runs import open_run
 from foredrive.view.example_panel import front_camera
 from foredrive.view.image_drawing import Camera, resize
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.volume_nodes import shown_voxels
 from foredrive.view.voxel_drawing import draw_volume_pca, draw_voxels
 
@@ -22,21 +22,26 @@ PCA_PX, GAP = 198, 6
 NAMES = ("camera", "rendered from the volume", "PCA, mean over Z", "occupancy now", "imagined, 1 s ahead")
 
 
-def row(times: LogTimes, t_s: float) -> list[np.ndarray]:
+def row(frames: LogFrames, t_s: float) -> list[np.ndarray]:
     """What the front camera saw, and what the model made of it."""
-    index = times.nearest(t_s)
-    clip, vision = times.clip(index), times.vision(index)
-    if vision is None or times.observer is None or times.run is None or (c := front_camera(clip)) is None:
-        sys.exit(f"no view of {times.name} at {t_s:g} s")
-    spec, camera = times.run.recipe.clips.voxels, Camera.of(clip.rig[clip.now], c).resized(CELL_HW)
+    index = frames.nearest(t_s)
+    clip, prediction = frames.clip(index), frames.prediction(index)
+    if (
+        prediction is None
+        or frames.predictor is None
+        or frames.run is None
+        or (c := front_camera(clip)) is None
+    ):
+        sys.exit(f"no view of {frames.name} at {t_s:g} s")
+    spec, camera = frames.run.recipe.clips.voxels, Camera.of(clip.rig[clip.now], c).resized(CELL_HW)
     one = clip.rig[clip.now, c : c + 1]
     rig = dataclasses.replace(one, K=camera.K[None], names=(clip.rig.names[c],), size_hw=CELL_HW)
-    last = len(vision.occupancy_logit) - 1
-    occupied = [shown_voxels(vision, k, spec, 0.5, spec.lower_m[2]) for k in (0, last)]
+    last = len(prediction.occupancy_logit) - 1
+    occupied = [shown_voxels(prediction, k, spec, 0.5, spec.lower_m[2]) for k in (0, last)]
     return [
         resize(clip.images[clip.now, c].permute(1, 2, 0).numpy(), CELL_HW),
-        (255 * times.observer.render(vision, 0, rig)[0]).to(torch.uint8).numpy(),
-        resize(draw_volume_pca(vision.volume[0]), (PCA_PX, PCA_PX)),
+        (255 * frames.predictor.render(prediction, 0, rig)[0]).to(torch.uint8).numpy(),
+        resize(draw_volume_pca(prediction.volume[0]), (PCA_PX, PCA_PX)),
         *(draw_voxels(voxels, spec, CELL_HW) for voxels in occupied),
     ]
 
@@ -57,8 +62,8 @@ def sheet(rows: list[list[np.ndarray]]) -> Image.Image:
 
 def main(log: Path, run: Path, *seconds: float) -> None:
     """One row a time."""
-    times = LogTimes(find_logs(log)[0], CELL_HW[1], open_run(run))
-    page = sheet([row(times, t_s) for t_s in seconds])
+    frames = LogFrames(find_logs(log)[0], CELL_HW[1], open_run(run))
+    page = sheet([row(frames, t_s) for t_s in seconds])
     page.save(HERE / "nemo_volume.jpg", quality=88, optimize=True)
 
 

@@ -16,8 +16,21 @@ import pytest
 import torch
 from hypothesis import settings
 
-from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
+import shape_checks  # isort: skip
+
+shape_checks.install()  # before anything of the package is imported
+
+from foredrive.geometry.se3 import matrix_from_yaw  # noqa: E402
+from foredrive.scene import (  # noqa: E402
+    Boxes,
+    CameraRig,
+    Clip,
+    Example,
+    LidarSweep,
+    Trajectory,
+    VoxelGrid,
+    VoxelSpec,
+)
 
 if TYPE_CHECKING:
     from foredrive.data import LogPath
@@ -47,6 +60,10 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real logs here: set FOREDRIVE_REAL_DATA")
     return folder
+
+
+def pytest_runtest_setup() -> None:
+    shape_checks.begin_test()
 
 
 def synthetic_example(
@@ -166,7 +183,7 @@ def town02(town_of: "Callable[[str], TownMap]") -> "TownMap":
 
 @pytest.fixture(scope="session")
 def world02(town02: "TownMap") -> "World":
-    from foredrive.towns.conditions import Conditions
+    from foredrive.scene.conditions import Conditions
     from foredrive.towns.world import World
 
     return World(town02, seed=3, conditions=Conditions(hour=12.0))

@@ -8,6 +8,12 @@ import synthetic_log
 from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.models.backbone import BackboneConfig
 from foredrive.models.driveworld import DriveWorldConfig
+from foredrive.models.driveworld.planes import (
+    PlanesToVolumeConfig,
+    PlaneToVectorConfig,
+    StaticSceneConfig,
+    VectorToPlaneConfig,
+)
 from foredrive.models.driveworld.state_space import StateSpaceConfig
 from foredrive.models.lift_splat import LiftSplatConfig
 from foredrive.models.lifting import LiftingConfig
@@ -17,7 +23,7 @@ from foredrive.recipes import Recipe
 from foredrive.recipes.driveworld import DriveWorldRecipe
 from foredrive.recipes.nemo import NemoRecipe
 from foredrive.scene import VoxelSpec
-from foredrive.training import DriveWorldStage, DriveWorldWeights, LossWeights, NemoStage, Schedule
+from foredrive.training import DriveWorldStage, DriveWorldWeights, NemoStage, NemoWeights, Schedule
 
 STEPS = 3
 """Of either stage."""
@@ -50,12 +56,12 @@ def miniature() -> NemoRecipe:
         planner=PlannerConfig(width=16, layers=1, heads=2, pool=(1, 4, 4)),
         pretrain=NemoStage(
             schedule=Schedule(batch_size=2, lr=2e-3, steps=STEPS, warmup_steps=1),
-            weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
+            weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=4,
         ),
         finetune=NemoStage(
             schedule=Schedule(batch_size=2, lr=1e-3, steps=STEPS, warmup_steps=1),
-            weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
+            weights=NemoWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
         ),
     )
@@ -74,11 +80,11 @@ def miniature_driveworld() -> DriveWorldRecipe:
                 observation=8, state=6, history=8, memory=4, heads=2, objects=3, hidden=16
             ),
             channels=8,
-            plane=8,
-            observation_hidden=4,
-            expanded=(8, 4),
-            volume_hidden=4,
-            statics=4,
+            plane_channels=8,
+            to_vector=PlaneToVectorConfig(hidden=4),
+            from_vector=VectorToPlaneConfig(widths=(8, 4)),
+            to_volume=PlanesToVolumeConfig(hidden=4),
+            statics=StaticSceneConfig(channels=4),
             prompt=None,
         ),
         planner=nemo.planner,

@@ -10,6 +10,6 @@ SMALLEST = RebuildRecipe(
     initial=InitialGaussians(
         lidar_points=1100, unseen_points=400, pixel_points=1000, near_points=0, actor_points=80, features=2
     ),
-    schedule=RebuildSchedule(steps=2, most_gaussians=3000, beam_stride=4),
+    schedule=RebuildSchedule(steps=2, max_gaussians=3000, beam_stride=4),
     decoder_width=8,
 )

@@ -125,3 +125,28 @@ def test_imports_flow_downwards_within_towns() -> None:
                 if other in level and other != folder and level[other] >= floor:
                     wrong.append(f"{path} imports {module}")
     assert not wrong, "\n".join(wrong)
+
+
+def foredrive_files(path: Path) -> set[Path]:
+    """The files of the package that a file imports, at any depth of the file."""
+    found = set()
+    for module in imported_modules(path):
+        if module.startswith("foredrive."):
+            place = ROOT.joinpath(*module.split(".")[1:])
+            found.add(
+                place.with_suffix(".py") if place.with_suffix(".py").exists() else place / "__init__.py"
+            )
+    return found
+
+
+def test_carla_is_driven_in_without_the_embedded_towns() -> None:
+    todo, reached = set((ROOT / "simulation" / "carla").rglob("*.py")), set[Path]()
+    while todo:
+        reached |= todo
+        todo = {other for path in todo for other in foredrive_files(path)} - reached
+    names = {path.relative_to(ROOT).as_posix() for path in reached}
+    assert "simulation/lane_rules.py" in names
+    assert not {name for name in names if name.startswith("towns/") or name == "simulation/town.py"}
+    source = foredrive_files(ROOT / "runs" / "drive" / "in_carla.py")
+    assert not {path for path in source if ROOT / "towns" in path.parents}
+    assert not source & {ROOT / "simulation" / "town.py", ROOT / "runs" / "drive" / "in_towns.py"}

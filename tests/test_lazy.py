@@ -1,5 +1,6 @@
 """Packages that import on demand offer what they say, and nothing else."""
 
+import gc
 import importlib
 import json
 import subprocess
@@ -8,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from foredrive.lazy import importing
 
-@pytest.mark.parametrize("package", ["data", "training", "evaluation", "recipes", "runs"])
+
+@pytest.mark.parametrize("package", ["data", "scene", "training", "recipes", "runs"])
 def test_what_a_package_offers_is_there(package: str) -> None:
     module = importlib.import_module(f"foredrive.{package}")
     assert all(getattr(module, name) is not None for name in module.__all__)
@@ -28,8 +31,41 @@ def test_what_a_deferred_package_offers_is_what_its_own_init_offers() -> None:
     assert _homes(f"{deferred}; p.__all__ = {list(own)}") == own
 
 
+def test_a_deferred_package_is_whole_once_it_is_used() -> None:
+    _run(
+        "from foredrive.lazy import defer_package; import sys; defer_package('email')\n"
+        "import email; assert 'email.message' not in sys.modules and 'email.parser' not in sys.modules\n"
+        "import email.charset; assert email.message_from_string('a: b')['a'] == 'b'\n"
+        "assert email.__path__ and email.charset.Charset"
+    )
+
+
+def test_no_verb_begins_with_imports_that_it_may_not_need() -> None:
+    """A log is opened, and drives are recorded, without the libraries that made py123d slow to import."""
+    _run(
+        "import sys, foredrive.data.logs, foredrive.runs.drive.recording, foredrive.runs.drive.suite\n"
+        "slow = {'ray', 'jsonschema', 'matplotlib', 'pandas.core'}\n"
+        "slow |= {'geopandas.base', 'laspy.lib', 'scipy.stats'}\n"
+        "assert not slow & set(sys.modules), slow & set(sys.modules)"
+    )
+
+
+def test_the_garbage_collector_runs_again_after_imports() -> None:
+    with importing():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    with pytest.raises(KeyError), importing():
+        raise KeyError
+    assert gc.isenabled()
+
+
+def _run(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def _homes(imported: str) -> dict[str, str]:
     code = f"{imported}; import json; print(json.dumps({{n: getattr(p, n).__module__ for n in p.__all__}}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    found: dict[str, str] = json.loads(done.stdout)
+    found: dict[str, str] = json.loads(_run(code))
     return found

@@ -14,7 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
-from foredrive.evaluation.detections import DetectionSet, Frame, score_frames, summarise_scores
+from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
+from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.models.detection import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
@@ -129,7 +131,7 @@ def judge(
     """Return the metrics of `foredrive score`: likelihood, its parts, mAP, calibration; NaN for none."""
     region = unexplained(spec)
     frames = [
-        Frame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
+        DetectionFrame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
         for n, (found, sample) in enumerate(zip(detected, samples, strict=True))
     ]
     read = DetectionSet(frames, CLASSES, True, {}, len(CLASSES))

@@ -6,7 +6,7 @@ from dataclasses import replace
 from torch.utils.data import DataLoader
 
 from foredrive.data import LogPath, collate
-from foredrive.evaluation import evaluate
+from foredrive.evaluation.run import evaluate
 from foredrive.recipes.config import Recipe
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.evaluate.run import FUTURES
@@ -47,7 +47,7 @@ def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float
     """
     clips = run.recipe.clips
     dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)
-    prior, _ = fit_baselines(run.logs, clips, run.cache_dir, clips.past_frames)
+    prior, _ = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
     summary = evaluate(
         AgentPredictor(load_agent(run), clips.future_frames, 0, FUTURES),
         DataLoader(dataset, batch_size=BATCH, collate_fn=collate),

@@ -18,11 +18,12 @@ from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo
 from foredrive.rendering.novel_views import novel_camera_view
 from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.vehicle import camera_rig, find_lidar
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd, LabelKinds, record, split_of
+from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, find_lidar
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
@@ -36,7 +37,9 @@ class TownDrive:
     seed: int
     seconds: float = 8.0
     rate_hz: float = 10.0
-    crowd: Crowd = dataclasses.field(default_factory=lambda: Crowd(vehicles=60, people=20))
+    background_traffic: BackgroundTraffic = dataclasses.field(
+        default_factory=lambda: BackgroundTraffic(vehicles=60, pedestrians=20)
+    )
     cameras: tuple[str, ...] = ("PCAM_F0",)
     image_hw: tuple[int, int] = (270, 480)
     readout_s: float = 0.03
@@ -60,7 +63,7 @@ class TownDrive:
         path = LogPath(out / "logs" / split_of(self.town) / name, out / "maps")
         if path.folder.is_dir():
             return path
-        labels = LabelKinds(occupancy=None, visibility=False, captions=False)
+        labels = LabelOptions(occupancy=None, visibility=False, captions=False)
         return record(
             self.town,
             self.seconds,
@@ -68,7 +71,7 @@ class TownDrive:
             out,
             self.rate_hz,
             self.sensors,
-            self.crowd,
+            self.background_traffic,
             labels,
             log_name=name,
         )
@@ -90,7 +93,9 @@ class TownTruth:
         self.drive = drive
         town = load_town_map(drive.town)
         self._world = World(town, drive.seed)
-        traffic = Traffic(town, drive.seed, drive.crowd.vehicles + 1, drive.crowd.people)
+        traffic = Traffic(
+            town, drive.seed, drive.background_traffic.vehicles + 1, drive.background_traffic.pedestrians
+        )
         moments = ExpertDrive(traffic, drive.seconds).snapshots(drive.frames, 1 / drive.rate_hz)
         self.snapshots: list[DriveSnapshot] = list(moments)
 

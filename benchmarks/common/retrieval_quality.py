@@ -11,7 +11,7 @@ from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.setting import Place
-from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
+from foredrive.metrics.retrieval import Ranking, draw_sequences, mean_and_interval, precision_at
 from foredrive.runs.search.sector_views import LogViews, Row
 from foredrive.search.facts import MANY, NOUNS
 from foredrive.search.find import collapse
@@ -234,5 +234,5 @@ def _mean(values: Float[np.ndarray, "Q B K"]) -> Float[np.ndarray, "B K"]:
 
 
 def _with_bounds(name: str, values: Float[np.ndarray, "B"]) -> dict[str, float]:
-    value, low, high = with_interval(values)
+    value, low, high = mean_and_interval(values)
     return {name: value, f"{name}_low": low, f"{name}_high": high}

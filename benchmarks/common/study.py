@@ -10,9 +10,10 @@ from typing import Any
 from foredrive.data import LogPath, find_logs
 from foredrive.data.convert import convert
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance, read_summary
+from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.metrics import PROTOCOLS
+from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import NemoRecipe
 from foredrive.runs.drive.recording import record_drives

@@ -4,8 +4,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import StripKind, TownMap
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Poses
 
@@ -111,7 +111,9 @@ class Audit:
         stays = w.lane == v.lane
         reaches = ~stays | (w.front_m > graph.length_m[w.lane])
         crosses = (v.front_m <= graph.length_m[v.lane]) & reaches & (w.lane == np.where(stays, v.lane, ahead))
-        return crosses & signals.guarded[ahead] & (signals.light_states(before.time_s)[ahead] == Light.RED)
+        return (
+            crosses & signals.guarded[ahead] & (signals.light_states(before.time_s)[ahead] == LightState.RED)
+        )
 
     def _compare_outlines(self, state: TrafficState, poses: Poses) -> None:
         live = np.flatnonzero(state.vehicles.active)

@@ -1,9 +1,11 @@
 """Packages that import their modules on first use, so that a command imports only what it needs."""
 
+import contextlib
+import gc
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 
@@ -41,3 +43,38 @@ def defer_imports(package: str, homes: Mapping[str, tuple[str, ...]]) -> None:
     module = importlib.util.module_from_spec(spec)
     module.__getattr__ = on_demand(package, homes)  # type: ignore[method-assign]
     sys.modules[package] = module
+
+
+def defer_package(package: str) -> None:
+    """Make `import package` cheap: its `__init__` runs when the first attribute or module of it is used.
+
+    If the package is already imported, nothing changes. `from package import name` uses it at once.
+    """
+    if package in sys.modules:
+        return
+    spec = importlib.util.find_spec(package)
+    assert spec is not None, f"{package} is not installed"
+    assert spec.loader is not None
+    loader = spec.loader
+    module = importlib.util.module_from_spec(spec)
+    path = vars(module).pop("__path__")  # an import of one of its modules asks for this
+
+    def run_init(name: str) -> Any:
+        del module.__getattr__
+        module.__path__ = path
+        loader.exec_module(module)
+        return getattr(module, name)
+
+    module.__getattr__ = run_init  # type: ignore[method-assign]
+    sys.modules[package] = module
+
+
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """Pause the garbage collector during imports. It would look at each of their objects several times."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()

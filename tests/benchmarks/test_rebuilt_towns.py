@@ -17,7 +17,7 @@ from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.runs.rebuild.calibration_check import calibration_findings
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 
 DRIVE = TownDrive(
     "Town02", seed=3, seconds=6.0, rate_hz=2.0, cameras=("PCAM_F0", "PCAM_R0"), image_hw=(120, 240)

@@ -296,7 +296,7 @@ def test_verbs_wait_for_nothing_they_do_not_use() -> None:
         "import foredrive.evaluation.bench",
         "import foredrive.data.convert",
         "import foredrive.runs.drive.recording",
-        "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_times",
+        "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_frames",
         "import foredrive.recipes.known",
         "import foredrive.runs.evaluate.run, foredrive.view.run_report",
     )

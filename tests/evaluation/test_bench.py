@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation import Benchmark, run_benchmark
+from foredrive.evaluation.bench import Benchmark, run_benchmark
 
 
 class Recorder:

@@ -9,8 +9,11 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
-from foredrive.evaluation import ConstantVelocity, Prediction, StandStill, evaluate
-from foredrive.metrics import PROTOCOLS, OccupancyPrior
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.run import evaluate
+from foredrive.metrics.occupancy import OccupancyPrior
+from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
 
 MakeExample = Callable[..., Example]

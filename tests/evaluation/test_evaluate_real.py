@@ -7,8 +7,10 @@ from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, collate
 from foredrive.data.convert import convert
-from foredrive.evaluation import ConstantVelocity, Prediction, StandStill, evaluate
-from foredrive.metrics import PROTOCOLS
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.run import evaluate
+from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.scene import Clip, VoxelSpec
 
 

@@ -13,8 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from foredrive.evaluation import ConstantVelocity, Prediction, StandStill, evaluate
-from foredrive.metrics import OccupancyPrior
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.run import evaluate
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.scene import Clip, Example, Trajectory
 
 GOLDEN = Path(__file__).with_name("golden_summary.json")

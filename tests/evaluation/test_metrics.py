@@ -8,16 +8,11 @@ from typing import get_args
 import pytest
 import torch
 
-from foredrive.evaluation import (
-    METRICS,
-    ConstantVelocity,
-    EvaluationContext,
-    Figures,
-    Part,
-    Prediction,
-    StandStill,
-    evaluate,
-)
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.metric import EvaluationContext, Figures
+from foredrive.evaluation.metrics import METRICS
+from foredrive.evaluation.predictor import Part, Prediction
+from foredrive.evaluation.run import evaluate
 from foredrive.scene import Clip, Example
 
 MakeExample = Callable[..., Example]

@@ -14,7 +14,7 @@ from torch._utils import ExceptionWrapper
 
 from foredrive.cli import main as program
 from foredrive.data import LogPath, find_logs
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
 from foredrive.runs import Run
 from foredrive.training import read_metrics

@@ -8,59 +8,50 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from miniature import miniature
+from program_server import ProgramServer
 
 from foredrive.data import LogPath
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, train_run
 from foredrive.training import read_metrics
 
-PROGRAM = """
-import sys
-from miniature import miniature
-from foredrive.cli.main import main
-from foredrive.recipes import RECIPES
-RECIPES["miniature"] = miniature()
-sys.exit(main(sys.argv[1:]))
-"""
 PATIENCE_S = 300.0
-TESTS = Path(__file__).parents[1]
 Sign = Callable[[], bool]
 
 
-def start(*args: str | Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-W", "error", "-c", PROGRAM, *map(str, args)]
-    path = os.pathsep.join([str(TESTS), str(TESTS / "data"), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path}
-    return subprocess.Popen(
-        command, stdout=-1, stderr=-1, text=True, env=environment, start_new_session=True, cwd=TESTS
-    )
+class Programs:
+    """What the tests do with a program."""
+
+    def __init__(self, server: ProgramServer) -> None:
+        self._server = server
+
+    def finish(self, *args: str | Path) -> None:
+        self._server.start(*args)
+        assert self._server.finish(PATIENCE_S) == (0, "")
+
+    def interrupt(self, sign: Sign, *args: str | Path) -> None:
+        """Start the program, press Ctrl-C when the sign is there, and see it end as it should."""
+        group = self._server.start(*args)
+        until = time.monotonic() + PATIENCE_S
+        while not sign():
+            assert self._server.is_running(), f"ended before the sign: {self._server.finish(0.0)}"
+            assert time.monotonic() < until, "the sign did not come"
+            time.sleep(0.01)
+        os.killpg(group, signal.SIGINT)
+        assert self._server.finish(PATIENCE_S) == (130, "foredrive: interrupted\n")
 
 
-def finish(*args: str | Path) -> None:
-    process = start(*args)
-    _, err = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, err) == (0, "")
-
-
-def interrupt(sign: Sign, *args: str | Path) -> None:
-    """Start the program, press Ctrl-C when the sign is there, and see it end as it should."""
-    process = start(*args)
-    until = time.monotonic() + PATIENCE_S
-    while not sign():
-        assert process.poll() is None, f"ended before the sign: {process.communicate()}"
-        assert time.monotonic() < until, "the sign did not come"
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, err) == (130, "foredrive: interrupted\n")
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
+    server = ProgramServer(tmp_path_factory.mktemp("programs"))
+    yield Programs(server)
+    server.close()
 
 
 def all_files(folder: Path) -> set[str]:
@@ -81,7 +72,7 @@ def no_scratch(folder: Path) -> bool:
     return not any(".part" in file for file in all_files(folder))
 
 
-def test_record(tmp_path: Path) -> None:
+def test_record(programs: Programs, tmp_path: Path) -> None:
     arguments = (
         "record",
         "--town",
@@ -94,43 +85,43 @@ def test_record(tmp_path: Path) -> None:
         "--out",
         tmp_path,
     )
-    interrupt(there(tmp_path, "logs/*.part/*"), *arguments)
+    programs.interrupt(there(tmp_path, "logs/*.part/*"), *arguments)
     assert all_files(tmp_path) == {"maps/foredrive/foredrive_Town02.arrow"}
-    finish(*arguments)
+    programs.finish(*arguments)
     assert "logs/town_train/Town02_seed0/sync.arrow" in all_files(tmp_path)
 
 
-def test_a_campaign_of_recordings(tmp_path: Path) -> None:
+def test_a_campaign_of_recordings(programs: Programs, tmp_path: Path) -> None:
     arguments = ("record", "--town", "Town02", "--seeds", "1..3", "--seconds", "1", "--rate", "2")
     arguments = (*arguments, "--image-size", "36", "64", "--workers", "2", "--out", tmp_path)
-    interrupt(there(tmp_path, "logs/*Town02_seed3.*.part/*"), *arguments)
+    programs.interrupt(there(tmp_path, "logs/*Town02_seed3.*.part/*"), *arguments)
     assert no_scratch(tmp_path)
     whole = {file.parent for file in tmp_path.rglob("sync.arrow")}
     assert 1 <= len(whole) <= 2
     assert not (tmp_path / "contact_sheet.png").exists()
     written = {file: file.stat().st_mtime_ns for log in whole for file in log.iterdir()}
-    finish(*arguments)
+    programs.finish(*arguments)
     assert {file: file.stat().st_mtime_ns for file in written} == written
     assert len(list(tmp_path.rglob("sync.arrow"))) == 3
     assert (tmp_path / "contact_sheet.png").is_file()
 
 
 @pytest.mark.real
-def test_convert(real_data: Path, tmp_path: Path) -> None:
-    interrupt(
+def test_convert(programs: Programs, real_data: Path, tmp_path: Path) -> None:
+    programs.interrupt(
         there(tmp_path, "logs/*.part/*"), "convert", "pandaset", real_data / "pandaset", "--out", tmp_path
     )
     assert not [file for file in all_files(tmp_path) if file.startswith("logs/")]
     assert no_scratch(tmp_path)
 
 
-def test_train(log: LogPath, trained: Run, tmp_path: Path) -> None:
+def test_train(programs: Programs, log: LogPath, trained: Run, tmp_path: Path) -> None:
     arguments = ("train", "miniature", "--logs", log.folder, "--out", tmp_path)
-    interrupt(there(tmp_path / "cache", "*.labels"), *arguments)
+    programs.interrupt(there(tmp_path / "cache", "*.labels"), *arguments)
     assert no_scratch(tmp_path)
-    interrupt(there(tmp_path / "finetune", "metrics.jsonl"), *arguments)
+    programs.interrupt(there(tmp_path / "finetune", "metrics.jsonl"), *arguments)
     assert no_scratch(tmp_path)
-    finish(*arguments)
+    programs.finish(*arguments)
     assert without_cache(tmp_path) == without_cache(trained.folder)
     for stage in ("pretrain", "finetune"):
         found, expected = (
@@ -141,34 +132,34 @@ def test_train(log: LogPath, trained: Run, tmp_path: Path) -> None:
     assert len(expected) == miniature().finetune.schedule.steps
 
 
-def test_evaluate(log: LogPath, tmp_path: Path) -> None:
+def test_evaluate(programs: Programs, log: LogPath, tmp_path: Path) -> None:
     """While labels are made, and while the report is drawn."""
     run = train_run(miniature(), [log], tmp_path / "run").folder
     shutil.rmtree(run / "cache")
     before, out = all_files(run), tmp_path / "out"
     arguments = ("evaluate", run, "--out", out)
-    interrupt(there(run / "cache", "*.labels"), *arguments)
+    programs.interrupt(there(run / "cache", "*.labels"), *arguments)
     assert not out.exists()
-    interrupt(there(out, "summary.json"), *arguments)
+    programs.interrupt(there(out, "summary.json"), *arguments)
     assert all_files(out) == {"summary.json"}
     assert without_cache(run) == before
     assert no_scratch(tmp_path)
 
 
-def test_the_demo_goes_on_from_every_phase(tmp_path: Path) -> None:
+def test_the_demo_goes_on_from_every_phase(programs: Programs, tmp_path: Path) -> None:
     """The quick demo, interrupted in each of its phases, ends with what an undisturbed one has."""
     run, arguments = tmp_path / "run", ("demo", "--quick", "--out", tmp_path)
-    interrupt(there(tmp_path, "*Town02_seed1.*.part/*"), *arguments)
+    programs.interrupt(there(tmp_path, "*Town02_seed1.*.part/*"), *arguments)
     assert not (tmp_path / "towns/logs/town_train/Town02_seed1").exists()
     for sign in (
         lambda: len(read_metrics(run / "pretrain/metrics.jsonl")) > 1,
         lambda: len(read_metrics(run / "finetune/metrics.jsonl")) > 1,
         there(run, "summary.json"),
     ):
-        interrupt(sign, *arguments)
+        programs.interrupt(sign, *arguments)
         assert no_scratch(tmp_path)
     assert not (run / "report.html").exists()
-    finish(*arguments)
+    programs.finish(*arguments)
     assert [line["step"] for line in read_metrics(run / "pretrain/metrics.jsonl")] == list(range(1, 13))
     assert read_summary(run / "summary.json")["failed"] == 0
     assert re.search(r"<img[^>]*data:image", (run / "report.html").read_text())

@@ -29,8 +29,8 @@ def test_the_worst_twentieth_of_ranges_does_not_count() -> None:
     rendered = real + 0.5
     rendered[:2] = 200.0
     returned[-1], rendered[-1] = False, 1e6
-    assert float(range_loss(rendered, real, returned)) == pytest.approx(0.5)
-    assert float(range_loss(rendered, real, returned & False)) == 0.0
+    assert float(range_loss(rendered, real, returned, 0.95)) == pytest.approx(0.5)
+    assert float(range_loss(rendered, real, returned & False, 0.95)) == 0.0
 
 
 def test_beams_that_return_are_compared_alone() -> None:

@@ -113,8 +113,8 @@ def test_who_was_seen_when() -> None:
     obstacles = future_obstacles(clip, steps=3, step_s=0.5)
     assert obstacles.annotated.tolist() == [[True, True, False]]  # the clip ends at 1 s
     assert obstacles.boxes.valid[0].tolist() == [*seen[4:].tolist(), [False] * 5]
-    assert obstacles.seen_now[0, 0].tolist() == [True, False, False, False, False]
-    assert obstacles.seen_lately[0, 0].tolist() == [True, True, False, False, False]
+    assert obstacles.tracked_now[0, 0].tolist() == [True, False, False, False, False]
+    assert obstacles.tracked_lately[0, 0].tolist() == [True, True, False, False, False]
     assert bool(obstacles.annotated_now.all())
 
 

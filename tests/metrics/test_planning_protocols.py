@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from foredrive.errors import InputError
 from foredrive.metrics.obstacles import Obstacles
 from foredrive.metrics.planning import PlanScores, score_plan
-from foredrive.metrics.protocols import LIDAR_AHEAD_M, PROTOCOLS, STEP_S, STEPS
+from foredrive.metrics.protocols import LIDAR_FORWARD_M, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Boxes, Category, Trajectory
 
 NAMES = sorted(PROTOCOLS)
@@ -40,8 +40,8 @@ class Thing:
     y: float
     size: float = 0.4
     category: Category = Category.CAR
-    seen_now: bool = True
-    seen_lately: bool = True
+    tracked_now: bool = True
+    tracked_lately: bool = True
 
 
 def obstacles(*things: Thing, annotated_steps: int = STEPS) -> Obstacles:
@@ -54,7 +54,7 @@ def obstacles(*things: Thing, annotated_steps: int = STEPS) -> Obstacles:
         size[0, :, i] = thing.size
         for step in thing.steps:
             valid[0, step - 1, i] = step <= annotated_steps
-            now[0, step - 1, i], lately[0, step - 1, i] = thing.seen_now, thing.seen_lately
+            now[0, step - 1, i], lately[0, step - 1, i] = thing.tracked_now, thing.tracked_lately
     return Obstacles(
         boxes=Boxes(
             centre=centre,
@@ -66,8 +66,8 @@ def obstacles(*things: Thing, annotated_steps: int = STEPS) -> Obstacles:
             valid=valid,
         ),
         annotated=(torch.arange(STEPS) < annotated_steps)[None],
-        seen_now=now,
-        seen_lately=lately,
+        tracked_now=now,
+        tracked_lately=lately,
         annotated_now=torch.ones(1, dtype=torch.bool),
     )
 
@@ -88,10 +88,10 @@ def test_one_plan_five_numbers() -> None:
     on_plan = {k: (2.5 * k + 1.2, 1.0 * k + 0.3) for k in range(1, STEPS + 1)}
     around = obstacles(
         Thing((2,), *on_plan[2]),  # a car
-        Thing((3,), *on_plan[3], seen_now=False),  # a car hidden now, seen half a second ago
+        Thing((3,), *on_plan[3], tracked_now=False),  # a car hidden now, seen half a second ago
         Thing((4,), *on_plan[4], category=Category.PEDESTRIAN),
         Thing((5,), *on_plan[5], category=Category.TRAFFIC_CONE),
-        Thing((6,), *on_plan[6], seen_now=False, seen_lately=False),  # a car that turns up later
+        Thing((6,), *on_plan[6], tracked_now=False, tracked_lately=False),  # a car that turns up later
     )
     # Who counts what, by step:       car 2 | hidden car 3 | pedestrian 4 | cone 5 | late car 6
     #   ST-P3 (seen within 1 s)         x           x               x
@@ -167,7 +167,7 @@ def test_a_log_that_ends_within_three_seconds(name: str) -> None:
     plan = path([(2.5 * k, 1.0) for k in range(1, STEPS + 1)])
     things = [Thing((k,), 2.5 * k + 1.2, 1.7) for k in (2, 5)]
     scores = score(name, plan, driven, obstacles(*things, annotated_steps=3))
-    assert not bool(scores.complete)
+    assert not bool(scores.future_complete)
     if name == "uniad":  # masked steps add nothing and are counted: 1 m at 1 s, then 0
         assert bool(scores.counted)
         assert bool(scores.collision_counted)
@@ -190,11 +190,11 @@ def test_a_broken_plan_is_not_scored(name: str) -> None:
     plan = straight(5.0)
     plan.xy[0, 0, 3, 0] = math.nan
     scores = score(name, plan, straight(5.0), obstacles())
-    assert not bool(scores.planned)
+    assert not bool(scores.plan_complete)
     assert not bool(scores.counted)
     assert scores.l2_m.tolist() == [[0.0, 0.0, 0.0]]
     short = path([(2.5 * k, 0.0) for k in range(1, STEPS + 1)], valid_steps=5)
-    assert not bool(score(name, short, straight(5.0), obstacles()).planned)
+    assert not bool(score(name, short, straight(5.0), obstacles()).plan_complete)
 
 
 def test_centre_point_and_box_are_two_numbers() -> None:
@@ -243,7 +243,7 @@ def test_the_followed_point_swings_out_with_the_heading() -> None:
     assert score("uniad", turned, away, beside).collision[0].tolist() == [1.0, 1.0, 1.0]
     straight_on = path([(0.0, 0.0)] * STEPS)
     assert score("uniad", straight_on, away, beside).collision[0].tolist() == [0.0, 0.0, 0.0]
-    assert LIDAR_AHEAD_M == 0.985793
+    assert LIDAR_FORWARD_M == 0.985793
 
 
 def test_wrong_inputs_are_named() -> None:

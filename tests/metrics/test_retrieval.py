@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from foredrive.metrics.retrieval import Ranking, draw_sequences, precision_at, with_interval
+from foredrive.metrics.retrieval import Ranking, draw_sequences, mean_and_interval, precision_at
 
 OUT = -np.inf
 RANKING = Ranking(
@@ -33,10 +33,10 @@ def test_draws_begin_with_all_sequences_and_bounds_hold_what_varies() -> None:
     assert drawn[0].tolist() == list(range(8))
     assert set(drawn[1:].ravel()) == set(range(8))
     share = np.array([1.0, 1, 1, 1, 0, 0, 0, 0])
-    value, low, high = with_interval(share[drawn].mean(axis=1))
+    value, low, high = mean_and_interval(share[drawn].mean(axis=1))
     assert value == 0.5
     # the standard error of a mean of 8 is 0.18
     assert low == pytest.approx(0.125, abs=0.07)
     assert high == pytest.approx(0.875, abs=0.07)
     alike = np.full(8, 0.25)[drawn].mean(axis=1)
-    assert with_interval(alike) == (0.25, 0.25, 0.25)
+    assert mean_and_interval(alike) == (0.25, 0.25, 0.25)

@@ -20,7 +20,13 @@ from foredrive.models.driveworld import (
     kl_divergence,
     motion_of,
 )
-from foredrive.models.driveworld.planes import carried_plane
+from foredrive.models.driveworld.planes import (
+    PlanesToVolumeConfig,
+    PlaneToVectorConfig,
+    StaticSceneConfig,
+    VectorToPlaneConfig,
+    warp_plane,
+)
 from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace, StateSpaceConfig
 from foredrive.models.driveworld.task_prompt import PromptConfig
 from foredrive.models.lift_splat import LiftSplatConfig
@@ -49,12 +55,12 @@ def model() -> DriveWorld:
         encoder=LiftSplatConfig(near_m=1.0, far_m=7.0, step_m=1.0),
         states=SIZES,
         channels=8,
-        plane=WIDTH,
-        observation_hidden=4,
-        expanded=(8, 8),
-        volume_hidden=4,
-        statics=4,
-        prompt=PromptConfig(widths=(4, 4), encoding=6, text_encoder="none"),
+        plane_channels=WIDTH,
+        to_vector=PlaneToVectorConfig(hidden=4),
+        from_vector=VectorToPlaneConfig(widths=(8, 8)),
+        to_volume=PlanesToVolumeConfig(hidden=4),
+        statics=StaticSceneConfig(channels=4),
+        prompt=PromptConfig(expand=VectorToPlaneConfig(widths=(4, 4)), encoding=6, text_encoder="none"),
     )
     model = DriveWorld(config, SPEC, past_frames=PAST, dt_s=0.5, fetch=False).eval()
     assert model.prompt is not None
@@ -106,11 +112,11 @@ def test_samples_have_the_mean_and_spread_and_repeat() -> None:
     assert float(drawn.mean()) == pytest.approx(2.0, abs=4 * 0.5 / 200)
     assert float(drawn.std()) == pytest.approx(0.5, rel=0.02)
     assert torch.equal(drawn, wide.sample(torch.Generator().manual_seed(1)))
-    assert float(DiagonalGaussian.of(torch.zeros(2)).std) == pytest.approx(1.1)
+    assert float(DiagonalGaussian.from_output(torch.zeros(2), 0.1).std) == pytest.approx(1.1)
 
 
 def test_motion_aware_normalisation_begins_as_plain_normalisation() -> None:
-    norm, state = MotionAwareNorm(STATE, 3), torch.randn(4, STATE)
+    norm, state = MotionAwareNorm(STATE, 3, 10.0), torch.randn(4, STATE)
     out = norm(state, torch.randn(4, 3, 2), torch.rand(4))
     torch.testing.assert_close(out, torch.nn.functional.layer_norm(state, (STATE,)))
     torch.nn.init.normal_(norm.gamma.weight)
@@ -121,23 +127,23 @@ def test_motion_aware_normalisation_begins_as_plain_normalisation() -> None:
 def test_only_what_is_remembered_is_recalled() -> None:
     torch.manual_seed(0)
     space = states()
-    latent = space.begin(2, torch.device("cpu"))
-    assert latent.remembered.sum(1).tolist() == [1, 1]
+    latent = space.initial(2, torch.device("cpu"))
+    assert latent.memory_valid.sum(1).tolist() == [1, 1]
     nonsense = dataclasses.replace(
-        latent, memory=torch.where(latent.remembered[..., None], latent.memory, torch.tensor(9.0))
+        latent, memory=torch.where(latent.memory_valid[..., None], latent.memory, torch.tensor(9.0))
     )
     assert space.recall is not None
     torch.testing.assert_close(space.recall(latent), space.recall(nonsense))
     for _ in range(MEMORY + 2):
         latent = space.transition(latent, torch.full((2,), 0.5))
-    assert bool(latent.remembered.all())
+    assert bool(latent.memory_valid.all())
     assert torch.equal(latent.memory[:, -1], latent.history)
     assert not (latent.memory == 0).all(-1).any()  # h_1 is forgotten
 
 
 def test_without_its_parts_the_transition_is_a_plain_cell() -> None:
     space = states(memory_bank=False, motion_norm=False)
-    latent = dataclasses.replace(space.begin(3, torch.device("cpu")), state=torch.randn(3, STATE))
+    latent = dataclasses.replace(space.initial(3, torch.device("cpu")), state=torch.randn(3, STATE))
     expected = space.cell(space.into(latent.state), latent.history)
     for dt_s in (0.1, 2.0):
         torch.testing.assert_close(space.transition(latent, torch.full((3,), dt_s)).history, expected)
@@ -192,7 +198,7 @@ def test_given_actions_move_the_vehicle_and_change_what_is_imagined(model: Drive
     assert policy is not None
     own = model.imagine(now, 1)[0]
     torch.testing.assert_close(own.volume, model.imagine(now, 1, policy[:, None])[0].volume)
-    with pytest.raises(InputError, match="3 of them with 2 given actions"):
+    with pytest.raises(InputError, match="asked for 3 with 2 given actions"):
         model.imagine(now, 3, straight)
 
 
@@ -215,7 +221,7 @@ def test_actions_are_those_that_led_from_pose_to_pose(clip: Clip) -> None:
 
 
 def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, clip: Clip) -> None:
-    seen = model.unroll(model.see(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
+    seen = model.unroll(model.lift_frames(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
     assert (len(seen.beliefs), len(seen.posteriors), len(seen.priors)) == (PAST + 3, PAST + 1, PAST + 1)
     assert seen.actions.shape == (2, PAST + 3, 2)
     assert seen.velocities_mps.shape == (2, PAST + 1, 3, 2)
@@ -232,7 +238,7 @@ def test_training_sees_every_frame_and_reaches_every_part(model: DriveWorld, cli
     without = {name for name, parameter in model.named_parameters() if parameter.grad is None}
     assert without == set()
     assert not any(name.endswith("encodings") for name, _ in model.named_parameters())  # the text is frozen
-    repeated = model.unroll(model.see(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
+    repeated = model.unroll(model.lift_frames(last_frames(clip, PAST)), 2, torch.Generator().manual_seed(0))
     assert torch.equal(repeated.beliefs[-1].volume, seen.beliefs[-1].volume)
 
 
@@ -257,11 +263,11 @@ def test_a_carried_plane_shows_what_lies_there() -> None:
     plane = torch.zeros(1, 1, *SPEC.shape_zyx[1:])  # 12 rows of y from -6 m, 10 columns of x from -4 m
     plane[0, 0, 6, 7] = 1.0  # the cell around x 3.5 m, y 0.5 m
     ahead = motion_of(torch.tensor([[4.0, 0.0]]), 0.5)  # 2 m straight on
-    (where,) = carried_plane(plane, ahead, SPEC)[0, 0].nonzero().tolist()
+    (where,) = warp_plane(plane, ahead, SPEC)[0, 0].nonzero().tolist()
     assert where == [6, 5]
     left = torch.eye(4)[None].clone()
     left[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])  # facing left: what was ahead lies to the right
-    carried = carried_plane(plane, left, SPEC)
+    carried = warp_plane(plane, left, SPEC)
     assert carried[0, 0, 2, 4] == pytest.approx(1.0)  # x 0.5 m, y -3.5 m
     assert carried.sum() == pytest.approx(1.0)
 
@@ -270,16 +276,16 @@ def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: C
     now = model.observe(clip)
     stand, go = torch.zeros(2, 2, 2), torch.tensor([4.0, 0.0]).expand(2, 2, 2)
     as_it_is = [model.imagine(now, 2, actions)[-1].volume for actions in (stand, go)]
-    model.carry_statics = True
+    model.warp_statics = True
     try:
         torch.testing.assert_close(model.observe(clip).volume, now.volume)
         standing, going = (model.imagine(now, 2, actions)[-1] for actions in (stand, go))
         torch.testing.assert_close(model.volume_for(going, "forecast"), going.volume)
-        seen = model.see(last_frames(clip, PAST))
+        seen = model.lift_frames(last_frames(clip, PAST))
         first, *_, last = model.unroll(seen, 0, None).beliefs  # statics of now
         torch.testing.assert_close(last.volume, now.volume)
     finally:
-        model.carry_statics = False
+        model.warp_statics = False
     torch.testing.assert_close(standing.volume, as_it_is[0])
     assert not torch.allclose(going.volume, as_it_is[1])
     assert going.statics is now.statics  # carried when looked at, not twice

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from foredrive.models.averaging import AveragingConfig, AveragingEncoder
-from foredrive.models.bev import BevConfig, BevEncoder, PillarCrossAttention
-from foredrive.models.lifting import place_code, project_to_cameras
+from foredrive.models.bev import BevConfig, BevEncoder
+from foredrive.models.lifting import CameraCrossAttention, position_code, project_to_cameras
 from foredrive.scene import CameraRig, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -47,7 +47,7 @@ def test_pillars_stand_on_the_middle_of_their_cells() -> None:
 
 def test_a_cell_hears_of_every_height_above_it() -> None:
     """Half of the image above the horizon, half below: a pillar that reaches both reads their mean."""
-    attention = PillarCrossAttention(features=2, channels=2, heads=1, levels=1, points=1, pillars=2)
+    attention = CameraCrossAttention(features=2, channels=2, heads=1, levels=1, points=1, heights=2)
     with torch.no_grad():
         for layer in (attention.value, attention.out):
             layer.weight.copy_(torch.eye(2))
@@ -101,13 +101,13 @@ def test_a_camera_without_an_image_is_not_looked_at(kind: str) -> None:
 def test_queries_begin_by_knowing_their_place() -> None:
     """No two voxels begin alike, those that lie together begin more alike than others, whatever the seed."""
     centres = SPEC.centres_m().flatten(0, 2)
-    code = place_code(centres, 28)
+    code = position_code(centres, 28)
     apart = torch.cdist(code, code) + 10 * torch.eye(len(code))
     assert float(apart.min()) > 0.1
     away = torch.cdist(centres, centres)
     assert float(apart[(away > 0) & (away < 1.5)].mean()) < 0.7 * float(apart[away > 6].mean())
     torch.manual_seed(1)
-    wide = place_code(centres, 40)
+    wide = position_code(centres, 40)
     assert torch.equal(wide[:, :28], code)
     assert 0.0 < float(wide[:, 28:].std()) < 0.05
-    assert torch.equal(place_code(centres, 8), code[:, :8])
+    assert torch.equal(position_code(centres, 8), code[:, :8])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foredrive.models.attention_pool import AttentionPool
-from foredrive.models.lidar_clip import LidarEncoder, PillarGrid, PointCloud
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PillarGrid, PointCloud
 from foredrive.models.lidar_clip.pillars import PillarEncoder, pillar_max
 from foredrive.models.lidar_clip.windows import WindowAttention, Windows
 from foredrive.scene import LidarSweep
@@ -25,7 +25,7 @@ def cloud(seed: int, count: int = 300, items: int = 1) -> PointCloud:
 @pytest.fixture(scope="module")
 def encoder() -> LidarEncoder:
     torch.manual_seed(0)
-    return LidarEncoder(GRID, dim=6, width=16, heads=2, hidden=16, blocks=2, window=12).eval()
+    return LidarEncoder(LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=2, grid=GRID), dim=6).eval()
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,9 @@ def test_windows_of_unequal_size_attend_as_a_dense_mask_says(attention: WindowAt
 
 def test_a_sweep_is_embedded_alike_while_nothing_learns() -> None:
     torch.manual_seed(0)
-    encoder = LidarEncoder(GRID, dim=6, width=32, heads=2, hidden=16, blocks=2, window=12).eval()
+    encoder = LidarEncoder(
+        LidarEncoderConfig(width=32, heads=2, hidden=16, blocks=2, grid=GRID), dim=6
+    ).eval()
     made = cloud(9, count=2000, items=2)
     learning = encoder(made, 2)
     with torch.no_grad():
@@ -191,7 +193,7 @@ def test_padding_misses_and_what_is_not_finite_are_left_out() -> None:
         beam=torch.zeros(2, 4, dtype=torch.int64),
         valid=torch.tensor([[True, True, True, True], [True, True, False, True]]),
     )
-    made = PointCloud.of_sweeps(sweep)
+    made = PointCloud.from_sweeps(sweep)
     assert made.points.tolist() == [[1, 0, 0, 0.5], [0, 0, 3, 0.5], [4, 0, 0, 0.5], [7, 0, 0, 0.5]]
     assert made.item.tolist() == [0, 0, 1, 1]
 

@@ -19,7 +19,7 @@ def rig_of(make_example: Callable[..., Example]) -> CameraRig:
 def encoder() -> LiftSplatEncoder:
     torch.manual_seed(0)
     depths = LiftSplatConfig(near_m=1.0, far_m=10.0, step_m=1.0)
-    return LiftSplatEncoder(depths, SPEC, channels=3, width=4, levels=1)
+    return LiftSplatEncoder(depths, SPEC, channels=3, plane_channels=4, levels=1)
 
 
 def test_depths_lie_along_the_optical_axis(make_example: Callable[..., Example]) -> None:

@@ -16,7 +16,7 @@ from foredrive.models.nemo import MotionConfig, MotionFlow, RendererConfig, Volu
 from foredrive.models.nemo.motion import Motion
 from foredrive.ops.volume import sample_volume_reference, warp_volume
 from foredrive.recipes.nemo import NemoRecipe, nemo_base, nemo_tiny
-from foredrive.recipes.nemo_rows import nemo_rows
+from foredrive.recipes.nemo_ablations import nemo_ablations
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Command, Example, VoxelSpec
 from foredrive.training import NemoStage
@@ -169,7 +169,7 @@ def test_an_unknown_command_is_not_taken_for_a_known_one(agent: PlanningAgent, e
     assert not any(torch.allclose(unknown[0], plan) for plan in plans.values())
 
 
-ROWS = nemo_rows(small_recipe(), BevConfig(width=24, heads=4, points=2, pillars=2, layers=1))
+ROWS = nemo_ablations(small_recipe(), BevConfig(width=24, heads=4, points=2, pillars=2, layers=1))
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -196,9 +196,9 @@ def test_what_is_trained_is_what_gets_a_gradient(row: str, stage: str, example: 
     assert all(math.isfinite(value.item()) for value in losses.values())
     assert ("agent.planner.plan" in trained) == (stage == "finetune") == ("wpts" in losses)
     part = {name.split(".")[2] for name in reached if name.startswith("agent.world_model.")}
-    weights, looks_ahead = chosen.weights, stage == "finetune" and objective.agent.planner.looks_ahead > 0
+    weights, imagines = chosen.weights, stage == "finetune" and objective.agent.planner.imagined_frames > 0
     expected = {"backbone", "encoder"}
-    expected |= {"motion"} if chosen.imagine or looks_ahead else set()
+    expected |= {"motion"} if chosen.imagine or imagines else set()
     expected |= {"occupancy"} if weights.occ or weights.recon else set()
     expected |= {"renderer"} if weights.recon else set()
     assert part == expected

@@ -43,9 +43,9 @@ def small_planner(
     return VolumePlanner(config, SPEC, channels=4, horizon_steps=steps, dt_s=0.5).eval()
 
 
-def path_correction(distances_m: tuple[float, ...], *, told: int, steps: int) -> PathCorrection:
+def path_correction(distances_m: tuple[float, ...], *, status: int, steps: int) -> PathCorrection:
     config = PathCorrectionConfig(distances_m=distances_m, width=8, hidden=4)
-    return PathCorrection(config, SPEC, channels=3, told=told, steps=steps)
+    return PathCorrection(config, SPEC, channels=3, status=status, steps=steps)
 
 
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
@@ -76,7 +76,7 @@ def test_the_next_volume_matters_where_it_is_looked_at(
     status = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
     with torch.no_grad():
         same = torch.allclose(planner(now, one, *status).xy, planner(now, other, *status).xy)
-    assert same == (future == "none") == (planner.looks_ahead == 0)
+    assert same == (future == "none") == (planner.imagined_frames == 0)
     if future != "none":
         with pytest.raises(ValueError, match="next volume"):
             planner(now, None, *status)
@@ -114,39 +114,39 @@ def test_a_planner_that_knows_where_the_route_leads_asks_and_goes_by_it() -> Non
     planner = small_planner("none", history=0, steps=3, ego_mlp=EgoMLPConfig(), target=True)
     ego_mlp = planner.ego_mlp
     assert ego_mlp is not None
-    told = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
+    known = (torch.zeros(1, dtype=torch.int64), SEEN, torch.full((1,), 5.0), SEEN, torch.zeros(1, 0, 4))
     volume, left = torch.randn(1, 4, 2, 8, 8), torch.tensor([[15.0, 9.0, 1.0]])
-    plan = planner(volume, None, *told, left)
+    plan = planner(volume, None, *known, left)
     status = torch.tensor([[5.0, 1.0, 0.0, 0.0, 15.0, 9.0, 1.0]])
     torch.testing.assert_close(plan.xy[:, 0], ego_mlp(status)[..., :2])
     torch.nn.init.normal_(planner.waypoints[-1].weight)  # what is learned beyond the MLP knows it too
-    learned = [planner(volume, None, *told, lead).xy[:, 0] for lead in (left, -left)]
-    unseen = [planner.without_looking(*told[:3], told[4], lead)[0] for lead in (left, -left)]
-    assert not torch.allclose(learned[0] - unseen[0], learned[1] - unseen[1])
-    with pytest.raises(ValueError, match="where the route leads"):
-        planner(volume, None, *told)
+    learned = [planner(volume, None, *known, lead).xy[:, 0] for lead in (left, -left)]
+    initial = [planner.initial_plan(*known[:3], known[4], lead)[0] for lead in (left, -left)]
+    assert not torch.allclose(learned[0] - initial[0], learned[1] - initial[1])
+    with pytest.raises(ValueError, match="target point"):
+        planner(volume, None, *known)
 
 
 def test_a_path_is_read_along_its_curve_and_beyond_its_end() -> None:
     """3 m ahead, then 4 m to the left: distances 1.5, 5 and 9 m lie on both legs and 2 m beyond."""
-    reading = path_correction((1.5, 5.0, 9.0), told=0, steps=2)
-    places = reading.places(torch.tensor([[[3.0, 0.0], [3.0, 4.0]]]))[0]
+    reading = path_correction((1.5, 5.0, 9.0), status=0, steps=2)
+    places = reading.positions_m(torch.tensor([[[3.0, 0.0], [3.0, 4.0]]]))[0]
     right, middle, left = places.unbind(1)
     torch.testing.assert_close(middle, torch.tensor([[1.5, 0.0], [3.0, 2.0], [3.0, 6.0]]))
     torch.testing.assert_close(left, torch.tensor([[1.5, 3.0], [0.0, 2.0], [0.0, 6.0]]))
     torch.testing.assert_close(right, torch.tensor([[1.5, -3.0], [6.0, 2.0], [6.0, 6.0]]))
-    standing = reading.places(torch.zeros(1, 2, 2))[0, :, 1]  # looks straight ahead
+    standing = reading.positions_m(torch.zeros(1, 2, 2))[0, :, 1]  # looks straight ahead
     torch.testing.assert_close(standing, torch.tensor([[1.5, 0.0], [5.0, 0.0], [9.0, 0.0]]))
 
 
 def test_what_stands_on_the_path_matters_and_what_stands_elsewhere_does_not() -> None:
     torch.manual_seed(0)
-    reading = path_correction((1.0, 2.5), told=1, steps=1).eval()
+    reading = path_correction((1.0, 2.5), status=1, steps=1).eval()
     torch.nn.init.normal_(reading.change[-2].weight)
     path = torch.tensor([[[2.5, 0.0]]])
 
     def change(volume: torch.Tensor) -> torch.Tensor:
-        return reading(reading.read(volume, path), torch.ones(1, 1))
+        return reading(reading.sample(volume, path), torch.ones(1, 1))
 
     volume = torch.randn(1, 3, 2, 8, 8)
     on_path, elsewhere = volume.clone(), volume.clone()
@@ -154,8 +154,8 @@ def test_what_stands_on_the_path_matters_and_what_stands_elsewhere_does_not() ->
     elsewhere[0, :, 1, 4, 1] += 1  # behind
     assert not torch.allclose(change(on_path), change(volume))
     torch.testing.assert_close(change(elsewhere), change(volume))
-    read = reading.read(volume, path).values[0, 1, 1]  # at x 2.5 m, y 0: between two cells
-    torch.testing.assert_close(read, volume[0, :, :, 3:5, 6].mean(-1).T.flatten())
+    sampled = reading.sample(volume, path).values[0, 1, 1]  # at x 2.5 m, y 0: between two cells
+    torch.testing.assert_close(sampled, volume[0, :, :, 3:5, 6].mean(-1).T.flatten())
 
 
 SEEN = torch.ones(1, dtype=torch.bool)

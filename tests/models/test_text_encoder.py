@@ -7,7 +7,7 @@ import torch
 from transformers import BertConfig, BertModel, BertTokenizerFast, CLIPConfig, CLIPModel
 
 from foredrive.errors import InputError
-from foredrive.models.text_encoder import IN_A_PACKAGE, TextEncoder
+from foredrive.models.text_encoder import PACKAGED_MODEL, TextEncoder
 
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "the", "car", "stops", "at", "night", "rain"]
 SMALL = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
@@ -53,5 +53,5 @@ def test_what_cannot_be_had_is_named(tmp_path: Path) -> None:
 
 
 def test_the_packaged_one_knows_what_sentences_mean() -> None:
-    rain, wet, car = TextEncoder(IN_A_PACKAGE)(["It is raining.", "The weather is wet.", "A red car."])
+    rain, wet, car = TextEncoder(PACKAGED_MODEL)(["It is raining.", "The weather is wet.", "A red car."])
     assert float(rain @ wet) > 0.5 > float(rain @ car)

@@ -135,7 +135,7 @@ def test_tiles_lose_nothing(scene) -> None:  # type: ignore[no-untyped-def]
     everything = torch.arange(len(splats.mean))[splats.range_m.argsort()]
     tiles = len(points.index)
     full = splatting.SplatLists(everything.repeat(tiles), len(everything) * torch.arange(tiles + 1))
-    again = splatting.composite_lists(exact, points, full)
+    again = composite_splats_reference(exact, points, lists=full)
     for name in ("feature", "expected_range_m", "alpha", "median_range_m"):
         torch.testing.assert_close(getattr(seen, name), getattr(again, name))
     listed = list_splats(exact, points).first[-1]

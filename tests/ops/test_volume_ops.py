@@ -27,13 +27,22 @@ def path(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="session")
 def attend(path: str, triton_op: Callable[[str, str], Op]) -> Op:
     """A fast path of attention."""
-    return attend_volume if path == "numba" else triton_op("volume_triton", "read_volume_triton")
+    return attend_volume if path == "numba" else triton_op("volume_triton", "attend_volume_triton")
 
 
 @pytest.fixture(scope="session")
 def sample(path: str, triton_op: Callable[[str, str], Op]) -> Op:
     """A fast path of sampling."""
-    return sample_volume if path == "numba" else triton_op("volume_triton", "sample_volume_triton")
+    return (
+        sample_volume if path == "numba" else sampled_by(triton_op("volume_triton", "attend_volume_triton"))
+    )
+
+
+def sampled_by(attend: Op) -> Op:
+    """Sampling as `sample_volume` does it: attention of one head to one point of weight 1."""
+    return lambda volume, points: attend(
+        volume, points[:, :, None, None], points.new_ones(*points.shape[:2], 1, 1)
+    )
 
 
 def volume_case(
@@ -135,7 +144,7 @@ def test_sampling_is_its_reference(
 def test_attention_by_triton_is_its_reference(
     parity: Parity, triton_op: Callable[[str, str], Op], shape: dict[str, Any]
 ) -> None:
-    attend = triton_op("volume_triton", "read_volume_triton")
+    attend = triton_op("volume_triton", "attend_volume_triton")
     parity(attend, attend_volume_reference, attention_case(4, **shape))
 
 
@@ -143,7 +152,7 @@ def test_attention_by_triton_is_its_reference(
 def test_sampling_by_triton_is_its_reference(
     parity: Parity, triton_op: Callable[[str, str], Op], channels: int
 ) -> None:
-    sample = triton_op("volume_triton", "sample_volume_triton")
+    sample = sampled_by(triton_op("volume_triton", "attend_volume_triton"))
     case = volume_case(3, b=2, channels=channels, size_zyx=(2, 3, 4), points=(40,))
     parity(sample, sample_volume_reference, case)
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES, find_recipe, labelled_by
+from foredrive.recipes import RECIPES, find_recipe, with_occupancy_source
 from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.gaussians import find_rebuild_recipe
+from foredrive.recipes.gaussians import find_rebuild_recipe, load_rebuild_recipe
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -24,8 +24,8 @@ def test_a_recipe_survives_writing_and_reading(name: str, tmp_path: Path) -> Non
 
 def test_a_recipe_may_take_its_labels_from_recordings(tmp_path: Path) -> None:
     plain = find_recipe("nemo_tiny")
-    recorded = labelled_by(plain, "recorded")
-    assert labelled_by(plain, "lidar") == plain
+    recorded = with_occupancy_source(plain, "recorded")
+    assert with_occupancy_source(plain, "lidar") == plain
     assert recorded.clips.occupancy_source == "recorded"
     assert recorded.name == "nemo_tiny (recorded occupancy)"
     save_recipe(recorded, tmp_path / "config.yaml")
@@ -93,12 +93,18 @@ def test_an_unknown_name_is_told_the_known_ones() -> None:
         find_recipe("nemo_huge")
 
 
-WRITTEN_BEFORE = sorted((Path(__file__).parent / "written_before").glob("*.yaml"))
+WRITTEN_BEFORE = Path(__file__).parent / "written_before"
+FLAT, NESTED = WRITTEN_BEFORE.glob("*.yaml"), (WRITTEN_BEFORE / "nested").glob("*.yaml")
 
 
-@pytest.mark.parametrize("file", WRITTEN_BEFORE, ids=lambda file: file.stem)
-def test_a_recipe_in_the_flat_format_opens_as_the_same_recipe(file: Path) -> None:
+@pytest.mark.parametrize("file", sorted([*FLAT, *NESTED]), ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_a_recipe_in_an_earlier_format_opens_as_the_same_recipe(file: Path) -> None:
     assert load_recipe(file) == find_recipe(file.stem)
+
+
+def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> None:
+    file = WRITTEN_BEFORE / "reconstructions" / "gaussians_tiny.yaml"
+    assert load_rebuild_recipe(file) == find_rebuild_recipe("gaussians_tiny")
 
 
 def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:

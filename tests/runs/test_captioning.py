@@ -10,9 +10,10 @@ from small_towers import save_clip
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.errors import InputError
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
 from foredrive.runs.search.captioning import CAPTIONS, load_captions, train_captions
 from foredrive.runs.search.towers import find_towers
-from foredrive.search.embedded import LidarSize, TowerCard, build_lidar_tower, save_towers
+from foredrive.search.embedded import TowerCard, save_towers
 from foredrive.training import Schedule
 
 
@@ -26,10 +27,10 @@ def towers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lidar tower that learned nothing beside a CLIP that did not either."""
     root = tmp_path_factory.mktemp("towers")
     base = find_towers(str(save_clip(root / "clip")))
-    size = LidarSize(width=16, heads=2, hidden=16, blocks=1)
+    size = LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=1)
     torch.manual_seed(0)
     card = TowerCard(base.dim, str(root / "clip"), None, base.fingerprint, size, {})
-    save_towers(root / "both", card, None, build_lidar_tower(size, base.dim))
+    save_towers(root / "both", card, None, LidarEncoder(size, dim=base.dim))
     return root / "both"
 
 

@@ -14,26 +14,26 @@ from transformers import BertConfig, BertModel, BertTokenizerFast
 from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.models.driveworld import DriveWorld
+from foredrive.models.driveworld.planes import VectorToPlaneConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.driveworld_rows import driveworld_rows
-from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
+from foredrive.recipes.driveworld_ablations import driveworld_ablations
+from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import Needs, needs_of
+from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
-from foredrive.runs.evaluate.vision import Observer
 from foredrive.runs.export import export_run
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
 from foredrive.training import DriveWorldObjective, load_weights, read_metrics, save_weights
 from foredrive.view.imagination_video import write_imagination_video
-from foredrive.view.report import write_report
-from foredrive.view.run_report import report_on_run
+from foredrive.view.run_report import report_on_run, write_run_report
 
 FUTURES = 2
 
@@ -96,9 +96,9 @@ def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     assert "occupancy.iou_now.copy" not in summary
     assert "flow.epe_moving_now_mps" in summary
     assert "image.psnr_db" not in summary
-    report = report_on_run(run, [log], result.summary, inspect_run(run, [log], 1), result.failures)
-    write_report(tmp_path / "report.html", report)
-    assert "carried copy" in (tmp_path / "report.html").read_text()
+    report = report_on_run(run, [log], result.summary, predict_examples(run, [log], 1), result.failures)
+    write_run_report(tmp_path / "report.html", report)
+    assert "ego-compensated persistence" in (tmp_path / "report.html").read_text()
 
 
 def test_what_a_log_was_trained_on_is_not_what_a_forecast_is_judged_by(
@@ -150,20 +150,20 @@ def test_it_drives_and_is_looked_at(run: Run) -> None:
     agent = load_agent(run)
     observed = collate([ClipDataset(run.logs, run.recipe.clips, run.cache_dir)[0]]).clip.observed()
     assert agent.act(observed).xy.shape == (1, 1, 6, 2)
-    seen = Observer(agent, 2).look(observed)
+    seen = DisplayPredictor(agent, 2).predict(observed)
     assert seen.flow_m.shape == (2, 3, *run.recipe.clips.voxels.shape_zyx)
     start, end = seen.movement_m(1, run.recipe.clips.voxels)
     assert start.shape == end.shape
 
 
-@pytest.mark.parametrize("row", driveworld_rows(miniature_driveworld()))
+@pytest.mark.parametrize("row", driveworld_ablations(miniature_driveworld()))
 def test_every_row_trains(row: str, run: Run, example: Example) -> None:
-    recipe = driveworld_rows(miniature_driveworld())[row]
+    recipe = driveworld_ablations(miniature_driveworld())[row]
     torch.manual_seed(0)
     agent = build_agent(recipe)
     for stage in (recipe.pretrain, recipe.finetune):
         if stage is not None:
-            objective = DriveWorldObjective(agent, stage.weights, steps=2, temporal=stage.temporal)
+            objective = DriveWorldObjective(agent, stage, steps=2)
             objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     assert agent.act(example.clip.observed()).xy.isfinite().all()
 
@@ -178,14 +178,16 @@ def test_the_plane_may_come_from_deformable_lifting(example: Example) -> None:
     recipe = miniature_driveworld()
     lifting = PooledLiftingConfig(LiftingConfig(heads=2, points=2, layers=1))
     agent = build_agent(dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, encoder=lifting)))
-    objective = DriveWorldObjective(agent, recipe.pretrain.weights, steps=2)
+    objective = DriveWorldObjective(agent, recipe.pretrain, steps=2)
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     assert agent.world_model.encoder.fold.weight.grad.abs().sum() > 0
 
 
 def prompted(text_encoder: Path) -> Recipe:
     recipe = miniature_driveworld()
-    prompt = PromptConfig(widths=(8, 4), encoding=16, text_encoder=str(text_encoder))
+    prompt = PromptConfig(
+        expand=VectorToPlaneConfig(widths=(8, 4)), encoding=16, text_encoder=str(text_encoder)
+    )
     return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
 
 
@@ -201,7 +203,7 @@ def test_a_trained_model_needs_no_text_encoder(tmp_path: Path, example: Example)
     agent = build_agent(prompted(folder))
     world = agent.world_model
     assert isinstance(world, DriveWorld)
-    objective = DriveWorldObjective(agent, prompted(folder).finetune.weights, steps=2)
+    objective = DriveWorldObjective(agent, prompted(folder).finetune, steps=2)
     before = world.prompt.encodings.clone()
     optimizer = torch.optim.AdamW(objective.parameters(), 0.1)
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()

@@ -15,10 +15,11 @@ from foredrive.cli.main import main
 from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.agents import needs_of
-from foredrive.runs.drive.in_towns import TownRoutes, job_of
+from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive
+from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, Driven, DriveSuite, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
 from foredrive.simulation.route_sets import RouteWaypoints

@@ -9,12 +9,12 @@ from miniature import write_log
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import EvaluationResult, read_summary
-from foredrive.metrics import PROTOCOLS
-from foredrive.runs import Inspection, Run, evaluate_run, inspect_run
+from foredrive.evaluation.run import EvaluationResult
+from foredrive.evaluation.summary import read_summary
+from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.runs import ExamplePrediction, Run, evaluate_run, predict_examples
 from foredrive.runs.folder import WEIGHTS
-from foredrive.view.report import write_report
-from foredrive.view.run_report import report_on_run
+from foredrive.view.run_report import report_on_run, write_run_report
 
 CLIPS = 4
 """Of a log of 5 s: half a second before now, three seconds after it, one each half second."""
@@ -31,8 +31,8 @@ def result(trained: Run, log: LogPath, folder: Path) -> EvaluationResult:
 
 
 @pytest.fixture(scope="module")
-def inspections(trained: Run, log: LogPath) -> list[Inspection]:
-    return inspect_run(trained, [log], 2)
+def examples(trained: Run, log: LogPath) -> list[ExamplePrediction]:
+    return predict_examples(trained, [log], 2)
 
 
 def test_the_summary_says_what_it_promises(result: EvaluationResult, folder: Path) -> None:
@@ -75,10 +75,10 @@ def test_baselines_score_what_they_must_on_a_straight_drive(result: EvaluationRe
 
 
 def test_the_report_is_drawn_from_a_run(
-    trained: Run, log: LogPath, result: EvaluationResult, inspections: list[Inspection], tmp_path: Path
+    trained: Run, log: LogPath, result: EvaluationResult, examples: list[ExamplePrediction], tmp_path: Path
 ) -> None:
     file = tmp_path / "report.html"
-    write_report(file, report_on_run(trained, [log], result.summary, inspections, result.failures))
+    write_run_report(file, report_on_run(trained, [log], result.summary, examples, result.failures))
     html = file.read_text()
     assert "miniature on flat_train/flat" in html
     assert "1 of the 1 evaluated logs were trained on" in html
@@ -86,19 +86,19 @@ def test_the_report_is_drawn_from_a_run(
     assert "http://" not in html.replace("http://www.w3.org", "")
 
 
-def test_inspections_are_spread_over_the_log(trained: Run, inspections: list[Inspection]) -> None:
+def test_examples_are_spread_over_the_log(trained: Run, examples: list[ExamplePrediction]) -> None:
     past, future = trained.recipe.clips.past_frames, trained.recipe.clips.future_frames
     shape_zyx = trained.recipe.clips.voxels.shape_zyx
-    times = [int(inspection.example.key[0].rpartition("@")[2]) for inspection in inspections]
+    times = [int(example.example.key[0].rpartition("@")[2]) for example in examples]
     assert times[1] - times[0] == 2_000_000  # of eight clips the third and the seventh
-    for inspection in inspections:
-        assert inspection.example.clip.t_s.shape == (past + 1 + future,)
-        assert inspection.example.clip.sweeps.valid.any()
-        assert inspection.occupancy_prob.shape == (1 + future, *shape_zyx)
-        assert inspection.volume.shape == (trained.recipe.model.channels, *shape_zyx)
-        assert inspection.rendered.shape == (2, 3, 16, 32)
-        assert 0 <= inspection.rendered.min() <= inspection.rendered.max() <= 1
-        assert torch.isfinite(inspection.plan.xy).all()
+    for example in examples:
+        assert example.example.clip.t_s.shape == (past + 1 + future,)
+        assert example.example.clip.sweeps.valid.any()
+        assert example.occupied.shape == (1 + future, *shape_zyx)
+        assert example.volume.shape == (trained.recipe.model.channels, *shape_zyx)
+        assert example.rendered.shape == (2, 3, 16, 32)
+        assert 0 <= example.rendered.min() <= example.rendered.max() <= 1
+        assert torch.isfinite(example.plan.xy).all()
 
 
 def test_figures_do_not_depend_on_the_batch_size(

@@ -68,7 +68,7 @@ def test_nothing_of_the_clip_it_was_traced_with_is_constant(
     )
     agent = load_agent(trained)
     session = onnxruntime.InferenceSession(exported / "model.onnx")
-    inputs = GraphInputs.of(other, agent)._asdict()
+    inputs = GraphInputs.from_clip(other, agent)._asdict()
     said = session.run(None, {entry.name: inputs[entry.name].numpy() for entry in session.get_inputs()})
     with torch.no_grad():
         truth, before = agent(other, 2), agent(clip, 2)

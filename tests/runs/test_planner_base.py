@@ -16,7 +16,7 @@ from foredrive.recipes import Recipe
 from foredrive.runs import Run, evaluate_run, train_run
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.path_features import read_paths
+from foredrive.runs.train.path_features import sample_paths
 from foredrive.runs.train.run import load_agent
 from foredrive.training import PathFit
 
@@ -68,10 +68,10 @@ def test_what_is_read_along_the_path_is_fitted_first_and_read_once(log: LogPath,
     fitted = recipe(lr=0.0, path=PathFit(stride_s=0.5, steps=20))
     fitted = dataclasses.replace(fitted, pretrain=miniature().pretrain)  # which leaves planners out
     run = train_run(fitted, [log], tmp_path / "first", tmp_path / "cache")
-    kept = list((tmp_path / "cache" / "paths").glob("*.safetensors"))
+    kept = list((tmp_path / "cache" / "path_features").glob("*.safetensors"))
     assert len(kept) == 1
     again = train_run(fitted, [log], tmp_path / "second", tmp_path / "cache")
-    assert list((tmp_path / "cache" / "paths").glob("*.safetensors")) == kept
+    assert list((tmp_path / "cache" / "path_features").glob("*.safetensors")) == kept
     one, other = load_file(run.weights), load_file(again.weights)
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert one["planner.path.change.2.weight"].abs().max() > 0  # it began at 0
@@ -85,10 +85,10 @@ def test_what_the_decoder_says_is_not_said_twice(log: LogPath, tmp_path: Path) -
     joint = load_file(run.folder / "finetune" / "model.safetensors")
     assert joint["planner.path.change.2.weight"].abs().max() == 0  # left alone until its turn
     agent = load_agent(run)
-    shown = read_paths(agent, [log], fitted.clips, tmp_path / "cache", stride_s=0.5)
+    shown = sample_paths(agent, [log], fitted.clips, tmp_path / "cache", stride_s=0.5)
     agent.planner.path.change[2].weight.data.zero_()
     agent.planner.path.change[2].bias.data.zero_()
-    again = read_paths(agent, [log], fitted.clips, tmp_path / "other", stride_s=0.5)
+    again = sample_paths(agent, [log], fitted.clips, tmp_path / "other", stride_s=0.5)
     torch.testing.assert_close(shown.planned_xy, again.planned_xy, atol=1e-4, rtol=0)
     dataset = open_clips([log], dataclasses.replace(fitted.clips, now_stride_s=0.5), tmp_path / "other")
     planned = agent.act(collate([dataset[0]]).clip.observed()).xy[0, 0]

@@ -10,10 +10,10 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
 from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run
-from foredrive.runs.evaluate.real_to_sim_gap import Comparison, measure_gap, rendered_images
+from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
 from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import read_reconstruction_data, reconstruct
 from foredrive.scene import Clip, Trajectory
@@ -80,7 +80,7 @@ def test_agreement_is_of_what_is_said_of_both(trained: Run, log: LogPath) -> Non
     example = ClipDataset([log], config, None)[0]
     bright = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 200))
     dark = dataclasses.replace(example.clip, images=torch.full_like(example.clip.images, 10))
-    seen = Comparison(Told(), config.image_hw)
+    seen = RealToSimComparison(Told(), config.image_hw)
     seen.add(dataclasses.replace(example, clip=bright), dark)
     figures = seen.figures(0.5)
     assert figures["agreement.occupancy.iou_now"] == pytest.approx(0.5)
@@ -92,7 +92,7 @@ def test_the_verb_shows_a_table(
     trained: Run, rebuilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", str(trained.folder), "--in", str(rebuilt), "--out", str(tmp_path)]) == 0
-    assert "rendered beside real" in capsys.readouterr().out
+    assert "agreement of both" in capsys.readouterr().out
 
 
 def test_a_camera_that_was_not_rebuilt_is_named() -> None:

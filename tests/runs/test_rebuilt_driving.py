@@ -12,7 +12,7 @@ from foredrive.cli.main import main
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
 from foredrive.data.drives import read_drive as read_log
 from foredrive.errors import InputError
-from foredrive.evaluation import read_summary
+from foredrive.evaluation.summary import read_summary
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.drive.in_rebuilt import REPLAY, RebuiltRoutes

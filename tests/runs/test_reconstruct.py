@@ -1,6 +1,7 @@
 """A log is rebuilt in seconds: whole, interrupted, and without what logs may lack."""
 
 import dataclasses
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -12,11 +13,18 @@ import torch
 from plyfile import PlyData
 from safetensors.torch import load_file
 
+from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
-from foredrive.recipes.config import load_values
-from foredrive.recipes.gaussians import RebuildRecipe, find_rebuild_recipe, gaussians_base, gaussians_tiny
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.recipes.config import save_recipe
+from foredrive.recipes.gaussians import (
+    RebuildRecipe,
+    find_rebuild_recipe,
+    gaussians_base,
+    gaussians_tiny,
+    load_rebuild_recipe,
+)
 from foredrive.rendering.initial import InitialGaussians
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.runs.rebuild.reconstruct import (
@@ -25,7 +33,7 @@ from foredrive.runs.rebuild.reconstruct import (
     read_reconstruction_data,
     reconstruct,
 )
-from foredrive.training import rebuilding
+from foredrive.training import loop
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
 STEPS = 40
@@ -47,7 +55,7 @@ def recipe(steps: int = STEPS) -> RebuildRecipe:
         ),
         schedule=RebuildSchedule(
             steps=steps,
-            most_gaussians=2200,
+            max_gaussians=2200,
             rates=LearningRates(mean_m=1e-3, albedo=1e-2),
             images_per_sweep=2,
             beam_stride=2,
@@ -78,11 +86,11 @@ def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: L
     summary = reconstruct(recipe(), log, run).summary  # is there already
     assert summary["images"] == summary["sweeps"] == 4
     assert summary["actors"] == 2
-    assert summary["gaussians"] > 2200  # those that learning may make, and ground that empty saw
+    assert summary["gaussians"] > 2200  # those that learning may make, and ground without observations
     data = read_reconstruction_data(recipe(), log, run / "cache")
     scene = initial_model(recipe(), data)
-    before = judge_cameras(scene, data.held_out.cameras, data.train.cameras)
-    before |= judge_sweeps(scene, data.held_out.sweeps)
+    before = evaluate_cameras(scene, data.held_out.cameras, data.train.cameras)
+    before |= evaluate_sweeps(scene, data.held_out.sweeps)
     after = {name: value for name, value in summary.items() if isinstance(value, float)}
     assert after["psnr_db"] > before["psnr_db"] + 2
     assert after["ssim"] > before["ssim"]
@@ -97,7 +105,7 @@ def test_an_interrupted_run_comes_to_the_same(
 ) -> None:
     """Stopped after the first checkpoint, when Gaussians have been added and moved."""
 
-    save = rebuilding.save_checkpoint
+    save = loop.save_checkpoint
 
     def save_and_stop(*args):  # type: ignore[no-untyped-def]
         save(*args)
@@ -106,7 +114,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
     folder = tmp_path / "halves"
     with monkeypatch.context() as patched:
-        patched.setattr(rebuilding, "save_checkpoint", save_and_stop)
+        patched.setattr(loop, "save_checkpoint", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(recipe(), log, folder)
     reconstruct(recipe(), log, folder)
@@ -115,7 +123,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
-    assert load_values(RebuildRecipe, run / "config.yaml") == recipe()
+    assert load_rebuild_recipe(run / "config.yaml") == recipe()
 
 
 def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
@@ -167,7 +175,7 @@ def test_too_little_memory_is_said_before(
     log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     huge = dataclasses.replace(
-        recipe(), schedule=dataclasses.replace(recipe().schedule, most_gaussians=10**12)
+        recipe(), schedule=dataclasses.replace(recipe().schedule, max_gaussians=10**12)
     )
     with pytest.raises(InputError, match=r"smallest needs about \d+\.\d GiB .* GiB are free"):
         reconstruct(huge, log, tmp_path / "huge")
@@ -180,3 +188,14 @@ def test_named_recipes() -> None:
         find_rebuild_recipe("gaussians_huge")
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
+
+
+def test_a_log_of_one_frame_is_said_not_to_be_evaluated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (single,) = find_logs(world.write(tmp_path, frames=1))
+    save_recipe(recipe(1), tmp_path / "recipe.yaml")
+    line = ["reconstruct", str(single.folder), "--out", str(tmp_path / "run")]
+    assert main([*line, "--recipe", str(tmp_path / "recipe.yaml")]) == 0
+    assert "no frame was held out, so the scene is not evaluated" in capsys.readouterr().out
+    assert "psnr_db" not in json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -17,9 +17,10 @@ from foredrive.losses import waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
-from foredrive.recipes.world_models import WORLD_MODELS, WorldModelKind
-from foredrive.runs import Run, evaluate_run, inspect_run, open_run, train_run
-from foredrive.runs.drive.in_towns import TownRoutes, job_of
+from foredrive.recipes.world_models import WORLD_MODELS, WorldModelEntry
+from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
@@ -27,7 +28,7 @@ from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.training import Schedule
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.viewer import Viewer
 
 
@@ -115,7 +116,7 @@ def recipe() -> Recipe[FrozenConfig, FrozenStage]:
 def known() -> Iterator[None]:
     """The one row that a new world model adds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(WORLD_MODELS, "frozen", WorldModelKind(FrozenConfig, FrozenStage, build, objective))
+        patch.setitem(WORLD_MODELS, "frozen", WorldModelEntry(FrozenConfig, FrozenStage, build, objective))
         yield
 
 
@@ -134,7 +135,7 @@ def test_it_is_evaluated_and_looked_at(run: Run, log: LogPath, tmp_path: Path) -
     summary = evaluate_run(run, [log], tmp_path).summary
     assert summary["failed"] == 0
     assert 0 <= summary["occupancy.above_ground.iou_now"] < 1
-    (seen,) = inspect_run(run, [log], 1)
+    (seen,) = predict_examples(run, [log], 1)
     assert seen.rendered is None
     (imagined,) = imagine_run(run, log, seconds=2.0, samples=3, moments=1)  # beyond the recipe's own future
     assert imagined.futures.shape[:2] == (1, 5)
@@ -142,7 +143,7 @@ def test_it_is_evaluated_and_looked_at(run: Run, log: LogPath, tmp_path: Path) -
 
 
 def test_it_is_viewed(run: Run, log: LogPath) -> None:
-    viewer = Viewer(LogTimes(log, 96, run), "localhost", 0)
+    viewer = Viewer(LogFrames(log, 96, run), "localhost", 0)
     viewer.show(20)  # far enough into the log for a clip
     assert viewer.server.scene.get_handle_by_name("/plan") is not None
     viewer.close()

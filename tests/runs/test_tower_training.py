@@ -12,6 +12,9 @@ from transformers import BertConfig, BertModel
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
+from foredrive.losses.contrastive import is_true
+from foredrive.models.image_tower import ImageTowerConfig
+from foredrive.models.lidar_clip import LidarEncoderConfig
 from foredrive.models.text_encoder import TextEncoder
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.tower_data import (
@@ -24,9 +27,8 @@ from foredrive.runs.search.tower_data import (
 )
 from foredrive.runs.search.tower_training import TowerRecipe, train_towers
 from foredrive.runs.search.towers import find_towers
-from foredrive.search.embedded import ImageSize, LidarSize, SentenceTowers, load_towers
+from foredrive.search.embedded import SentenceTowers, load_towers
 from foredrive.training import Schedule, read_metrics
-from foredrive.training.alignment import true_of
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +46,8 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> TowerRecipe:
     return TowerRecipe(
         contrast=Schedule(batch_size=4, lr=1e-3, steps=3),
         distil=Schedule(batch_size=4, lr=1e-3, steps=3),
-        image=ImageSize(widths=(8, 8), depths=(1, 1), heads=2, side_px=24),
-        lidar=LidarSize(width=16, heads=2, hidden=16, blocks=2),
+        image=ImageTowerConfig(widths=(8, 8), depths=(1, 1), heads=2, side_px=24),
+        lidar=LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=2),
         stride_s=0.5,
         texts=3,
         text=str(folder),
@@ -152,7 +154,7 @@ def test_every_text_of_a_view_is_true_of_it(recipe: TowerRecipe, log: LogPath, t
     batch = collate_captioned([dataset[n] for n in range(len(dataset))])
     assert batch.texts.shape == (len(dataset), 3, 16)
     for text in range(3):
-        assert true_of(batch.said[:, text], batch.holds).diagonal().all()
+        assert is_true(batch.stated[:, text], batch.holds).diagonal().all()
     torch.testing.assert_close(batch.texts.mean((0, 1)), torch.zeros(16), atol=1e-5, rtol=0)
 
 

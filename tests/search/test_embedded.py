@@ -13,16 +13,14 @@ from foredrive.data import LogPath
 from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.models.image_tower import ImageTower, ImageTowerConfig
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedded import (
     CARD,
     IMAGE,
     LIDAR,
-    ImageSize,
-    LidarSize,
     TowerCard,
-    build_image_tower,
-    build_lidar_tower,
     load_towers,
     save_towers,
 )
@@ -30,8 +28,8 @@ from foredrive.search.embedding import read_views
 from foredrive.search.pretrained import PretrainedTowers
 from foredrive.search.towers import Towers, unit
 
-IMAGE_SIZE = ImageSize(widths=(8, 8), depths=(1, 1), heads=2, side_px=24)
-LIDAR_SIZE = LidarSize(width=16, heads=2, hidden=16, blocks=2)
+IMAGE_SIZE = ImageTowerConfig(widths=(8, 8), depths=(1, 1), heads=2, side_px=24)
+LIDAR_SIZE = LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=2)
 DIM = 16
 
 
@@ -47,13 +45,13 @@ def text_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def save(folder: Path, text: Path, *, lidar: bool = True, seed: int = 0) -> Path:
     torch.manual_seed(seed)
-    image = build_image_tower(IMAGE_SIZE, DIM)
+    image = ImageTower(IMAGE_SIZE, dim=DIM)
     card = TowerCard(DIM, str(text), IMAGE_SIZE, "", None, {})
     save_towers(folder, card, (image, torch.full((DIM,), 0.1)), None)
     if lidar:
         base = load_towers(folder)
         card = dataclasses.replace(card, base_fingerprint=base.fingerprint, lidar=LIDAR_SIZE)
-        save_towers(folder, card, (image, torch.full((DIM,), 0.1)), build_lidar_tower(LIDAR_SIZE, DIM))
+        save_towers(folder, card, (image, torch.full((DIM,), 0.1)), LidarEncoder(LIDAR_SIZE, dim=DIM))
     return folder
 
 
@@ -80,7 +78,7 @@ def test_they_answer_as_the_protocol_asks(text_folder: Path, tmp_path: Path, log
 def test_half_precision_turns_vectors_by_next_to_nothing(text_folder: Path, tmp_path: Path) -> None:
     folder = save(tmp_path / "towers", text_folder)
     torch.manual_seed(0)
-    exact = build_image_tower(IMAGE_SIZE, DIM).eval()
+    exact = ImageTower(IMAGE_SIZE, dim=DIM).eval()
     images = torch.randint(0, 256, (3, 3, 24, 40), dtype=torch.uint8)
     with torch.no_grad():
         cosine = (unit(exact(images)) * unit(load_towers(folder).embed_images(images))).sum(-1)
@@ -102,7 +100,7 @@ def test_the_fingerprint_changes_with_either_tower(text_folder: Path, tmp_path: 
 def test_a_lidar_tower_beside_clip(clip_folder: Path, tmp_path: Path) -> None:
     clip = PretrainedTowers(str(clip_folder))
     card = TowerCard(clip.dim, str(clip_folder), None, clip.fingerprint, LIDAR_SIZE, {})
-    save_towers(tmp_path / "towers", card, None, build_lidar_tower(LIDAR_SIZE, clip.dim))
+    save_towers(tmp_path / "towers", card, None, LidarEncoder(LIDAR_SIZE, dim=clip.dim))
     towers = load_towers(tmp_path / "towers")
     images = torch.randint(0, 256, (2, 3, 16, 28), dtype=torch.uint8)
     torch.testing.assert_close(towers.embed_images(images), clip.embed_images(images))
@@ -111,7 +109,7 @@ def test_a_lidar_tower_beside_clip(clip_folder: Path, tmp_path: Path) -> None:
         tmp_path / "towers",
         dataclasses.replace(card, base_fingerprint="clip-0"),
         None,
-        build_lidar_tower(LIDAR_SIZE, clip.dim),
+        LidarEncoder(LIDAR_SIZE, dim=clip.dim),
     )
     with pytest.raises(InputError, match="trained beside other weights"):
         load_towers(tmp_path / "towers")

@@ -6,12 +6,12 @@ import math
 import numpy as np
 
 from foredrive.scene import Control, Event
+from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.routes import DriveRoute
 from foredrive.simulation.scenarios.kinds import Scenario
 from foredrive.simulation.scenarios.kinematics import BRAKING_MPS2, REACTION_S
 from foredrive.simulation.town import TownScenario, TownSimulator, TownState
-from foredrive.towns.recorder import Crowd
 
 SEED = 3
 LOOK_S, LOOK_M = 0.6, 3.0
@@ -58,8 +58,8 @@ class Driver:
 
 def town_scenario(route: DriveRoute, scenarios: tuple[Scenario, ...], seed: int = SEED) -> TownScenario:
     """A drive along a route on an empty road."""
-    crowd = Crowd(vehicles=0, people=0)
-    return TownScenario(route.town, route.xyz, seed, route.lanes, crowd=crowd, scenarios=scenarios)
+    nobody = BackgroundTraffic(vehicles=0, pedestrians=0)
+    return TownScenario(route.town, route.xyz, seed, nobody, lanes=route.lanes, scenarios=scenarios)
 
 
 def drive(

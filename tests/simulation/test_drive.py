@@ -9,6 +9,7 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
+from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.drive import Drive, Pace, drive_route
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.scores import Ending
@@ -16,7 +17,6 @@ from foredrive.simulation.simple_agents import Straight
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.simulation.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd
 from foredrive.towns.traffic.traffic import Traffic
 
 SEED = 3
@@ -28,7 +28,9 @@ def scenario() -> TownScenario:
     graph = Traffic(load_town_map("Town02"), SEED, 1, 0).lanes
     lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
     route = graph.position(np.full(45, lane), 20.0 + np.arange(45))
-    return TownScenario("Town02", route, SEED, lanes=(lane,), crowd=Crowd(6, 4), limit_s=40.0)
+    return TownScenario(
+        "Town02", route, SEED, lanes=(lane,), background_traffic=BackgroundTraffic(6, 4), limit_s=40.0
+    )
 
 
 @pytest.fixture(scope="module")

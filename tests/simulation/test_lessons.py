@@ -8,10 +8,10 @@ import torch
 
 from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, Trajectory
+from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.simulation.lessons import STEERED_SHARE, STEERS_RAD, Alternating, Disturbed
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.simple_agents import Straight
-from foredrive.towns.recorder import boxes_of
 
 STEP_S, HOURS_S = 0.5, 3600.0
 
@@ -33,7 +33,7 @@ def teacher(clip: Clip) -> Steady:
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    frame = KeyFrame(0.0, np.eye(4), 5.0, no_images(), None, boxes_of([], np.eye(4)))
+    frame = KeyFrame(0.0, np.eye(4), 5.0, no_images(), None, boxes_in_ego_frame([], np.eye(4)))
     return stack_records([make_clip([frame], None, Command.STRAIGHT)])
 
 

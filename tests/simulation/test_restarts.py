@@ -8,10 +8,10 @@ import torch
 
 from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, LidarSweep
+from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.restarts import Restarting, is_free_ahead
 from foredrive.simulation.simple_agents import Straight
-from foredrive.towns.recorder import boxes_of
 
 
 def sweep(*points: tuple[float, float, float]) -> LidarSweep:
@@ -33,7 +33,7 @@ def sweep(*points: tuple[float, float, float]) -> LidarSweep:
 
 
 def seen(speed_mps: float, lidar: LidarSweep | None) -> Clip:
-    nobody = boxes_of([], np.eye(4))
+    nobody = boxes_in_ego_frame([], np.eye(4))
     frame = KeyFrame(0.0, np.eye(4), speed_mps, no_images(), lidar, nobody)
     return stack_records([make_clip([frame], None, Command.STRAIGHT)])
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from foredrive.scene import BicycleState, Command, Event
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.lane_rules import LaneRules, RuleState, stop_lines
+from foredrive.simulation.lane_rules import RuleState
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
 from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.town_lanes import LaneRules, stop_lines
 from foredrive.towns.map.town_map import TownMap, load_town_map
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 
 
@@ -79,7 +80,11 @@ def rules(town07: TownMap) -> LaneRules:
 
 
 def towards(
-    rules: LaneRules, town: TownMap, is_sign: bool, stations: list[tuple[float, float]], light: Light
+    rules: LaneRules,
+    town: TownMap,
+    is_sign: bool,
+    stations: list[tuple[float, float]],
+    light: LightState,
 ) -> list[Event]:
     """Drive over a line: where the middle is along the lane from it, and how fast one is there."""
     lines = stop_lines(town)
@@ -102,17 +107,25 @@ def towards(
 @pytest.mark.parametrize(
     ("light", "stations", "runs"),
     [
-        (Light.RED, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], True),
-        (Light.RED, [(-4.0, 5.0), (-2.5, 1.0), (-2.45, 0.0)], False),
-        (Light.RED, [(-4.0, 5.0), (1.5, 1.0), (1.5, 0.0)], False),  # over the line, but not with its tail
-        (Light.GREEN, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], False),
-        (Light.YELLOW, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], False),
-        (Light.RED, [(3.0, 5.0), (1.0, 5.0), (-4.0, 5.0)], False),  # the other way
+        (LightState.RED, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], True),
+        (LightState.RED, [(-4.0, 5.0), (-2.5, 1.0), (-2.45, 0.0)], False),
+        (
+            LightState.RED,
+            [(-4.0, 5.0), (1.5, 1.0), (1.5, 0.0)],
+            False,
+        ),  # over the line, but not with its tail
+        (LightState.GREEN, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], False),
+        (LightState.YELLOW, [(-4.0, 5.0), (1.0, 5.0), (3.0, 5.0)], False),
+        (LightState.RED, [(3.0, 5.0), (1.0, 5.0), (-4.0, 5.0)], False),  # the other way
     ],
     ids=["through", "stops before", "stops on it", "green", "yellow", "back"],
 )
 def test_a_red_light_is_run_when_the_tail_crosses_the_line(
-    rules: LaneRules, town07: TownMap, light: Light, stations: list[tuple[float, float]], runs: bool
+    rules: LaneRules,
+    town07: TownMap,
+    light: LightState,
+    stations: list[tuple[float, float]],
+    runs: bool,
 ) -> None:
     events = towards(rules, town07, False, stations, light)
     assert [event.kind for event in events] == (["red_light"] if runs else [])
@@ -131,7 +144,7 @@ def test_a_red_light_is_run_when_the_tail_crosses_the_line(
 def test_a_stop_sign_asks_for_a_stop_near_its_line(
     rules: LaneRules, town07: TownMap, stations: list[tuple[float, float]], runs: bool
 ) -> None:
-    events = towards(rules, town07, True, stations, Light.NONE)
+    events = towards(rules, town07, True, stations, LightState.NONE)
     assert [event.kind for event in events] == (["stop_sign"] if runs else [])
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.scenarios.acts import act
 from foredrive.simulation.scenarios.kinds import MEETINGS, Scenario, ScenarioKind, Way
 from foredrive.simulation.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
@@ -15,7 +16,6 @@ from foredrive.simulation.time_to_collision import MovingBoxes
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, grant_junction, points_along
 from foredrive.towns.traffic.scripted_actors import ScriptedActor
@@ -312,7 +312,7 @@ def test_only_who_may_runs_a_light(traffic: Traffic, runs: bool) -> None:
     red_s = next(
         t
         for t in np.arange(0.0, 60.0, 0.5).tolist()
-        if all(traffic.signals.light_states(t + ds)[lane] == Light.RED for ds in (0.0, 4.0))
+        if all(traffic.signals.light_states(t + ds)[lane] == LightState.RED for ds in (0.0, 4.0))
     )
     begin_m = float(graph.length_m[before]) - 30.0
     high = points_along(graph, (before,), np.array([begin_m]))[0] + [0.0, 0.0, 40.0]

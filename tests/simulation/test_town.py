@@ -9,6 +9,8 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.collisions import Contacts
 from foredrive.simulation.controller import Following, follow
 from foredrive.simulation.dynamics import STEP_S
@@ -16,13 +18,11 @@ from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.road_users import RoadUsers
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.traffic import Traffic
 
 SEED = 3
-CROWD = Crowd(vehicles=12, people=8)
+CROWD = BackgroundTraffic(vehicles=12, pedestrians=8)
 SENSORS = SensorSuite(camera_rig((9, 16)), roof_lidar(channels=4, azimuth_steps=60))
 BRAKE = Control(-3.0, 0.0)
 
@@ -36,7 +36,7 @@ def straight_route(length_m: float = 120.0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scenario() -> TownScenario:
-    return TownScenario("Town02", straight_route(), SEED, crowd=CROWD)
+    return TownScenario("Town02", straight_route(), SEED, background_traffic=CROWD)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,9 @@ def test_a_saved_drive_goes_on_bit_by_bit(simulator: TownSimulator, scenario: To
 def test_who_stands_breaks_no_rule_and_is_blocked_at_last(
     simulator: TownSimulator, scenario: TownScenario
 ) -> None:
-    simulator.reset(dataclasses.replace(scenario, crowd=Crowd(vehicles=3, people=0)))
+    simulator.reset(
+        dataclasses.replace(scenario, background_traffic=BackgroundTraffic(vehicles=3, pedestrians=0))
+    )
     first = drive(simulator, BRAKE, 200)
     assert first == []
     state = simulator.state

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import RoadUsers
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.simulation.town_expert import TownExpert, _is_free, _is_too_late, _rejoined
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import Crowd
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
 from foredrive.towns.traffic.lane_graph import Control
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle
 from foredrive.towns.traffic.traffic import Traffic
 
@@ -71,15 +71,24 @@ def traffic() -> Traffic:
 @pytest.mark.parametrize(
     ("shows", "to_line_m", "mps", "late"),
     [
-        ((Light.GREEN, Light.GREEN), 2.0, 0.0, False),
-        ((Light.GREEN, Light.YELLOW), 2.0, 0.0, True),
-        ((Light.GREEN, Light.YELLOW), 2.0, 4.0, False),  # under way
-        ((Light.GREEN, Light.YELLOW), 9.0, 0.0, False),  # it may still come up to the line
-        ((Light.RED, Light.RED), 2.0, 0.0, True),
+        ((LightState.GREEN, LightState.GREEN), 2.0, 0.0, False),
+        ((LightState.GREEN, LightState.YELLOW), 2.0, 0.0, True),
+        ((LightState.GREEN, LightState.YELLOW), 2.0, 4.0, False),  # under way
+        (
+            (LightState.GREEN, LightState.YELLOW),
+            9.0,
+            0.0,
+            False,
+        ),  # it may still come up to the line
+        ((LightState.RED, LightState.RED), 2.0, 0.0, True),
     ],
 )
 def test_nobody_sets_off_over_a_line_that_closes_before_he_is_over_it(
-    traffic: Traffic, shows: tuple[Light, Light], to_line_m: float, mps: float, late: bool
+    traffic: Traffic,
+    shows: tuple[LightState, LightState],
+    to_line_m: float,
+    mps: float,
+    late: bool,
 ) -> None:
     graph = traffic.lanes
     lit = np.flatnonzero((graph.control == Control.LIGHT) & graph.contested)
@@ -103,7 +112,9 @@ def simulator() -> TownSimulator:
     lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
     route = graph.position(np.full(90, lane), BEGIN_M + np.arange(90))
     simulator = TownSimulator()
-    simulator.reset(TownScenario("Town02", route, 3, lanes=(lane,), crowd=Crowd(0, 0)))
+    simulator.reset(
+        TownScenario("Town02", route, 3, lanes=(lane,), background_traffic=BackgroundTraffic(0, 0))
+    )
     return simulator
 
 

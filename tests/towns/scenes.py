@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.map.town_map import Strip, StripKind, TownMap
 
 STILL = np.zeros(6)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scenes import ACTOR_ID, STILL, actor_at, ego_pose
 
+from foredrive.scene.actors import ActorState
 from foredrive.sensors import CameraOptics
-from foredrive.towns.actors import ActorState
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.world import World
 
 SIZE = (48, 80)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.scene import Command
+from foredrive.scene.conditions import CONDITIONS
 from foredrive.towns.campaign import (
     ANY_CONDITIONS,
     Campaign,
@@ -16,7 +17,6 @@ from foredrive.towns.campaign import (
     plan_drives,
     select_balanced,
 )
-from foredrive.towns.conditions import CONDITIONS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic

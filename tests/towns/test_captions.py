@@ -6,26 +6,28 @@ import re
 import numpy as np
 import pytest
 
-from foredrive.data.setting import Doing, LightColour, Place, Setting
+from foredrive.data.setting import Doing, LightColour, Place, Setting, TimeOfDay, Weather
 from foredrive.data.setting import ObjectKind as Kind
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import CONDITIONS, Conditions
-from foredrive.towns.labels.captions import Situation, Thing, caption
-from foredrive.towns.labels.situation import kind_of
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import CONDITIONS, Conditions
+from foredrive.towns.labels.captions import CaptionActor, FrameFacts, caption
+from foredrive.towns.labels.frame_facts import object_kind
 
 SEEDS = range(24)
 
 
-def thing(kind: Kind, x: float, y: float, **changes: object) -> Thing:
-    standing = Thing(kind, np.array([x, y], dtype=np.float64), np.zeros(2), 0.0, visibility=1.0)
+def thing(kind: Kind, x: float, y: float, **changes: object) -> CaptionActor:
+    standing = CaptionActor(kind, np.array([x, y], dtype=np.float64), np.zeros(2), 0.0, visibility=1.0)
     return dataclasses.replace(standing, **changes)
 
 
-def situation(*things: Thing, conditions: Conditions = CONDITIONS["clear"], **changes: object) -> Situation:
+def situation(
+    *things: CaptionActor, conditions: Conditions = CONDITIONS["clear"], **changes: object
+) -> FrameFacts:
     plain = Setting(
-        time_of_day=conditions.time_of_day,
-        weather=conditions.weather,
+        time_of_day=TimeOfDay.at_hour(conditions.hour),
+        weather=Weather.under(conditions),
         place=Place.STREET,
         doing=Doing.DRIVES,
         speed_mps=10.0,
@@ -33,7 +35,7 @@ def situation(*things: Thing, conditions: Conditions = CONDITIONS["clear"], **ch
         light=None,
         **dataclasses.asdict(conditions),
     )
-    return Situation(dataclasses.replace(plain, **changes), things)
+    return FrameFacts(dataclasses.replace(plain, **changes), things)
 
 
 WALKER = thing(Kind.PEDESTRIAN, 12.0, -4.0, velocity_mps=np.array([0.0, 1.4]), on_road=True)
@@ -132,7 +134,7 @@ def test_language_varies_with_the_seed_alone() -> None:
         (situation(conditions=Conditions(wetness=0.8)), "road is wet|wet road", "rain"),
     ],
 )
-def test_facts(scene: Situation, says: str, never: str) -> None:
+def test_facts(scene: FrameFacts, says: str, never: str) -> None:
     for seed in SEEDS:
         text = caption(scene, seed).lower()
         assert re.search(says, text), text
@@ -147,7 +149,9 @@ def test_many_are_counted_by_kind() -> None:
 def test_vans_and_riders_go_by_their_own_names() -> None:
     def named(category: Category, *size_lwh: float) -> Kind:
         still = np.zeros(3)
-        return kind_of(ActorState(1, category, still, 0.0, 0.0, np.array(size_lwh), still, 0, parked=False))
+        return object_kind(
+            ActorState(1, category, still, 0.0, 0.0, np.array(size_lwh), still, 0, parked=False)
+        )
 
     assert named(Category.CAR, 4.5, 1.8, 1.5) is Kind.CAR
     assert named(Category.CAR, 5.5, 2.0, 2.3) is Kind.VAN
@@ -169,4 +173,4 @@ def test_vans_and_riders_go_by_their_own_names() -> None:
     ],
 )
 def test_conditions_in_words(name: str, facts: tuple[str, str]) -> None:
-    assert (CONDITIONS[name].time_of_day, CONDITIONS[name].weather) == facts
+    assert (TimeOfDay.at_hour(CONDITIONS[name].hour), Weather.under(CONDITIONS[name])) == facts

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from foredrive.scene import Category
+from foredrive.scene.actors import ActorState
 from foredrive.sensors import SpinningLidar
-from foredrive.towns.actors import ActorState
+from foredrive.sensors.vehicle import camera_rig
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.echoes import chance_of_shares, group_echoes, pick_echo
-from foredrive.towns.sensing.rig import camera_rig
+from foredrive.towns.sensing.echoes import footprint_chance, group_echoes, pick_echo
 from foredrive.towns.world import World
 
 
@@ -47,7 +47,7 @@ def test_the_strongest_echo_is_returned_or_the_last() -> None:
 def test_an_echo_of_a_part_of_a_beam_is_lost_as_a_weaker_one() -> None:
     chance = np.linspace(0.01, 0.99, 99, dtype=np.float32)[:, None]
     echo, threshold, share = 0.05, 0.02, 0.25
-    asked = chance_of_shares(chance, np.full((99, 1), share, np.float32))[:, 0]
+    asked = footprint_chance(chance, np.full((99, 1), share, np.float32))[:, 0]
     kept = asked < echo / (echo + threshold)
     expected = share * echo / (share * echo + threshold)
     assert kept.tolist() == (chance[:, 0] < expected).tolist()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.actor_looks import MeshLooks

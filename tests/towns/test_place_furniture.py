@@ -9,9 +9,9 @@ from foredrive.towns.map.town_map import Lane, MarkingKind, Strip, StripKind, To
 from foredrive.towns.place.assets import AssetSet, assets_of
 from foredrive.towns.place.furniture_meshes import (
     FurnitureLooks,
+    furniture_items,
     guard_rail,
     sound_barrier,
-    things,
 )
 from foredrive.towns.place.looks import LookTable, Surface
 from foredrive.towns.place.site import Site
@@ -46,7 +46,7 @@ def site() -> Site:
 
 
 def test_furniture_is_solid_and_rooted() -> None:
-    for name, thing in things(FurnitureLooks(LookTable())).items():
+    for name, thing in furniture_items(FurnitureLooks(LookTable())).items():
         assert volume(thing.mesh.xyz) > 0, name
         low, high = thing.mesh.xyz.reshape(-1, 3).min(0), thing.mesh.xyz.reshape(-1, 3).max(0)
         assert -0.7 < low[2] < -0.1, name  # reaches into the ground

@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 from foredrive.errors import InputError
 from foredrive.towns.place.mesh import Mesh, triangles
 from foredrive.towns.sensing.embree import check_release
-from foredrive.towns.sensing.raycast import PlacedShapes, Surroundings, TriangleScene
+from foredrive.towns.sensing.raycast import RaycastScene, ShapeInstances, TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
 RAYS = 1003
@@ -61,7 +61,7 @@ def test_actors_are_met_where_they_are_when_a_ray_looks() -> None:
     maps[:, :3, 3] = [[3.0, 1.0, 0.0], [-3.0, 0.0, 1.0]]
     velocity_mps = np.array([[0.0, 0.0, 0.0], [12.0, -5.0, 0.0]])
     scene = TriangleScene(shape)
-    world = Surroundings(TriangleScene(ground), PlacedShapes((scene, scene), maps, velocity_mps))
+    world = RaycastScene(TriangleScene(ground), ShapeInstances((scene, scene), maps, velocity_mps))
     origin, direction = some_rays(rng, 6.0)
     dt_s = rng.choice(np.array([-0.1, 0.0, 0.04], np.float32), RAYS)
     hits, blocked = world.cast(origin, direction, dt_s), world.occluded(origin, direction, dt_s)
@@ -82,7 +82,7 @@ def test_actors_are_met_where_they_are_when_a_ray_looks() -> None:
 
 def test_nobody_there() -> None:
     scene = TriangleScene(triangles(np.array([[[5.0, -1, -1], [5.0, 1, -1], [5.0, 0, 2]]]), 0))
-    world = Surroundings(scene, PlacedShapes((), np.zeros((0, 4, 4)), np.zeros((0, 3))))
+    world = RaycastScene(scene, ShapeInstances((), np.zeros((0, 4, 4)), np.zeros((0, 3))))
     ahead, away = np.array([[1.0, 0, 0]], np.float32), np.array([[-1.0, 0, 0]], np.float32)
     start = np.zeros((1, 3), np.float32)
     assert world.cast(start, ahead).t[0] == pytest.approx(5.0)

@@ -26,13 +26,15 @@ from foredrive.data.recorded import read_caption, read_setting, read_traffic_lig
 from foredrive.data.recorded_labels import recorded_labels
 from foredrive.errors import InputError
 from foredrive.scene import Category, MapKind, VoxelSpec
+from foredrive.scene.actors import BOX_RANGE_M, boxes_in_ego_frame
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.scene.traffic_light import LightState
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns import recorder
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.recorder import Crowd, LabelKinds, boxes_of, record, split_of
+from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import ExpertDrive
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
 
@@ -42,8 +44,17 @@ RATE_HZ = 2.0
 
 def record_small(out: Path, seed: int = 3, town: str = "Town02") -> LogPath:
     sensors = SensorSuite(camera_rig((36, 64)), roof_lidar(channels=16, azimuth_steps=180))
-    labels = LabelKinds(depth=True, semantic=True, instance=True)
-    return record(town, FRAMES / RATE_HZ, seed, out, RATE_HZ, sensors, Crowd(vehicles=12, people=8), labels)
+    labels = LabelOptions(depth=True, semantic=True, instance=True)
+    return record(
+        town,
+        FRAMES / RATE_HZ,
+        seed,
+        out,
+        RATE_HZ,
+        sensors,
+        BackgroundTraffic(vehicles=12, pedestrians=8),
+        labels,
+    )
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -138,7 +149,7 @@ def test_boxes_are_around_and_on_the_road(recording: LogPath) -> None:
     boxes = read_boxes(log, 0)
     assert boxes is not None
     assert len(boxes.yaw) > 5
-    assert torch.linalg.vector_norm(boxes.centre, dim=-1).max() < recorder.BOXES_WITHIN_M
+    assert torch.linalg.vector_norm(boxes.centre, dim=-1).max() < BOX_RANGE_M
     bottom = boxes.centre[:, 2] - 0.5 * boxes.size_lwh[:, 2]
     assert -0.02 < bottom.min() <= bottom.max() < 0.3  # a flat town; walkways and car parks are raised
     moving = torch.linalg.vector_norm(boxes.velocity, dim=-1) > 0.5
@@ -164,7 +175,7 @@ def test_traffic_lights_stand_at_the_lanes_that_they_guard(recording: LogPath, t
         for map_id, status in recorded.items():
             line = api.get_map_object_in_layer(map_id, MapLayer.LANE).centerline.array[[0, -1], :2]
             (lane,) = (i for i in of_lane if np.abs(ends[i] - line).max() < 0.01)
-            assert status.name == Light(shown[of_lane[lane]]).name
+            assert status.name == LightState(shown[of_lane[lane]]).name
 
 
 def test_lidar_points_tell_hidden_boxes_from_visible_ones(recording: LogPath) -> None:
@@ -323,7 +334,7 @@ def test_boxes_move_as_their_velocities_say(town02: TownMap) -> None:
     dt_s, at, velocity = 0.05, {}, {}
     traffic = Traffic(town02, 3, 13, 8)
     for k, moment in enumerate(ExpertDrive(traffic, 3.0).snapshots(60, dt_s)):
-        boxes, R = boxes_of(moment.actors, moment.T_world_ego), moment.T_world_ego[:3, :3]
+        boxes, R = boxes_in_ego_frame(moment.actors, moment.T_world_ego), moment.T_world_ego[:3, :3]
         for row, track in enumerate(boxes.track_id.tolist()):
             at[track, k] = R @ boxes.centre[row].double().numpy() + moment.T_world_ego[:3, 3]
             velocity[track, k] = R @ [*boxes.velocity[row].tolist(), 0.0]
@@ -338,16 +349,18 @@ def test_boxes_move_as_their_velocities_say(town02: TownMap) -> None:
 
 @pytest.mark.usefixtures("built_already")
 def test_labels_may_be_left_out(tmp_path: Path) -> None:
-    bare = LabelKinds(occupancy=None, visibility=False, captions=False)
+    bare = LabelOptions(occupancy=None, visibility=False, captions=False)
     sensors = SensorSuite(camera_rig((12, 16)), roof_lidar(channels=4, azimuth_steps=36))
-    log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, Crowd(4, 2), bare))
+    log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, BackgroundTraffic(4, 2), bare))
     assert read_visibility(log, 0) is read_caption(log, 0) is read_setting(log, 0) is None
     assert not list(log.path.folder.glob("custom.[!l]*"))
     boxes = read_boxes(log, 0)
     assert boxes is not None
     assert len(boxes.yaw) > 0
     told = replace(bare, captions=True)  # which take visibility, but do not leave it there
-    log = Log(record("Town02", 0.5, 3, tmp_path, RATE_HZ, sensors, Crowd(4, 2), told, log_name="told"))
+    log = Log(
+        record("Town02", 0.5, 3, tmp_path, RATE_HZ, sensors, BackgroundTraffic(4, 2), told, log_name="told")
+    )
     assert read_caption(log, 0)
     assert read_visibility(log, 0) is None
 

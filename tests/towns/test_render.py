@@ -13,15 +13,15 @@ from foredrive.geometry.boxes import box_corners
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Category, VoxelSpec
+from foredrive.scene.conditions import find_conditions
+from foredrive.scene.traffic_light import LightState
 from foredrive.sensors import SpinningLidar
-from foredrive.towns.conditions import find_conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.patterns import band, bands
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
-from foredrive.towns.traffic.lights import Light
-from foredrive.towns.world import NOBODY, World
+from foredrive.towns.world import NO_ACTOR, World
 
 SIZE = (48, 80)
 
@@ -123,10 +123,10 @@ def test_lights_show_their_colour(world02: World, town02: TownMap) -> None:
     T[:3, 3] = zone.post_xyz - T[:3, 0] * 5.5
     sensors = SensorSuite(camera_rig((120, 200)), roof_lidar(2, 4))
     seen = {}
-    for light in (Light.RED, Light.GREEN):
+    for light in (LightState.RED, LightState.GREEN):
         lights = np.full(len(town02.stop_zones), int(light))
         seen[light] = world02.render([], sensors, T, STILL, 0, lights).images["PCAM_F0"].astype(int)
-    change = seen[Light.RED] - seen[Light.GREEN]
+    change = seen[LightState.RED] - seen[LightState.GREEN]
     assert change[..., 0].max() > 100  # the red lamp
     assert change[..., 1].min() < -100  # the green one
 
@@ -214,7 +214,7 @@ def test_parked_cars_are_told_apart(world02: World, town02: TownMap, sensors: Se
     frame = world02.render([car], sensors, T, STILL, noise_seed=0)
     seen = set(np.unique(frame.pixel_ids["PCAM_F0"]).tolist())
     assert car.track_id in seen
-    assert NOBODY in seen
+    assert NO_ACTOR in seen
 
 
 def test_filtered_bands_keep_their_share() -> None:

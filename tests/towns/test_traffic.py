@@ -8,9 +8,10 @@ import pytest
 import shapely
 
 from foredrive.scene import Category
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.car_following import MAX_BRAKING_MPS2
-from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, Light
+from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
 
@@ -127,7 +128,7 @@ def test_nobody_passes_a_red_light(watched: Watched) -> None:
         still_there = w.lane == v.lane
         crossed = np.where(still_there, graph.length_m[v.lane] - w.front_m < 0, True) & (to_line >= 0)
         guarded = v.active & crossed & signals.guarded[ahead]
-        assert (signals.light_states(before.time_s)[ahead[guarded]] != Light.RED).all(), before.time_s
+        assert (signals.light_states(before.time_s)[ahead[guarded]] != LightState.RED).all(), before.time_s
         passed += int(guarded.sum())
     assert passed > 10 or not signals.guarded.any()
 
@@ -194,8 +195,10 @@ def test_lights_show_green_to_one_axis_at_a_time(town02: TownMap) -> None:
         light = signals.light_states(float(time_s))
         seen[np.arange(len(light)), light] = True
         for junction in np.unique(graph.junction[signals.guarded]):
-            lanes = np.flatnonzero(signals.guarded & (graph.junction == junction) & (light == Light.GREEN))
+            lanes = np.flatnonzero(
+                signals.guarded & (graph.junction == junction) & (light == LightState.GREEN)
+            )
             assert np.abs(np.sin(heading[lanes] - heading[lanes[:1]])).max(initial=0.0) < 0.72
-    assert seen[signals.guarded][:, [Light.RED, Light.YELLOW, Light.GREEN]].all()
+    assert seen[signals.guarded][:, [LightState.RED, LightState.YELLOW, LightState.GREEN]].all()
     assert not seen[~signals.guarded][:, 1:].any()
     assert GREEN_S + YELLOW_S < PHASE_S

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from foredrive.scene import Category
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.drivers import move_vehicles
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.pedestrians import (
     Pedestrians,
     crossing_gap,
@@ -73,7 +73,7 @@ def walk_on(traffic: Traffic, person: Pedestrians, cars: Vehicles, light: np.nda
 
 
 def test_a_person_waits_for_a_car_that_is_near_and_crosses_behind_it(traffic: Traffic) -> None:
-    dark = np.full(len(traffic.lanes.ids), int(Light.NONE))
+    dark = np.full(len(traffic.lanes.ids), int(LightState.NONE))
     cars, crossing = lone_car(traffic, before_m=10.0, speed_mps=10.0)
     person = at_the_kerb(traffic, crossing)
     crossed_s = None
@@ -94,7 +94,7 @@ def test_a_person_waits_for_a_car_that_is_near_and_crosses_behind_it(traffic: Tr
 
 
 def test_a_person_goes_at_once_where_cars_can_stop_and_they_do(traffic: Traffic) -> None:
-    dark = np.full(len(traffic.lanes.ids), int(Light.NONE))
+    dark = np.full(len(traffic.lanes.ids), int(LightState.NONE))
     cars, crossing = lone_car(traffic, before_m=25.0, speed_mps=6.0)
     person = at_the_kerb(traffic, crossing)
     person = walk_on(traffic, person, cars, dark)
@@ -110,8 +110,12 @@ def test_nobody_crosses_while_traffic_has_green(traffic: Traffic) -> None:
         int(walks.crossing[near][0]),
         dataclasses.replace(traffic.start().vehicles, active=np.zeros(30, dtype=bool)),
     )
-    for shows, crosses in ((Light.GREEN, False), (Light.YELLOW, False), (Light.RED, True)):
-        light = np.where(guarded, int(shows), int(Light.NONE))
+    for shows, crosses in (
+        (LightState.GREEN, False),
+        (LightState.YELLOW, False),
+        (LightState.RED, True),
+    ):
+        light = np.where(guarded, int(shows), int(LightState.NONE))
         person = at_the_kerb(traffic, crossing)
         for _ in range(5):
             person = walk_on(traffic, person, nobody, light)

@@ -7,21 +7,27 @@ import pytest
 from scenes import STILL, actor_at, ego_pose
 from scipy.integrate import quad
 
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import CONDITIONS, Conditions, find_conditions
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import CONDITIONS, Conditions, find_conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture
 from foredrive.towns.sensing import lens
 from foredrive.towns.sensing.air import BACKSCATTER_RATIO, make_air, rain_extinction_per_m
-from foredrive.towns.sensing.beams import ASIDE_M, add_beams, phase
+from foredrive.towns.sensing.beams import MAX_LATERAL_M, add_beams, phase
 from foredrive.towns.sensing.capture import NOT_KNOWN, SensorSuite
 from foredrive.towns.sensing.lamps import UNIT_LUX, gather_lamps, lamp_light
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
-from foredrive.towns.sensing.light import daylight_lux, drive_lit, is_dark, make_light, sun_direction
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
+from foredrive.towns.sensing.light import (
+    daylight_lux,
+    headlights_on,
+    make_light,
+    street_lamps_on,
+    sun_direction,
+)
 from foredrive.towns.sensing.shading import Surfaces, shade
 from foredrive.towns.sensing.wet import water_mirror
-from foredrive.towns.world import NOBODY, SensorFrame, World
+from foredrive.towns.world import NO_ACTOR, SensorFrame, World
 
 DOWN = np.array([0.0, 0.0, 1.0], np.float32)
 
@@ -160,8 +166,8 @@ def test_overcast_has_no_sun() -> None:
 
 
 def test_lights_go_on_when_it_is_dark_or_hard_to_see() -> None:
-    assert [n for n, c in CONDITIONS.items() if is_dark(c)] == ["night", "night_rain", "night_fog"]
-    assert {n for n, c in CONDITIONS.items() if drive_lit(c)} == {
+    assert [n for n, c in CONDITIONS.items() if street_lamps_on(c)] == ["night", "night_rain", "night_fog"]
+    assert {n for n, c in CONDITIONS.items() if headlights_on(c)} == {
         "dusk",
         "night",
         "rain",
@@ -280,7 +286,7 @@ def test_fog_takes_contrast_and_sends_beams_back(under: dict[str, SensorFrame]) 
     sweep, clear = under["fog"].sweep, under["clear"].sweep
     early = (sweep.range_m < 0.8 * clear.range_m) & sweep.returned
     assert early.float().mean() > 0.05
-    assert (under["fog"].beam_ids[early.numpy()] == NOBODY).all()
+    assert (under["fog"].beam_ids[early.numpy()] == NO_ACTOR).all()
 
 
 def test_rain_changes_beams_and_road(under: dict[str, SensorFrame]) -> None:
@@ -321,6 +327,6 @@ def test_beams_in_fog_are_seen_from_aside_and_scatter_all_that_they_lose() -> No
         sent = min(max(5.0 * (-z / r - 0.2), 0.0), 1.0) * 0.8 * 3200.0 / UNIT_LUX
         return math.pi * extinction * sent * phase(-y / r) * math.exp(-extinction * (s + r)) / r**2
 
-    aside = ASIDE_M[0] * math.exp(-extinction * 10.0)
+    aside = MAX_LATERAL_M[0] * math.exp(-extinction * 10.0)
     faded = 1.0 - (3.5 / aside) ** 2
     assert seen[0, 1] == pytest.approx(faded * quad(gathered, 0.0, 20.0)[0], rel=0.05)

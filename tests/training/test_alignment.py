@@ -4,21 +4,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from foredrive.models.image_tower import ImageTower
-from foredrive.models.lidar_clip import LidarEncoder, PillarGrid, PointCloud
+from foredrive.models.image_tower import ImageTower, ImageTowerConfig
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.training.alignment import (
     CaptionedImages,
+    ContrastConfig,
     ContrastObjective,
-    DistilObjective,
+    DistillationObjective,
     ImagedSweeps,
 )
+
+IMAGE_TOWER = ImageTowerConfig(widths=(8, 8), depths=(1, 1), heads=2, side_px=24)
 
 
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def captioned(said: Tensor | None = None) -> CaptionedImages:
+def captioned(stated: Tensor | None = None) -> CaptionedImages:
     """Two red views and two blue ones, and a text each."""
     colour = torch.tensor([0, 0, 2, 2])
     images = torch.zeros(4, 3, 40, 60, dtype=torch.uint8)
@@ -26,7 +29,7 @@ def captioned(said: Tensor | None = None) -> CaptionedImages:
     return CaptionedImages(
         images=images,
         texts=torch.eye(8)[colour][:, None],
-        said=torch.eye(3).bool()[colour][:, None] if said is None else said,
+        stated=torch.eye(3).bool()[colour][:, None] if stated is None else stated,
         holds=torch.eye(3).bool()[colour],
         key=("a", "b", "c", "d"),
     )
@@ -34,7 +37,7 @@ def captioned(said: Tensor | None = None) -> CaptionedImages:
 
 def test_an_image_tower_learns_what_colours_are_called() -> None:
     torch.manual_seed(0)
-    objective = ContrastObjective(ImageTower(widths=(8, 8), depths=(1, 1), heads=2, dim=8))
+    objective = ContrastObjective(ImageTower(IMAGE_TOWER, dim=8), ContrastConfig())
     optimizer = torch.optim.Adam(objective.parameters(), 1e-2)
     random = generator()
     for _ in range(30):  # running means of batches need some time
@@ -55,7 +58,7 @@ def test_an_image_tower_learns_what_colours_are_called() -> None:
 @pytest.mark.parametrize("kind", ["mse", "cosine"])
 def test_mirrored_sweeps_are_compared_with_mirrored_images(kind: str) -> None:
     torch.manual_seed(0)
-    encoder = LidarEncoder(PillarGrid(), dim=4, width=16, heads=2, hidden=16, blocks=1).eval()
+    encoder = LidarEncoder(LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=1), dim=4).eval()
     points = torch.rand(8 * 20, 4, generator=generator()) * torch.tensor([30.0, 15.0, 3.0, 1.0])
     item = torch.arange(8).repeat_interleave(20)
     other_side = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
@@ -67,7 +70,7 @@ def test_mirrored_sweeps_are_compared_with_mirrored_images(kind: str) -> None:
     batch = ImagedSweeps(
         PointCloud(points, item), torch.stack([plain, mirrored], 1) * longer + off, ("x",) * 8
     )
-    losses = DistilObjective(encoder, kind)(batch, generator())  # type: ignore[arg-type]
+    losses = DistillationObjective(encoder, kind)(batch, generator())  # type: ignore[arg-type]
     assert losses["loss"].item() == pytest.approx(9 / 4 if kind == "mse" else 0, abs=1e-4)
 
 
@@ -75,8 +78,8 @@ def test_mirrored_sweeps_are_compared_with_mirrored_images(kind: str) -> None:
 def test_a_lidar_tower_learns_from_embeddings_without_a_text(kind: str) -> None:
     assert set(ImagedSweeps.__dataclass_fields__) == {"cloud", "targets", "key"}
     torch.manual_seed(0)
-    encoder = LidarEncoder(PillarGrid(), dim=4, width=16, heads=2, hidden=16, blocks=2)
-    objective = DistilObjective(encoder, kind)  # type: ignore[arg-type]
+    encoder = LidarEncoder(LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=2), dim=4)
+    objective = DistillationObjective(encoder, kind)  # type: ignore[arg-type]
     near = torch.rand(50, 4) * torch.tensor([5.0, 5.0, 2.0, 1.0])
     cloud = PointCloud(
         torch.cat([near, near + torch.tensor([30.0, 0.0, 0.0, 0.0])]), torch.arange(2).repeat_interleave(50)

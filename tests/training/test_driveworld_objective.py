@@ -11,12 +11,12 @@ from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import motion_of
 from foredrive.runs.build import build_agent
 from foredrive.scene import Example
-from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_moving
+from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_velocities
 
 RECIPE = miniature_driveworld()
 SPEC = RECIPE.clips.voxels
 PAST, STEPS = RECIPE.clips.past_frames, RECIPE.clips.future_frames
-PRETRAINING, PLANNING = RECIPE.pretrain.weights, RECIPE.finetune.weights
+PRETRAINING, PLANNING = RECIPE.pretrain, RECIPE.finetune
 
 
 def agent() -> PlanningAgent:
@@ -61,7 +61,7 @@ def test_descending_it_lowers_every_term_but_the_divergence(example: Example) ->
     assert last["loss"] < 0.9 * first["loss"]
     for name in ("occ", "action", "velocity"):
         assert last[name] < first[name]
-    weights = PRETRAINING
+    weights = PRETRAINING.weights
     assert first["loss"] == pytest.approx(
         sum(getattr(weights, name) * value for name, value in first.items() if name != "loss"), rel=1e-5
     )
@@ -82,10 +82,13 @@ def test_the_nearest_that_move_come_first(example: Example) -> None:
     boxes = example.clip.boxes
     centre = torch.tensor([[9.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]).expand_as(boxes.centre)
     velocity = torch.tensor([[1.0, 0.0], [2.0, 0.0], [0.1, 0.0]]).expand_as(boxes.velocity)
-    found, there = nearest_moving(dataclasses.replace(boxes, centre=centre, velocity=velocity), 4)
+    found, there = nearest_velocities(
+        dataclasses.replace(boxes, centre=centre, velocity=velocity), 4, moving_mps=0.5
+    )
     assert found[0, 0, :2, 0].tolist() == [2.0, 1.0]
     assert there[0, 0].tolist() == [True, True, False, False]
-    nothing, none = nearest_moving(dataclasses.replace(boxes, valid=torch.zeros_like(boxes.valid)), 2)
+    unmoved = dataclasses.replace(boxes, valid=torch.zeros_like(boxes.valid))
+    nothing, none = nearest_velocities(unmoved, 2, moving_mps=0.5)
     assert not none.any()
     assert nothing.isfinite().all()
 
@@ -97,7 +100,8 @@ def test_pretraining_reaches_all_but_the_planner_and_finetuning_that_too(example
     left_out = {name for name, reached in before.items() if not reached and name.startswith("world_model.")}
     assert left_out == {f"world_model.backbone.smooth.1.{kind}" for kind in ("weight", "bias")}
     joint = gradients(DriveWorldObjective(agent(), PLANNING, steps=STEPS), example)
-    alone = dataclasses.replace(PLANNING, kl=0.0, occ=0.0, action=0.0, flow=0.0, velocity=0.0)
+    weights = dataclasses.replace(PLANNING.weights, kl=0.0, occ=0.0, action=0.0, flow=0.0, velocity=0.0)
+    alone = dataclasses.replace(PLANNING, weights=weights)
     planning = gradients(DriveWorldObjective(agent(), alone, steps=STEPS), example)
     for reached in (joint, planning):
         assert reached["planner.plan"]
@@ -107,7 +111,7 @@ def test_pretraining_reaches_all_but_the_planner_and_finetuning_that_too(example
 
 
 def test_without_time_only_what_a_single_frame_shows_is_learned(example: Example) -> None:
-    objective = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS, temporal=False)
+    objective = DriveWorldObjective(agent(), dataclasses.replace(PRETRAINING, temporal=False), steps=STEPS)
     assert set(objective(example, torch.Generator())) == {"occ", "flow", "loss"}
     reached = gradients(objective, example)
     assert reached["world_model.backbone.lateral.0.weight"]

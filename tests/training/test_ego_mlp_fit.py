@@ -7,28 +7,27 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.evaluation import ConstantVelocity
-from foredrive.models.ego_mlp import EgoMLP
-from foredrive.training import fit_ego_mlp, read_status
-from foredrive.training.ego_mlp_fit import EGO_MLP_FIT
-from foredrive.training.row_fit import RowFit
+from foredrive.evaluation.baselines import ConstantVelocity
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
+from foredrive.training import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
 
 
-def some_steps(steps: int) -> RowFit:
-    return dataclasses.replace(EGO_MLP_FIT, steps=steps)
+def fitted(data: StatusDemonstrations, *, steps: int, past_frames: int = 2, seed: int = 0) -> EgoMLP:
+    fit = EgoMLPFit(steps=steps, seed=seed)
+    return fit_ego_mlp(EgoMLPConfig(), data, fit, past_frames=past_frames, dt_s=0.5)
 
 
 def test_the_ego_mlp_learns_what_the_status_gives_away() -> None:
     # Vehicles on circles: the past says exactly what comes next.
     data = read_status([drives(*range(100)).clip], past_frames=2)
-    model = fit_ego_mlp(data, past_frames=2, dt_s=0.5, seed=0, fit=some_steps(300))
+    model = fitted(data, steps=300)
     test = drives(*range(200, 240))
     observed, driven = test.clip.observed(), test.clip.future.xy
     error_m = (model.act(observed).xy - driven).norm(dim=-1).mean()
     straight_m = (ConstantVelocity(6, 0.5).act(observed).xy - driven).norm(dim=-1).mean()
     assert error_m < 0.5 * straight_m
-    again = fit_ego_mlp(data, past_frames=2, dt_s=0.5, seed=0, fit=some_steps(300))
-    other = fit_ego_mlp(data, past_frames=2, dt_s=0.5, seed=1, fit=some_steps(300))
+    again = fitted(data, steps=300)
+    other = fitted(data, steps=300, seed=1)
     assert torch.equal(again.act(observed).xy, model.act(observed).xy)
     assert not torch.equal(other.act(observed).xy, model.act(observed).xy)
 
@@ -40,13 +39,7 @@ def test_steps_that_were_not_driven_teach_nothing() -> None:
     spoilt = torch.where(valid[..., None], data.driven, torch.full_like(data.driven, 1e6))
     kept = torch.where(valid[..., None], data.driven, torch.zeros_like(data.driven))
     plans = [
-        fit_ego_mlp(
-            dataclasses.replace(data, driven=driven, valid=valid),
-            past_frames=2,
-            dt_s=0.5,
-            seed=0,
-            fit=some_steps(5),
-        )(data.status)
+        fitted(dataclasses.replace(data, driven=driven, valid=valid), steps=5)(data.status)
         for driven in (spoilt, kept)
     ]
     assert torch.equal(*plans)
@@ -54,7 +47,7 @@ def test_steps_that_were_not_driven_teach_nothing() -> None:
 
 def test_one_clip_is_enough_to_train_on() -> None:
     data = read_status([drives(0).clip], past_frames=1)
-    model = fit_ego_mlp(data, past_frames=1, dt_s=0.5, seed=0, fit=some_steps(3))
+    model = fitted(data, steps=3, past_frames=1)
     assert isinstance(model, EgoMLP)
     assert model.act(drives(1).clip.observed()).xy.isfinite().all()
     with pytest.raises(InputError, match="empty"):

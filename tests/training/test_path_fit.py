@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from foredrive.models.planner import PathCorrection, PathCorrectionConfig, PathReads
+from foredrive.models.planner import PathCorrection, PathCorrectionConfig, PathSamples
 from foredrive.scene import VoxelSpec
 from foredrive.training import PathDemonstrations, PathFit, fit_path
 
@@ -16,7 +16,7 @@ COUNT, DISTANCES = 400, (2.0, 6.0)
 def correction() -> PathCorrection:
     torch.manual_seed(0)
     config = PathCorrectionConfig(distances_m=DISTANCES, width=32, hidden=16)
-    return PathCorrection(config, SPEC, channels=2, told=1, steps=2)
+    return PathCorrection(config, SPEC, channels=2, status=1, steps=2)
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def shown() -> PathDemonstrations:
     short = torch.tensor([[1.0, 0.0], [2.0, 0.0]]) * blocked[:, None, None]
     return PathDemonstrations(
         values=values.half(),
-        places_m=torch.zeros(COUNT, len(DISTANCES), 3, 2),
-        told=torch.zeros(COUNT, 1),
+        positions_m=torch.zeros(COUNT, len(DISTANCES), 3, 2),
+        status=torch.zeros(COUNT, 1),
         planned_xy=unseen,
         driven_xy=unseen - short,
         valid=torch.ones(COUNT, 2, dtype=torch.bool),
@@ -39,7 +39,7 @@ def shown() -> PathDemonstrations:
 
 def errors_m(path: PathCorrection, shown: PathDemonstrations) -> torch.Tensor:
     with torch.no_grad():
-        change = path(PathReads(shown.values, shown.places_m), shown.told).cumsum(dim=1)
+        change = path(PathSamples(shown.values, shown.positions_m), shown.status).cumsum(dim=1)
     return (shown.planned_xy + change - shown.driven_xy).norm(dim=-1)
 
 

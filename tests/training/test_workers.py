@@ -1,7 +1,38 @@
-"""The process that workers are forked from."""
+"""The processes that load data, and the process that they are forked from."""
 
+import os
 import subprocess
 import sys
+import time
+from pathlib import Path
+
+import pytest
+
+PATIENCE_S = 300.0
+KILLED = """
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+from torch.utils.data import Dataset
+
+from foredrive.training.loop import Schedule, _loader
+
+
+class Workers(Dataset):
+    def __len__(self):
+        return 100
+
+    def __getitem__(self, index):
+        return os.getpid()
+
+
+if __name__ == "__main__":
+    schedule = Schedule(batch_size=1, lr=1e-3, steps=50, workers=2)
+    batches = iter(_loader(Workers(), list, schedule, 0, 50, SimpleNamespace(world_size=1, global_rank=0)))
+    Path("workers").write_text(f"{next(batches)[0]} {next(batches)[0]}")
+    os.kill(os.getpid(), 9)
+"""
 
 
 def test_a_collection_in_a_worker_leaves_the_modules_it_was_born_with_alone() -> None:
@@ -15,3 +46,26 @@ def test_a_collection_in_a_worker_leaves_the_modules_it_was_born_with_alone() ->
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(done.stdout) > 5_000  # objects of the modules that any Python process imports
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()  # a zombie waits for its parent only
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_the_workers_of_a_killed_training_end(tmp_path: Path) -> None:
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED)
+    with (tmp_path / "errors.txt").open("w") as errors:  # a pipe would be waited for until the workers end
+        done = subprocess.run([sys.executable, script], cwd=tmp_path, stdout=errors, stderr=errors)
+    assert done.returncode == -9, (tmp_path / "errors.txt").read_text()
+    workers = {int(worker) for worker in (tmp_path / "workers").read_text().split()}
+    assert len(workers) == 2
+    until = time.monotonic() + PATIENCE_S
+    while any(is_running(worker) for worker in workers):
+        assert time.monotonic() < until, "a worker still runs"
+        time.sleep(0.1)

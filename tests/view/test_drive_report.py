@@ -6,7 +6,7 @@ from urllib.parse import quote
 
 from html_pages import EVIL, Page, assert_harmless
 
-from foredrive.evaluation import write_summary
+from foredrive.evaluation.summary import write_summary
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.view.drive_report import score_table, write_drive_report
 
@@ -81,5 +81,5 @@ def test_the_terminal_shows_scores_infractions_and_failures(tmp_path: Path) -> N
     rows = {str(row.cells[0]): row.cells[1] for section in table.sections for row in section.rows}
     assert table.title == "1 routes, 1 repetitions"
     assert rows["collision static"] == "1  (100.00 / km)"
-    assert rows["Drives that the agent failed at"] == 0
-    assert rows["Time of a plan, ms"] == "10"
+    assert rows["Failed drives"] == 0
+    assert rows["Planning time, median, ms"] == "10"

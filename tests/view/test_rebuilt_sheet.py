@@ -24,7 +24,7 @@ def test_the_verb_writes_a_picture_and_says_how_good_it_is(
         gaussians.gaussians_tiny(),
         image_hw=(24, 48),
         initial=size,
-        schedule=RebuildSchedule(steps=3, most_gaussians=3000, beam_stride=4),
+        schedule=RebuildSchedule(steps=3, max_gaussians=3000, beam_stride=4),
     )
     monkeypatch.setitem(gaussians.REBUILD_RECIPES, "smallest", smallest)
     log = world.write(tmp_path, frames=4)

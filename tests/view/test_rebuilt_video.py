@@ -13,7 +13,7 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
-from foredrive.runs.rebuild import film as rebuilt_film
+from foredrive.runs.rebuild import render as rebuilt_render
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames, render_frame
@@ -122,7 +122,7 @@ def test_what_is_inserted_has_an_id_of_its_own(run: Reconstruction) -> None:
 
 def test_captions_say_what_was_changed() -> None:
     edits = [ShiftEgo((0.0, -2.0, 0.0)), Move(4, (1.0, 0.0, 0.0)), Remove(7), Remove(8)]
-    assert rebuilt_video.caption_of(edits) == "edited: 2 m to the right, 4 moved, without 7, and 1 more"
+    assert rebuilt_video.describe_edits(edits) == "edited: 2 m to the right, 4 moved, without 7, and 1 more"
 
 
 @pytest.mark.parametrize(
@@ -180,4 +180,4 @@ def test_a_saved_edit_is_not_written_before_it_is_known_to_work(run: Reconstruct
 
 
 def test_lidars_have_names() -> None:
-    assert set(rebuilt_film.LIDARS) == {"pandar64", "hdl32e", "vlp16"}
+    assert set(rebuilt_render.LIDARS) == {"pandar64", "hdl32e", "vlp16"}

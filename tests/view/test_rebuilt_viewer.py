@@ -19,9 +19,9 @@ from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.tracks import states_at
 from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.view.background import Background
+from foredrive.view.job_runner import JobRunner
 from foredrive.view.rebuilt_viewer import RebuiltViewer
-from foredrive.view.splat_nodes import thinned
+from foredrive.view.splat_nodes import thin_out
 
 PARKED, MOVING = 7, 11
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
@@ -57,7 +57,7 @@ def node(page: RebuiltViewer, name: str):
 
 
 def picture(page: RebuiltViewer) -> np.ndarray:
-    page.background.wait()
+    page.jobs.wait()
     return page.pictures.images[0].image.astype(int)
 
 
@@ -69,7 +69,7 @@ def test_what_is_drawn_is_where_it_is_then(page: Page, run: OpenedReconstruction
         moved = node(page, f"/scene/actors/{MOVING}").position
         assert moved == pytest.approx(world.MOVING["centre"] + [world.MOVING["speed"] * t_s, 0, 0], abs=0.1)
     assert node(page, f"/scene/actors/{MOVING}/face").dimensions == pytest.approx((4, 2, 2), abs=0.05)
-    page.background.wait()
+    page.jobs.wait()
     assert np.ptp(node(page, "/lidar").points[:, 0]) > 5
     assert node(page, "/cameras/ahead").position == pytest.approx((1.6, 0, 1.5), abs=1e-3)
 
@@ -88,8 +88,8 @@ def test_pictures_follow_time_and_edits(page: Page) -> None:
     assert node(page, "/scene").position == pytest.approx((0, -2, 0), abs=1e-4)
     assert np.abs(picture(page) - removed).mean() > 1
     assert page.edits.edits == [Remove(MOVING), ShiftEgo((0.0, 2.0, 0.0))]
-    page.edits._take_back()
-    page.edits._take_back()
+    page.edits._undo()
+    page.edits._undo()
     assert page.edits.undo.disabled
     assert np.array_equal(picture(page), before)
 
@@ -169,7 +169,7 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(
 def test_a_job_gives_way_to_a_newer_one_and_none_starves() -> None:
     done: list[str] = []
     told: list[str] = []
-    background = Background(told.append)
+    jobs = JobRunner(told.append)
     begin, begun = threading.Event(), threading.Event()
 
     def first() -> None:
@@ -177,21 +177,21 @@ def test_a_job_gives_way_to_a_newer_one_and_none_starves() -> None:
         begin.wait()
         done.append("a0")
 
-    background.ask("a", first)
+    jobs.submit("a", first)
     begun.wait()
     for k in range(1, 4):
-        background.ask("a", lambda k=k: done.append(f"a{k}"))
-    background.ask("b", lambda: done.append("b"))
+        jobs.submit("a", lambda k=k: done.append(f"a{k}"))
+    jobs.submit("b", lambda: done.append("b"))
 
     def fails() -> None:
         raise InputError("it cannot be done")
 
-    background.ask("c", fails)
+    jobs.submit("c", fails)
     begin.set()
-    background.wait()
+    jobs.wait()
     assert done == ["a0", "b", "a3"]  # the other name first: "a" had its turn
     assert told == ["it cannot be done"]
-    background.close()
+    jobs.close()
 
 
 def test_of_too_many_splats_those_that_cover_most_are_left() -> None:
@@ -203,11 +203,11 @@ def test_of_too_many_splats_those_that_cover_most_are_left() -> None:
         feature=torch.zeros(4, 3),
     )
     here = torch.zeros(1, 3)
-    assert thinned(four, 1.0, here).mean_m[:, 0].tolist() == [0, 1, 2]  # the last is too faint to be seen
-    assert thinned(four, 0.5, here).mean_m[:, 0].tolist() == [1, 2]  # 0.9 · 0.3 and 0.9 · 1 beside 0.1 · 1
+    assert thin_out(four, 1.0, here).mean_m[:, 0].tolist() == [0, 1, 2]  # the last is too faint to be seen
+    assert thin_out(four, 0.5, here).mean_m[:, 0].tolist() == [1, 2]  # 0.9 · 0.3 and 0.9 · 1 beside 0.1 · 1
     there = torch.tensor([[1.0, 1.0, 1.0], [-30.0, 0.0, 0.0]])
     far = dataclasses.replace(four, mean_m=four.mean_m * torch.tensor([1.0, 1.0, 100.0, 1.0])[:, None])
-    assert thinned(far, 0.5, there).mean_m[:, 0].tolist() == [0, 1]  # the third is 345 m away
+    assert thin_out(far, 0.5, there).mean_m[:, 0].tolist() == [0, 1]  # the third is 345 m away
 
 
 def test_a_move_is_read_off_two_poses(run: OpenedReconstruction) -> None:

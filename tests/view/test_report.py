@@ -12,19 +12,19 @@ from PIL import Image
 
 from foredrive.errors import InputError
 from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.runs import ExamplePrediction
 from foredrive.scene import Example
 from foredrive.view import palette
 from foredrive.view.example_panel import (
-    ExamplePanel,
     camera_with_paths,
     comparison_picture,
+    draw_example,
     front_camera,
-    show_panel,
 )
-from foredrive.view.hero import write_hero
+from foredrive.view.html import Provenance
 from foredrive.view.loss_curves import draw_loss_curves
-from foredrive.view.origin import Origin
-from foredrive.view.report import ReportData, write_report
+from foredrive.view.overview import write_overview
+from foredrive.view.run_report import RunReport, write_run_report
 from foredrive.view.summary_tables import (
     full_table,
     image_table,
@@ -38,13 +38,12 @@ DASH, TIMES = "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
 
 
 @pytest.fixture(scope="module")
-def panel(example: Example) -> ExamplePanel:
+def panel(example: Example) -> ExamplePrediction:
     clip = example.clip
     labels = example.occupancy.values[clip.now :, 0] > 0.5
     plan = dataclasses.replace(clip.future, xy=clip.future.xy + torch.tensor([0.0, -1.0]))
-    return ExamplePanel(
-        title="street <1>",
-        example=example,
+    return ExamplePrediction(
+        example=dataclasses.replace(example, key=("street <1>@1577836802250000",)),
         occupied=labels.roll(1, dims=2),
         rendered=clip.images[clip.now].float() / 255,
         volume=torch.randn(6, *labels.shape[1:], generator=torch.Generator().manual_seed(0)),
@@ -82,22 +81,22 @@ def summary() -> dict[str, float | int | str | None]:
 
 
 @pytest.fixture(scope="module")
-def report(panel: ExamplePanel) -> ReportData:
+def report(panel: ExamplePrediction) -> RunReport:
     lines = [{"step": i, "loss": 3.0 / i, "occ": 2.0 / i, "perc": 0.0} for i in range(1, 40)]
-    return ReportData(
+    return RunReport(
         title="A run & more",
-        origin=Origin("foredrive evaluate runs/a", "abc123", "2 cores", "2026-11-21"),
+        provenance=Provenance("foredrive evaluate runs/a", "abc123", "2 cores", "2026-11-21"),
         summary=summary(),
         losses={"pretrain": lines, "finetune": []},
-        panels=[panel],
+        examples=[panel],
         notes=["one log of five seconds"],
     )
 
 
 @pytest.fixture(scope="module")
-def html(report: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
+def html(report: RunReport, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"
-    write_report(path, report)
+    write_run_report(path, report)
     return path.read_text()
 
 
@@ -138,10 +137,10 @@ def test_every_part_is_there_and_text_is_escaped(html: str) -> None:
         "2026-11-21",
         "one log of five seconds",
         "Planning, open loop",
-        "Occupancy on voxels the lidar knows",
+        "Occupancy on known voxels",
         "Rendered images",
         "Losses",
-        "street <1>",
+        "street <1> at 2020-01-01 00:00:02.25 UTC",
         "Predicted occupancy",
         "Volume: PCA",
         "driven future (green) and plan (red)",
@@ -150,34 +149,36 @@ def test_every_part_is_there_and_text_is_escaped(html: str) -> None:
         assert part in page.text, part
 
 
-def test_names_from_outside_run_nothing(report: ReportData, panel: ExamplePanel, tmp_path: Path) -> None:
+def test_names_from_outside_run_nothing(report: RunReport, panel: ExamplePrediction, tmp_path: Path) -> None:
     example = panel.example
     rig = dataclasses.replace(example.clip.rig, names=(EVIL,) * len(example.clip.rig.names))
     clip = dataclasses.replace(example.clip, rig=rig)
     figures = {"planning.uniad.l2_avg_m": 1.0, f"planning.{EVIL}.failed": 3, EVIL: EVIL}
-    evil = ReportData(
+    evil = RunReport(
         title=EVIL,
-        origin=Origin(EVIL, EVIL, EVIL, EVIL),
+        provenance=Provenance(EVIL, EVIL, EVIL, EVIL),
         summary=figures,
         losses={EVIL: [{"step": 1, EVIL: 2.0}]},
-        panels=[dataclasses.replace(panel, title=EVIL, example=dataclasses.replace(example, clip=clip))],
+        examples=[
+            dataclasses.replace(panel, example=dataclasses.replace(example, clip=clip, key=(f"{EVIL}@0",)))
+        ],
         notes=[EVIL],
     )
-    write_report(tmp_path / "report.html", evil)
-    # title and heading, origin, failures, note, key and value, stage and loss, example, front and 12 cameras
+    write_run_report(tmp_path / "report.html", evil)
+    # title, heading, provenance, failures, note, key and value, stage and loss, example, front and 12 cameras
     assert_harmless((tmp_path / "report.html").read_text(), times=2 + 4 + 1 + 1 + 2 + 2 + 1 + 1 + 12)
 
 
 def test_failures_and_leaking_commands_are_said_first_and_loudly(html: str) -> None:
-    start = html[: html.index("In short")]
-    assert "<strong>Failed items of this model: 2.</strong>" in start
-    assert "<strong>Commands taken from the driven future, which leaks" in start
+    start = html[: html.index("Main metrics")]
+    assert "<strong>Failed clips of this model: 2.</strong>" in start
+    assert "<strong>Commands from the driven future, which leaks" in start
     assert "stand still" not in start  # no failures, nothing to say
 
 
-def test_six_cameras_stand_beside_six_rendered_views(panel: ExamplePanel) -> None:
+def test_six_cameras_stand_beside_six_rendered_views(panel: ExamplePrediction) -> None:
     order = ["front_left", "front", "front_right", "back_left", "back", "back_right"]
-    cameras = show_panel(panel).cameras
+    cameras = draw_example(panel).cameras
     assert list(cameras) == ["Camera images", "Rendered from the volume"]
     assert all([shown.caption for shown in pictures] == order for pictures in cameras.values())
 
@@ -209,7 +210,7 @@ def test_planning_tables_show_every_protocol_beside_its_baselines() -> None:
     assert (best_of(overview), best_of(detail)) == (5, 4 * 5)  # L2 only, the model's
 
 
-def test_occupancy_is_shown_against_the_best_constant() -> None:
+def test_occupancy_is_shown_against_the_occupancy_prior() -> None:
     rows = cells_of(occupancy_table(summary()))
     assert [row for row in rows if row[0] == "now"] == [
         ["now", *["0.600"] * 3, *["0.120"] * 3, f"5.00 {TIMES}"],
@@ -251,16 +252,18 @@ def test_curves_leave_out_what_is_no_loss_and_what_never_was_positive() -> None:
     assert draw_loss_curves({"finetune": []}) is None
 
 
-def test_a_log_without_images_gets_its_panel(report: ReportData, panel: ExamplePanel, tmp_path: Path) -> None:
+def test_a_log_without_images_gets_its_panel(
+    report: RunReport, panel: ExamplePrediction, tmp_path: Path
+) -> None:
     clip = panel.example.clip
     dark = dataclasses.replace(clip, image_valid=torch.zeros_like(clip.image_valid))
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
-    write_report(tmp_path / "report.html", dataclasses.replace(report, panels=[blind]))
+    write_run_report(tmp_path / "report.html", dataclasses.replace(report, examples=[blind]))
     assert "no camera images" in (tmp_path / "report.html").read_text()
     assert front_camera(dark) is None
 
 
-def test_the_front_camera_looks_ahead_and_shows_both_paths(panel: ExamplePanel) -> None:
+def test_the_front_camera_looks_ahead_and_shows_both_paths(panel: ExamplePrediction) -> None:
     clip = panel.example.clip
     front = front_camera(clip)
     assert front is not None
@@ -274,7 +277,7 @@ def test_the_front_camera_looks_ahead_and_shows_both_paths(panel: ExamplePanel) 
     assert np.nonzero(red)[1].mean() > np.nonzero(green)[1].mean()  # planned 1 m to the right
 
 
-def test_the_comparison_shows_the_key_frame_that_is_asked_for(panel: ExamplePanel) -> None:
+def test_the_comparison_shows_the_key_frame_that_is_asked_for(panel: ExamplePrediction) -> None:
     perfect = panel.example.occupancy.values[panel.example.clip.now :, 0] > 0.5
     right = dataclasses.replace(panel, occupied=perfect)
     swapped = dataclasses.replace(panel, occupied=perfect.flip(0))
@@ -285,18 +288,18 @@ def test_the_comparison_shows_the_key_frame_that_is_asked_for(panel: ExamplePane
         assert (confused[:, None] == np.array(wrong)).all(-1).any(0).all()
 
 
-def test_the_report_is_written_whole(report: ReportData, tmp_path: Path) -> None:
-    write_report(tmp_path / "report.html", dataclasses.replace(report, panels=[]))
+def test_the_report_is_written_whole(report: RunReport, tmp_path: Path) -> None:
+    write_run_report(tmp_path / "report.html", dataclasses.replace(report, examples=[]))
     assert (tmp_path / "report.html").read_text(encoding="utf-8").endswith("</html>\n")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_the_hero_needs_images(panel: ExamplePanel, tmp_path: Path) -> None:
-    write_hero(tmp_path / "hero.png", panel)
-    with Image.open(tmp_path / "hero.png") as picture:
+def test_the_overview_needs_images(panel: ExamplePrediction, tmp_path: Path) -> None:
+    write_overview(tmp_path / "overview.png", panel)
+    with Image.open(tmp_path / "overview.png") as picture:
         assert picture.width > 1500
     clip = panel.example.clip
     dark = dataclasses.replace(clip, image_valid=torch.zeros_like(clip.image_valid))
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
     with pytest.raises(InputError, match="no camera images"):
-        write_hero(tmp_path / "none.png", blind)
+        write_overview(tmp_path / "none.png", blind)

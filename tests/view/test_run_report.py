@@ -1,16 +1,16 @@
 """The report of a run: what its notes say and how its examples are named."""
 
+import dataclasses
 import json
 from pathlib import Path
 
-import torch
-
 from foredrive.data import LogPath
-from foredrive.evaluation import Failure
+from foredrive.evaluation.run import Failure
 from foredrive.recipes import find_recipe
-from foredrive.runs import Inspection, Run
+from foredrive.runs import Run
 from foredrive.scene import Example
-from foredrive.view.run_report import inspection_panel, report_on_run
+from foredrive.view.example_panel import example_title
+from foredrive.view.run_report import report_on_run
 
 SUMMARY = {"command": "foredrive evaluate a", "commit": None, "machine.cpu": "CPU", "machine.cores": 2}
 
@@ -31,7 +31,7 @@ def test_testing_on_training_logs_is_said(tmp_path: Path) -> None:
     assert fair.notes == []
     assert unfair.notes[0].startswith("1 of the 2 evaluated logs were trained on")
     assert fair.title == "nemo_tiny on a_test/two"
-    assert fair.origin.commit == "not a git checkout"
+    assert fair.provenance.commit == "not a git checkout"
     assert fair.losses["pretrain"][0]["loss"] == 2.0
     assert list(fair.losses["finetune"]) == []
 
@@ -46,16 +46,5 @@ def test_a_perceptual_loss_that_was_off_and_failures_are_said(tmp_path: Path) ->
 
 
 def test_an_example_is_named_by_log_and_time(example: Example) -> None:
-    shape = example.occupancy.spec.shape_zyx
-    inspection = Inspection(
-        example=Example(
-            example.clip, example.occupancy, example.flow, ("town_test/Town05_seed3@1577836802250000",)
-        ),
-        occupancy_prob=torch.stack([torch.full(shape, 0.4), torch.full(shape, 0.6)]),
-        rendered=torch.zeros(6, 3, 4, 4),
-        volume=torch.zeros(2, *shape),
-        plan=example.clip.future,
-    )
-    panel = inspection_panel(inspection)
-    assert panel.title == "town_test/Town05_seed3 at 2020-01-01 00:00:02.25 UTC"
-    assert panel.occupied.flatten(1).any(1).tolist() == [False, True]
+    named = dataclasses.replace(example, key=("town_test/Town05_seed3@1577836802250000",))
+    assert example_title(named) == "town_test/Town05_seed3 at 2020-01-01 00:00:02.25 UTC"

@@ -57,10 +57,10 @@ def fetch(page: SearchPage, path: str, body: object = None, **asked: object) -> 
 
 def test_a_text_has_hits_with_pictures(page: SearchPage) -> None:
     found = fetch(page, "/find", text="car at night", gap_s=0.4, top=2, view="sectors", modality="image")
-    assert found["told"] == "2 hits, all compared"
+    assert found["message"] == "2 hits, all compared"
     hit = found["hits"][0]
     assert hit["name"].startswith("flat_train/flat@")
-    assert hit["why"].startswith("image ")
+    assert hit["score"].startswith("image ")
     assert fetch(page, "/picture", key=hit["key"]).startswith(b"\xff\xd8")
 
 
@@ -83,7 +83,7 @@ def test_scenes_in_a_lasso_are_shown_tagged_and_listed(page: SearchPage, tmp_pat
     assert (len(plane["points"]), plane["total"]) == (MOMENTS, MOMENTS)
     keys = [point["key"] for point in plane["points"][1:]]
     assert [hit["key"] for hit in fetch(page, "/moments", {"keys": keys})["hits"]] == keys
-    assert fetch(page, "/tag", {"tag": "late", "keys": keys})["told"] == "2 moments are tagged late"
+    assert fetch(page, "/tag", {"tag": "late", "keys": keys})["message"] == "2 moments are tagged late"
     assert len(fetch(page, "/find", tag="late", gap_s=0, view="all")["hits"]) == 2
     assert "error" in fetch(page, "/tag", {"tag": " ", "keys": keys})
     listed = tmp_path / "clips.json"
@@ -119,7 +119,7 @@ def browse(url: str, profile: Path) -> Page:
 def test_the_page_opens_with_scenes(page: SearchPage, tmp_path: Path) -> None:
     shown = browse(page.url, tmp_path)
     assert [tag for tag, _ in shown.tags].count("figure") == MOMENTS
-    assert "3 of 3 whole scenes, evenly chosen" in shown.text
+    assert "3 of 3 whole scenes, evenly selected" in shown.text
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium here")

@@ -53,7 +53,7 @@ def test_square_brackets_are_no_markup() -> None:
 
 
 def html_of(table: Table) -> Page:
-    nothing = {"tiles": [], "diagrams": [], "frames": [], "every_figure": table}
+    nothing = {"tiles": [], "diagrams": [], "frames": [], "all_metrics": table}
     return Page(render_page("score_report.html.j2", title="t", table=table, **nothing))
 
 
@@ -62,7 +62,7 @@ def test_a_page_marks_groups_sections_and_the_best() -> None:
     heads = [attributes for tag, attributes in page.tags if tag == "th"]
     assert {"class": "group", "colspan": "2"} in heads
     assert {"class": "text", "colspan": "4"} in heads  # a section's title
-    assert heads.count({"rowspan": "2"}) == 2  # frames, here and among every figure
+    assert heads.count({"rowspan": "2"}) == 2  # frames, here and in the full table
     assert ("tr", {"class": "strong"}) in page.tags
     assert ("td", {"class": "best"}) in page.tags
 

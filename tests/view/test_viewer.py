@@ -14,9 +14,9 @@ from miniature import miniature, write_log
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.runs import Run, train_run
-from foredrive.runs.evaluate.vision import Vision
+from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import pinhole
 from foredrive.view.page import free_port
 from foredrive.view.viewer import Viewer
@@ -38,7 +38,7 @@ def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def viewer(log: LogPath, run: Run) -> Iterator[Viewer]:
-    viewer = Viewer(LogTimes(log, 96, run), "localhost", 0)
+    viewer = Viewer(LogFrames(log, 96, run), "localhost", 0)
     yield viewer
     viewer.close()
 
@@ -48,7 +48,7 @@ def node(viewer: Viewer, name: str):
 
 
 def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
-    viewer = Viewer(LogTimes(log, 96), "localhost", 0)
+    viewer = Viewer(LogFrames(log, 96), "localhost", 0)
     with urllib.request.urlopen(viewer.url) as page:
         assert page.status == 200
         assert b"<html" in page.read().lower()
@@ -65,7 +65,7 @@ def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
 def test_stepping_shows_what_was_sensed_then(viewer: Viewer) -> None:
     for index in (3, 20):
         viewer.show(index)
-        clip = viewer.times.clip(index)
+        clip = viewer.frames.clip(index)
         sweep = clip.sweeps[clip.now]
         points = sweep.points_ego[sweep.returned & sweep.valid].numpy()
         assert node(viewer, "/lidar").points == pytest.approx(points, abs=0.05)  # sent in half precision
@@ -85,20 +85,20 @@ def test_layers_stay_hidden_while_time_goes_on(viewer: Viewer) -> None:
 
 def test_the_model_is_shown_where_it_has_seen_enough(viewer: Viewer) -> None:
     viewer.show(2)  # at 0.2 s; the model wants to have seen 0.5 s
-    assert viewer.times.vision(2) is None
+    assert viewer.frames.prediction(2) is None
     viewer.show(10)
-    vision = viewer.times.vision(10)
-    assert vision is not None
+    prediction = viewer.frames.prediction(10)
+    assert prediction is not None
     panel = viewer.model
     assert panel is not None
     panel.lowest_m.value = panel.spec.lower_m[2]  # by default the road is left out
     for k in (0, 2):
-        above = float(vision.occupancy_logit[k].sigmoid().median())
+        above = float(prediction.occupancy_logit[k].sigmoid().median())
         panel.frame.value, panel.above.value = k, above
-        shown = shown_voxels(vision, k, panel.spec, above, panel.spec.lower_m[2])
+        shown = shown_voxels(prediction, k, panel.spec, above, panel.spec.lower_m[2])
         cubes = node(viewer, "/occupancy")
         assert len(cubes.batched_positions) == int(shown.sum()) > 0
-        assert cubes.position == pytest.approx(vision.T_now_ego[k, :3, 3].numpy(), abs=1e-6)
+        assert cubes.position == pytest.approx(prediction.T_now_ego[k, :3, 3].numpy(), abs=1e-6)
     assert len(node(viewer, "/plan").points) == 6
     panel.above.value = 1.0
     assert node(viewer, "/occupancy") is None
@@ -112,26 +112,28 @@ def test_what_a_camera_renders_is_what_evaluation_renders(log: LogPath, run: Run
     from foredrive.data import ClipDataset, collate
     from foredrive.runs.evaluate.predict import AgentPredictor
 
-    times = LogTimes(log, 96, run)
-    vision, observer = times.vision(10), times.observer
-    assert vision is not None
-    assert observer is not None
+    frames = LogFrames(log, 96, run)
+    prediction, predictor = frames.prediction(10), frames.predictor
+    assert prediction is not None
+    assert predictor is not None
     dataset = ClipDataset([log], run.recipe.clips, None)
-    at = next(k for k in range(len(dataset)) if dataset.now_us(k) == times.now_us[10])
+    at = next(k for k in range(len(dataset)) if dataset.now_us(k) == frames.now_us[10])
     observed = collate([dataset[at]]).clip.observed()
-    expected = AgentPredictor(observer.agent, 2, ray_stride=4).predict(observed, frozenset({"images"})).images
+    expected = (
+        AgentPredictor(predictor.agent, 2, ray_stride=4).predict(observed, frozenset({"images"})).images
+    )
     assert expected is not None
-    whole = observer.render(vision, 0, observed.rig[0, -1])
+    whole = predictor.render(prediction, 0, observed.rig[0, -1])
     assert whole[:, 2::4, 2::4].permute(0, 3, 1, 2).numpy() == pytest.approx(expected[0, 0].numpy(), abs=1e-5)
 
 
-def some_vision(flow: torch.Tensor) -> Vision:
+def some_vision(flow: torch.Tensor) -> DisplayPrediction:
     """Nothing but motion: the vehicle goes 2 m ahead and turns left by 90°."""
     turned = torch.eye(4)
     turned[:2, :2], turned[0, 3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]]), 2.0
     nothing = torch.zeros(2, *SPEC.shape_zyx)
     plan = Trajectory(torch.zeros(1, 1, 2), torch.zeros(1, 1), torch.ones(1, 1).bool(), torch.zeros(1), 0.5)
-    return Vision(nothing, nothing[:, None], torch.stack([torch.eye(4), turned]), flow, plan)
+    return DisplayPrediction(nothing, nothing[:, None], torch.stack([torch.eye(4), turned]), flow, plan)
 
 
 def test_what_stands_still_has_no_arrow_however_the_vehicle_goes() -> None:

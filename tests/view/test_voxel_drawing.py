@@ -5,7 +5,7 @@ import torch
 
 from foredrive.scene import VoxelSpec
 from foredrive.view import palette
-from foredrive.view.voxel_drawing import Eye, draw_comparison, draw_volume_pca, draw_voxels
+from foredrive.view.voxel_drawing import Viewpoint, draw_comparison, draw_volume_pca, draw_voxels
 
 SPEC = VoxelSpec(lower_m=(-4.0, -3.0, -0.5), voxel_m=0.5, shape_zyx=(4, 12, 16))
 SIZE_HW = (120, 160)
@@ -25,21 +25,21 @@ def bounds(image: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def test_a_voxel_appears_where_its_corners_project() -> None:
-    eye = Eye.behind(SPEC, SIZE_HW)
+    viewpoint = Viewpoint.behind(SPEC, SIZE_HW)
     for z, y, x in [(0, 3, 3), (3, 9, 13), (1, 6, 8)]:
-        image = draw_voxels(cells((z, y, x)), SPEC, SIZE_HW, eye)
+        image = draw_voxels(cells((z, y, x)), SPEC, SIZE_HW, viewpoint)
         corner = np.array(SPEC.lower_m) + 0.5 * np.array([x, y, z])
         corners = corner + 0.5 * np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(8, 3)
-        uv = eye.project(corners, SIZE_HW)
+        uv = viewpoint.project(corners, SIZE_HW)
         expected = (uv[:, 1].min(), uv[:, 1].max(), uv[:, 0].min(), uv[:, 0].max())
         np.testing.assert_allclose(np.array(bounds(image)) + 0.5, expected, atol=1.01)
 
 
 def test_a_near_voxel_hides_a_far_one() -> None:
-    eye = Eye(position_m=(-20.0, 0.25, 0.25), target_m=(0.0, 0.25, 0.25), focal=4.0)
+    viewpoint = Viewpoint(position_m=(-20.0, 0.25, 0.25), target_m=(0.0, 0.25, 0.25), focal=4.0)
     colours = np.zeros((*SPEC.shape_zyx, 3), dtype=np.uint8)
     colours[1, 6, 2], colours[1, 6, 12] = (200, 0, 0), (0, 200, 0)  # on the line of sight, 5 m apart
-    image = draw_voxels(cells((1, 6, 2), (1, 6, 12)), SPEC, SIZE_HW, eye, colours)
+    image = draw_voxels(cells((1, 6, 2), (1, 6, 12)), SPEC, SIZE_HW, viewpoint, colours)
     red, green, _ = image[60, 80].astype(int)
     assert red > 50
     assert green == 0

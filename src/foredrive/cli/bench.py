@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
-    from foredrive.evaluation import Benchmark
+    from foredrive.evaluation.bench import Benchmark
 
 
 def bench(
@@ -27,7 +28,8 @@ def bench(
         folder: Folder of the benchmarks. Each benchmark is a Python file that defines BENCHMARK; its file
             name has _ in place of -.
     """
-    from foredrive.evaluation import run_benchmark
+    with importing():
+        from foredrive.evaluation.bench import run_benchmark
 
     files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:
@@ -53,7 +55,7 @@ def bench(
 
 def _load(path: Path) -> "Benchmark | None":
     """Load the BENCHMARK of a file; return None if the file defines none."""
-    from foredrive.evaluation import Benchmark
+    from foredrive.evaluation.bench import Benchmark
 
     module_name = f"benchmarks.{path.stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)

@@ -7,6 +7,7 @@ import tyro
 
 from foredrive.cli.arguments import check_out_folder
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 
 def convert(
@@ -26,7 +27,8 @@ def convert(
     if not source.is_dir():
         raise InputError(f"{source}: no such folder")
 
-    from foredrive.data.convert import convert as convert_logs
+    with importing():
+        from foredrive.data.convert import convert as convert_logs
 
     for log in convert_logs(source, dataset, out):
         print(f"wrote {log.folder}")

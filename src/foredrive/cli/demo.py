@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from foredrive.cli.arguments import OptionalPath, check_out_folder
+from foredrive.lazy import importing
 
 EXAMPLES, QUICK_EXAMPLES = 4, 1
 
@@ -18,14 +19,14 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     """
     check_out_folder(out)
 
-    from rich.console import Console
+    with importing():
+        from rich.console import Console
 
-    from foredrive.evaluation import read_summary
-    from foredrive.runs import full_demo, inspect_run, quick_demo, run_demo
-    from foredrive.view.hero import write_hero
-    from foredrive.view.report import write_report
-    from foredrive.view.run_report import inspection_panel, report_on_run
-    from foredrive.view.summary_tables import print_summary
+        from foredrive.evaluation.summary import read_summary
+        from foredrive.runs import full_demo, predict_examples, quick_demo, run_demo
+        from foredrive.view.overview import write_overview
+        from foredrive.view.run_report import report_on_run, write_run_report
+        from foredrive.view.summary_tables import print_summary
 
     started = time.perf_counter()
     folder = out or Path("runs", "demo-quick" if quick else "demo")
@@ -33,9 +34,9 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     summary = read_summary(run.folder / "summary.json")
     print_summary(summary, Console(), run.recipe.name)
     print("4/4 drawing the report")
-    inspections = inspect_run(run, logs, QUICK_EXAMPLES if quick else EXAMPLES)
+    examples = predict_examples(run, logs, QUICK_EXAMPLES if quick else EXAMPLES)
     report = run.folder / "report.html"
-    write_report(report, report_on_run(run, logs, summary, inspections))
-    fastest = max(inspections, key=lambda shown: float(shown.example.clip.ego_speed_mps.amax()))
-    write_hero(run.folder / "hero.png", inspection_panel(fastest))  # its plan is long enough to be seen
+    write_run_report(report, report_on_run(run, logs, summary, examples))
+    fastest = max(examples, key=lambda shown: float(shown.example.clip.ego_speed_mps.amax()))
+    write_overview(run.folder / "hero.png", fastest)  # its plan is long enough to be seen
     print(f"done in {time.perf_counter() - started:.0f} s: the report is {report}")

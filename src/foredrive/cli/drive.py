@@ -9,6 +9,7 @@ import tyro
 from foredrive.cli.arguments import check_out_folder
 from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.suite import DriveJob, Driven
@@ -41,8 +42,8 @@ def drive(
     check_out_folder(out)
     for options in (planning, towns, rebuilt):
         options.check()
-    from foredrive.runs.drive.suite import DriveSuite, drive_suite
-    from foredrive.view.drive_report import write_drive_report
+    with importing():
+        from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
     driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = rebuilt.source() or towns.source()
@@ -51,6 +52,9 @@ def drive(
     with _Progress(len(suite.jobs())) as progress:
         driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)
     _tell(driven)
+
+    from foredrive.view.drive_report import write_drive_report
+
     print(f"look: {write_drive_report(out)}")
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -87,23 +87,22 @@ class InTowns:
 
     def source(self) -> "TownRoutes | CarlaRoutes":
         """Return the source of the drives."""
+        options: dict[str, Any] = {
+            "routes": self.routes,
+            "repetitions": self.repetitions,
+            "seed": self.seed,
+            "conditions": self.conditions,
+            "image_hw": self.image_size,
+            "vehicles": self.vehicles,
+            "people": self.people,
+        }
+        if self.carla is not None:
+            from foredrive.runs.drive.in_carla import CarlaRoutes
+
+            return CarlaRoutes(**options, server=self.carla)
         from foredrive.runs.drive.in_towns import TownRoutes
 
-        routes = TownRoutes(
-            routes=self.routes,
-            repetitions=self.repetitions,
-            seed=self.seed,
-            conditions=self.conditions,
-            image_hw=self.image_size,
-            vehicles=self.vehicles,
-            people=self.people,
-            scenarios=self.scenarios and self.carla is None,
-        )
-        if self.carla is None:
-            return routes
-        from foredrive.runs.drive.in_carla import CarlaRoutes
-
-        return CarlaRoutes(self.carla, routes)
+        return TownRoutes(**options, scenarios=self.scenarios)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from foredrive.cli.arguments import (
     check_run,
 )
 from foredrive.data.log_paths import find_all_logs
+from foredrive.lazy import importing
 
 
 def evaluate(
@@ -47,34 +48,37 @@ def evaluate(
         return
     named = find_all_logs(logs)
 
-    from rich.console import Console
-
-    from foredrive.evaluation import read_summary
-    from foredrive.runs import evaluate_run, inspect_run, open_run
-    from foredrive.view.report import write_report
-    from foredrive.view.run_report import report_on_run
-    from foredrive.view.summary_tables import print_summary
+    with importing():
+        from foredrive.runs import evaluate_run, open_run, predict_examples
 
     trained = open_run(run)
     chosen = named or trained.logs
     folder = out or run
     result = evaluate_run(trained, chosen, folder, batch_size)
+
+    from rich.console import Console
+
+    from foredrive.evaluation.summary import read_summary
+    from foredrive.view.run_report import report_on_run, write_run_report
+    from foredrive.view.summary_tables import print_summary
+
     summary = read_summary(folder / "summary.json")
     print_summary(summary, Console(), trained.recipe.name)
-    inspections = inspect_run(trained, chosen, examples)
-    report = report_on_run(trained, chosen, summary, inspections, result.failures)
-    write_report(folder / "report.html", report)
+    predictions = predict_examples(trained, chosen, examples)
+    report = report_on_run(trained, chosen, summary, predictions, result.failures)
+    write_run_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
 
 
 def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
-    from rich.console import Console
-    from rich.progress import Progress
+    with importing():
+        from rich.console import Console
+        from rich.progress import Progress
 
-    from foredrive.runs import open_run
-    from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
-    from foredrive.view.gap_table import gap_table
-    from foredrive.view.table import print_table
+        from foredrive.runs import open_run
+        from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
+        from foredrive.view.gap_table import gap_table
+        from foredrive.view.table import print_table
 
     with Progress() as progress:
         bar = progress.add_task("real and rendered")

@@ -7,6 +7,7 @@ import tyro
 
 from foredrive.cli.arguments import OptionalPath, SomePaths, check_number, check_out_folder, check_run
 from foredrive.data.log_paths import find_all_logs
+from foredrive.lazy import importing
 
 
 def export(
@@ -29,8 +30,9 @@ def export(
     check_out_folder(out)
     named = find_all_logs(logs)
 
-    from foredrive.runs import open_run
-    from foredrive.runs.export import export_run
+    with importing():
+        from foredrive.runs import open_run
+        from foredrive.runs.export import export_run
 
     trained = open_run(run)
     folder = out or run / "export"

@@ -7,6 +7,7 @@ import tyro
 
 from foredrive.cli.arguments import check_number, check_run
 from foredrive.data.log_paths import find_one_log
+from foredrive.lazy import importing
 
 
 def imagine(
@@ -38,9 +39,10 @@ def imagine(
     found = find_one_log(log)
     check_run(run)
 
-    from foredrive.runs import open_run
-    from foredrive.runs.evaluate.imagination import imagine_run
-    from foredrive.view.imagination_video import write_imagination_video
+    with importing():
+        from foredrive.runs import open_run
+        from foredrive.runs.evaluate.imagination import imagine_run
+        from foredrive.view.imagination_video import write_imagination_video
 
     opened = open_run(run)
     seen = imagine_run(opened, found, seconds=seconds, samples=samples, moments=moments)

@@ -4,6 +4,8 @@ from typing import Annotated
 
 import tyro
 
+from foredrive.lazy import importing
+
 
 def recipes(
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECIPE")] = None,
@@ -13,9 +15,10 @@ def recipes(
     Args:
         name: Print this recipe; without a name, all recipes are listed.
     """
-    from foredrive.recipes.config import recipe_yaml
-    from foredrive.recipes.gaussians import REBUILD_RECIPES, find_rebuild_recipe
-    from foredrive.recipes.known import RECIPES, find_recipe
+    with importing():
+        from foredrive.recipes.config import recipe_yaml
+        from foredrive.recipes.gaussians import REBUILD_RECIPES, find_rebuild_recipe
+        from foredrive.recipes.known import RECIPES, find_recipe
 
     if name is not None:
         recipe = find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name)

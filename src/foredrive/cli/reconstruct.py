@@ -8,6 +8,7 @@ import tyro
 
 from foredrive.cli.arguments import ImageSize, OptionalPath, Settings, check_image_size, check_out_folder
 from foredrive.data.log_paths import find_one_log
+from foredrive.lazy import importing
 
 
 def reconstruct(
@@ -44,9 +45,9 @@ def reconstruct(
     check_out_folder(out)
     found = find_one_log(log)
 
-    from foredrive.recipes.gaussians import find_rebuild_recipe
-    from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
-    from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
+    with importing():
+        from foredrive.recipes.gaussians import find_rebuild_recipe
+        from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
 
     chosen = find_rebuild_recipe(recipe, set)
     if cameras:
@@ -55,10 +56,12 @@ def reconstruct(
         chosen = dataclasses.replace(chosen, image_hw=image_size)
     run = rebuild_log(chosen, found, out, cache)
     if run.held_out.cameras:
+        from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
+
         title = f"{found.name}, frames that were held out"
         write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
     if not run.held_out.cameras and not run.held_out.sweeps:
-        print(f"{found.name} is too short for a frame to be held out: the scene is judged on nothing")
+        print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
     print(f"rebuilt {found.name} by {method}: {out}")
     for name in (
         *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),

@@ -11,6 +11,7 @@ import tyro
 
 from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 from foredrive.towns.map.names import check_town
 
 if TYPE_CHECKING:
@@ -72,8 +73,9 @@ def record(
     for name in town:
         check_town(name)
 
-    from foredrive.runs.drive.recording import record_drives, record_plan
-    from foredrive.towns.campaign import Campaign, plan_drives
+    with importing():
+        from foredrive.runs.drive.recording import record_drives, record_plan
+        from foredrive.towns.campaign import Campaign, plan_drives
 
     campaign = Campaign(
         towns=town,
@@ -138,7 +140,7 @@ def _seeds(text: str) -> tuple[int, ...] | int:
 
 def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
     """Check the names of conditions and return them; "none" alone gives no names."""
-    from foredrive.towns.conditions import ANY_CONDITIONS, find_conditions
+    from foredrive.scene.conditions import ANY_CONDITIONS, find_conditions
 
     if names in ((NO_CONDITIONS,), (ANY_CONDITIONS,)):
         return () if names == (NO_CONDITIONS,) else names

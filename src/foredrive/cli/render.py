@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import tyro
 
 from foredrive.cli.arguments import OptionalPath, check_file, check_number, check_rebuilt
+from foredrive.lazy import importing
 
 LARGEST_SHIFT_M = 100.0
 
@@ -57,11 +58,12 @@ def render(
     check_file(edits)
     check_rebuilt(run)
 
-    from foredrive.rendering.edits import load_edits
-    from foredrive.rendering.edits import save_edits as write_edits
-    from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-    from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames
-    from foredrive.view.rebuilt_video import write_rebuilt_video
+    with importing():
+        from foredrive.rendering.edits import load_edits
+        from foredrive.rendering.edits import save_edits as write_edits
+        from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
+        from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames
+        from foredrive.view.rebuilt_video import write_rebuilt_video
 
     opened = open_rebuilt(run)
     plan = plan_frames(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)

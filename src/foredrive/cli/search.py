@@ -7,6 +7,7 @@ import tyro
 from foredrive.cli.arguments import check_number
 from foredrive.cli.search_options import Among, Choose, LookFor, Name, Place, Then, as_query, check_index
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.search.find import Found
@@ -40,9 +41,10 @@ def search(
     check_index(index)
     asked = as_query(query, condition, ranking) if saved is None and untag is None else None
 
-    from foredrive.runs.search.searching import ask
-    from foredrive.search.index import FrameIndex
-    from foredrive.search.kept import remove_tag
+    with importing():
+        from foredrive.runs.search.searching import ask
+        from foredrive.search.index import FrameIndex
+        from foredrive.search.kept import remove_tag
 
     opened = FrameIndex(index)
     if untag is not None:
@@ -69,8 +71,9 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
     check_number("--port", port, low=1, high=65535)
     check_index(index)
 
-    from foredrive.search.index import FrameIndex
-    from foredrive.view.search_page import SearchPage
+    with importing():
+        from foredrive.search.index import FrameIndex
+        from foredrive.view.search_page import SearchPage
 
     page = SearchPage(FrameIndex(index), towers, host, port)
     print(f"{index} is asked at {page.url} until you press Ctrl-C", flush=True)

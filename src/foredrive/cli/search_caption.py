@@ -9,6 +9,7 @@ from foredrive.cli.arguments import SomePaths, check_number, check_out_folder
 from foredrive.cli.search import INDEX
 from foredrive.cli.search_options import Name, Place, check_index
 from foredrive.data.log_paths import find_all_logs
+from foredrive.lazy import importing
 
 
 def search_caption(
@@ -27,14 +28,15 @@ def search_caption(
     if towers is None:
         check_index(index)
 
-    from rich.console import Console
+    with importing():
+        from rich.console import Console
 
-    from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
-    from foredrive.runs.search.towers import find_towers
-    from foredrive.search.index import FrameIndex
-    from foredrive.search.query import parse_like
-    from foredrive.search.target import example_views
-    from foredrive.view.table import Column, print_table, simple_table
+        from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_captions
+        from foredrive.runs.search.towers import find_towers
+        from foredrive.search.index import FrameIndex
+        from foredrive.search.query import parse_like
+        from foredrive.search.target import example_views
+        from foredrive.view.table import Column, print_table, simple_table
 
     like = parse_like(moment)
     opened = FrameIndex(index) if towers is None else None
@@ -70,8 +72,9 @@ def search_train_captions(
     check_out_folder(out)
     found = find_all_logs(logs)
 
-    from foredrive.runs.search.captioning import train_captions
-    from foredrive.training import Schedule
+    with importing():
+        from foredrive.runs.search.captioning import train_captions
+        from foredrive.training import Schedule
 
     schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)
     print(f"wrote {train_captions(found, towers, out, schedule, stride)}")

@@ -12,6 +12,7 @@ from foredrive.cli.search import INDEX
 from foredrive.cli.search_options import Place, Seconds
 from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -49,8 +50,9 @@ def search_index(
     check_file(scores)
     found = find_all_logs(logs)
 
-    from foredrive.runs.search.indexing import index_logs
-    from foredrive.search.scores import read_scores
+    with importing():
+        from foredrive.runs.search.indexing import index_logs
+        from foredrive.search.scores import read_scores
 
     told = None if scores is None else read_scores(scores)
     with _progress() as tick:
@@ -91,7 +93,8 @@ def search_train(
     check_out_folder(out)
     found = find_all_logs(logs)
 
-    from foredrive.runs.search.tower_training import embedded_recipe, train_towers
+    with importing():
+        from foredrive.runs.search.tower_training import embedded_recipe, train_towers
 
     recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
     towers = train_towers(recipe, found, out, cache, beside)

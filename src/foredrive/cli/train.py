@@ -7,6 +7,7 @@ import tyro
 
 from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run
 from foredrive.data.log_paths import find_all_logs
+from foredrive.lazy import importing
 
 
 def train(
@@ -36,10 +37,11 @@ def train(
         check_run(start)
     found = find_all_logs(logs)
 
-    from foredrive.recipes import find_recipe, labelled_by
-    from foredrive.runs import train_run
+    with importing():
+        from foredrive.recipes import find_recipe, with_occupancy_source
+        from foredrive.runs import train_run
 
-    chosen = labelled_by(find_recipe(recipe, set), occupancy)
+    chosen = with_occupancy_source(find_recipe(recipe, set), occupancy)
     run = train_run(chosen, found, out, cache, start)
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

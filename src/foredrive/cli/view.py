@@ -8,6 +8,7 @@ import tyro
 from foredrive.cli.arguments import RUN_CONFIG, OptionalPath, check_file, check_number, check_run
 from foredrive.data.log_paths import find_one_log
 from foredrive.errors import InputError
+from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
@@ -60,22 +61,24 @@ def view(
     if run is not None:
         check_run(run)
 
-    from foredrive.view.log_sheet import CAMERA_WIDTH_PX, write_log_sheet
-    from foredrive.view.log_times import LogTimes
+    with importing():
+        from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 
-    times = LogTimes(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
-    index = times.nearest(t)
+    frames = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    index = frames.nearest(t)
     if save is not None:
-        title = f"{times.name}    t = {times.t_s[index]:.2f} s"
-        write_log_sheet(save, times.clip(index), title, reach)
+        from foredrive.view.log_sheet import write_log_sheet
+
+        title = f"{frames.name}    t = {frames.t_s[index]:.2f} s"
+        write_log_sheet(save, frames.clip(index), title, reach)
         print(f"wrote {save}")
         return
     from foredrive.view.viewer import Viewer
 
-    viewer = Viewer(times, host, port)
+    viewer = Viewer(frames, host, port)
     try:
         viewer.show(index)
-        print(f"{times.name} is at {viewer.url} until you press Ctrl-C")
+        print(f"{frames.name} is at {viewer.url} until you press Ctrl-C")
         viewer.play()
     finally:
         viewer.close()
@@ -88,9 +91,10 @@ def _opened(run: Path) -> "Run":
 
 
 def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
-    from foredrive.rendering.edits import load_edits
-    from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-    from foredrive.view.rebuilt_viewer import RebuiltViewer
+    with importing():
+        from foredrive.rendering.edits import load_edits
+        from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
+        from foredrive.view.rebuilt_viewer import RebuiltViewer
 
     run = open_rebuilt(folder)
     if t_s is not None:

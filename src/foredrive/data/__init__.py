@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from foredrive.lazy import defer_imports, on_demand
+from foredrive.lazy import defer_imports, defer_package, on_demand
 
 if TYPE_CHECKING:
     from foredrive.data.batches import collate
@@ -38,3 +38,6 @@ defer_imports(
         ),
     },
 )
+# py123d needs these for single formats only: written maps, raw AV2 and PandaSet logs, LAZ files.
+for _package in ("pandas", "geopandas", "laspy"):
+    defer_package(_package)

@@ -58,7 +58,7 @@ def load_pickle(file: Path) -> Any:
     return _load(file, open, _PLAIN)
 
 
-def load_table(file: Path) -> pd.DataFrame:
+def load_table(file: Path) -> "pd.DataFrame":
     """Load a gzipped pickle of one pandas table of numbers and strings.
 
     Raises:

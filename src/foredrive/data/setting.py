@@ -5,6 +5,8 @@ import enum
 from dataclasses import dataclass
 from typing import Any
 
+from foredrive.scene.conditions import FOG_M, Conditions
+
 
 class TimeOfDay(enum.StrEnum):
     """Time of day by the position of the sun."""
@@ -16,6 +18,19 @@ class TimeOfDay(enum.StrEnum):
     AFTERNOON = "afternoon"
     DUSK = "dusk"
 
+    @classmethod
+    def at_hour(cls, hour: float) -> "TimeOfDay":
+        """Return the time of day by the height of the sun and, during the day, by the hour (solar time)."""
+        if hour < 5.3 or hour >= 18.7:
+            return cls.NIGHT
+        if hour < 6.7:
+            return cls.DAWN
+        if hour >= 17.3:
+            return cls.DUSK
+        if hour < 11.0:
+            return cls.MORNING
+        return cls.MIDDAY if hour < 13.0 else cls.AFTERNOON
+
 
 class Weather(enum.StrEnum):
     """Weather. Rain has priority over fog, and fog over the state of the sky."""
@@ -25,6 +40,17 @@ class Weather(enum.StrEnum):
     OVERCAST = "overcast"
     RAIN = "rain"
     FOG = "fog"
+
+    @classmethod
+    def under(cls, conditions: Conditions) -> "Weather":
+        """Return the weather of some conditions in one word."""
+        if conditions.rain_mmph > 0:
+            return cls.RAIN
+        if conditions.visibility_m < FOG_M:
+            return cls.FOG
+        if conditions.clouds >= 0.9:
+            return cls.OVERCAST
+        return cls.CLOUDY if conditions.clouds >= 0.5 else cls.CLEAR
 
 
 class Place(enum.StrEnum):

@@ -6,10 +6,9 @@ from typing import Protocol
 
 from foredrive.errors import InputError
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import OccupancyPrior
+from foredrive.evaluation.summary import Figures
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.scene import Clip, Example, VoxelGrid
-
-Figures = dict[str, float | int | str]
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ from pathlib import Path
 import torch
 
 import foredrive
+from foredrive.evaluation.summary import Figures
 
 GIB = 1024**3
 CODE = ("--", "src", "pyproject.toml")
 """Paths that figures depend on, as arguments to git."""
 
 
-def collect_provenance() -> dict[str, float | int | str | None]:
+def collect_provenance() -> Figures:
     """Return the facts needed to repeat a measurement, as flat dotted keys."""
     return {
         "machine.cpu": _cpu_model(),

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.metrics import psnr_db, ssim
+from foredrive.metrics.images import psnr_db, ssim
 from foredrive.metrics.lidar_rendering import SweepScores, score_sweep
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
@@ -21,7 +21,7 @@ MOVING_MPS = 0.5
 
 
 @torch.no_grad()
-def judge_cameras(
+def evaluate_cameras(
     scene: RebuiltScene,
     views: Sequence[CameraView],
     learned: Sequence[CameraView],
@@ -73,7 +73,7 @@ def _image(view: CameraView) -> Float[Tensor, "1 3 H W"]:
 
 
 @torch.no_grad()
-def judge_sweeps(
+def evaluate_sweeps(
     scene: RebuiltScene,
     views: Sequence[SweepView],
     *,

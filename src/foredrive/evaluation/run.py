@@ -15,7 +15,7 @@ from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactor
 from foredrive.evaluation.metrics import METRICS
 from foredrive.evaluation.predictor import Part, PlannerPredictor, Prediction, Predictor
 from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.metrics import OccupancyPrior
+from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.metrics.protocols import STEPS
 from foredrive.scene import Agent, Example, Trajectory
 
@@ -73,31 +73,31 @@ def evaluate(
     """
     started = time.perf_counter()
     context = EvaluationContext(frame_dt_s, prior)
-    model = _Judged(predictor, metrics, context)
+    model = _EvaluatedMethod(predictor, metrics, context)
     planners = {
-        name: _Judged(PlannerPredictor(planner), metrics, context, only=frozenset({"plan"}))
+        name: _EvaluatedMethod(PlannerPredictor(planner), metrics, context, only=frozenset({"plan"}))
         for name, planner in (baselines or {}).items()
     }
     with torch.inference_mode():
         for loaded in _load(loader, model.failures, on_items):
             example = loaded.to(device)
-            for judged in (model, *planners.values()):
-                judged.add(example)
+            for method in (model, *planners.values()):
+                method.add(example)
             on_items(len(example.key))
     failed = len(model.failures)
     if model.items == 0:
         first = f"all {failed} items failed, {model.failures[0].reason}" if failed else "no items"
         raise InputError(f"there is nothing to evaluate: {first}")
     summary = model.figures()
-    for name, judged in planners.items():
-        summary |= judged.figures(f"{name}.") | {f"planning.{name}.failed": len(judged.failures)}
+    for name, method in planners.items():
+        summary |= method.figures(f"{name}.") | {f"planning.{name}.failed": len(method.failures)}
     summary |= _command_figures(command_source or {})
     summary |= {"items": model.items + failed, "failed": failed}
     summary |= {"peak_rss_gib": peak_rss_gib(), "wall_s": time.perf_counter() - started}
     return EvaluationResult(summary, tuple(model.failures))
 
 
-class _Judged:
+class _EvaluatedMethod:
     """A model or baseline, its metrics and its failures.
 
     Args:
@@ -115,7 +115,7 @@ class _Judged:
         started = [start(context) for start in metrics]
         self._metrics = [metric for metric in started if only is None or metric.needs <= only]
         self._asked: frozenset[Part] = frozenset().union(*(metric.needs for metric in self._metrics))
-        self._met = [only is not None for _ in self._metrics]
+        self._has_figures = [only is not None for _ in self._metrics]
         """Which metrics give figures: those that were updated, and all of them where `only` is given."""
         self.failures: list[Failure] = []
         self.items = 0
@@ -129,13 +129,13 @@ class _Judged:
             for number, metric in enumerate(self._metrics):
                 if all(getattr(prediction, part) is not None for part in metric.needs):
                     metric.update(prediction, truth)
-                    self._met[number] = True
+                    self._has_figures[number] = True
 
     def figures(self, infix: str = "") -> Figures:
         """Return the figures of all metrics, `infix` standing between a metric's name and its keys."""
         return {
             f"{metric.name}.{infix}{key}": value
-            for metric, met in zip(self._metrics, self._met, strict=True)
+            for metric, met in zip(self._metrics, self._has_figures, strict=True)
             if met
             for key, value in metric.result().items()
         }
@@ -154,7 +154,7 @@ class _Judged:
                 else:
                     self.failures.append(Failure(example.key[int(chosen)], _line(error)))
                 continue
-            good = _whole(prediction).cpu()
+            good = _is_complete(prediction).cpu()
             bad = chosen[~good].tolist()
             self.failures.extend(Failure(example.key[i], "not finite or incomplete") for i in bad)
             if good.all():
@@ -188,20 +188,20 @@ def _select(example: Example, chosen: Tensor) -> Example:
     return dataclasses.replace(example[chosen], key=tuple(example.key[i] for i in chosen.tolist()))
 
 
-def _whole(prediction: Prediction) -> Bool[Tensor, "b"]:
+def _is_complete(prediction: Prediction) -> Bool[Tensor, "b"]:
     """Return which of b predictions are finite in all their parts.
 
     Raises:
         InputError: if all parts are None.
     """
     parts = [getattr(prediction, part) for part in get_args(Part)]
-    fine = [_whole_part(part) for part in parts if part is not None]
+    fine = [_is_part_complete(part) for part in parts if part is not None]
     if not fine:
         raise InputError("the model predicted nothing")
     return torch.stack(fine).all(dim=0)
 
 
-def _whole_part(part: Trajectory | Tensor) -> Bool[Tensor, "b"]:
+def _is_part_complete(part: Trajectory | Tensor) -> Bool[Tensor, "b"]:
     """Return which of b items are finite; a plan has all steps that are scored, too."""
     if isinstance(part, Trajectory):
         fine = part.valid & part.xy.isfinite().all(dim=-1) & part.yaw.isfinite()

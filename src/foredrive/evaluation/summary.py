@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +9,10 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
 Value = float | int | str | None
-_BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
+Summary = Mapping[str, Value]
+"""Figures under flat dotted keys, as in summary.json; None where nothing could be counted."""
+Figures = dict[str, Value]
+"""A summary while it is put together."""
 
 
 def write_json(path: Path, content: object) -> None:
@@ -19,12 +21,12 @@ def write_json(path: Path, content: object) -> None:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
-def write_summary(path: Path, summary: Mapping[str, Value]) -> None:
+def write_summary(path: Path, summary: Summary) -> None:
     """Write a flat summary (dotted keys) as JSON, keys in their given order."""
     write_json(path, dict(summary))
 
 
-def read_summary(path: Path) -> dict[str, Value]:
+def read_summary(path: Path) -> Figures:
     """Read what `write_summary` wrote."""
     try:
         summary = json.loads(path.read_text())
@@ -41,12 +43,3 @@ def _finite(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def occupancy_baselines(summary: Mapping[str, Value]) -> dict[str, str]:
-    """Return the keys and titles of all that is judged by the IoU of occupancy beside the model.
-
-    They are the occupancy prior, persistence, ego-compensated persistence and sampled futures.
-    """
-    found = [match[1] for key in summary if (match := _BASELINE.fullmatch(key))]
-    return {name: name.replace("_", " ") for name in dict.fromkeys(found) if "threshold" not in name}

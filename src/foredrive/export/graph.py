@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor, nn
 
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.ego_mlp import ego_motion, route_lead
+from foredrive.models.agent import AgentOutput, PlanningAgent
+from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.scene import CameraRig, Clip, Frames, last_frames
 
 
@@ -31,7 +31,7 @@ class GraphInputs(NamedTuple):
     frame_speed_valid: Bool[Tensor, "1 T"]
 
     @classmethod
-    def of(cls, observed: Clip, agent: PlanningAgent[Any]) -> "GraphInputs":
+    def from_clip(cls, observed: Clip, agent: PlanningAgent[Any]) -> "GraphInputs":
         """Return the inputs of `agent` from an observed clip with a batch of one."""
         frames = last_frames(observed, agent.world_model.past_frames)
         poses, speeds = ego_motion(observed, agent.planner.history)
@@ -46,7 +46,7 @@ class GraphInputs(NamedTuple):
             command=observed.command.long(),
             command_valid=observed.command_valid,
             past_motion=torch.cat([poses, speeds[:, :-1, None]], dim=-1),
-            route_lead=route_lead(observed),
+            route_lead=route_target(observed),
             frame_t_s=frames.t_s.contiguous(),
             T_now_frame=frames.T_now_ego.contiguous(),
             frame_speed_mps=frames.speed_mps.contiguous(),
@@ -61,6 +61,18 @@ class GraphOutputs(NamedTuple):
     waypoints_yaw: Float[Tensor, "1 S"]
     occupancy_logit: Float[Tensor, "1 F Z Y X"]
     T_now_ego: Float[Tensor, "1 F 4 4"]
+
+    @classmethod
+    def from_agent(cls, output: AgentOutput) -> "GraphOutputs":
+        """Return the outputs of the graph from those of the agent."""
+        now = torch.eye(4)[None]
+        poses = [now if belief.T_now_ego is None else belief.T_now_ego for belief in output.beliefs]
+        return cls(
+            waypoints_xy=output.plan.xy[:, 0],
+            waypoints_yaw=output.plan.yaw[:, 0],
+            occupancy_logit=torch.stack([decoded.occupancy_logit for decoded in output.decoded], dim=1),
+            T_now_ego=torch.stack(poses, dim=1),
+        )
 
 
 MEANING = {
@@ -144,18 +156,12 @@ class AgentGraph(nn.Module):
             speed_valid=frame_speed_valid,
         )
         now = model.encode(frames)
-        beliefs = [now, *model.imagine(now, max(self.steps, planner.looks_ahead))]
-        planned_on = self.agent.planned_on
-        ahead = planned_on(beliefs[1]) if planner.looks_ahead else None
+        beliefs = [now, *model.imagine(now, max(self.steps, planner.imagined_frames))]
+        volume = self.agent.planner_volume
+        future = volume(beliefs[1]) if planner.imagined_frames else None
         plan = planner(
-            planned_on(now), ahead, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
+            volume(now), future, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
         )
-        shown = beliefs[: self.steps + 1]
-        poses = [torch.eye(4)[None] if belief.T_now_ego is None else belief.T_now_ego for belief in shown]
-        outputs = GraphOutputs(
-            waypoints_xy=plan.xy[:, 0],
-            waypoints_yaw=plan.yaw[:, 0],
-            occupancy_logit=torch.stack([model.decode(belief).occupancy_logit for belief in shown], dim=1),
-            T_now_ego=torch.stack(poses, dim=1),
-        )
-        return outputs._asdict()
+        beliefs = beliefs[: self.steps + 1]
+        decoded = [model.decode(belief) for belief in beliefs]
+        return GraphOutputs.from_agent(AgentOutput(beliefs, decoded, plan))._asdict()

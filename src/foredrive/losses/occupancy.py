@@ -5,6 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.losses.masked import masked_mean
+
 EPS = 1e-6
 
 
@@ -20,7 +22,7 @@ def occupancy_bce(
     """
     weight = logit.new_tensor([occupied_weight])
     per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none", pos_weight=weight)
-    return (per_voxel * known).sum() / known.sum().clamp_min(1)
+    return masked_mean(per_voxel, known)
 
 
 def scene_class_affinity(

@@ -6,6 +6,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.losses.masked import masked_mean
+
 ImageFeatures = Callable[[Float[Tensor, "n 3 H W"]], Sequence[Float[Tensor, "n _c _h _w"]]]
 
 
@@ -13,8 +15,7 @@ def l1_loss(
     predicted: Float[Tensor, "n 3 H W"], truth: Float[Tensor, "n 3 H W"], valid: Bool[Tensor, "n"]
 ) -> Float[Tensor, ""]:
     """Return the mean absolute colour error of the valid images, RGB in [0, 1]; 0 when none is valid."""
-    per_image = (predicted - truth).abs().mean(dim=(1, 2, 3))
-    return (per_image * valid).sum() / valid.sum().clamp_min(1)
+    return masked_mean((predicted - truth).abs().mean(dim=(1, 2, 3)), valid)
 
 
 def perceptual_loss(

@@ -5,8 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-DEPTH_QUANTILE = 0.95
-"""The worst beams are left out: they met something thin or moving."""
+from foredrive.losses.masked import masked_mean
+
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
@@ -29,26 +29,29 @@ def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Floa
         stack = F.conv2d(stack, kernel.expand(15, 1, -1, -1), groups=15)
     mean_a, mean_b, aa, bb, ab = stack[0].unflatten(0, (5, 3)).unbind(0)
     var_a, var_b, cov = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
-    likeness = (2 * mean_a * mean_b + _SSIM_C1) * (2 * cov + _SSIM_C2)
-    return (likeness / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (var_a + var_b + _SSIM_C2))).mean()
+    similarity = (2 * mean_a * mean_b + _SSIM_C1) * (2 * cov + _SSIM_C2)
+    return (similarity / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (var_a + var_b + _SSIM_C2))).mean()
 
 
 def range_loss(
-    rendered_m: Float[Tensor, "P"], real_m: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
+    rendered_m: Float[Tensor, "P"], real_m: Float[Tensor, "P"], returned: Bool[Tensor, "P"], quantile: float
 ) -> Float[Tensor, ""]:
-    """Return the mean absolute error of returned beams, without the worst twentieth; 0 without any."""
+    """Return the mean absolute error of returned beams up to a quantile of the error; 0 if none returned.
+
+    The worst beams are left out, because they hit something thin or moving.
+    """
     error = (rendered_m - real_m).abs()[returned]
     if not len(error):
         return rendered_m.new_zeros(())
-    worst = error.detach().kthvalue(max(int(DEPTH_QUANTILE * len(error)), 1)).values
-    return error[error <= worst].mean()
+    limit = error.detach().kthvalue(max(int(quantile * len(error)), 1)).values
+    return error[error <= limit].mean()
 
 
 def intensity_loss(
     rendered: Float[Tensor, "P"], real: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
 ) -> Float[Tensor, ""]:
     """Return the mean squared error of the beams that returned; 0 if none did."""
-    return ((rendered - real) ** 2 * returned).sum() / returned.sum().clamp_min(1)
+    return masked_mean((rendered - real) ** 2, returned)
 
 
 def drop_loss(drop_logit: Float[Tensor, "P"], returned: Bool[Tensor, "P"]) -> Float[Tensor, ""]:
@@ -60,4 +63,4 @@ def line_of_sight_loss(
     alpha_before_hit: Float[Tensor, "P"], returned: Bool[Tensor, "P"]
 ) -> Float[Tensor, ""]:
     """Return the mean share of light that is stopped before the beam's hit; 0 if none returned."""
-    return (alpha_before_hit * returned).sum() / returned.sum().clamp_min(1)
+    return masked_mean(alpha_before_hit, returned)

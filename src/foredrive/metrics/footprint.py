@@ -46,7 +46,7 @@ def polygon_hits(
     centre, size_lw, yaw = _seen_from_above(boxes)
     direction = torch.stack([heading.cos(), heading.sin()], dim=-1)
     ego_size = torch.tensor(protocol.ego_size_lw_m).to(path_xy).expand_as(path_xy)
-    ego = rectangle(path_xy + protocol.centre_ahead_m * direction, ego_size, heading)[:, :, None]
+    ego = rectangle(path_xy + protocol.centre_forward_m * direction, ego_size, heading)[:, :, None]
     other = rectangle(centre, size_lw, yaw)  # [b, T, M, 4, 2]
     apart = _apart_along(heading[..., None], ego, other) | _apart_along(yaw, ego, other)
     inside = (_turn(path_xy[:, :, None] - centre, -yaw).abs() <= 0.5 * size_lw).all(dim=-1)
@@ -130,7 +130,7 @@ def _ego_template(protocol: PlanningProtocol, grid: ObstacleGrid) -> Float[Tenso
     """Return centres (forward, sideways) of the cells inside an ego vehicle whose point is at the origin."""
     length_m, width_m = protocol.ego_size_lw_m
     centres = _first_centre_m(grid) + grid.cell_m * torch.arange(_cells(grid), dtype=torch.float64)
-    forward = centres[(centres - protocol.centre_ahead_m).abs() < 0.5 * length_m]
+    forward = centres[(centres - protocol.centre_forward_m).abs() < 0.5 * length_m]
     sideways = centres[centres.abs() < 0.5 * width_m]
     return torch.cartesian_prod(forward, sideways)
 

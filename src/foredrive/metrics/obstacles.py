@@ -25,9 +25,9 @@ class Obstacles(Record):
     """Leading dimensions [b T]."""
     annotated: Bool[Tensor, "b T"]
     """Whether the step has annotations at all."""
-    seen_now: Bool[Tensor, "b T M"]
+    tracked_now: Bool[Tensor, "b T M"]
     """Whether the box's track is annotated at now."""
-    seen_lately: Bool[Tensor, "b T M"]
+    tracked_lately: Bool[Tensor, "b T M"]
     """Whether it is annotated at now or within the second before."""
     annotated_now: Bool[Tensor, "b"]
 
@@ -70,8 +70,8 @@ def future_obstacles(clip: Clip, steps: int, step_s: float) -> Obstacles:
     return Obstacles(
         boxes=boxes,
         annotated=annotated,
-        seen_now=_tracked(boxes, clip.boxes.track_id[:, now : now + 1], past_valid[:, now : now + 1]),
-        seen_lately=_tracked(boxes, clip.boxes.track_id[:, : now + 1], past_valid[:, : now + 1]),
+        tracked_now=_tracked(boxes, clip.boxes.track_id[:, now : now + 1], past_valid[:, now : now + 1]),
+        tracked_lately=_tracked(boxes, clip.boxes.track_id[:, : now + 1], past_valid[:, : now + 1]),
         annotated_now=clip.boxes_valid[:, now],
     )
 

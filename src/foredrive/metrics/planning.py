@@ -23,16 +23,16 @@ class PlanScores(Record):
     """
 
     l2_m: Float[Tensor, "b H"]
-    """Distance between planned and driven rear axle."""
+    """Distance between plan_complete and driven rear axle."""
     collision: Float[Tensor, "b H"]
     """Share of steps (as the protocol has it) at which the ego box touches an obstacle ("obj_box_col")."""
     collision_centre: Float[Tensor, "b H"]
     """The same for the path's point alone ("obj_col")."""
     driven_collision: Float[Tensor, "b H"]
     """The same for the box of the driven vehicle: boxes and paths are not exact."""
-    planned: Bool[Tensor, "b"]
+    plan_complete: Bool[Tensor, "b"]
     """True if the plan has all its steps, finite. Otherwise it is a failure, not a score."""
-    complete: Bool[Tensor, "b"]
+    future_complete: Bool[Tensor, "b"]
     """Whether the driven future has all its steps."""
     counted: Bool[Tensor, "b"]
     """Whether the protocol counts the frame."""
@@ -55,9 +55,9 @@ def score_plan(
     driven_xy, driven_yaw, driven_valid = _first_steps(driven, "driven future")
     if obstacles.annotated.shape[1] != STEPS:
         raise InputError(f"expected obstacles at {STEPS} steps, got {obstacles.annotated.shape[1]}")
-    planned = (plan_valid & plan_xy.isfinite().all(dim=-1) & plan_yaw.isfinite()).all(dim=-1)
-    complete = driven_valid.all(dim=-1)
-    counted = planned if protocol.frames == "all" else planned & complete
+    plan_complete = (plan_valid & plan_xy.isfinite().all(dim=-1) & plan_yaw.isfinite()).all(dim=-1)
+    future_complete = driven_valid.all(dim=-1)
+    counted = plan_complete if protocol.frames == "all" else plan_complete & future_complete
 
     distance_m = torch.where(driven_valid, (plan_xy - driven_xy).norm(dim=-1), 0.0)
     boxes = _relevant_boxes(obstacles, protocol)
@@ -75,8 +75,8 @@ def score_plan(
         collision=masked(_at_horizons(plan_box & scored, protocol.collision), collision_counted),
         collision_centre=masked(_at_horizons(plan_point & scored, protocol.collision), collision_counted),
         driven_collision=masked(_at_horizons(driven_box & known, protocol.collision), collision_counted),
-        planned=planned,
-        complete=complete,
+        plan_complete=plan_complete,
+        future_complete=future_complete,
         counted=counted,
         collision_counted=collision_counted,
     )
@@ -96,11 +96,11 @@ def _relevant_boxes(obstacles: Obstacles, protocol: PlanningProtocol) -> Boxes:
     boxes = obstacles.boxes
     seen = {
         "anytime": torch.ones_like(boxes.valid),
-        "observed": obstacles.seen_lately,
-        "now": obstacles.seen_now,
+        "observed": obstacles.tracked_lately,
+        "now": obstacles.tracked_now,
     }[protocol.known]
     wanted = torch.tensor(sorted(protocol.categories), device=boxes.category.device)
-    ahead = torch.tensor([protocol.point_ahead_m, 0.0, 0.0]).to(boxes.centre)
+    ahead = torch.tensor([protocol.point_forward_m, 0.0, 0.0]).to(boxes.centre)
     return dataclasses.replace(
         boxes, centre=boxes.centre - ahead, valid=boxes.valid & seen & torch.isin(boxes.category, wanted)
     )
@@ -109,7 +109,7 @@ def _relevant_boxes(obstacles: Obstacles, protocol: PlanningProtocol) -> Boxes:
 def _hits(xy: Tensor, yaw: Tensor, boxes: Boxes, protocol: PlanningProtocol) -> tuple[Tensor, Tensor]:
     """Return whether box and point of a vehicle on a rear-axle path [b T 2] touch a box, both [b T]."""
     lever = torch.stack([yaw.cos() - 1, yaw.sin()], dim=-1)
-    path = xy + protocol.point_ahead_m * lever
+    path = xy + protocol.point_forward_m * lever
     heading = path_headings(path, protocol.heading)
     if protocol.grid is None:
         return polygon_hits(path, heading, boxes, protocol)

@@ -34,9 +34,9 @@ HORIZON_STEPS = (1, 3, 5)
 HORIZON_NAMES = ("1s", "2s", "3s")
 
 EGO_SIZE_LW_M = (4.084, 1.85)
-LIDAR_AHEAD_M = 0.985793
+LIDAR_FORWARD_M = 0.985793
 """Distance of nuScenes' lidar ahead of the rear axle; most of the protocols follow its path."""
-EGO_CENTRE_AHEAD_M = 0.5
+EGO_CENTRE_FORWARD_M = 0.5
 """Distance of the vehicle's centre ahead of the followed point, in public code."""
 
 VEHICLES = frozenset(
@@ -84,9 +84,9 @@ class PlanningProtocol:
     heading: Literal["now", "step", "path"]
     """The ego box keeps its heading at now, turns along each step of at least 1 m, or along the path."""
     ego_size_lw_m: tuple[float, float]
-    point_ahead_m: float
+    point_forward_m: float
     """The point whose path is followed, and the origin of boxes and grid, ahead of the rear axle."""
-    centre_ahead_m: float
+    centre_forward_m: float
     """Centre of the ego box ahead of that point."""
     frames: Literal["all", "complete"]
     """All frames, steps without a driven pose adding 0; or frames whose driven future is complete."""
@@ -102,8 +102,8 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         grid=ObstacleGrid(cell_m=0.5, reach_m=50.0, column_axis="left", row_step="down", corner="nearest"),
         heading="now",
         ego_size_lw_m=EGO_SIZE_LW_M,
-        point_ahead_m=0.0,  # its boxes are relative to the rear axle: the ego box sits 1 m too far back
-        centre_ahead_m=EGO_CENTRE_AHEAD_M,
+        point_forward_m=0.0,  # its boxes are relative to the rear axle: the ego box sits 1 m too far back
+        centre_forward_m=EGO_CENTRE_FORWARD_M,
         frames="complete",
     ),
     "uniad": PlanningProtocol(
@@ -115,8 +115,8 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         grid=ObstacleGrid(cell_m=0.5, reach_m=50.0, column_axis="right", row_step="down", corner="nearest"),
         heading="now",
         ego_size_lw_m=EGO_SIZE_LW_M,
-        point_ahead_m=LIDAR_AHEAD_M,
-        centre_ahead_m=EGO_CENTRE_AHEAD_M,
+        point_forward_m=LIDAR_FORWARD_M,
+        centre_forward_m=EGO_CENTRE_FORWARD_M,
         frames="all",
     ),
     "vad": PlanningProtocol(
@@ -128,8 +128,8 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         grid=ObstacleGrid(cell_m=0.5, reach_m=50.0, column_axis="right", row_step="up", corner="nearest"),
         heading="now",
         ego_size_lw_m=EGO_SIZE_LW_M,
-        point_ahead_m=LIDAR_AHEAD_M,
-        centre_ahead_m=EGO_CENTRE_AHEAD_M,
+        point_forward_m=LIDAR_FORWARD_M,
+        centre_forward_m=EGO_CENTRE_FORWARD_M,
         frames="complete",
     ),
     "sparsedrive": PlanningProtocol(
@@ -141,8 +141,8 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         grid=None,
         heading="path",
         ego_size_lw_m=EGO_SIZE_LW_M,
-        point_ahead_m=LIDAR_AHEAD_M,
-        centre_ahead_m=EGO_CENTRE_AHEAD_M,
+        point_forward_m=LIDAR_FORWARD_M,
+        centre_forward_m=EGO_CENTRE_FORWARD_M,
         frames="complete",
     ),
     "bevplanner": PlanningProtocol(
@@ -154,8 +154,8 @@ PROTOCOLS: dict[str, PlanningProtocol] = {
         grid=ObstacleGrid(cell_m=0.1, reach_m=50.0, column_axis="left", row_step="down", corner="down"),
         heading="step",
         ego_size_lw_m=EGO_SIZE_LW_M,
-        point_ahead_m=0.0,
-        centre_ahead_m=EGO_CENTRE_AHEAD_M + LIDAR_AHEAD_M,
+        point_forward_m=0.0,
+        centre_forward_m=EGO_CENTRE_FORWARD_M + LIDAR_FORWARD_M,
         frames="complete",
     ),
 }

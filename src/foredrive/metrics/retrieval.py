@@ -41,7 +41,7 @@ def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B 
     return np.concatenate([np.arange(sequences)[None], drawn])
 
 
-def with_interval(values: Float[np.ndarray, "B"]) -> tuple[float, float, float]:
+def mean_and_interval(values: Float[np.ndarray, "B"]) -> tuple[float, float, float]:
     """Return the value of all sequences, and its 2.5 and 97.5 % quantiles over `draw_sequences`."""
     low, high = np.nanquantile(values[1:], (0.025, 0.975))
     return float(values[0]), float(low), float(high)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.models.ego_mlp import ego_motion, route_lead
+from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
@@ -33,11 +33,11 @@ class PlanningAgent(nn.Module, Generic[W]):
 
     def forward(self, clip: Clip, steps: int) -> AgentOutput:
         """Observe the clip, imagine `steps` key frames (and those the planner needs), and plan."""
-        beliefs = self.foresee(clip, max(steps, self.planner.looks_ahead))
+        beliefs = self.rollout(clip, max(steps, self.planner.imagined_frames))
         decoded = [self.world_model.decode(belief) for belief in beliefs[: steps + 1]]
         return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs))
 
-    def foresee(self, clip: Clip, steps: int) -> list[Belief]:
+    def rollout(self, clip: Clip, steps: int) -> list[Belief]:
         """Return the beliefs about now and about the next `steps` key frames."""
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
@@ -47,22 +47,22 @@ class PlanningAgent(nn.Module, Generic[W]):
         now = clip.now
         poses, speeds = ego_motion(clip, self.planner.history)
         plan: Trajectory = self.planner(
-            self.planned_on(beliefs[0]),
-            self.planned_on(beliefs[1]) if self.planner.looks_ahead else None,
+            self.planner_volume(beliefs[0]),
+            self.planner_volume(beliefs[1]) if self.planner.imagined_frames else None,
             clip.command,
             clip.command_valid,
             clip.ego_speed_mps[:, now],
             clip.ego_speed_valid[:, now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
-            route_lead(clip) if self.planner.target else None,
+            route_target(clip) if self.planner.target else None,
         )
         return plan
 
-    def planned_on(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
+    def planner_volume(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
         """Return the volume that the planner reads."""
         return self.world_model.volume_for(belief, "plan")
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan from now on."""
-        return self.plan(observation, self.foresee(observation, self.planner.looks_ahead))
+        return self.plan(observation, self.rollout(observation, self.planner.imagined_frames))

@@ -5,13 +5,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import LiftingLayer, directions_2d, place_code, project_to_cameras, refine
-from foredrive.ops.attention3d import attend_volume
-from foredrive.ops.lifting import lift
+from foredrive.models.lifting import (
+    CameraCrossAttention,
+    LiftingLayer,
+    NeighbourhoodAttention,
+    directions_2d,
+    position_code,
+    project_to_cameras,
+    refine,
+)
 from foredrive.scene import CameraRig, VoxelSpec
 
 
@@ -33,96 +38,6 @@ class BevConfig:
     checkpoint: bool = False
     """Keep only the input of each round for the backward pass and recompute the rest."""
     kind: Literal["bev"] = "bev"
-
-
-class PlaneSelfAttention(nn.Module):
-    """Deformable self-attention in the plane: each cell reads P learned places around itself, in H heads."""
-
-    def __init__(self, channels: int, heads: int, points: int) -> None:
-        super().__init__()
-        self.heads, self.points = heads, points
-        self.value = nn.Linear(channels, channels)
-        self.offset = nn.Linear(channels, heads * points * 2)
-        self.weight = nn.Linear(channels, heads * points)
-        self.out = nn.Linear(channels, channels)
-        nn.init.zeros_(self.offset.weight)
-        radius = torch.arange(1, points + 1).view(1, points, 1)
-        with torch.no_grad():
-            self.offset.bias.copy_((directions_2d(heads)[:, None] * radius).flatten())
-        nn.init.zeros_(self.weight.weight)
-        nn.init.zeros_(self.weight.bias)
-
-    def forward(
-        self, query: Float[Tensor, "b Q W"], shape_zyx: tuple[int, int, int], place: Float[Tensor, "Q 3"]
-    ) -> Float[Tensor, "b Q W"]:
-        """Attend among the cells of the plane.
-
-        Args:
-            query: cell features in Y X order.
-            shape_zyx: (1, Y, X).
-            place: cell centres in cell units (x, y, z = 0.5).
-        """
-        b, q, _ = query.shape
-        offset = F.pad(self.offset(query).view(b, q, self.heads, self.points, 2), (0, 1))
-        weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
-        values = self.value(query).view(b, *shape_zyx, -1)
-        return self.out(attend_volume(values, place[:, None, None] + offset, weight))
-
-
-class PillarCrossAttention(nn.Module):
-    """Deformable cross-attention of a cell: it reads around the projections of K heights above it.
-
-    As in BEVFormer, the P points of a head and level are divided among the heights, and one softmax weights
-    all of them. Each height is averaged over the cameras that see it.
-
-    Args:
-        features: channels of the image features.
-        channels: W, channels of the cells.
-        heads, levels, points: as in `CameraCrossAttention`; `points` is per height.
-        pillars: K.
-    """
-
-    def __init__(
-        self, features: int, channels: int, heads: int, levels: int, points: int, pillars: int
-    ) -> None:
-        super().__init__()
-        self.shape = (pillars, heads, levels, points)
-        self.value = nn.Linear(features, channels)
-        self.offset = nn.Linear(channels, pillars * heads * levels * points * 2)
-        self.weight = nn.Linear(channels, pillars * heads * levels * points)
-        self.out = nn.Linear(channels, channels)
-        nn.init.zeros_(self.offset.weight)
-        radius = torch.arange(points).view(1, points, 1)
-        with torch.no_grad():
-            spread = directions_2d(heads)[:, None, None] * radius
-            self.offset.bias.copy_(spread.expand(*self.shape, 2).flatten())
-        nn.init.zeros_(self.weight.weight)
-        nn.init.zeros_(self.weight.bias)
-
-    def forward(
-        self,
-        query: Float[Tensor, "_b Q W"],
-        features: Sequence[Float[Tensor, "b C _h _w D"]],
-        uv: Float[Tensor, "b C N 2"],
-        visible: Bool[Tensor, "b C N"],
-    ) -> Float[Tensor, "b Q W"]:
-        """Attend to the cameras.
-
-        Args:
-            query: cells, of batch size b or 1.
-            features: image features, one tensor per level.
-            uv, visible: projections of N = Q·K points, heights last, and their visibility.
-        """
-        b, q = len(uv), query.shape[1]
-        pillars, heads, levels, points = self.shape
-        offset = self.offset(query).view(-1, q * pillars, heads, levels, points, 2)
-        score = self.weight(query).view(-1, q, *self.shape).transpose(2, 3)  # [b Q H K L P]
-        weight = score.flatten(3).softmax(-1).view(score.shape).transpose(2, 3).flatten(1, 2)
-        values = [self.value(level) for level in features]
-        read = lift(
-            values, uv, visible, offset.expand(b, *offset.shape[1:]), weight.expand(b, *weight.shape[1:])
-        )
-        return self.out(read.unflatten(1, (q, pillars)).sum(2))
 
 
 class BevEncoder(nn.Module):
@@ -156,13 +71,15 @@ class BevEncoder(nn.Module):
         )
         pillars_m = torch.tensor(spec.lower_m) + spec.voxel_m * pillar.flatten(0, 1)
         self.register_buffer("pillars_m", pillars_m, persistent=False)
-        self.query = nn.Parameter(place_code(spec.centres_m(place.device)[0].flatten(0, 1), width))
+        self.query = nn.Parameter(position_code(spec.centres_m(place.device)[0].flatten(0, 1), width))
         self.layers = nn.ModuleList(
             [
                 LiftingLayer(
                     width,
-                    PlaneSelfAttention(width, heads, points),
-                    PillarCrossAttention(channels, width, heads, levels, points, pillars),
+                    NeighbourhoodAttention(width, directions_2d(heads), points),
+                    CameraCrossAttention(
+                        channels, width, heads=heads, levels=levels, points=points, heights=pillars
+                    ),
                     config.feed_forward,
                 )
                 for _ in range(config.layers)

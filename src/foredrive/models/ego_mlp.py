@@ -23,11 +23,11 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
     """
     now = clip.now
     if now < past_frames:
-        raise InputError(f"the ego status needs {past_frames} frames before now, the clip has {now}")
-    seen = slice(now - past_frames, now + 1)
-    T_now_ego = compose_se3(inverse_se3(clip.T_world_ego[:, now : now + 1]), clip.T_world_ego[:, seen])
+        raise InputError(f"the ego status needs {past_frames} frames before now, but the clip has {now}")
+    frames = slice(now - past_frames, now + 1)
+    T_now_ego = compose_se3(inverse_se3(clip.T_world_ego[:, now : now + 1]), clip.T_world_ego[:, frames])
     poses = torch.cat([T_now_ego[..., :2, 3], yaw_from_matrix(T_now_ego)[..., None]], dim=-1)[:, :-1]
-    return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, seen]
+    return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, frames]
 
 
 def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[Tensor, "b S"]:
@@ -36,30 +36,30 @@ def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[T
     Accelerations are implied by the speeds.
 
     Args:
-        target: append `route_lead`.
+        target: append `route_target`.
     """
     poses, speeds = ego_motion(clip, past_frames)
-    leads = route_lead(clip) if target else None
-    return status_row(poses, speeds, clip.command, clip.command_valid, leads)
+    target_xy1 = route_target(clip) if target else None
+    return status_vector(poses, speeds, clip.command, clip.command_valid, target_xy1)
 
 
-def route_lead(clip: Clip) -> Float[Tensor, "b 3"]:
+def route_target(clip: Clip) -> Float[Tensor, "b 3"]:
     """Return the target point of the route: x, y (m) and 1; zeros where it is unknown."""
     known = clip.target_valid[:, None]
     return torch.cat([torch.where(known, clip.target_xy, 0.0), known.to(clip.target_xy)], dim=-1)
 
 
-def status_row(
+def status_vector(
     poses: Float[Tensor, "b P 3"],
     speeds: Float[Tensor, "b P+1"],
     command: Int[Tensor, "b"],
     command_valid: Bool[Tensor, "b"],
-    lead: Float[Tensor, "b 3"] | None = None,
+    target: Float[Tensor, "b 3"] | None = None,
 ) -> Float[Tensor, "b S"]:
-    """Return the numbers of `ego_status` in order. `route_lead` comes last, if given."""
+    """Return the numbers of `ego_status` in order. `route_target` comes last, if given."""
     one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
-    row = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
-    return row if lead is None else torch.cat([row, lead.to(row)], dim=-1)
+    status = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
+    return status if target is None else torch.cat([status, target.to(status)], dim=-1)
 
 
 @dataclass(frozen=True)

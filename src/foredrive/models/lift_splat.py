@@ -33,25 +33,25 @@ class LiftSplatEncoder(nn.Module):
         config: depths.
         spec: grid whose plane and range of heights are filled.
         channels: D of the image features.
-        width: C of the plane.
+        plane_channels: C of the plane.
         levels: number of image feature levels; only the finest is read.
     """
 
     depths_m: Tensor
 
     def __init__(
-        self, config: LiftSplatConfig, spec: VoxelSpec, *, channels: int, width: int, levels: int
+        self, config: LiftSplatConfig, spec: VoxelSpec, *, channels: int, plane_channels: int, levels: int
     ) -> None:
         super().__init__()
-        self.spec, self.width = spec, width
+        self.spec, self.plane_channels = spec, plane_channels
         depths_m = torch.arange(config.near_m, config.far_m, config.step_m)
         self.register_buffer("depths_m", depths_m, persistent=False)
-        self.depth_and_context = nn.Linear(channels, len(self.depths_m) + width)
+        self.depth_and_context = nn.Linear(channels, len(self.depths_m) + plane_channels)
         self.out = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.GroupNorm(config.norm_groups, width),
+            nn.Conv2d(plane_channels, plane_channels, 3, padding=1),
+            nn.GroupNorm(config.norm_groups, plane_channels),
             nn.ReLU(),
-            nn.Conv2d(width, width, 1),
+            nn.Conv2d(plane_channels, plane_channels, 1),
         )
 
     def forward(
@@ -62,8 +62,8 @@ class LiftSplatEncoder(nn.Module):
     ) -> Float[Tensor, "b _W Y X"]:
         """Encode image features as a plane."""
         finest = features[0]
-        told = self.depth_and_context(finest).float()
-        depth, context = told.split([len(self.depths_m), self.width], dim=-1)
+        sizes = [len(self.depths_m), self.plane_channels]
+        depth, context = self.depth_and_context(finest).float().split(sizes, dim=-1)
         depth = depth.softmax(-1) * image_valid[:, :, None, None, None]
         cell, inside = self.cells(rig, (finest.shape[2], finest.shape[3]))
         plane = splat(depth.flatten(1, 3), context.flatten(1, 3), cell, inside, self.spec.shape_zyx[1:])
@@ -107,8 +107,8 @@ def splat(
         cell: index y · X + x of each of the P = N·K points; any value where not `inside`.
     """
     b, count, width = len(share), size_yx[0] * size_yx[1], feature.shape[-1]
-    whose = inside.flatten().nonzero()[:, 0] // share.shape[-1]
-    values = share.flatten(1)[inside][:, None] * feature.flatten(0, 1)[whose]
+    source = inside.flatten().nonzero()[:, 0] // share.shape[-1]
+    values = share.flatten(1)[inside][:, None] * feature.flatten(0, 1)[source]
     first = torch.arange(b, device=cell.device)[:, None] * count
     plane = values.new_zeros(b * count, width).index_add(0, (first + cell)[inside], values)
     return plane.view(b, *size_yx, width).permute(0, 3, 1, 2)

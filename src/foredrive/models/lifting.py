@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -14,7 +15,7 @@ from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
-from foredrive.scene import CameraRig, VoxelSpec
+from foredrive.scene import CameraRig, Frames, VoxelSpec
 
 
 def directions_2d(heads: int) -> Float[Tensor, "H 2"]:
@@ -34,7 +35,7 @@ def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
     return grid / grid.abs().amax(-1, keepdim=True)
 
 
-def place_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, "Q D"]:
+def position_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tensor, "Q D"]:
     """Return the initial queries: sines and cosines of the position of each voxel relative to the vehicle.
 
     Direction, distance and height come first, because they decide how cameras see a place; then x and y.
@@ -69,81 +70,106 @@ class LiftingConfig:
     kind: Literal["lifting"] = "lifting"
 
 
-class VolumeSelfAttention(nn.Module):
-    """Deformable self-attention in 3-D: each voxel reads P learned places around itself, in H heads."""
+class NeighbourhoodAttention(nn.Module):
+    """Deformable self-attention: each cell reads P learned places around itself, in H heads.
 
-    def __init__(self, channels: int, heads: int, points: int) -> None:
+    Args:
+        channels: D.
+        directions: direction of each head's first offsets, [H, 3] in a volume and [H, 2] in a plane.
+        points: P.
+    """
+
+    def __init__(self, channels: int, directions: Float[Tensor, "H _d"], points: int) -> None:
         super().__init__()
-        self.heads, self.points = heads, points
+        self.heads, self.dims = directions.shape
+        self.points = points
         self.value = nn.Linear(channels, channels)
-        self.offset = nn.Linear(channels, heads * points * 3)
-        self.weight = nn.Linear(channels, heads * points)
+        self.offset = nn.Linear(channels, self.heads * points * self.dims)
+        self.weight = nn.Linear(channels, self.heads * points)
         self.out = nn.Linear(channels, channels)
-        nn.init.zeros_(self.offset.weight)
         radius = torch.arange(1, points + 1).view(1, points, 1)
-        with torch.no_grad():
-            self.offset.bias.copy_((_directions_3d(heads)[:, None] * radius).flatten())
-        nn.init.zeros_(self.weight.weight)
-        nn.init.zeros_(self.weight.bias)
+        _begin_attention(self.offset, self.weight, directions[:, None] * radius)
 
     def forward(
         self, query: Float[Tensor, "b Q D"], shape_zyx: tuple[int, int, int], place: Float[Tensor, "Q 3"]
     ) -> Float[Tensor, "b Q D"]:
-        """Attend among the voxels.
+        """Attend among the cells.
 
         Args:
-            query: voxel features in Z Y X order.
-            shape_zyx: shape of their grid.
-            place: voxel centres in voxel units (x, y, z).
+            query: cell features in Z Y X order.
+            shape_zyx: shape of their grid; (1, Y, X) for a plane.
+            place: cell centres in cell units (x, y, z).
         """
         b, q, _ = query.shape
-        offset = self.offset(query).view(b, q, self.heads, self.points, 3)
+        offset = self.offset(query).view(b, q, self.heads, self.points, self.dims)
+        if self.dims == 2:
+            offset = F.pad(offset, (0, 1))
         weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
         values = self.value(query).view(b, *shape_zyx, -1)
         return self.out(attend_volume(values, place[:, None, None] + offset, weight))
 
 
 class CameraCrossAttention(nn.Module):
-    """Deformable cross-attention: each voxel reads P learned places around its projection, per level."""
+    """Deformable cross-attention: each cell reads P learned places around its projections, per level.
 
-    def __init__(self, channels: int, heads: int, levels: int, points: int) -> None:
+    A voxel has one projection into each camera. A cell of a plane has one for each of K heights above it. As
+    in BEVFormer, one softmax then weights the points of all heights, and each height is averaged over the
+    cameras that see it.
+
+    Args:
+        features: channels of the image features.
+        channels: channels of the cells.
+        heads: H.
+        levels: L, number of image feature levels.
+        points: P, per head, level and height.
+        heights: K.
+    """
+
+    def __init__(
+        self, features: int, channels: int, *, heads: int, levels: int, points: int, heights: int = 1
+    ) -> None:
         super().__init__()
-        self.heads, self.levels, self.points = heads, levels, points
-        self.value = nn.Linear(channels, channels)
-        self.offset = nn.Linear(channels, heads * levels * points * 2)
-        self.weight = nn.Linear(channels, heads * levels * points)
+        self.shape = (heights, heads, levels, points)
+        self.value = nn.Linear(features, channels)
+        self.offset = nn.Linear(channels, heights * heads * levels * points * 2)
+        self.weight = nn.Linear(channels, heights * heads * levels * points)
         self.out = nn.Linear(channels, channels)
-        nn.init.zeros_(self.offset.weight)
-        radius = torch.arange(points).view(1, 1, points, 1)  # the first point starts on the projection
-        with torch.no_grad():
-            spread = directions_2d(heads)[:, None, None] * radius
-            self.offset.bias.copy_(spread.expand(heads, levels, points, 2).flatten())
-        nn.init.zeros_(self.weight.weight)
-        nn.init.zeros_(self.weight.bias)
+        radius = torch.arange(points).view(1, points, 1)  # the first point starts on the projection
+        spread = directions_2d(heads)[:, None, None] * radius
+        _begin_attention(self.offset, self.weight, spread.expand(*self.shape, 2))
 
     def forward(
         self,
-        query: Float[Tensor, "_b Q D"],
+        query: Float[Tensor, "_b Q W"],
         features: Sequence[Float[Tensor, "b C _h _w D"]],
-        uv: Float[Tensor, "b C Q 2"],
-        visible: Bool[Tensor, "b C Q"],
-    ) -> Float[Tensor, "b Q D"]:
+        uv: Float[Tensor, "b C N 2"],
+        visible: Bool[Tensor, "b C N"],
+    ) -> Float[Tensor, "b Q W"]:
         """Attend to the cameras.
 
         Args:
-            query: voxel features, of batch size b or 1.
+            query: cell features, of batch size b or 1.
             features: image features, one tensor per level.
-            uv, visible: projections of the voxels and their visibility per camera.
+            uv, visible: projections of N = Q·K points, heights last, and their visibility per camera.
         """
-        q, b = query.shape[1], len(uv)
-        offset = self.offset(query).view(-1, q, self.heads, self.levels, self.points, 2)
-        weight = self.weight(query).view(-1, q, self.heads, self.levels * self.points).softmax(-1)
-        weight = weight.view(-1, q, self.heads, self.levels, self.points)
+        b, q = len(uv), query.shape[1]
+        heights, *per_height = self.shape
+        offset = self.offset(query).view(-1, q * heights, *per_height, 2)
+        score = self.weight(query).view(-1, q, *self.shape).transpose(2, 3)  # [b Q H K L P]
+        weight = score.flatten(3).softmax(-1).view(score.shape).transpose(2, 3).flatten(1, 2)
         values = [self.value(level) for level in features]
-        read = lift(
+        sampled = lift(
             values, uv, visible, offset.expand(b, *offset.shape[1:]), weight.expand(b, *weight.shape[1:])
         )
-        return self.out(read)
+        return self.out(sampled if heights == 1 else sampled.unflatten(1, (q, heights)).sum(2))
+
+
+def _begin_attention(offset: nn.Linear, weight: nn.Linear, first_offsets: Float[Tensor, "... _d"]) -> None:
+    """Start deformable attention at fixed offsets with equal weights."""
+    with torch.no_grad():
+        offset.bias.copy_(first_offsets.flatten())
+    for parameter in (offset.weight, weight.weight, weight.bias):
+        nn.init.zeros_(parameter)
 
 
 class LiftingLayer(nn.Module):
@@ -151,8 +177,8 @@ class LiftingLayer(nn.Module):
 
     Args:
         channels: D.
-        self_attention: among the queries, as `VolumeSelfAttention`.
-        cross_attention: to the cameras, as `CameraCrossAttention`.
+        self_attention: a `NeighbourhoodAttention` among the queries.
+        cross_attention: a `CameraCrossAttention` to the images.
         feed_forward: hidden width as a multiple of D.
     """
 
@@ -216,6 +242,15 @@ def project_to_cameras(
     return uv / size_wh, inside & image_valid[..., None]
 
 
+def lift_frames(frames: Frames, backbone: nn.Module, encoder: nn.Module) -> Float[Tensor, "b T ..."]:
+    """Return the volume or plane of each frame, in its own ego frame."""
+    b, t, c = frames.image_valid.shape
+    features = [level.unflatten(0, (b * t, c)) for level in backbone(frames.images.flatten(0, 2))]
+    rig = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
+    lifted: Tensor = encoder(features, rig, frames.image_valid.flatten(0, 1))
+    return lifted.unflatten(0, (b, t))
+
+
 class LiftingEncoder(nn.Module):
     """An encoder from learned queries F ∈ R^{X×Y×Z×D} to a volume V (NeMo eq. 1).
 
@@ -236,13 +271,15 @@ class LiftingEncoder(nn.Module):
         self.register_buffer("centres_m", centres, persistent=False)
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
         self.register_buffer("place", place, persistent=False)
-        self.query = nn.Parameter(place_code(centres, channels))
+        self.query = nn.Parameter(position_code(centres, channels))
         self.layers = nn.ModuleList(
             [
                 LiftingLayer(
                     channels,
-                    VolumeSelfAttention(channels, config.heads, config.points),
-                    CameraCrossAttention(channels, config.heads, levels, config.points),
+                    NeighbourhoodAttention(channels, _directions_3d(config.heads), config.points),
+                    CameraCrossAttention(
+                        channels, channels, heads=config.heads, levels=levels, points=config.points
+                    ),
                     config.feed_forward,
                 )
                 for _ in range(config.layers)

@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
-from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_row
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.models.few_queries import FewQueriesDecoderLayer
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import Command, Trajectory, VoxelSpec
 
 MOVES_M = 0.1
+"""Minimum length of a step that has a heading of its own, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +25,8 @@ class PathCorrectionConfig:
 
     distances_m: tuple[float, ...]
     """Distances along the path. Beyond its end, the path continues straight."""
-    aside_m: tuple[float, ...] = (-3.0, 0.0, 3.0)
-    """Lateral offsets that are read: on the path and in the lanes beside it."""
+    lateral_m: tuple[float, ...] = (-3.0, 0.0, 3.0)
+    """Lateral offsets that are sampled: on the path and in the lanes beside it."""
     width: int
     hidden: int
     """Channels kept for each distance."""
@@ -57,7 +58,7 @@ class PlannerConfig:
     """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning. None corrects the plan
     that goes straight on at the present speed."""
     path: PathCorrectionConfig | None = None
-    """Also read the volume along the initial plan. Not in the paper."""
+    """Also sample the volume along the initial plan. Not in the paper."""
     feed_forward: float = 2.0
     """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
     dropout: float = 0.1
@@ -101,51 +102,51 @@ class FutureAttention(nn.Module):
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
-class PathReads(NamedTuple):
+class PathSamples(NamedTuple):
     """Features of a volume along a plan, at D distances and S lateral offsets."""
 
     values: Float[Tensor, "b D S F"]
     """Columns of the volume at these places, F = Z·D features."""
-    places_m: Float[Tensor, "b D S 2"]
+    positions_m: Float[Tensor, "b D S 2"]
     """Positions in the ego frame, m."""
 
 
 class PathCorrection(nn.Module):
     """A correction of a plan from the volume features along it.
 
-    Columns of the volume are read at given distances on the path and beside it. The same inputs then mean the
-    same place along the path whatever its curve, so braking for an obstacle in the lane is not learned anew
-    for every cell of the plane. The columns can be stored, so that many thousand demonstrations train it in
-    seconds (`training.fit_path`). The thousand demonstrations of fine-tuning would teach it nothing
+    Columns of the volume are sampled at given distances on the path and beside it. The same inputs then mean
+    the same place along the path whatever its curve, so braking for an obstacle in the lane is not learned
+    anew for every cell of the plane. The columns can be stored, so that many thousand demonstrations train it
+    in seconds (`training.fit_path`). The thousand demonstrations of fine-tuning are too few
     (`bench nemo-planning-limits`).
 
     Args:
         config: sizes.
         spec: grid of the volume.
         channels: channels of the volume.
-        told: number of inputs about the ego vehicle, because whether 20 m is near depends on its speed.
+        status: width of the ego status, an input because whether 20 m is near depends on the speed.
         steps: T, steps of the plan.
     """
 
     distances_m: Tensor
-    aside_m: Tensor
+    lateral_m: Tensor
     lower_m: Tensor
     mean: Tensor
     std: Tensor
 
     def __init__(
-        self, config: PathCorrectionConfig, spec: VoxelSpec, *, channels: int, told: int, steps: int
+        self, config: PathCorrectionConfig, spec: VoxelSpec, *, channels: int, status: int, steps: int
     ) -> None:
         super().__init__()
         self.voxel_m, self.place_scale_m = spec.voxel_m, config.place_scale_m
         self.register_buffer("distances_m", torch.tensor(config.distances_m), persistent=False)
-        self.register_buffer("aside_m", torch.tensor(config.aside_m), persistent=False)
+        self.register_buffer("lateral_m", torch.tensor(config.lateral_m), persistent=False)
         self.register_buffer("lower_m", torch.tensor(spec.lower_m[:2]), persistent=False)
         features, width, hidden = spec.shape_zyx[0] * channels, config.width, config.hidden
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
         self.place = nn.Sequential(
-            nn.Linear(len(config.aside_m) * (features + 2), width),
+            nn.Linear(len(config.lateral_m) * (features + 2), width),
             nn.ReLU(),
             nn.Dropout(config.dropout),
             nn.Linear(width, hidden),
@@ -154,7 +155,7 @@ class PathCorrection(nn.Module):
             nn.Linear(len(config.distances_m) * hidden, width), nn.ReLU(), nn.Dropout(config.dropout)
         )
         self.change = nn.Sequential(
-            nn.Linear(width + told, width),
+            nn.Linear(width + status, width),
             nn.ReLU(),
             nn.Linear(width, 2 * steps),
             nn.Unflatten(1, (steps, 2)),
@@ -162,29 +163,29 @@ class PathCorrection(nn.Module):
         for parameter in self.change[-2].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, reads: PathReads, told: Float[Tensor, "b S"]) -> Float[Tensor, "b T 2"]:
+    def forward(self, samples: PathSamples, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 2"]:
         """Return corrections of the steps between waypoints, m.
 
         Args:
-            reads: see `read`.
-            told: inputs about the ego vehicle, in numbers of order 1.
+            samples: see `sample`.
+            status: standardised ego status.
         """
-        values = (reads.values.float() - self.mean) / self.std
-        seen = torch.cat([values, reads.places_m / self.place_scale_m], dim=-1).flatten(2)
-        along = self.together(self.place(seen).flatten(1))
-        return self.change(torch.cat([along, told], dim=-1)).float()
+        values = (samples.values.float() - self.mean) / self.std
+        columns = torch.cat([values, samples.positions_m / self.place_scale_m], dim=-1).flatten(2)
+        along = self.together(self.place(columns).flatten(1))
+        return self.change(torch.cat([along, status], dim=-1)).float()
 
-    def read(self, volume: Float[Tensor, "b D Z Y X"], path_xy: Float[Tensor, "b T 2"]) -> PathReads:
-        """Read the volume along a path from the origin of the ego frame through waypoints."""
-        places = self.places(path_xy)
+    def sample(self, volume: Float[Tensor, "b D Z Y X"], path_xy: Float[Tensor, "b T 2"]) -> PathSamples:
+        """Sample the volume along a path from the origin of the ego frame through waypoints."""
+        positions_m = self.positions_m(path_xy)
         columns = volume.permute(0, 3, 4, 2, 1).flatten(3).contiguous()
-        with full_precision(columns, places) as (values, at):
-            cells = F.pad((at - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
-            read = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at.shape[1:3])
-        return PathReads(read, places)
+        with full_precision(columns, positions_m) as (values, at_m):
+            cells = F.pad((at_m - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
+            samples = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at_m.shape[1:3])
+        return PathSamples(samples, positions_m)
 
-    def places(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
-        """Return the positions to read: at every distance along the path, at S lateral offsets."""
+    def positions_m(self, path_xy: Float[Tensor, "b T 2"]) -> Float[Tensor, "b D S 2"]:
+        """Return the positions to sample: at every distance along the path, at S lateral offsets."""
         steps = torch.diff(path_xy, dim=1, prepend=torch.zeros_like(path_xy[:, :1]))
         lengths = steps.norm(dim=-1)[:, None]  # [b, 1, T]
         begins = lengths.cumsum(-1) - lengths
@@ -194,9 +195,9 @@ class PathCorrection(nn.Module):
         forward = torch.stack([yaw.cos(), yaw.sin()], dim=-1)  # [b, T, 2]
         on_path = share @ steps + beyond[..., None] * forward[:, -1:]
         step = (self.distances_m[:, None] >= begins).sum(-1) - 1  # [b, D]: index of the last step begun
-        ahead = forward.gather(1, step[..., None].expand(-1, -1, 2))
-        left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
-        return on_path[:, :, None] + self.aside_m[:, None] * left[:, :, None]
+        along = forward.gather(1, step[..., None].expand(-1, -1, 2))
+        left = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
+        return on_path[:, :, None] + self.lateral_m[:, None] * left[:, :, None]
 
 
 class VolumePlanner(nn.Module):
@@ -245,8 +246,8 @@ class VolumePlanner(nn.Module):
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command
-        told = 2 + 4 * config.history + 3 * config.target
-        self.speed = nn.Sequential(nn.Linear(told, width), nn.ReLU(), nn.Linear(width, width))
+        inputs = 2 + 4 * config.history + 3 * config.target
+        self.speed = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
         # Pre-norm keeps a direct path for speed and command, which determine most of a plan.
@@ -260,13 +261,15 @@ class VolumePlanner(nn.Module):
         if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
             for parameter in self.waypoints[-1].parameters():
                 nn.init.zeros_(parameter)
-        told = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
+        status = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
         self.path: PathCorrection | None = None
         if config.path is not None:
-            self.path = PathCorrection(config.path, spec, channels=channels, told=told, steps=horizon_steps)
+            self.path = PathCorrection(
+                config.path, spec, channels=channels, status=status, steps=horizon_steps
+            )
 
     @property
-    def looks_ahead(self) -> int:
+    def imagined_frames(self) -> int:
         """Number of key frames that have to be imagined for a plan."""
         return 0 if self.config.future == "none" else 1
 
@@ -279,7 +282,7 @@ class VolumePlanner(nn.Module):
         speed_mps: Float[Tensor, "b"],
         speed_valid: Bool[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
-        lead: Float[Tensor, "b 3"] | None = None,
+        target: Float[Tensor, "b 3"] | None = None,
     ) -> Trajectory:
         """Plan in the ego frame at now.
 
@@ -287,32 +290,32 @@ class VolumePlanner(nn.Module):
             now, future: volumes at now and, if it is used, at the next key frame.
             command, command_valid, speed_mps, speed_valid: values at now.
             past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
-            lead: see `route_lead`; required if `target` is set.
+            target: see `route_target`; required if the config's `target` is set.
         """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
         speed_mps = torch.where(speed_valid, speed_mps, 0.0)
-        unseen, told = self.without_looking(command, command_valid, speed_mps, past, lead)
+        initial_xy, ego_status = self.initial_plan(command, command_valid, speed_mps, past, target)
         command = torch.where(command_valid, command, len(Command))
         sizes = self.config
         status = torch.stack([speed_mps / sizes.speed_scale_mps, speed_valid.to(speed_mps)], dim=-1)
         past_scale = past.new_tensor((sizes.past_scale_m, sizes.past_scale_m, 1.0, sizes.speed_scale_mps))
         status = torch.cat([status, (past / past_scale).flatten(1)], dim=-1)
-        if self.target and lead is not None:
-            lead_scale = lead.new_tensor((sizes.target_scale_m, sizes.target_scale_m, 1.0))
-            status = torch.cat([status, lead / lead_scale], dim=-1)
+        if self.target and target is not None:
+            target_scale = target.new_tensor((sizes.target_scale_m, sizes.target_scale_m, 1.0))
+            status = torch.cat([status, target / target_scale], dim=-1)
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
-        asked = self.fuse_query(query)[:, None]
+        query = self.fuse_query(query)[:, None]
         for layer in self.decoder:
-            asked = layer(asked, memory)
-        change = self.waypoints(asked[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
+            query = layer(query, memory)
+        change = self.waypoints(query[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
         change = sizes.step_scale_m * change
         if self.path is not None:
-            change = change + self.path(self.path.read(now, unseen), told)
-        xy = (unseen + change.cumsum(dim=1))[:, None]
+            change = change + self.path(self.path.sample(now, initial_xy), ego_status)
+        xy = (initial_xy + change.cumsum(dim=1))[:, None]
         return Trajectory(
             xy=xy,
             yaw=_headings(xy),
@@ -322,24 +325,24 @@ class VolumePlanner(nn.Module):
         )
 
     @torch.no_grad()
-    def without_looking(
+    def initial_plan(
         self,
         command: Int[Tensor, "b"],
         command_valid: Bool[Tensor, "b"],
         speed_mps: Float[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
-        lead: Float[Tensor, "b 3"] | None = None,
+        target: Float[Tensor, "b 3"] | None = None,
     ) -> tuple[Float[Tensor, "b T 2"], Float[Tensor, "b _S"]]:
         """Return the initial plan and the standardised ego status (no columns without an ego MLP)."""
-        if self.target and lead is None:
-            raise ValueError("this planner knows where the route leads")
+        if self.target and target is None:
+            raise ValueError("this planner needs the target point of the route")
         if self.ego_mlp is None:
             step = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
             return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1), step[:, :0]
-        told = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
-        with full_precision(past, told) as (poses, speeds):
-            known = lead if self.target else None
-            status = status_row(poses[..., :3], speeds, command, command_valid, known)
+        speeds_mps = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
+        with full_precision(past, speeds_mps) as (poses, speeds):
+            target = target if self.target else None
+            status = status_vector(poses[..., :3], speeds, command, command_valid, target)
             return self.ego_mlp(status)[..., :2], self.ego_mlp.standardised(status)
 
     def _fuse(
@@ -348,7 +351,7 @@ class VolumePlanner(nn.Module):
         if self.config.future == "none":
             return now
         if future is None:
-            raise ValueError("this planner looks at the next volume too")
+            raise ValueError("this planner needs the next volume too")
         return torch.cat([now, future], 1) if self.fuse_future is None else self.fuse_future(now, future)
 
 

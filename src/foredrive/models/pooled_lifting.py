@@ -26,17 +26,16 @@ class PooledLiftingEncoder(nn.Module):
         config: sizes.
         spec: grid of the volume.
         channels: D.
-        width: C of the plane.
+        plane_channels: C of the plane.
         levels: number of image feature levels.
     """
 
     def __init__(
-        self, config: PooledLiftingConfig, spec: VoxelSpec, *, channels: int, width: int, levels: int
+        self, config: PooledLiftingConfig, spec: VoxelSpec, *, channels: int, plane_channels: int, levels: int
     ) -> None:
         super().__init__()
-        self.width = width
         self.lifting = LiftingEncoder(config.lifting, spec, channels=channels, levels=levels)
-        self.fold = nn.Linear(spec.shape_zyx[0] * channels, width)
+        self.fold = nn.Linear(spec.shape_zyx[0] * channels, plane_channels)
 
     @property
     def spec(self) -> VoxelSpec:

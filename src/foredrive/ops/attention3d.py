@@ -8,7 +8,7 @@ from torch import Tensor
 from foredrive.geometry.precision import full_precision
 from foredrive.ops.corners import BLOCK
 from foredrive.ops.precision import MAX_ITEM_SIZE, numba_supports, triton_supports
-from foredrive.ops.volume_reading import ReadVolume, readers_of
+from foredrive.ops.volume_numba import AttendVolume, channel_slices
 
 
 def attend_volume(
@@ -45,14 +45,14 @@ def attend_volume(
         raise ValueError(f"attend_volume: shapes do not fit together (D must be a multiple of H): {shapes}")
     small = values[:1].numel() < MAX_ITEM_SIZE
     if small and triton_supports(values, points, weights):
-        from foredrive.ops.volume_triton import read_volume_triton  # Triton may be missing
+        from foredrive.ops.volume_triton import attend_volume_triton  # Triton may be missing
 
-        return read_volume_triton(values, points, weights)
+        return attend_volume_triton(values, points, weights)
     if not (small and per_head <= BLOCK and numba_supports(values, points, weights)):
         return attend_volume_reference(values, points, weights)
-    readers = readers_of(heads, values.shape[-1])
+    slices = channel_slices(heads, values.shape[-1])
     with full_precision(values, points, weights) as (values, points, weights):
-        out: Tensor = ReadVolume.apply(values, points, weights, readers)
+        out: Tensor = AttendVolume.apply(values, points, weights, slices)
         return out
 
 

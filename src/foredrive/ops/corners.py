@@ -43,7 +43,22 @@ def new_block(axes):
 
 @inlined_part
 @no_type_check
-def read_point(values, base, block, p, corners, total, zero):
+def set_corners(block, i, weight, row0, row1, x0, x1, wy0, wy1, wx0, wx1, channels):
+    """Fill `corner` and `part` at i for four corners in one plane. row0 and row1 are starts of pixel rows."""
+    corner, part = block.corner, block.part
+    corner[i] = (row0 + x0) * channels
+    corner[BLOCK + i] = (row0 + x1) * channels
+    corner[2 * BLOCK + i] = (row1 + x0) * channels
+    corner[3 * BLOCK + i] = (row1 + x1) * channels
+    part[i] = weight * wy0 * wx0
+    part[BLOCK + i] = weight * wy0 * wx1
+    part[2 * BLOCK + i] = weight * wy1 * wx0
+    part[3 * BLOCK + i] = weight * wy1 * wx1
+
+
+@inlined_part
+@no_type_check
+def sample_point(values, base, block, p, corners, total, zero):
     """Return total + weighted interpolated value at point p, in the channels from `base` on.
 
     `zero` sets the number of channels: a float32 for one, a vector for eight.
@@ -57,8 +72,8 @@ def read_point(values, base, block, p, corners, total, zero):
 
 @inlined_part
 @no_type_check
-def send_back(values, base, block, p, corners, grad, zero, grad_values, to_points):
-    """Add the gradient of `read_point` to `grad_values` (unless that is empty) and to `block.dots`."""
+def sample_point_backward(values, base, block, p, corners, grad, zero, grad_values, to_points):
+    """Add the gradient of `sample_point` to `grad_values` (unless that is empty) and to `block.dots`."""
     if to_points:
         for k in range(0, corners, 4):
             add_dots(

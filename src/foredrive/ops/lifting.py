@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from foredrive.geometry.precision import full_precision
 from foredrive.ops.corners import BLOCK
-from foredrive.ops.lifting_kernels import Gradients, Inputs, lift_pairs, lift_pairs_backward
+from foredrive.ops.lifting_kernels import LiftingGradients, LiftingInputs, lift_pairs, lift_pairs_backward
 from foredrive.ops.precision import MAX_ITEM_SIZE, numba_supports, triton_supports
 from foredrive.ops.threads import in_parallel
 
@@ -63,7 +63,7 @@ def lift(
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
         joined, sizes = join_levels(values)
         pairs = _visible_pairs(uv, visible)
-        out: Tensor = _Lift.apply(joined, offsets, weights, np.array(sizes, np.int32), pairs)
+        out: Tensor = _LiftNumba.apply(joined, offsets, weights, np.array(sizes, np.int32), pairs)
         return out
 
 
@@ -108,7 +108,7 @@ def lift_reference(
 
 
 class _Pairs(NamedTuple):
-    """Pairs of a query and a camera that sees it, sorted by query. See `Inputs` for the fields."""
+    """Pairs of a query and a camera that sees it, sorted by query. See `LiftingInputs` for the fields."""
 
     query: np.ndarray
     image: np.ndarray
@@ -135,7 +135,7 @@ def _visible_pairs(uv: Float[Tensor, "b C Q 2"], visible: Bool[Tensor, "b C Q"])
     )
 
 
-class _Lift(torch.autograd.Function):
+class _LiftNumba(torch.autograd.Function):
     """The numba path of `lift`, for float32 on the CPU."""
 
     @staticmethod
@@ -171,7 +171,7 @@ class _Lift(torch.autograd.Function):
         grad_offsets = torch.zeros_like(offsets) if wants_points else offsets[:0]
         grad_weights = torch.zeros_like(weights) if wants_points else weights[:0]
         inputs = _inputs(values, offsets, weights, ctx.sizes, ctx.pairs)
-        grads = Gradients(
+        grads = LiftingGradients(
             out=grad_out.contiguous().flatten(0, 1).numpy(),
             values=grad_values.flatten(0, 1).numpy(),
             offsets=grad_offsets.flatten(0, 1).numpy(),
@@ -194,8 +194,10 @@ class _Lift(torch.autograd.Function):
         )
 
 
-def _inputs(values: Tensor, offsets: Tensor, weights: Tensor, sizes: np.ndarray, pairs: _Pairs) -> Inputs:
-    return Inputs(
+def _inputs(
+    values: Tensor, offsets: Tensor, weights: Tensor, sizes: np.ndarray, pairs: _Pairs
+) -> LiftingInputs:
+    return LiftingInputs(
         values=values.detach().flatten(0, 1).numpy(),
         sizes=sizes,
         offsets=offsets.detach().flatten(0, 1).numpy(),

@@ -8,11 +8,11 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.corners import BLOCK, Block, new_block, read_point, send_back
+from foredrive.ops.corners import BLOCK, Block, new_block, sample_point, sample_point_backward, set_corners
 from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, neighbours, store, zeros8
 
 
-class Inputs(NamedTuple):
+class LiftingInputs(NamedTuple):
     """Inputs of the kernels. Pairs are sorted by query."""
 
     values: np.ndarray
@@ -33,7 +33,7 @@ class Inputs(NamedTuple):
     """Float[pairs], 1 / number of cameras that see the query."""
 
 
-class Gradients(NamedTuple):
+class LiftingGradients(NamedTuple):
     """Gradients with respect to the result and to the inputs of the same names."""
 
     out: np.ndarray
@@ -52,7 +52,7 @@ def _level(block, start):
 
 @kernel_part
 @no_type_check
-def _collect(inputs, block, first, last, head):
+def _fill_block(inputs, block, first, last, head):
     """Fill `block` with the points of pairs first … last - 1, sorted by level, then by pair."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
@@ -75,21 +75,13 @@ def _collect(inputs, block, first, last, head):
 def _corners(block, count, size, channels):
     """Fill `corner` and `part` for one level."""
     height, width, start = size
-    corner, part = block.corner, block.part
     for i in range(count):
         x, y = block.place[i], block.place[BLOCK + i]
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
         # NaN coordinates must give NaN, although `neighbours` treats them as outside.
         w = block.weight[i] if (x == x) & (y == y) else np.float32(np.nan)
-        corner[i] = (start + y0 * width + x0) * channels
-        corner[BLOCK + i] = (start + y0 * width + x1) * channels
-        corner[2 * BLOCK + i] = (start + y1 * width + x0) * channels
-        corner[3 * BLOCK + i] = (start + y1 * width + x1) * channels
-        part[i] = w * wy0 * wx0
-        part[BLOCK + i] = w * wy0 * wx1
-        part[2 * BLOCK + i] = w * wy1 * wx0
-        part[3 * BLOCK + i] = w * wy1 * wx1
+        set_corners(block, i, w, start + y0 * width, start + y1 * width, x0, x1, wy0, wy1, wx0, wx1, channels)
 
 
 @kernel_part
@@ -105,7 +97,7 @@ def _read(inputs, block, first, last, channel, zero, out):
         for level in range(levels):
             i = (level * (last - first) + pair - first) * points
             for p in range(i, i + points):
-                total = read_point(inputs.values, base, block, p, 4, total, zero)
+                total = sample_point(inputs.values, base, block, p, 4, total, zero)
         store(out, at, total)
 
 
@@ -120,7 +112,7 @@ def lift_pairs(inputs, first_pair, last_pair, out):
     for first in range(first_pair, last_pair, step):
         last = min(first + step, last_pair)
         for head in range(heads):
-            _collect(inputs, block, first, last, head)
+            _fill_block(inputs, block, first, last, head)
             start = head * width
             for c in range(start, start + whole, WIDTH):
                 _read(inputs, block, first, last, c, zeros8(), out)
@@ -140,7 +132,9 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
         for level in range(levels):
             i = (level * (last - first) + pair - first) * points
             for p in range(i, i + points):
-                send_back(inputs.values, base, block, p, 4, grad, zero, grads.values, grads.weights.size > 0)
+                sample_point_backward(
+                    inputs.values, base, block, p, 4, grad, zero, grads.values, grads.weights.size > 0
+                )
 
 
 @kernel_part
@@ -161,7 +155,7 @@ def _slopes(block, count, size):
 
 @kernel_part
 @no_type_check
-def _hand_out(inputs, block, first, last, head, grads):
+def _scatter_gradients(inputs, block, first, last, head, grads):
     """Add the gradients of a block's points to those of their queries. It overwrites `block.part`."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
@@ -183,8 +177,8 @@ def lift_pairs_backward(inputs, first_pair, last_pair, head, grads):
     """Add the gradients of one head for the pairs first_pair … last_pair - 1.
 
     Heads use disjoint channels of the values and disjoint offsets and weights. Batch items use disjoint
-    images. So calls that differ in head or item can run in parallel. Gradients that are not wanted have size
-    0 (offsets and weights: both or none).
+    images. So calls that differ in head or item can run in parallel. Gradients that are not wanted
+    have size 0 (offsets and weights: both or none).
     """
     width = inputs.values.shape[2] // inputs.weights.shape[1]
     start = head * width
@@ -192,11 +186,11 @@ def lift_pairs_backward(inputs, first_pair, last_pair, head, grads):
     block, step = new_block(2), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
     for first in range(first_pair, last_pair, step):
         last = min(first + step, last_pair)
-        _collect(inputs, block, first, last, head)
+        _fill_block(inputs, block, first, last, head)
         block.dots[:] = 0
         for c in range(start, start + whole, WIDTH):
             _read_back(inputs, block, first, last, c, zeros8(), grads)
         for c in range(start + whole, start + width):
             _read_back(inputs, block, first, last, c, ZERO, grads)
         if grads.weights.size > 0:
-            _hand_out(inputs, block, first, last, head, grads)
+            _scatter_gradients(inputs, block, first, last, head, grads)

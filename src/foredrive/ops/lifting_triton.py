@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from foredrive.ops.lifting import join_levels
-from foredrive.ops.tiles import launch, neighbours, read, read_back
+from foredrive.ops.tiles import launch, neighbours, read, read_back, rows_of_program
 
 
 def lift_triton(
@@ -32,13 +32,13 @@ def lift_triton(
     joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
     share = visible / visible.sum(1, keepdim=True).clamp_min(1)
-    out: Tensor = _Lift.apply(
+    out: Tensor = _LiftTriton.apply(
         joined, offsets, weights, places, share, torch.tensor(sizes, dtype=torch.int32, device=uv.device)
     )
     return out
 
 
-class _Lift(torch.autograd.Function):
+class _LiftTriton(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -100,6 +100,15 @@ def _points(offsets, weights, at, inside):
 
 @triton.jit
 @no_type_check
+def _camera(share, query, queries, camera, cameras, exists):
+    """Return the rows' images of a camera, their pairs of query and camera, and the shares of the pairs."""
+    image = query // queries * cameras + camera
+    pair = image * queries + query % queries
+    return image, pair, tl.load(share + pair, mask=exists, other=0.0)
+
+
+@triton.jit
+@no_type_check
 def _places(uv, pair, seen, dx, dy, height, width):
     """Return the coordinates of rows × points in the feature map of a level. Integers are pixel centres."""
     u = tl.load(uv + 2 * pair, mask=seen, other=0.0)
@@ -130,9 +139,7 @@ def _lift_rows(
     W: tl.constexpr,
 ):
     CHANNELS: tl.constexpr = HEADS * WIDTH
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    exists = row < row_count
-    query, head = row // HEADS, row % HEADS
+    row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     c = tl.arange(0, W)
     total = tl.zeros([ROWS, W], tl.float32)
     for level in range(0, levels):
@@ -144,9 +151,7 @@ def _lift_rows(
             at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
             dx, dy, weight = _points(offsets, weights, at, inside)
             for camera in range(0, cameras):
-                image = query // queries * cameras + camera
-                pair = image * queries + query % queries
-                part = tl.load(share + pair, mask=exists, other=0.0)
+                image, pair, part = _camera(share, query, queries, camera, cameras, exists)
                 # Skip the camera if it sees none of the program's queries.
                 if tl.max(part, axis=0) > 0:
                     seen = inside & (part > 0)[:, None]
@@ -193,9 +198,7 @@ def _lift_rows_back(
     TO_POINTS: tl.constexpr,
 ):
     CHANNELS: tl.constexpr = HEADS * WIDTH
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    exists = row < row_count
-    query, head = row // HEADS, row % HEADS
+    row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     c = tl.arange(0, W)
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
     grad = tl.load(grad_out + to, mask=exists[:, None] & (c < WIDTH)[None, :], other=0.0)
@@ -210,9 +213,7 @@ def _lift_rows_back(
             to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
             to_weight = tl.zeros([ROWS, P], tl.float32)
             for camera in range(0, cameras):
-                image = query // queries * cameras + camera
-                pair = image * queries + query % queries
-                part = tl.load(share + pair, mask=exists, other=0.0)
+                image, pair, part = _camera(share, query, queries, camera, cameras, exists)
                 # Skip the camera if it sees none of the program's queries.
                 if tl.max(part, axis=0) > 0:
                     seen = inside & (part > 0)[:, None]
@@ -223,26 +224,17 @@ def _lift_rows_back(
                     w = tl.where(seen, w, 0.0)
                     base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
                     g = grad * part[:, None]
-                    # `met` is the dot product of the corner's value and the gradient.
+                    # `dot` is the dot product of the corner's value and the gradient.
                     for corner in tl.static_range(4):
                         cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
                         cy, wy, sy = (y1, wy1, sy1) if corner // 2 else (y0, wy0, sy0)
-                        at_corner = base + (cy * width + cx) * CHANNELS
-                        met = read_back(
-                            values,
-                            grad_values,
-                            at_corner,
-                            w * wy * wx,
-                            seen,
-                            g,
-                            c,
-                            WIDTH,
-                            TO_VALUES,
-                            TO_POINTS,
+                        cell = base + (cy * width + cx) * CHANNELS
+                        dot = read_back(
+                            values, grad_values, cell, w * wy * wx, seen, g, c, WIDTH, TO_VALUES, TO_POINTS
                         )
-                        to_x += w * wy * sx * met
-                        to_y += w * sy * wx * met
-                        to_weight += wy * wx * met
+                        to_x += w * wy * sx * dot
+                        to_y += w * sy * wx * dot
+                        to_weight += wy * wx * dot
             if TO_POINTS:
                 tl.store(grad_offsets + 2 * at, to_x, mask=inside)
                 tl.store(grad_offsets + 2 * at + 1, to_y, mask=inside)

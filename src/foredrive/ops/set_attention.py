@@ -74,11 +74,11 @@ class _Group(NamedTuple):
 
 
 def _groups(order: Int[Tensor, "K"], counts: Int[Tensor, "S"]) -> list[_Group]:
-    starts, groups, least = counts.cumsum(0) - counts, [], 0
-    largest = int(counts.max())
-    for length in (*(bucket for bucket in BUCKETS if bucket < largest), largest):
-        chosen = (counts > least) & (counts <= length)
-        least = length
+    starts, groups, min_count = counts.cumsum(0) - counts, [], 0
+    max_count = int(counts.max())
+    for length in (*(bucket for bucket in BUCKETS if bucket < max_count), max_count):
+        chosen = (counts > min_count) & (counts <= length)
+        min_count = length
         if bool(chosen.any()):
             count = counts[chosen, None]
             steps = torch.arange(int(count.max()), device=order.device)

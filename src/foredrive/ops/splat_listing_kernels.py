@@ -8,9 +8,9 @@ from foredrive.ops.vectors import inlined_part, kernel
 
 LOG2_E = np.float32(1.4426950408889634)
 ZERO, HALF = np.float32(0), np.float32(0.5)
-SLACK = np.float32(1e-3)
+TOLERANCE = np.float32(1e-3)
 """Tolerance of an exponent for rounding errors."""
-LEAST = np.float32(np.log2(1 / 255) - SLACK)
+MIN_LOG_OPACITY = np.float32(np.log2(1 / 255) - TOLERANCE)
 """log2 of the minimum opacity (1/255, minus the tolerance). A splat whose opacity stays below it in the whole
 box is not listed."""
 
@@ -21,14 +21,14 @@ XX, XY, YY, LOG_OPACITY = 4, 5, 6, 7
 RANGE, SLOPE_X, SLOPE_Y, RATE = 8, 9, 10, 11
 TILT_Y, TILT_X = 12, 13
 """For given dx, the exponent is largest at dy = tilt_y · dx. For given dy, at dx = tilt_x · dy."""
-REACH_X, REACH_Y = 14, 15
+EXTENT_X, EXTENT_Y = 14, 15
 """Distance from the mean, along each axis, at which the opacity falls to 1/255."""
 COLUMNS = 16
 """Number of columns: one cache line."""
 
 
-class Raw(NamedTuple):
-    """Geometry arrays of `Splats`, all float32 and contiguous."""
+class SplatArrays(NamedTuple):
+    """Fields of `Splats`, or the gradients with respect to them, all float32 and contiguous."""
 
     mean: np.ndarray
     inverse_covariance: np.ndarray
@@ -37,13 +37,22 @@ class Raw(NamedTuple):
     range_slope: np.ndarray
     velocity: np.ndarray
     range_rate_mps: np.ndarray
+    feature: np.ndarray
 
 
-class Tiles(NamedTuple):
-    """Geometry arrays of `TiledPoints`."""
+class PointArrays(NamedTuple):
+    """Fields of `TiledPoints`, and the hits."""
 
-    bounds: np.ndarray
-    """Float32[T 6], smallest and largest x, y and time."""
+    rows: np.ndarray
+    """Float32[T 3 256], x, y, time."""
+    block_bounds: np.ndarray
+    """Float32[T 6 16], smallest and largest x, y and time of each block."""
+    tile_bounds: np.ndarray
+    """Float32[T 6], smallest and largest x, y and time of each tile."""
+    point: np.ndarray
+    """Int32[T 256], index of the point in each slot; -1 for none."""
+    hit: np.ndarray
+    """Float32[P], range of the hit of each point."""
     left_edge: np.ndarray
     lower_edge: np.ndarray
     first_tile: np.ndarray
@@ -55,30 +64,27 @@ class Tiles(NamedTuple):
 
 @kernel
 @no_type_check
-def pack_splats(start, stop, raw, period, packed):
+def pack_splats(start, stop, splats, period, packed):
     """Fill rows start … stop - 1 of `packed`, Float32[N 16], the input of the other kernels."""
     for i in range(start, stop):
         row = packed[i]
-        x = raw.mean[i, 0]
+        x = splats.mean[i, 0]
         row[MEAN_X] = x - period * np.floor(x / period + HALF) if period > 0 else x
-        row[MEAN_Y] = raw.mean[i, 1]
-        row[VELOCITY_X], row[VELOCITY_Y] = raw.velocity[i, 0], raw.velocity[i, 1]
-        xx, xy, yy = (
-            raw.inverse_covariance[i, 0],
-            raw.inverse_covariance[i, 1],
-            raw.inverse_covariance[i, 2],
-        )
+        row[MEAN_Y] = splats.mean[i, 1]
+        row[VELOCITY_X], row[VELOCITY_Y] = splats.velocity[i, 0], splats.velocity[i, 1]
+        xx, xy = splats.inverse_covariance[i, 0], splats.inverse_covariance[i, 1]
+        yy = splats.inverse_covariance[i, 2]
         row[XX], row[XY], row[YY] = -HALF * LOG2_E * xx, -LOG2_E * xy, -HALF * LOG2_E * yy
-        opacity = raw.opacity[i]
+        opacity = splats.opacity[i]
         log_opacity = np.log2(opacity) if opacity > 0 else np.float32(-np.inf)
         row[LOG_OPACITY] = log_opacity
-        row[RANGE], row[RATE] = raw.range_m[i], raw.range_rate_mps[i]
-        row[SLOPE_X], row[SLOPE_Y] = raw.range_slope[i, 0], raw.range_slope[i, 1]
+        row[RANGE], row[RATE] = splats.range_m[i], splats.range_rate_mps[i]
+        row[SLOPE_X], row[SLOPE_Y] = splats.range_slope[i, 0], splats.range_slope[i, 1]
         row[TILT_Y], row[TILT_X] = -xy / yy, -xy / xx
         # The ellipse dᵀ A d ≤ c reaches √(c · yy / det A) along x and √(c · xx / det A) along y.
         area = np.float64(xx) * np.float64(yy) - np.float64(xy) * np.float64(xy)
-        square = max(2 * (log_opacity - LEAST) / LOG2_E, 0) / max(area, 1e-30)
-        row[REACH_X], row[REACH_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
+        square = max(2 * (log_opacity - MIN_LOG_OPACITY) / LOG2_E, 0) / max(area, 1e-30)
+        row[EXTENT_X], row[EXTENT_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
 
 
 @inlined_part
@@ -97,12 +103,12 @@ def touches(row, bounds, x):
     along_y, along_x = min(max(row[TILT_Y] * near_x, y0), y1), min(max(row[TILT_X] * near_y, x0), x1)
     at_side = near_x * (row[XX] * near_x + row[XY] * along_y) + row[YY] * along_y * along_y
     at_edge = along_x * (row[XX] * along_x + row[XY] * near_y) + row[YY] * near_y * near_y
-    return row[LOG_OPACITY] + max(at_side, at_edge) >= LEAST
+    return row[LOG_OPACITY] + max(at_side, at_edge) >= MIN_LOG_OPACITY
 
 
 @inlined_part
 @no_type_check
-def turned(x, bounds, period):
+def nearest_turn(x, bounds, period):
     """Return the position x shifted by whole periods to be nearest to the middle of a tile."""
     if period > 0:
         middle = HALF * (bounds[0] + bounds[1])
@@ -129,33 +135,33 @@ def _last_at_most(values, start, stop, x):
 
 @inlined_part
 @no_type_check
-def _list_box(row, tiles, box, turn, found, count):
+def _find_tiles_in_box(row, points, box, turn, found, count):
     """Add the tiles that a splat touches within a box x0 x1 y0 y1 to `found`. Return the new count.
 
     The box is shifted by `turn` periods from the splat.
     """
     x0, x1, y0, y1 = box
-    rows = tiles.lower_edge.size
-    first_row = _last_at_most(tiles.lower_edge, 0, rows, y0)
+    rows = points.lower_edge.size
+    first_row = _last_at_most(points.lower_edge, 0, rows, y0)
     r = first_row
-    while r < rows and tiles.lower_edge[r] <= y1:
-        first, last = tiles.first_tile[r], tiles.first_tile[r + 1]
-        first_here = _last_at_most(tiles.left_edge, first, last, x0)
+    while r < rows and points.lower_edge[r] <= y1:
+        first, last = points.first_tile[r], points.first_tile[r + 1]
+        first_here = _last_at_most(points.left_edge, first, last, x0)
         t = first_here
-        while t < last and tiles.left_edge[t] <= x1:
-            bounds = tiles.bounds[t]
+        while t < last and points.left_edge[t] <= x1:
+            bounds = points.tile_bounds[t]
             # `alone` means that the box overlaps a single tile.
             alone = r == first_row and t == first_here
-            alone = alone and (r + 1 == rows or tiles.lower_edge[r + 1] > y1)
-            alone = alone and (t + 1 == last or tiles.left_edge[t + 1] > x1)
-            x = turned(row[MEAN_X], bounds, tiles.period)
-            if abs(x - row[MEAN_X] - turn * tiles.period) > HALF * tiles.period:
-                yes = False  # another turn is nearer to this tile
+            alone = alone and (r + 1 == rows or points.lower_edge[r + 1] > y1)
+            alone = alone and (t + 1 == last or points.left_edge[t + 1] > x1)
+            x = nearest_turn(row[MEAN_X], bounds, points.period)
+            if abs(x - row[MEAN_X] - turn * points.period) > HALF * points.period:
+                touched = False  # another turn is nearer to this tile
             elif alone:  # a small splat in one tile: the exact test would change little
-                yes = x0 <= bounds[1] and x1 >= bounds[0] and y0 <= bounds[3] and y1 >= bounds[2]
+                touched = x0 <= bounds[1] and x1 >= bounds[0] and y0 <= bounds[3] and y1 >= bounds[2]
             else:
-                yes = touches(row, bounds, x)
-            if yes:
+                touched = touches(row, bounds, x)
+            if touched:
                 if count < found.size:
                     found[count] = t
                 count += 1
@@ -166,34 +172,36 @@ def _list_box(row, tiles, box, turn, found, count):
 
 @kernel
 @no_type_check
-def list_tiles(start, stop, packed, tiles, per_splat, found):
+def find_tiles(start, stop, packed, points, per_splat, found):
     """Write the tiles that the splats start … stop - 1 touch to `found`, Int32, splat by splat.
 
     `per_splat` gets the number of tiles of each splat. Return the total number. If `found` is too short, call
     the function again with a longer array.
     """
     count = 0
-    turns = 1 if tiles.period > 0 else 0
-    half_turn = HALF * tiles.period
+    turns = 1 if points.period > 0 else 0
+    half_turn = HALF * points.period
     for i in range(start, stop):
         row, before = packed[i], count
-        if row[LOG_OPACITY] >= LEAST and tiles.lower_edge.size > 0:
-            vx, vy, t0, t1 = row[VELOCITY_X], row[VELOCITY_Y], tiles.first_s, tiles.last_s
-            x0 = row[MEAN_X] - row[REACH_X] + min(vx * t0, vx * t1)
-            x1 = row[MEAN_X] + row[REACH_X] + max(vx * t0, vx * t1)
-            y0 = row[MEAN_Y] - row[REACH_Y] + min(vy * t0, vy * t1)
-            y1 = row[MEAN_Y] + row[REACH_Y] + max(vy * t0, vy * t1)
+        if row[LOG_OPACITY] >= MIN_LOG_OPACITY and points.lower_edge.size > 0:
+            vx, vy, t0, t1 = row[VELOCITY_X], row[VELOCITY_Y], points.first_s, points.last_s
+            x0 = row[MEAN_X] - row[EXTENT_X] + min(vx * t0, vx * t1)
+            x1 = row[MEAN_X] + row[EXTENT_X] + max(vx * t0, vx * t1)
+            y0 = row[MEAN_Y] - row[EXTENT_Y] + min(vy * t0, vy * t1)
+            y1 = row[MEAN_Y] + row[EXTENT_Y] + max(vy * t0, vy * t1)
             for turn in range(-turns, turns + 1):
-                away = turn * tiles.period
+                away = turn * points.period
                 if turns == 0 or (x1 + away >= -half_turn and x0 + away <= half_turn):
-                    count = _list_box(row, tiles, (x0 + away, x1 + away, y0, y1), turn, found, count)
+                    count = _find_tiles_in_box(
+                        row, points, (x0 + away, x1 + away, y0, y1), turn, found, count
+                    )
         per_splat[i] = count - before
     return count
 
 
 @kernel
 @no_type_check
-def front_to_back(packed, order):
+def sort_by_range(packed, order):
     """Fill `order`, Int32[N], with the splats sorted by ascending range. The sort is stable.
 
     It is a radix sort with 11 bits per pass. The bits of positive float32 numbers have the order of the
@@ -202,16 +210,16 @@ def front_to_back(packed, order):
     count = order.size
     keys, other_keys = np.empty(count, np.uint32), np.empty(count, np.uint32)
     other = np.empty(count, np.int32)
-    places = np.zeros((3, 2048), np.int32)
+    starts = np.zeros((3, 2048), np.int32)
     for i in range(count):
         key = np.float32(packed[i, RANGE]).view(np.uint32)
         # Map the float's bits to an unsigned integer of the same order.
         key = ~key if key >> np.uint32(31) else key | np.uint32(1 << 31)
         keys[i], order[i] = key, i
         for digit in range(3):
-            places[digit, (key >> np.uint32(11 * digit)) & np.uint32(2047)] += 1
+            starts[digit, (key >> np.uint32(11 * digit)) & np.uint32(2047)] += 1
     for digit in range(3):
-        place, at = places[digit], 0
+        place, at = starts[digit], 0
         for value in range(2048):
             place[value], at = at, at + place[value]
         for i in range(count):
@@ -224,7 +232,7 @@ def front_to_back(packed, order):
 
 @kernel
 @no_type_check
-def hand_out(order, first_slot, tile_of, first, splat, slot):
+def fill_tile_lists(order, first_slot, tile_of, first, splat, slot):
     """Distribute the splats to the lists of the tiles, in the given order.
 
     Args:

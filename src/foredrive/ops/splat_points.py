@@ -16,7 +16,7 @@ LANES = 16
 """Number of points in a block, and of blocks in a tile."""
 SLOTS = LANES * LANES
 """Maximum number of points in a tile."""
-PARTS = 4
+QUADRANTS = 4
 """Number of parts of a turn. A tile of beams never extends over two parts."""
 SIDE_PX = 16
 """Side length of a camera tile in pixels. Its blocks have 4 by 4 pixels."""
@@ -65,7 +65,7 @@ class TiledPoints:
         return torch.stack([self.rows.amin(2), self.rows.amax(2)], 2).flatten(1, 2)
 
     @cached_property
-    def at_once(self) -> bool:
+    def single_instant(self) -> bool:
         """Return whether the points are the pixels of an image of one instant."""
         return self.size_hw is not None and not bool(self.time_s.any())
 
@@ -134,16 +134,17 @@ def beam_points(
     starts = _row_starts(elevation_rad[by_elevation])
     row = torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff())
     order = by_elevation[_sorted_within(row, azimuth_rad[by_elevation])]
-    part = row * PARTS + ((azimuth_rad[order] + math.pi) * (PARTS / (2 * math.pi))).long().clamp(0, PARTS - 1)
-    lengths = part.bincount(minlength=PARTS * (len(starts) - 1))
+    quadrant = ((azimuth_rad[order] + math.pi) * (QUADRANTS / (2 * math.pi))).long().clamp(0, QUADRANTS - 1)
+    part = row * QUADRANTS + quadrant
+    lengths = part.bincount(minlength=QUADRANTS * (len(starts) - 1))
     zero = torch.zeros(1, dtype=torch.long)
     first_in_part = torch.cat([zero, (-(-lengths // SLOTS)).cumsum(0)])  # in tiles
-    place = torch.arange(len(order)) - torch.cat([zero, lengths.cumsum(0)])[part]
-    tile = first_in_part[part] + place // SLOTS
-    quarter = tile * 4 + place % SLOTS // (SLOTS // 4)  # four columns of blocks, with four blocks in each
-    order = order[_sorted_within(quarter, elevation_rad[order])]
+    slot_in_part = torch.arange(len(order)) - torch.cat([zero, lengths.cumsum(0)])[part]
+    tile = first_in_part[part] + slot_in_part // SLOTS
+    column = tile * 4 + slot_in_part % SLOTS // (SLOTS // 4)  # four columns of blocks, of four blocks each
+    order = order[_sorted_within(column, elevation_rad[order])]
     index = torch.full((int(first_in_part[-1]) * SLOTS,), -1)
-    index[tile * SLOTS + place % SLOTS] = order
+    index[tile * SLOTS + slot_in_part % SLOTS] = order
     index = index.view(-1, SLOTS)
     filled = torch.where(index >= 0, index, index.amax(1, keepdim=True))
     position = torch.stack([azimuth_rad, elevation_rad], -1)[filled]
@@ -154,7 +155,7 @@ def beam_points(
         count=len(order),
         left_edge=position[..., 0].amin(1),
         lower_edge=elevation_rad[by_elevation][starts[:-1]],
-        first_tile=first_in_part[::PARTS],
+        first_tile=first_in_part[::QUADRANTS],
         period=2 * math.pi,
     )
 

@@ -6,7 +6,7 @@ At a point p with measurement time t, a splat has the opacity
 
     α = min(o · exp(-dᵀ A d / 2), 0.999),   d = p - mean - velocity · t,
 
-and the range r = range + slope · d + range rate · t. Splats are composited in the order of `range_m`. A splat
+and the range r = range + slope · d + range rate · t. Splats are values in the order of `range_m`. A splat
 with α < 1/255 is skipped. The first splat that would reduce the transmittance to 1e-4 or less ends the ray
 and is not counted.
 """
@@ -97,10 +97,10 @@ def composite_splats(
         InputError: gsplat is needed and not installed.
     """
     _check(splats, points, hit_range_m)
-    if splats.mean.is_cuda and points.at_once and hit_range_m is None and not median:
+    if splats.mean.is_cuda and points.single_instant and hit_range_m is None and not median:
         return _composite_image(splats, points)
-    seen = _composite(splats, points, hit_range_m)
-    return seen if median else seen._replace(median_range_m=torch.full_like(seen.alpha, math.nan))
+    result = _composite(splats, points, hit_range_m)
+    return result if median else result._replace(median_range_m=torch.full_like(result.alpha, math.nan))
 
 
 def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
@@ -125,24 +125,20 @@ def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "
         return composite_splats_reference(splats, points, hit_range_m)
     from foredrive.ops.splatting_numba import CompositeSplats  # numba is slow to import
 
-    *where, feature = (field.float() for field in splats)
-    hits = feature.new_zeros(points.count) if hit_range_m is None else hit_range_m.detach().float()
-    return _composited(
-        CompositeSplats.apply(points.to("cpu", torch.float32), hits, feature, *where), hit_range_m is not None
-    )
+    hits = torch.zeros(points.count) if hit_range_m is None else hit_range_m.detach().float()
+    fields = (field.float() for field in splats)
+    out = CompositeSplats.apply(points.to("cpu", torch.float32), hits, *fields)
+    return _composited(out, hit_range_m is not None)
 
 
 def composite_splats_reference(
-    splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None = None
+    splats: Splats,
+    points: TiledPoints,
+    hit_range_m: Float[Tensor, "P"] | None = None,
+    lists: SplatLists | None = None,
 ) -> Composited:
-    """Compute `composite_splats` in plain PyTorch."""
-    return composite_lists(splats, points, list_splats(splats, points), hit_range_m)
-
-
-def composite_lists(
-    splats: Splats, points: TiledPoints, lists: SplatLists, hit_range_m: Float[Tensor, "P"] | None = None
-) -> Composited:
-    """Composite the splats on the lists of the tiles, in plain PyTorch."""
+    """Compute `composite_splats` in plain PyTorch, on the lists of `list_splats` if no others are given."""
+    lists = lists or list_splats(splats, points)
     points = points.to(splats.mean.device, splats.mean.dtype)
     lengths = lists.first.diff()
     hits = splats.range_m.new_zeros(points.count) if hit_range_m is None else hit_range_m
@@ -150,11 +146,11 @@ def composite_lists(
     out = splats.feature.new_zeros(points.count, columns)
     tiles = lengths.argsort(descending=True)  # lists of similar lengths together: little padding
     while len(tiles):
-        longest = int(lengths[tiles[0]])
-        chunk, tiles = tiles.split([n := min(_chunk(points, longest), len(tiles)), len(tiles) - n])
+        max_length = int(lengths[tiles[0]])
+        chunk, tiles = tiles.split([n := min(_chunk(points, max_length), len(tiles)), len(tiles) - n])
         index = points.index[chunk].flatten()
-        seen = _look(splats, points, hits, lists, chunk, longest).flatten(0, 1)
-        out = out.index_copy(0, index[index >= 0], seen[index >= 0])
+        values = _composite_tiles(splats, points, hits, lists, chunk, max_length).flatten(0, 1)
+        out = out.index_copy(0, index[index >= 0], values[index >= 0])
     return _composited(out, hit_range_m is not None)
 
 
@@ -163,21 +159,21 @@ def _composited(out: Float[Tensor, "P D4"], has_hits: bool) -> Composited:
     return Composited(out[:, :-4], expected, median.detach(), alpha, before if has_hits else None)
 
 
-def _chunk(points: TiledPoints, longest: int) -> int:
+def _chunk(points: TiledPoints, max_length: int) -> int:
     """Return the number of tiles that plain PyTorch processes at once."""
-    return max(REFERENCE_SIZE // (max(longest, 1) * points.index.shape[1]), 1)
+    return max(REFERENCE_SIZE // (max(max_length, 1) * points.index.shape[1]), 1)
 
 
-def _look(
+def _composite_tiles(
     splats: Splats,
     points: TiledPoints,
     hit_range_m: Float[Tensor, "P"],
     lists: SplatLists,
     tiles: Int[Tensor, "C"],
-    longest: int,
+    max_length: int,
 ) -> Float[Tensor, "C S D4"]:
     """Return, per slot: feature, expected range, median range, alpha, alpha before the hit."""
-    place = lists.first[tiles, None] + torch.arange(longest, device=tiles.device)  # [C L]
+    place = lists.first[tiles, None] + torch.arange(max_length, device=tiles.device)  # [C L]
     listed = (place < lists.first[tiles + 1, None])[:, None]
     chosen = lists.splat[place.clamp(max=len(lists.splat) - 1)]
     position, time_s = points.position[tiles], points.time_s[tiles, :, None]
@@ -206,12 +202,14 @@ def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
     points = points.to(splats.mean.device, splats.mean.dtype)
     low, high = points.tile_bounds[:, 0::2], points.tile_bounds[:, 1::2]  # [T 3]: x y time
     tiles, count = len(low), len(splats.opacity)
-    cut = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # largest dᵀ A d that counts
+    max_exponent = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # largest dᵀ A d that counts
     order = splats.range_m.argsort(stable=True)
-    order = order[cut[order] >= 0]
+    order = order[max_exponent[order] >= 0]
     found, tile_of = [], []
     for start in range(0, tiles, step := max(REFERENCE_SIZE // max(count, 1), 1)):
-        touched = _touch(splats, order, cut, low[start : start + step], high[start : start + step], points)
+        touched = _touches(
+            splats, order, max_exponent, low[start : start + step], high[start : start + step], points
+        )
         tile, rank = touched.nonzero(as_tuple=True)
         found.append(order[rank])
         tile_of.append(tile + start)
@@ -220,15 +218,15 @@ def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
     return SplatLists(torch.cat([empty, *found]), torch.cat([in_tile.new_zeros(1), in_tile.cumsum(0)]))
 
 
-def _touch(
+def _touches(
     splats: Splats,
     chosen: Int[Tensor, "M"],
-    cut: Float[Tensor, "N"],
+    max_exponent: Float[Tensor, "N"],
     low: Float[Tensor, "C 3"],
     high: Float[Tensor, "C 3"],
     points: TiledPoints,
 ) -> Bool[Tensor, "C M"]:
-    """Return whether the ellipses dᵀ A d ≤ cut of splats reach boxes in x, y and time."""
+    """Return whether the ellipses dᵀ A d ≤ max_exponent of splats reach boxes in x, y and time."""
     mean = splats.mean[chosen].expand(len(low), -1, -1)
     mean = _nearest_image(mean, torch.stack([low[:, :2], high[:, :2]], 1), points.period)
     moved = splats.velocity[chosen] * torch.stack([low[:, 2:], high[:, 2:]])[..., None]  # [2 C M 2]
@@ -238,11 +236,11 @@ def _touch(
     near_x, near_y = x0.clamp(min=0) + x1.clamp(max=0), y0.clamp(min=0) + y1.clamp(max=0)
     along_y = torch.minimum(torch.maximum(-xy / yy * near_x, y0), y1)  # the minimum on the nearest side
     along_x = torch.minimum(torch.maximum(-xy / xx * near_y, x0), x1)
-    least = torch.minimum(
+    min_exponent = torch.minimum(
         xx * near_x * near_x + 2 * xy * near_x * along_y + yy * along_y * along_y,
         xx * along_x * along_x + 2 * xy * along_x * near_y + yy * near_y * near_y,
     )
-    return least <= cut[chosen] * (1 + 1e-5) + 1e-5
+    return min_exponent <= max_exponent[chosen] * (1 + 1e-5) + 1e-5
 
 
 def _nearest_image(

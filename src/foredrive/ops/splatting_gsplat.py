@@ -36,7 +36,7 @@ def composite_gsplat(
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)
     _, ids, splat = isect_tiles(
         mean[None],
-        _reach_px(inverse_covariance, opacity)[None],
+        _extent_px(inverse_covariance, opacity)[None],
         range_m[None],
         SIDE_PX,
         columns,
@@ -58,7 +58,7 @@ def composite_gsplat(
 
 
 @torch.no_grad()
-def _reach_px(inverse_covariance: Float[Tensor, "N 3"], opacity: Float[Tensor, "N"]) -> Tensor:
+def _extent_px(inverse_covariance: Float[Tensor, "N 3"], opacity: Float[Tensor, "N"]) -> Tensor:
     """Return the distance along u and v at which the opacity falls to 1/255, whole px; 0 if it is lower."""
     xx, xy, yy = inverse_covariance.unbind(-1)
     square = 2 * (opacity.clamp(min=1e-30).log() + math.log(255)).clamp(min=0) / (xx * yy - xy * xy)

@@ -9,10 +9,10 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 
 from foredrive.ops.splat_listing_kernels import (
-    LEAST,
     LOG_OPACITY,
     MEAN_X,
     MEAN_Y,
+    MIN_LOG_OPACITY,
     RANGE,
     RATE,
     SLOPE_X,
@@ -24,38 +24,38 @@ from foredrive.ops.splat_listing_kernels import (
     XX,
     XY,
     YY,
-    turned,
+    nearest_turn,
 )
 from foredrive.ops.vectors import (
     HALF,
     ONE,
     ROW,
     ZERO,
-    bits_more,
+    broadcast,
     exp2_row,
-    greatest,
+    greater_mask,
     inlined_part,
     kernel,
-    least,
     load_row,
-    lowest_bit,
+    lowest_set_bit,
+    maximum,
+    minimum,
     prefetch,
-    row_of,
+    select_greater,
     store,
-    where_more,
 )
 
-MIN_ALPHA, MAX_ALPHA, MIN_LEFT = np.float32(1 / 255), np.float32(0.999), np.float32(1e-4)
+MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE = np.float32(1 / 255), np.float32(0.999), np.float32(1e-4)
 POINTS = ROW * ROW
 """Number of slots of a tile."""
 ALL = np.uint32(0xFFFF)
-EXTRA = 4
+EXTRA_COLUMNS = 4
 """Number of result columns after the features: expected range, median range, alpha, alpha before the hit."""
-BATCH, AHEAD = 64, 12
+BATCH, PREFETCH_DISTANCE = 64, 12
 """Number of splats of a tile tested at once, and the prefetch distance in splats."""
 
 
-class Scene(NamedTuple):
+class TileLists(NamedTuple):
     """Splats and the lists of the tiles."""
 
     packed: np.ndarray
@@ -70,29 +70,13 @@ class Scene(NamedTuple):
     """Int64[≥ T + 1], start of the list of each tile."""
 
 
-class Places(NamedTuple):
-    """Points of the tiles."""
-
-    rows: np.ndarray
-    """Float32[T 3 256], x, y, time."""
-    block_bounds: np.ndarray
-    """Float32[T 6 16], smallest and largest x, y and time of each block."""
-    tile_bounds: np.ndarray
-    """Float32[T 6], smallest and largest x, y and time of each tile."""
-    point: np.ndarray
-    """Int32[T 256], index of the point in each slot; -1 for none."""
-    hit: np.ndarray
-    """Float32[P], range of the hit of each point."""
-    period: np.float32
-
-
 @inlined_part
 @no_type_check
-def aligned(rows):
+def aligned_rows(rows):
     """Return memory for `rows` rows that starts at a cache line."""
-    room = np.empty((rows + 1) * ROW, np.float32)
-    skip = (ROW - room.ctypes.data // 4 % ROW) % ROW
-    return room[skip : skip + rows * ROW]
+    buffer = np.empty((rows + 1) * ROW, np.float32)
+    skip = (ROW - buffer.ctypes.data // 4 % ROW) % ROW
+    return buffer[skip : skip + rows * ROW]
 
 
 @inlined_part
@@ -105,18 +89,18 @@ def blocks_touched(splat, bounds, x):
     y, vx, vy = splat[MEAN_Y], splat[VELOCITY_X], splat[VELOCITY_Y]
     t0, t1 = load_row(bounds, 4 * ROW), load_row(bounds, 5 * ROW)
     moved, moved_to = t0 * vx, t1 * vx
-    x0 = load_row(bounds, 0) - x - greatest(moved, moved_to)
-    x1 = load_row(bounds, ROW) - x - least(moved, moved_to)
+    x0 = load_row(bounds, 0) - x - maximum(moved, moved_to)
+    x1 = load_row(bounds, ROW) - x - minimum(moved, moved_to)
     moved, moved_to = t0 * vy, t1 * vy
-    y0 = load_row(bounds, 2 * ROW) - y - greatest(moved, moved_to)
-    y1 = load_row(bounds, 3 * ROW) - y - least(moved, moved_to)
-    near_x, near_y = least(greatest(x0, ZERO), x1), least(greatest(y0, ZERO), y1)
-    along_y = least(greatest(near_x * splat[TILT_Y], y0), y1)
-    along_x = least(greatest(near_y * splat[TILT_X], x0), x1)
+    y0 = load_row(bounds, 2 * ROW) - y - maximum(moved, moved_to)
+    y1 = load_row(bounds, 3 * ROW) - y - minimum(moved, moved_to)
+    near_x, near_y = minimum(maximum(x0, ZERO), x1), minimum(maximum(y0, ZERO), y1)
+    along_y = minimum(maximum(near_x * splat[TILT_Y], y0), y1)
+    along_x = minimum(maximum(near_y * splat[TILT_X], x0), x1)
     xx, xy, yy = splat[XX], splat[XY], splat[YY]
     at_side = near_x * (near_x * xx + along_y * xy) + along_y * along_y * yy
     at_edge = along_x * (along_x * xx + near_y * xy) + near_y * near_y * yy
-    return bits_more(greatest(at_side, at_edge) + splat[LOG_OPACITY], LEAST)
+    return greater_mask(maximum(at_side, at_edge) + splat[LOG_OPACITY], MIN_LOG_OPACITY)
 
 
 @inlined_part
@@ -134,8 +118,8 @@ def offsets(splat, rows, at, x):
 def opacity_at(splat, dx, dy):
     """Return the opacity of a splat at d, before the limit of 0.999. It is 0 below 1/255."""
     exponent = dx * (dx * splat[XX] + dy * splat[XY]) + dy * dy * splat[YY]
-    opacity = exp2_row(least(exponent, ZERO) + splat[LOG_OPACITY])  # rounding may make it > 0
-    return where_more(MIN_ALPHA, opacity, ZERO, opacity)
+    opacity = exp2_row(minimum(exponent, ZERO) + splat[LOG_OPACITY])  # rounding may make it > 0
+    return select_greater(MIN_ALPHA, opacity, ZERO, opacity)
 
 
 @inlined_part
@@ -147,15 +131,15 @@ def range_at(splat, dx, dy, t):
 
 @inlined_part
 @no_type_check
-def gather_hits(places, tile, hits):
+def gather_hits(points, tile, hits):
     """Fill `hits` with the hit ranges of the slots of a tile."""
     for s in range(POINTS):
-        hits[s] = places.hit[max(places.point[tile, s], 0)]
+        hits[s] = points.hit[max(points.point[tile, s], 0)]
 
 
 @inlined_part
 @no_type_check
-def _start(state, columns):
+def _reset_state(state, columns):
     """Initialise the rows of each block: transmittance 1, median range infinite, all else 0.
 
     The order is transmittance, expected range, median range, alpha, alpha before the hit, features.
@@ -163,100 +147,102 @@ def _start(state, columns):
     state[:] = 0
     for block in range(ROW):
         base = block * columns * ROW
-        store(state, base, row_of(ONE))
-        store(state, base + 2 * ROW, row_of(np.float32(np.inf)))
+        store(state, base, broadcast(ONE))
+        store(state, base + 2 * ROW, broadcast(np.float32(np.inf)))
 
 
 @inlined_part
 @no_type_check
-def _add(splat, feature, base, state, dx, dy, t, hit):
+def _accumulate(splat, feature, base, state, dx, dy, t, hit):
     """Add a splat behind the splats that a block already has. Return whether any of its rays continues."""
-    left = load_row(state, base)
-    alpha = least(opacity_at(splat, dx, dy), MAX_ALPHA)
-    passed = left - left * alpha
-    # A ray ends, without counting the splat, when its transmittance would fall to MIN_LEFT.
-    weight = where_more(passed, MIN_LEFT, left * alpha, ZERO)
+    transmittance = load_row(state, base)
+    alpha = minimum(opacity_at(splat, dx, dy), MAX_ALPHA)
+    passed = transmittance - transmittance * alpha
+    # A ray ends, without counting the splat, when its transmittance would fall to MIN_TRANSMITTANCE.
+    weight = select_greater(passed, MIN_TRANSMITTANCE, transmittance * alpha, ZERO)
     range_m = range_at(splat, dx, dy, t)
-    store(state, base, where_more(passed, MIN_LEFT, passed, ZERO))
+    store(state, base, select_greater(passed, MIN_TRANSMITTANCE, passed, ZERO))
     store(state, base + ROW, load_row(state, base + ROW) + weight * range_m)
     # The median range is that of the splat at which the transmittance falls from above 0.5 to 0.5 or less.
     # `crossed` is 0.5 at the rays where that happens, else 0.
-    crossed = where_more(weight, ZERO, where_more(left, HALF, HALF, ZERO), ZERO)
-    crossed = where_more(passed, HALF, ZERO, crossed)
+    crossed = select_greater(weight, ZERO, select_greater(transmittance, HALF, HALF, ZERO), ZERO)
+    crossed = select_greater(passed, HALF, ZERO, crossed)
     median = load_row(state, base + 2 * ROW)
-    store(state, base + 2 * ROW, where_more(crossed, ZERO, range_m, median))
+    store(state, base + 2 * ROW, select_greater(crossed, ZERO, range_m, median))
     store(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
-    nearer = where_more(hit, range_m, weight, ZERO)
+    nearer = select_greater(hit, range_m, weight, ZERO)
     store(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
-    at = base + (EXTRA + 1) * ROW
+    at = base + (EXTRA_COLUMNS + 1) * ROW
     for d in range(feature.size):
         store(state, at, load_row(state, at) + weight * feature[d])
         at += ROW
-    return bits_more(passed, MIN_LEFT) != 0
+    return greater_mask(passed, MIN_TRANSMITTANCE) != 0
 
 
 @inlined_part
 @no_type_check
-def look_for(scene, places, tile, begin, end, touched):
+def find_touched_blocks(lists, points, tile, begin, end, touched):
     """Fill `touched` with the block masks of the entries begin … end - 1 of a tile's list."""
-    bounds, tile_bounds = places.block_bounds[tile], places.tile_bounds[tile]
-    last = scene.splat.size - 1
+    bounds, tile_bounds = points.block_bounds[tile], points.tile_bounds[tile]
+    last = lists.splat.size - 1
     for at in range(begin, end):
-        splat = scene.packed[scene.splat[at]]
-        soon = scene.splat[min(at + AHEAD, last)]
-        prefetch(scene.packed, soon * scene.packed.shape[1])
-        prefetch(scene.feature, soon * scene.feature.shape[1])
-        touched[at - begin] = blocks_touched(splat, bounds, turned(splat[MEAN_X], tile_bounds, places.period))
+        splat = lists.packed[lists.splat[at]]
+        soon = lists.splat[min(at + PREFETCH_DISTANCE, last)]
+        prefetch(lists.packed, soon * lists.packed.shape[1])
+        prefetch(lists.feature, soon * lists.feature.shape[1])
+        touched[at - begin] = blocks_touched(
+            splat, bounds, nearest_turn(splat[MEAN_X], tile_bounds, points.period)
+        )
 
 
 @kernel
 @no_type_check
-def composite_tiles(start, stop, scene, places, out):
+def composite_tiles(start, stop, lists, points, out):
     """Write the results of tiles start … stop - 1 to `out`, Float32[P D + 4], features first."""
-    columns = scene.feature.shape[1] + EXTRA + 1
-    state, hits, touched = aligned(ROW * columns), aligned(ROW), np.empty(BATCH, np.uint32)
+    columns = lists.feature.shape[1] + EXTRA_COLUMNS + 1
+    state, hits, touched = aligned_rows(ROW * columns), aligned_rows(ROW), np.empty(BATCH, np.uint32)
     for tile in range(start, stop):
-        _start(state, columns)
-        gather_hits(places, tile, hits)
-        going = ALL  # bit mask of the blocks that have unfinished rays
-        for begin in range(scene.first[tile], scene.first[tile + 1], BATCH):
-            end = min(begin + BATCH, scene.first[tile + 1])
-            look_for(scene, places, tile, begin, end, touched)
+        _reset_state(state, columns)
+        gather_hits(points, tile, hits)
+        active = ALL  # bit mask of the blocks that have unfinished rays
+        for begin in range(lists.first[tile], lists.first[tile + 1], BATCH):
+            end = min(begin + BATCH, lists.first[tile + 1])
+            find_touched_blocks(lists, points, tile, begin, end, touched)
             for at in range(begin, end):
-                going = _pass(scene, places, tile, at, touched[at - begin], going, hits, state)
-            if going == 0:
+                active = _composite_splat(lists, points, tile, at, touched[at - begin], active, hits, state)
+            if active == 0:
                 break
-        _write(places, tile, state, columns, out)
+        _write(points, tile, state, columns, out)
 
 
 @inlined_part
 @no_type_check
-def _pass(scene, places, tile, at, touched, going, hits, state):
+def _composite_splat(lists, points, tile, at, touched, active, hits, state):
     """Add the splat of entry `at` to the blocks that it touches. Return the blocks that continue."""
-    splat, feature = scene.packed[scene.splat[at]], scene.feature[scene.splat[at]]
-    rows, columns = places.rows[tile], feature.size + EXTRA + 1
-    x = turned(splat[MEAN_X], places.tile_bounds[tile], places.period)
-    blocks = going & touched
+    splat, feature = lists.packed[lists.splat[at]], lists.feature[lists.splat[at]]
+    rows, columns = points.rows[tile], feature.size + EXTRA_COLUMNS + 1
+    x = nearest_turn(splat[MEAN_X], points.tile_bounds[tile], points.period)
+    blocks = active & touched
     # Loop over the set bits.
     while blocks != 0:
-        block = lowest_bit(blocks)
+        block = lowest_set_bit(blocks)
         blocks &= blocks - np.uint32(1)
         dx, dy, t = offsets(splat, rows, block * ROW, x)
         hit = load_row(hits, block * ROW)
-        if not _add(splat, feature, block * columns * ROW, state, dx, dy, t, hit):
-            going &= ~(np.uint32(1) << np.uint32(block))
-    return going
+        if not _accumulate(splat, feature, block * columns * ROW, state, dx, dy, t, hit):
+            active &= ~(np.uint32(1) << np.uint32(block))
+    return active
 
 
 @inlined_part
 @no_type_check
-def _write(places, tile, state, columns, out):
-    depth = columns - EXTRA - 1
+def _write(points, tile, state, columns, out):
+    depth = columns - EXTRA_COLUMNS - 1
     for s in range(POINTS):
-        p = places.point[tile, s]
+        p = points.point[tile, s]
         if p >= 0:
             base = s // ROW * columns * ROW + s % ROW
             for d in range(depth):
-                out[p, d] = state[base + (EXTRA + 1 + d) * ROW]
-            for k in range(EXTRA):
+                out[p, d] = state[base + (EXTRA_COLUMNS + 1 + d) * ROW]
+            for k in range(EXTRA_COLUMNS):
                 out[p, depth + k] = state[base + (1 + k) * ROW]

@@ -10,16 +10,20 @@ from torch.autograd.function import once_differentiable
 
 from foredrive.ops.splat_listing_kernels import (
     COLUMNS,
-    Raw,
-    Tiles,
-    front_to_back,
-    hand_out,
-    list_tiles,
+    PointArrays,
+    SplatArrays,
+    fill_tile_lists,
+    find_tiles,
     pack_splats,
+    sort_by_range,
 )
 from foredrive.ops.splat_points import TiledPoints
-from foredrive.ops.splatting_back_kernels import SUMS, Gradients, composite_back, gather_gradients
-from foredrive.ops.splatting_kernels import EXTRA, Places, Scene, composite_tiles
+from foredrive.ops.splatting_back_kernels import (
+    GEOMETRY_COLUMNS,
+    composite_tiles_backward,
+    gather_gradients,
+)
+from foredrive.ops.splatting_kernels import EXTRA_COLUMNS, TileLists, composite_tiles
 from foredrive.ops.threads import in_parallel
 from foredrive.ops.vectors import ROW
 
@@ -36,92 +40,87 @@ class CompositeSplats(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        points: TiledPoints,
-        hit_range_m: Float[Tensor, "P"],
-        feature: Float[Tensor, "N D"],
-        *where: Tensor,
+        ctx: Any, tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], *fields: Tensor
     ) -> Float[Tensor, "P D4"]:
-        """Composite the splats. `where` holds the other fields of `Splats`, in the order of `Raw`."""
-        feature, *where = (tensor.detach().contiguous() for tensor in (feature, *where))  # type: ignore[assignment]
-        raw = Raw(*(tensor.numpy() for tensor in where))
-        places = Places(
-            points.rows.numpy(),
-            points.block_bounds.numpy(),
-            points.tile_bounds.numpy(),
-            points.index.int().numpy(),
-            hit_range_m.numpy(),
-            np.float32(points.period),
-        )
-        scene, first_slot = _list(raw, feature.numpy(), points)
-        seen = np.empty((points.count, feature.shape[1] + EXTRA), np.float32)  # numpy requests huge pages
+        """Composite the splats. `fields` are those of `Splats`."""
+        fields = tuple(tensor.detach().contiguous() for tensor in fields)
+        splats, points = SplatArrays(*(tensor.numpy() for tensor in fields)), _arrays(tiled, hit_range_m)
+        lists, first_slot = _list(splats, points)
+        # numpy requests huge pages
+        composited = np.empty((tiled.count, splats.feature.shape[1] + EXTRA_COLUMNS), np.float32)
 
         def job(start: int, stop: int) -> None:
-            composite_tiles(start, stop, scene, places, seen)
+            composite_tiles(start, stop, lists, points, composited)
 
-        in_parallel(job, len(points.index), grain=MIN_TILES)
-        out = torch.from_numpy(seen)
-        ctx.save_for_backward(out, feature, *where)
-        ctx.found = scene, places, first_slot
+        in_parallel(job, len(points.point), grain=MIN_TILES)
+        out = torch.from_numpy(composited)
+        ctx.save_for_backward(out, *fields)
+        ctx.found = lists, points, first_slot
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of the fields of `Splats`."""
-        out, feature, *where = ctx.saved_tensors
-        scene, places, first_slot = ctx.found
-        columns = -(-(SUMS + feature.shape[1]) // ROW) * ROW
-        pairs = np.zeros((len(scene.splat), columns), np.float32)
-        seen, upstream = out.numpy(), grad_out.contiguous().numpy()
+        out, *fields = ctx.saved_tensors
+        lists, points, first_slot = ctx.found
+        columns = -(-(GEOMETRY_COLUMNS + lists.feature.shape[1]) // ROW) * ROW
+        pairs = np.zeros((len(lists.splat), columns), np.float32)
+        composited, upstream = out.numpy(), grad_out.contiguous().numpy()
 
-        def look(start: int, stop: int) -> None:
-            composite_back(start, stop, scene, places, seen, upstream, pairs)
+        def backward_tiles(start: int, stop: int) -> None:
+            composite_tiles_backward(start, stop, lists, points, composited, upstream, pairs)
 
-        in_parallel(look, len(places.point), grain=MIN_TILES)
-        raw = Raw(*(tensor.numpy() for tensor in where))
-        to_where, to_feature = [torch.empty_like(tensor) for tensor in where], torch.empty_like(feature)
-        grads = Gradients(*(tensor.numpy() for tensor in (*to_where, to_feature)))
+        in_parallel(backward_tiles, len(points.point), grain=MIN_TILES)
+        grads = [torch.empty_like(tensor) for tensor in fields]
+        splats, to_splats = (SplatArrays(*(tensor.numpy() for tensor in some)) for some in (fields, grads))
 
         def gather(start: int, stop: int) -> None:
-            gather_gradients(start, stop, pairs, first_slot, raw, grads)
+            gather_gradients(start, stop, pairs, first_slot, splats, to_splats)
 
-        in_parallel(gather, len(feature), grain=MIN_SPLATS)
-        return None, None, to_feature, *to_where
+        in_parallel(gather, len(splats.feature), grain=MIN_SPLATS)
+        return None, None, *grads
 
 
-def _list(raw: Raw, feature: np.ndarray, points: TiledPoints) -> tuple[Scene, np.ndarray]:
+def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"]) -> PointArrays:
+    times = tiled.rows[:, 2]
+    return PointArrays(
+        rows=tiled.rows.numpy(),
+        block_bounds=tiled.block_bounds.numpy(),
+        tile_bounds=tiled.tile_bounds.numpy(),
+        point=tiled.index.int().numpy(),
+        hit=hit_range_m.numpy(),
+        left_edge=tiled.left_edge.numpy(),
+        lower_edge=tiled.lower_edge.numpy(),
+        first_tile=tiled.first_tile.numpy(),
+        first_s=np.float32(times.min() if tiled.count else 0),
+        last_s=np.float32(times.max() if tiled.count else 0),
+        period=np.float32(tiled.period),
+    )
+
+
+def _list(splats: SplatArrays, points: PointArrays) -> tuple[TileLists, np.ndarray]:
     """Build the lists of the tiles. Return them with the start of the pairs of each splat."""
-    count = len(feature)
+    count = len(splats.feature)
     packed = np.empty((count, COLUMNS), np.float32)
     per_splat = np.empty(count, np.int64)
-    times = points.rows[:, 2]
-    tiles = Tiles(
-        points.tile_bounds.numpy(),
-        points.left_edge.numpy(),
-        points.lower_edge.numpy(),
-        points.first_tile.numpy(),
-        np.float32(times.min() if points.count else 0),
-        np.float32(times.max() if points.count else 0),
-        np.float32(points.period),
-    )
     found: dict[int, np.ndarray] = {}
 
     def job(start: int, stop: int) -> None:
-        pack_splats(start, stop, raw, tiles.period, packed)
-        room = np.empty(8 * (stop - start), np.int32)
-        needed = list_tiles(start, stop, packed, tiles, per_splat, room)
-        if needed > len(room):
-            room = np.empty(needed, np.int32)
-            list_tiles(start, stop, packed, tiles, per_splat, room)
-        found[start] = room[:needed]
+        pack_splats(start, stop, splats, points.period, packed)
+        buffer = np.empty(8 * (stop - start), np.int32)
+        needed = find_tiles(start, stop, packed, points, per_splat, buffer)
+        if needed > len(buffer):
+            buffer = np.empty(needed, np.int32)
+            find_tiles(start, stop, packed, points, per_splat, buffer)
+        found[start] = buffer[:needed]
 
     in_parallel(job, count, grain=MIN_SPLATS)
     tile_of = np.concatenate([np.empty(0, np.int32), *(found[start] for start in sorted(found))])
     first_slot = np.concatenate([np.zeros(1, np.int64), per_splat.cumsum()])
     order = np.empty(count, np.int32)
-    front_to_back(packed, order)
-    first = np.zeros(len(points.index) + 2, np.int64)
+    sort_by_range(packed, order)
+    first = np.zeros(len(points.point) + 2, np.int64)
     splat, slot = np.empty_like(tile_of), np.empty_like(tile_of)
-    hand_out(order, first_slot, tile_of, first, splat, slot)
-    return Scene(packed, feature, splat, slot, first), first_slot
+    fill_tile_lists(order, first_slot, tile_of, first, splat, slot)
+    return TileLists(packed, splats.feature, splat, slot, first), first_slot

@@ -13,12 +13,12 @@ from torch import Tensor
 
 TILE = 1024
 """Numbers in a tile: eight per thread."""
-PLACES, POINTS_AT_ONCE = 256, 16
+MAX_PLACES, MAX_POINTS = 256, 16
 """Maximum number of places (rows times points) and of points in a tile. A place needs more registers than a
 number that is read there."""
 
 
-class Tile(NamedTuple):
+class TileShape(NamedTuple):
     """The size of a program's tile. All entries are powers of two."""
 
     rows: int
@@ -26,11 +26,11 @@ class Tile(NamedTuple):
     channels: int
 
 
-def tile_of(points: int, channels: int) -> Tile:
+def tile_shape(points: int, channels: int) -> TileShape:
     """Return the tile for rows of given size: it has all channels, some points and some rows."""
     wide = int(triton.next_power_of_2(channels))
-    many = min(int(triton.next_power_of_2(points)), POINTS_AT_ONCE, max(TILE // wide, 1))
-    return Tile(rows=max(min(TILE // wide, PLACES) // many, 1), points=many, channels=wide)
+    count = min(int(triton.next_power_of_2(points)), MAX_POINTS, max(TILE // wide, 1))
+    return TileShape(rows=max(min(TILE // wide, MAX_PLACES) // count, 1), points=count, channels=wide)
 
 
 def launch(
@@ -51,7 +51,7 @@ def launch(
     """
     (queries, heads), points = weights.shape[1:3], weights.shape[-1]
     rows, width = len(weights) * queries * heads, channels // heads
-    tile = tile_of(points, width)
+    tile = tile_shape(points, width)
     if rows:
         kernel[(triton.cdiv(rows, tile.rows),)](
             *tensors,
@@ -66,6 +66,14 @@ def launch(
             W=tile.channels,
             **flags,
         )
+
+
+@triton.jit
+@no_type_check
+def rows_of_program(row_count, ROWS: tl.constexpr, HEADS: tl.constexpr):
+    """Return the rows of a program, whether they exist, their queries and their heads."""
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    return row, row < row_count, row // HEADS, row % HEADS
 
 
 @triton.jit

@@ -44,8 +44,10 @@ class Vector(types.Type):
         self.form = ir.VectorType(ir.FloatType(), lanes)
 
 
-float8, a_row = Vector(WIDTH), Vector(ROW)
-_FORM, _WHOLE = a_row.form, ir.VectorType(cgutils.int32_t, ROW)
+float32x8, float32x16 = Vector(WIDTH), Vector(ROW)
+_ROW_TYPE, _INT_ROW_TYPE = float32x16.form, ir.VectorType(cgutils.int32_t, ROW)
+Emit = Callable[..., ir.Value]
+"""A function that appends instructions to an IR builder. It returns their result."""
 
 
 @register_model(Vector)
@@ -54,16 +56,16 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, numba_type.form)
 
 
-def _shuffled(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: Iterable[int]) -> ir.Value:
+def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: Iterable[int]) -> ir.Value:
     """Return the chosen lanes of a and b. Lanes of b are numbered after those of a."""
     indices = list(lanes)
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(cgutils.int32_t, len(indices)), indices))
 
 
-def _broadcast(builder: ir.IRBuilder, scalar: ir.Value, form: ir.VectorType = _FORM) -> ir.Value:
+def _broadcast(builder: ir.IRBuilder, scalar: ir.Value, form: ir.VectorType = _ROW_TYPE) -> ir.Value:
     undefined = ir.Constant(form, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(cgutils.int32_t, 0))
-    return _shuffled(builder, first, undefined, [0] * form.count)
+    return _shuffle(builder, first, undefined, [0] * form.count)
 
 
 def _address(context: Any, builder: ir.IRBuilder, signature: Any, args: Any, form: ir.Type) -> ir.Value:
@@ -72,7 +74,7 @@ def _address(context: Any, builder: ir.IRBuilder, signature: Any, args: Any, for
     return builder.bitcast(builder.gep(array.data, [args[1]]), form.as_pointer())
 
 
-def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.Value:
+def _add_adjacent(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.Value:
     """Add adjacent runs of lanes within a and within b. The sums of a and of b alternate in the result."""
     count = a.type.count
     even = [lane for lane in range(count) if lane // run % 2 == 0]
@@ -83,29 +85,25 @@ def _add_runs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.V
         for lane in even[at : at + run]
     ]
     odd = [lane + run for lane in order]
-    return builder.fadd(_shuffled(builder, a, b, order), _shuffled(builder, a, b, odd))
+    return builder.fadd(_shuffle(builder, a, b, order), _shuffle(builder, a, b, odd))
 
 
 @intrinsic
 @no_type_check
 def load(typing_context, array, index, like):
     """Read a value of `like`'s type at `index` of a C-contiguous float32 array, without bounds check."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return builder.load(_address(context, builder, signature, args, args[2].type), align=4)
-
-    return like(array, types.intp, like), codegen
+    return like(array, types.intp, like), lambda context, builder, signature, args: builder.load(
+        _address(context, builder, signature, args, args[2].type), align=4
+    )
 
 
 @intrinsic
 @no_type_check
 def load_row(typing_context, array, index):
     """Read sixteen numbers at flat `index` of a C-contiguous float32 array, without a bounds check."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return builder.load(_address(context, builder, signature, args, _FORM), align=4)
-
-    return a_row(array, types.intp), codegen
+    return float32x16(array, types.intp), lambda context, builder, signature, args: builder.load(
+        _address(context, builder, signature, args, _ROW_TYPE), align=4
+    )
 
 
 @intrinsic
@@ -124,11 +122,7 @@ def store(typing_context, array, index, value):
 @no_type_check
 def zeros8(typing_context):
     """Return eight zeros."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return ir.Constant(float8.form, [0.0] * WIDTH)
-
-    return float8(), codegen
+    return float32x8(), lambda *_: ir.Constant(float32x8.form, [0.0] * WIDTH)
 
 
 @intrinsic
@@ -152,10 +146,10 @@ def add_dots(typing_context, array, index, a, b, c, d, other):
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         four = ir.VectorType(ir.FloatType(), 4)
         products = [builder.fmul(value, args[6], flags=_CONTRACT) for value in args[2:6]]
-        if other is float8:
-            ab, cd = (_add_runs(builder, *pair, 1) for pair in (products[:2], products[2:]))
-            abcd = _add_runs(builder, ab, cd, 2)
-            halves = (_shuffled(builder, abcd, abcd, lanes) for lanes in (range(4), range(4, 8)))
+        if other is float32x8:
+            ab, cd = (_add_adjacent(builder, *pair, 1) for pair in (products[:2], products[2:]))
+            abcd = _add_adjacent(builder, ab, cd, 2)
+            halves = (_shuffle(builder, abcd, abcd, lanes) for lanes in (range(4), range(4, 8)))
             sums = builder.fadd(*halves)
         else:
             sums = ir.Constant(four, ir.Undefined)
@@ -194,148 +188,132 @@ def neighbours(x, size):
     )
 
 
-def _as_rows(builder: ir.IRBuilder, args: Any) -> list[ir.Value]:
-    """Return the arguments as rows. Scalars are broadcast."""
-    return [value if value.type == _FORM else _broadcast(builder, value) for value in args]
+def _unary(emit: Emit, given: types.Type = float32x16, result: types.Type = float32x16) -> Any:
+    """Return an intrinsic of one argument."""
+
+    @intrinsic
+    @no_type_check
+    def apply(typing_context, value):
+        return result(given), lambda context, builder, signature, args: emit(builder, *args)
+
+    return apply
 
 
-def _kinds(*given: types.Type) -> list[types.Type]:
-    """Return the numba types of arguments that are each a row or a float32."""
-    return [kind if kind is a_row else types.float32 for kind in given]
-
-
-def _elementwise(emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> Any:
+def _elementwise(emit: Emit, result: types.Type = float32x16) -> Any:
     """Return an intrinsic of two rows, one of which may be a float32."""
 
     @intrinsic
     @no_type_check
     def apply(typing_context, a, b):
-        if a_row not in (a, b):
+        if float32x16 not in (a, b):
             return None
-
-        def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-            return emit(builder, _as_rows(builder, args))
-
-        return a_row(*_kinds(a, b)), codegen
+        return result(*_row_types(a, b)), lambda context, builder, signature, args: emit(
+            builder, *_as_rows(builder, args)
+        )
 
     return apply
 
 
-def _select(order: str) -> Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]:
-    def emit(builder: ir.IRBuilder, args: list[ir.Value]) -> ir.Value:
-        return builder.select(builder.fcmp_ordered(order, *args), *args)
-
-    return emit
+def _as_rows(builder: ir.IRBuilder, args: Any) -> list[ir.Value]:
+    """Return the arguments as rows. Scalars are broadcast."""
+    return [value if value.type == _ROW_TYPE else _broadcast(builder, value) for value in args]
 
 
-least = _elementwise(_select("<"))
-"""Elementwise minimum. It returns the second argument where one is NaN."""
-greatest = _elementwise(_select(">"))
-"""Elementwise maximum. It returns the second argument where one is NaN."""
+def _row_types(*given: types.Type) -> list[types.Type]:
+    """Return the numba types of arguments that are each a row or a float32."""
+    return [kind if kind is float32x16 else types.float32 for kind in given]
 
 
-def _operator(symbol: Any, emit: Callable[[ir.IRBuilder, list[ir.Value]], ir.Value]) -> None:
+def _operator(symbol: Any, emit: Emit) -> None:
     apply = _elementwise(emit)
 
     @overload(symbol)
     @no_type_check
     def implement(a, b):
-        if a_row in (a, b) and all(kind is a_row or isinstance(kind, types.Float) for kind in (a, b)):
+        if float32x16 in (a, b) and all(
+            kind is float32x16 or isinstance(kind, types.Float) for kind in (a, b)
+        ):
             return lambda a, b: apply(a, b)
         return None
 
 
-_operator(operator.add, lambda builder, args: builder.fadd(*args, flags=_REORDER))
-_operator(operator.sub, lambda builder, args: builder.fsub(*args, flags=_REORDER))
-_operator(operator.mul, lambda builder, args: builder.fmul(*args, flags=_REORDER))
-_operator(operator.truediv, lambda builder, args: builder.fdiv(*args, flags=_REORDER))
+_operator(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=_REORDER))
+_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=_REORDER))
+_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=_REORDER))
+_operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b, flags=_REORDER))
+
+
+def _select(order: str) -> Emit:
+    return lambda builder, a, b: builder.select(builder.fcmp_ordered(order, a, b), a, b)
+
+
+minimum = _elementwise(_select("<"))
+"""Elementwise minimum. It returns the second argument where one is NaN."""
+maximum = _elementwise(_select(">"))
+"""Elementwise maximum. It returns the second argument where one is NaN."""
+broadcast = _unary(_broadcast, given=types.float32)
+"""Row with sixteen copies of a float32."""
+
+
+def _mask(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    return builder.zext(builder.bitcast(builder.fcmp_ordered(">", a, b), ir.IntType(ROW)), cgutils.int32_t)
+
+
+greater_mask = _elementwise(_mask, result=types.uint32)
+"""Integer with bit k set where a > b in lane k."""
+lowest_set_bit = _unary(
+    lambda builder, bits: builder.zext(builder.cttz(bits, ir.Constant(ir.IntType(1), 1)), cgutils.intp_t),
+    given=types.uint32,
+    result=types.intp,
+)
+"""Position of the lowest set bit of a non-zero integer."""
 
 
 @intrinsic
 @no_type_check
-def row_of(typing_context, scalar):
-    """Return a row with sixteen copies of a scalar."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return _broadcast(builder, args[0])
-
-    return a_row(types.float32), codegen
-
-
-@intrinsic
-@no_type_check
-def where_more(typing_context, a, b, yes, no):
+def select_greater(typing_context, a, b, yes, no):
     """Return `yes` where a > b, else `no`, elementwise. Each argument is a row or a float32."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         a, b, yes, no = _as_rows(builder, args)
         return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
 
-    return a_row(*_kinds(a, b, yes, no)), codegen
+    return float32x16(*_row_types(a, b, yes, no)), codegen
 
 
-@intrinsic
-@no_type_check
-def bits_more(typing_context, a, b):
-    """Return an integer with bit k set where a > b in lane k."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        above = builder.fcmp_ordered(">", *_as_rows(builder, args))
-        return builder.zext(builder.bitcast(above, ir.IntType(ROW)), cgutils.int32_t)
-
-    return types.uint32(*_kinds(a, b)), codegen
-
-
-@intrinsic
-@no_type_check
-def lowest_bit(typing_context, bits):
-    """Return the position of the lowest set bit of a non-zero integer."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        return builder.zext(builder.cttz(args[0], ir.Constant(ir.IntType(1), 1)), cgutils.intp_t)
-
-    return types.intp(types.uint32), codegen
-
-
-def _halving(pair: Callable[[ir.IRBuilder, ir.Value, ir.Value], ir.Value]) -> Any:
+def _reduction(combine: Emit) -> Any:
     """Return an intrinsic that reduces a row to one float32 by halving it repeatedly."""
 
-    @intrinsic
-    @no_type_check
-    def apply(typing_context, row):
-        def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-            (value,) = args
-            for half in (8, 4, 2, 1):
-                other = [(lane + half) % ROW for lane in range(ROW)]
-                value = pair(builder, value, _shuffled(builder, value, value, other))
-            return builder.extract_element(value, ir.Constant(cgutils.int32_t, 0))
+    def emit(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+        for half in (8, 4, 2, 1):
+            other = [(lane + half) % ROW for lane in range(ROW)]
+            value = combine(builder, value, _shuffle(builder, value, value, other))
+        return builder.extract_element(value, ir.Constant(cgutils.int32_t, 0))
 
-        return types.float32(a_row), codegen
-
-    return apply
+    return _unary(emit, result=types.float32)
 
 
-total_of = _halving(lambda builder, a, b: builder.fadd(a, b, flags=_REORDER))
+row_sum = _reduction(lambda builder, a, b: builder.fadd(a, b, flags=_REORDER))
 """Sum of the numbers of a row."""
-greatest_in = _halving(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+row_max = _reduction(_select(">"))
 """Largest number of a row."""
 
 
 @intrinsic
 @no_type_check
-def totals(typing_context, array, index):
+def row_sums(typing_context, array, index):
     """Return the sums of sixteen consecutive rows from flat `index` of an array, as one row."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        first = _address(context, builder, signature, args, _FORM)
+        first = _address(context, builder, signature, args, _ROW_TYPE)
         places = [builder.gep(first, [ir.Constant(cgutils.int32_t, k)]) for k in range(ROW)]
         rows = [builder.load(place, align=4) for place in places]
         while len(rows) > 1:  # halve the rows, and the lanes of each row
             run = ROW // len(rows)
-            rows = [_add_runs(builder, a, b, run) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+            rows = [_add_adjacent(builder, a, b, run) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
 
-    return a_row(array, types.intp), codegen
+    return float32x16(array, types.intp), codegen
 
 
 @intrinsic
@@ -354,42 +332,31 @@ def prefetch(typing_context, array, index):
     return types.void(array, types.intp), codegen
 
 
-@intrinsic
-@no_type_check
-def _floor(typing_context, row):
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        kind = ir.FunctionType(_FORM, [_FORM])
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.floor.v{ROW}f32")
-        return builder.call(function, args)
-
-    return a_row(a_row), codegen
+def _emit_floor(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
+    kind = ir.FunctionType(_ROW_TYPE, [_ROW_TYPE])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.floor.v{ROW}f32"), [row])
 
 
-@intrinsic
-@no_type_check
-def _power_of_2(typing_context, row):
+def _emit_power_of_2(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
     """Return 2^n of integers n from -126 to 127, written directly into the exponent bits."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
-        whole = builder.add(builder.fptosi(args[0], _WHOLE), ir.Constant(_WHOLE, [127] * ROW))
-        return builder.bitcast(builder.shl(whole, ir.Constant(_WHOLE, [23] * ROW)), _FORM)
-
-    return a_row(a_row), codegen
+    exponent = builder.add(builder.fptosi(row, _INT_ROW_TYPE), ir.Constant(_INT_ROW_TYPE, [127] * ROW))
+    return builder.bitcast(builder.shl(exponent, ir.Constant(_INT_ROW_TYPE, [23] * ROW)), _ROW_TYPE)
 
 
+_floor, _power_of_2 = _unary(_emit_floor), _unary(_emit_power_of_2)
 _C5, _C4, _C3, _C2, _C1 = (
     np.float32(c) for c in (1.86713e-3, 9.01703e-3, 5.579991e-2, 2.4016445e-1, 6.9315131e-1)
 )
 """Coefficients of 2^f ≈ 1 + f (C1 + f (C2 + …)) for f from 0 to 1, with relative error below 8e-8. They are
 the minimax polynomial of degree 5, found by reweighted least squares."""
-_LEAST = np.float32(-126)
+_MIN_EXPONENT = np.float32(-126)
 
 
 @inlined_part
 @no_type_check
 def exp2_row(x):
     """Return 2^x for x ≤ 127, with relative error below 3e-7. For x < -126 return 2^-126."""
-    x = greatest(x, _LEAST)
+    x = maximum(x, _MIN_EXPONENT)
     whole = _floor(x)
     f = x - whole
     polynomial = ((((f * _C5 + _C4) * f + _C3) * f + _C2) * f + _C1) * f + ONE

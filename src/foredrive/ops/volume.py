@@ -13,8 +13,8 @@ from torch import Tensor
 
 from foredrive.geometry.precision import full_precision
 from foredrive.geometry.se3 import transform_points
-from foredrive.ops.precision import MAX_ITEM_SIZE, numba_supports, triton_supports
-from foredrive.ops.volume_reading import ReadVolume, readers_of
+from foredrive.ops.attention3d import attend_volume
+from foredrive.ops.precision import numba_supports, triton_supports
 
 
 def sample_volume(
@@ -34,18 +34,10 @@ def sample_volume(
     """
     if len(volume) != len(points) or min(volume.shape[1:]) == 0:
         raise ValueError(f"sample_volume: cannot read {(*points.shape,)} from {(*volume.shape,)}")
-    small = volume[:1].numel() < MAX_ITEM_SIZE
-    if small and triton_supports(volume, points):
-        from foredrive.ops.volume_triton import sample_volume_triton  # Triton may be missing
-
-        return sample_volume_triton(volume, points)
-    if not (small and numba_supports(volume, points)):
+    if not (numba_supports(volume, points) or triton_supports(volume, points)):
         return sample_volume_reference(volume, points)
-    readers = readers_of(1, volume.shape[-1])
-    with full_precision(volume, points) as (volume, points):
-        one = points.new_ones(()).expand(*points.shape[:2], 1, 1)
-        out: Tensor = ReadVolume.apply(volume, points[:, :, None, None], one, readers)
-        return out
+    one = points.new_ones(()).expand(*points.shape[:2], 1, 1)
+    return attend_volume(volume, points[:, :, None, None], one)  # one head with one point of weight 1
 
 
 def sample_volume_reference(

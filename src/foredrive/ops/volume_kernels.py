@@ -1,4 +1,4 @@
-"""Numba kernels of `sample_volume` and `attend_volume`: weighted sums of trilinear samples.
+"""Numba kernels of `attend_volume`: weighted sums of trilinear samples.
 
 Queries are processed in blocks of up to 256 points, head by head.
 """
@@ -7,11 +7,11 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from foredrive.ops.corners import BLOCK, new_block, read_point, send_back
+from foredrive.ops.corners import BLOCK, new_block, sample_point, sample_point_backward, set_corners
 from foredrive.ops.vectors import HALF, WIDTH, ZERO, kernel, kernel_part, load, neighbours, store, zeros8
 
 
-class Inputs(NamedTuple):
+class VolumeInputs(NamedTuple):
     """Inputs of the kernels."""
 
     values: np.ndarray
@@ -22,18 +22,18 @@ class Inputs(NamedTuple):
     """Float[b Q H P], weights."""
 
 
-class Gradients(NamedTuple):
+class VolumeGradients(NamedTuple):
     """Gradients with respect to the result and to the inputs of the same names."""
 
     out: np.ndarray
     values: np.ndarray
     points: np.ndarray
-    """Float[b Q slots P 3], one slot per reader."""
+    """Float[b Q slots P 3], one slot per slice."""
     weights: np.ndarray
-    """Float[b Q slots P], one slot per reader."""
+    """Float[b Q slots P], one slot per slice."""
 
 
-class Reader(NamedTuple):
+class ChannelSlice(NamedTuple):
     """A range of channels of one head, and the slot for the gradients of its points."""
 
     head: int
@@ -44,7 +44,7 @@ class Reader(NamedTuple):
 
 @kernel_part
 @no_type_check
-def _collect(inputs, block, item, first, last, head):
+def _fill_block(inputs, block, item, first, last, head):
     """Fill `block` with the points of the queries first … last - 1 of a batch item."""
     points = inputs.weights.shape[3]
     for q in range(first, last):
@@ -60,7 +60,7 @@ def _collect(inputs, block, item, first, last, head):
 @no_type_check
 def _corners(block, count, shape):
     """Fill `corner` and `part` of a block."""
-    place, corner, part = block.place, block.corner, block.part
+    place = block.place
     depth, height, width = np.int32(shape[1]), np.int32(shape[2]), np.int32(shape[3])
     channels = np.int32(shape[4])
     for i in range(count):
@@ -70,24 +70,10 @@ def _corners(block, count, shape):
         z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
         # NaN coordinates must give NaN, although `neighbours` treats them as outside.
         w = block.weight[i] if (x == x) & (y == y) & (z == z) else np.float32(np.nan)
-        row00, row01 = (z0 * height + y0) * width, (z0 * height + y1) * width
-        row10, row11 = (z1 * height + y0) * width, (z1 * height + y1) * width
-        corner[i] = (row00 + x0) * channels
-        corner[BLOCK + i] = (row00 + x1) * channels
-        corner[2 * BLOCK + i] = (row01 + x0) * channels
-        corner[3 * BLOCK + i] = (row01 + x1) * channels
-        corner[4 * BLOCK + i] = (row10 + x0) * channels
-        corner[5 * BLOCK + i] = (row10 + x1) * channels
-        corner[6 * BLOCK + i] = (row11 + x0) * channels
-        corner[7 * BLOCK + i] = (row11 + x1) * channels
-        part[i] = w * wz0 * wy0 * wx0
-        part[BLOCK + i] = w * wz0 * wy0 * wx1
-        part[2 * BLOCK + i] = w * wz0 * wy1 * wx0
-        part[3 * BLOCK + i] = w * wz0 * wy1 * wx1
-        part[4 * BLOCK + i] = w * wz1 * wy0 * wx0
-        part[5 * BLOCK + i] = w * wz1 * wy0 * wx1
-        part[6 * BLOCK + i] = w * wz1 * wy1 * wx0
-        part[7 * BLOCK + i] = w * wz1 * wy1 * wx1
+        row0, row1 = (z0 * height + y0) * width, (z0 * height + y1) * width
+        set_corners(block, i, w * wz0, row0, row1, x0, x1, wy0, wy1, wx0, wx1, channels)
+        row0, row1 = (z1 * height + y0) * width, (z1 * height + y1) * width
+        set_corners(block, 4 * BLOCK + i, w * wz1, row0, row1, x0, x1, wy0, wy1, wx0, wx1, channels)
 
 
 @kernel_part
@@ -101,7 +87,7 @@ def _read(inputs, block, item, first, last, channel, zero, out):
         total = zero
         i = (q - first) * points
         for p in range(i, i + points):
-            total = read_point(inputs.values, base, block, p, 8, total, zero)
+            total = sample_point(inputs.values, base, block, p, 8, total, zero)
         store(out, (item * queries + q) * channels + channel, total)
 
 
@@ -120,7 +106,7 @@ def read_queries(inputs, item, first_query, last_query, out):
     for first in range(first_query, last_query, step):
         last = min(first + step, last_query)
         for head in range(heads):
-            _collect(inputs, block, item, first, last, head)
+            _fill_block(inputs, block, item, first, last, head)
             start = head * width
             for c in range(start, start + whole, WIDTH):
                 _read(inputs, block, item, first, last, c, zeros8(), out)
@@ -140,7 +126,7 @@ def _read_back(inputs, block, item, first, last, channel, zero, grads):
         grad = load(grads.out, (item * queries + q) * channels + channel, zero)
         i = (q - first) * points
         for p in range(i, i + points):
-            send_back(inputs.values, base, block, p, 8, grad, zero, grads.values, to_points)
+            sample_point_backward(inputs.values, base, block, p, 8, grad, zero, grads.values, to_points)
 
 
 @kernel_part
@@ -174,7 +160,7 @@ def _slopes(block, count, shape):
 
 @kernel_part
 @no_type_check
-def _hand_out(inputs, block, item, first, last, slot, grads):
+def _scatter_gradients(inputs, block, item, first, last, slot, grads):
     """Write the gradients of a block's points. It overwrites `block.part`."""
     points = inputs.weights.shape[3]
     slope = block.part
@@ -191,23 +177,23 @@ def _hand_out(inputs, block, item, first, last, slot, grads):
 
 @kernel
 @no_type_check
-def read_back(inputs, item, reader, grads):
-    """Add the gradients of the values for one reader of a batch item, and write those of its points.
+def read_back(inputs, item, part, grads):
+    """Add the gradients of the values for one channel slice of a batch item, and write those of its points.
 
-    Readers use disjoint channels and slots, and batch items use disjoint volumes. So calls that differ in
-    reader or item can run in parallel. Gradients that are not wanted have size 0.
+    Slices use disjoint channels and slots, and batch items use disjoint volumes. So calls that differ in
+    slice or item can run in parallel. Gradients that are not wanted have size 0.
     """
-    width = reader.last_channel - reader.first_channel
-    whole = reader.first_channel + width - width % WIDTH
+    width = part.last_channel - part.first_channel
+    whole = part.first_channel + width - width % WIDTH
     block, step = new_block(3), BLOCK // inputs.weights.shape[3]
     queries = inputs.weights.shape[1]
     for first in range(0, queries, step):
         last = min(first + step, queries)
-        _collect(inputs, block, item, first, last, reader.head)
+        _fill_block(inputs, block, item, first, last, part.head)
         block.dots[:] = 0
-        for c in range(reader.first_channel, whole, WIDTH):
+        for c in range(part.first_channel, whole, WIDTH):
             _read_back(inputs, block, item, first, last, c, zeros8(), grads)
-        for c in range(whole, reader.last_channel):
+        for c in range(whole, part.last_channel):
             _read_back(inputs, block, item, first, last, c, ZERO, grads)
         if grads.points.size + grads.weights.size > 0:
-            _hand_out(inputs, block, item, first, last, reader.slot, grads)
+            _scatter_gradients(inputs, block, item, first, last, part.slot, grads)

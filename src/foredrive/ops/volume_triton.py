@@ -1,4 +1,4 @@
-"""The CUDA path of `sample_volume` and `attend_volume`: Triton kernels for sums of trilinear samples.
+"""The CUDA path of `attend_volume`: Triton kernels for sums of trilinear samples.
 
 A program handles a few rows (a row is one head of one query) and reads rows × points × channels at a time.
 """
@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.tiles import launch, neighbours, read, read_back
+from foredrive.ops.tiles import launch, neighbours, read, read_back, rows_of_program
 
 
-def read_volume_triton(
+def attend_volume_triton(
     values: Float[Tensor, "b Z Y X D"],
     points: Float[Tensor, "b Q H P 3"],
     weights: Float[Tensor, "b Q H P"],
@@ -25,19 +25,11 @@ def read_volume_triton(
 
     The gradient of the values is summed by atomics, so its last bits differ from run to run.
     """
-    out: Tensor = _ReadVolume.apply(values, points, weights)
+    out: Tensor = _AttendVolume.apply(values, points, weights)
     return out
 
 
-def sample_volume_triton(
-    volume: Float[Tensor, "b Z Y X D"], points: Float[Tensor, "b N 3"]
-) -> Float[Tensor, "b N D"]:
-    """Compute `sample_volume` on a GPU: one head with one point of weight 1."""
-    one = torch.ones(*points.shape[:2], 1, 1, device=points.device)
-    return read_volume_triton(volume, points[:, :, None, None], one)
-
-
-class _ReadVolume(torch.autograd.Function):
+class _AttendVolume(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -48,7 +40,7 @@ class _ReadVolume(torch.autograd.Function):
         inputs = [x.contiguous() for x in (values, points, weights)]
         ctx.save_for_backward(*inputs)
         out = torch.empty(*weights.shape[:2], values.shape[-1], device=values.device)
-        _launch(_read_rows, inputs, [out])
+        _launch(_attend_rows, inputs, [out])
         return out
 
     @staticmethod
@@ -61,7 +53,7 @@ class _ReadVolume(torch.autograd.Function):
         grad_points = torch.empty_like(points) if to_points else None
         grad_weights = torch.empty_like(weights) if to_points else None
         _launch(
-            _read_rows_back,
+            _attend_rows_back,
             [values, points, weights],
             [grad_out.float().contiguous(), grad_values, grad_points, grad_weights],
             TO_VALUES=wants_values,
@@ -94,7 +86,7 @@ def _places(points, weights, at, inside):
 
 @triton.jit
 @no_type_check
-def _read_rows(
+def _attend_rows(
     values,  # b Z Y X D
     points,  # b·Q H P 3
     weights,  # b·Q H P
@@ -112,9 +104,7 @@ def _read_rows(
     W: tl.constexpr,
 ):
     CHANNELS: tl.constexpr = HEADS * WIDTH
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    exists = row < row_count
-    query, head = row // HEADS, row % HEADS
+    row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     base = (query // queries * depth * height * width * CHANNELS + head * WIDTH)[:, None]
     c = tl.arange(0, W)
     total = tl.zeros([ROWS, W], tl.float32)
@@ -137,7 +127,7 @@ def _read_rows(
 
 @triton.jit
 @no_type_check
-def _read_rows_back(
+def _attend_rows_back(
     values,
     points,
     weights,
@@ -160,9 +150,7 @@ def _read_rows_back(
     TO_POINTS: tl.constexpr,
 ):
     CHANNELS: tl.constexpr = HEADS * WIDTH
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    exists = row < row_count
-    query, head = row // HEADS, row % HEADS
+    row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     base = (query // queries * depth * height * width * CHANNELS + head * WIDTH)[:, None]
     c = tl.arange(0, W)
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
@@ -177,20 +165,20 @@ def _read_rows_back(
         z0, z1, wz0, wz1, sz0, sz1 = neighbours(z, depth)
         to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
         to_z, to_weight = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
-        # `met` is the dot product of the corner's value and the gradient.
+        # `dot` is the dot product of the corner's value and the gradient.
         for corner in tl.static_range(8):
             cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
             cy, wy, sy = (y1, wy1, sy1) if corner // 2 % 2 else (y0, wy0, sy0)
             cz, wz, sz = (z1, wz1, sz1) if corner // 4 else (z0, wz0, sz0)
             at_corner = base + ((cz * height + cy) * width + cx) * CHANNELS
             part = wz * wy * wx
-            met = read_back(
+            dot = read_back(
                 values, grad_values, at_corner, w * part, inside, grad, c, WIDTH, TO_VALUES, TO_POINTS
             )
-            to_x += w * wz * wy * sx * met
-            to_y += w * wz * sy * wx * met
-            to_z += w * sz * wy * wx * met
-            to_weight += part * met
+            to_x += w * wz * wy * sx * dot
+            to_y += w * wz * sy * wx * dot
+            to_z += w * sz * wy * wx * dot
+            to_weight += part * dot
         if TO_POINTS:
             tl.store(grad_points + 3 * at, to_x, mask=inside)
             tl.store(grad_points + 3 * at + 1, to_y, mask=inside)

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING
 from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
-    from foredrive.recipes.config import Recipe, labelled_by
+    from foredrive.recipes.config import Recipe, with_occupancy_source
     from foredrive.recipes.known import RECIPES, find_recipe
 
-__all__ = ["RECIPES", "Recipe", "find_recipe", "labelled_by"]
+__all__ = ["RECIPES", "Recipe", "find_recipe", "with_occupancy_source"]
 
-__getattr__ = on_demand(__name__, {"config": ("Recipe", "labelled_by"), "known": ("RECIPES", "find_recipe")})
+__getattr__ = on_demand(
+    __name__, {"config": ("Recipe", "with_occupancy_source"), "known": ("RECIPES", "find_recipe")}
+)

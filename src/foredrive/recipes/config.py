@@ -15,11 +15,10 @@ from foredrive.files import atomic_path
 from foredrive.models.planner import PlannerConfig
 from foredrive.recipes.old_formats import upgraded
 from foredrive.recipes.world_models import WORLD_MODELS
-from foredrive.training import PathFit
+from foredrive.training import EgoMLPFit, PathFit
 
 M = TypeVar("M")
 S = TypeVar("S")
-V = TypeVar("V")
 R = TypeVar("R", bound="Recipe[Any, Any]")
 
 
@@ -40,6 +39,8 @@ class Recipe(Generic[M, S]):
     path: PathFit | None = None
     """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
     trains it in fine-tuning."""
+    ego_mlp: EgoMLPFit = field(default_factory=EgoMLPFit)
+    """Fit of the ego MLP: the baseline in the evaluation and, with `planner.ego_mlp`, the planner's base."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
@@ -50,7 +51,20 @@ def rescheduled(stage: S, **changes: Any) -> S:
     return replace(stage, schedule=replace(stage.schedule, **changes))  # type: ignore[attr-defined, type-var]
 
 
-def labelled_by(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
+def named_after(full: R, rows: Mapping[str, tuple[R, str]]) -> dict[str, R]:
+    """Return a recipe under its name, and its ablations under FULL_ROW.
+
+    Args:
+        rows: recipe and description of each ablation.
+    """
+    recipes = {full.name: full}
+    for row, (recipe, about) in rows.items():
+        name = f"{full.name}_{row}"
+        recipes[name] = replace(recipe, name=name, about=f"{full.name}: {about}")
+    return recipes
+
+
+def with_occupancy_source(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
     """Return the recipe with voxel labels of another source, which is added to its name."""
     if occupancy_source == recipe.clips.occupancy_source:
         return recipe
@@ -101,12 +115,6 @@ def recipe_from(written: Any, source: str) -> Recipe[Any, Any]:
     row = WORLD_MODELS[kind]
     recipe: Recipe[Any, Any] = validated(Recipe[row.config, row.stage], written, source)  # type: ignore[name-defined]
     return recipe
-
-
-def load_values(kind: type[V], path: Path) -> V:
-    """Read a dataclass of plain values from YAML. Raises the errors of `load_recipe`."""
-    found: V = validated(kind, read_values(path), str(path))
-    return found
 
 
 def read_values(path: Path) -> Any:

@@ -4,12 +4,18 @@ from dataclasses import replace
 
 from foredrive.data import ClipConfig
 from foredrive.models.driveworld import DriveWorldConfig
+from foredrive.models.driveworld.planes import (
+    PlanesToVolumeConfig,
+    PlaneToVectorConfig,
+    StaticSceneConfig,
+    VectorToPlaneConfig,
+)
 from foredrive.models.driveworld.state_space import StateSpaceConfig
 from foredrive.models.driveworld.task_prompt import PromptConfig
 from foredrive.models.lift_splat import LiftSplatConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
-from foredrive.models.text_encoder import IN_A_PACKAGE
+from foredrive.models.text_encoder import PACKAGED_MODEL
 from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_base, nemo_tiny, nemo_town
 from foredrive.training import DriveWorldStage, DriveWorldWeights, Schedule
@@ -37,12 +43,14 @@ def driveworld_tiny() -> DriveWorldRecipe:
                 observation=128, state=64, history=128, memory=8, heads=4, objects=8, hidden=128
             ),
             channels=32,
-            plane=32,
-            observation_hidden=16,
-            expanded=(64, 32, 16, 8),
-            volume_hidden=8,
-            statics=32,
-            prompt=PromptConfig(widths=(32, 16, 8), encoding=384, text_encoder=IN_A_PACKAGE),
+            plane_channels=32,
+            to_vector=PlaneToVectorConfig(hidden=16),
+            from_vector=VectorToPlaneConfig(widths=(64, 32, 16, 8)),
+            to_volume=PlanesToVolumeConfig(hidden=8),
+            statics=StaticSceneConfig(channels=32),
+            prompt=PromptConfig(
+                expand=VectorToPlaneConfig(widths=(32, 16, 8)), encoding=384, text_encoder=PACKAGED_MODEL
+            ),
         ),
         planner=nemo.planner,
         pretrain=DriveWorldStage(
@@ -60,7 +68,7 @@ def driveworld_tiny() -> DriveWorldRecipe:
 def driveworld_town() -> DriveWorldRecipe:
     """Return a DriveWorld for claims tested on two CPU cores, with `nemo_town`'s grid, planner and steps.
 
-    It has one round of deformable lifting. After 300 steps, with `carry_statics`, above-ground IoU on 32
+    It has one round of deformable lifting. After 300 steps, with `warp_statics`, above-ground IoU on 32
     clips of Town05 was 0.127. With lift-splat it was 0.108, at two thirds of the time per step.
     """
     tiny, nemo = driveworld_tiny(), nemo_town()
@@ -105,12 +113,16 @@ def driveworld_base() -> DriveWorldRecipe:
                 observation=512, state=512, history=1024, memory=16, heads=8, objects=32, hidden=1024
             ),
             channels=64,
-            plane=256,
-            observation_hidden=128,
-            expanded=(512, 256, 128, 64),
-            volume_hidden=16,
-            statics=256,
-            prompt=PromptConfig(widths=(256, 128, 64, 64), encoding=384, text_encoder=IN_A_PACKAGE),
+            plane_channels=256,
+            to_vector=PlaneToVectorConfig(hidden=128),
+            from_vector=VectorToPlaneConfig(widths=(512, 256, 128, 64)),
+            to_volume=PlanesToVolumeConfig(hidden=16),
+            statics=StaticSceneConfig(channels=256),
+            prompt=PromptConfig(
+                expand=VectorToPlaneConfig(widths=(256, 128, 64, 64)),
+                encoding=384,
+                text_encoder=PACKAGED_MODEL,
+            ),
         ),
         planner=nemo.planner,
         pretrain=DriveWorldStage(schedule=schedule, weights=DriveWorldWeights()),

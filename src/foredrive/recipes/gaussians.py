@@ -5,8 +5,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.recipes.config import is_recipe_file, load_values, overridden, validated
+from foredrive.recipes.config import is_recipe_file, overridden, read_values, validated
 from foredrive.recipes.known import nearest_name
+from foredrive.recipes.old_formats import upgraded_reconstruction
 from foredrive.rendering.initial import InitialGaussians
 from foredrive.training.rebuilding import LearningRates, RebuildSchedule
 
@@ -53,7 +54,7 @@ def gaussians_tiny() -> RebuildRecipe:
         ),
         schedule=RebuildSchedule(
             steps=steps,
-            most_gaussians=275_000,
+            max_gaussians=275_000,
             rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=3e-3),
             images_per_sweep=2,
             beam_stride=4,
@@ -84,7 +85,7 @@ def gaussians_base() -> RebuildRecipe:
             scale=0.2,
         ),
         schedule=RebuildSchedule(
-            steps=30_000, most_gaussians=5_000_000, shrink_steps=(3_000, 6_000), checkpoint_every=1_000
+            steps=30_000, max_gaussians=5_000_000, shrink_steps=(3_000, 6_000), checkpoint_every=1_000
         ),
     )
 
@@ -94,10 +95,16 @@ REBUILD_RECIPES: dict[str, RebuildRecipe] = {
 }
 
 
+def load_rebuild_recipe(path: Path) -> RebuildRecipe:
+    """Read a recipe from YAML, in today's format or an earlier one. Raises the errors of `load_recipe`."""
+    recipe: RebuildRecipe = validated(RebuildRecipe, upgraded_reconstruction(read_values(path)), str(path))
+    return recipe
+
+
 def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe:
     """Return a recipe by its name or from a YAML file. Arguments and errors are those of `find_recipe`."""
     if is_recipe_file(name):
-        recipe = load_values(RebuildRecipe, Path(name))
+        recipe = load_rebuild_recipe(Path(name))
     elif name in REBUILD_RECIPES:
         recipe = REBUILD_RECIPES[name]
     else:

@@ -9,18 +9,18 @@ from typing import Any
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe, is_recipe_file, load_recipe, overridden, recipe_from
 from foredrive.recipes.driveworld import driveworld_base, driveworld_tiny, driveworld_town
-from foredrive.recipes.driveworld_rows import driveworld_rows
+from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
-from foredrive.recipes.nemo_rows import nemo_rows
+from foredrive.recipes.nemo_ablations import nemo_ablations
 
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
-    **nemo_rows(nemo_town(), TOWN_BEV),
-    **nemo_rows(nemo_base(), BASE_BEV),
+    **nemo_ablations(nemo_town(), TOWN_BEV),
+    **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),
-    **driveworld_rows(driveworld_town()),
-    **driveworld_rows(driveworld_base()),
+    **driveworld_ablations(driveworld_town()),
+    **driveworld_ablations(driveworld_base()),
 }
 
 

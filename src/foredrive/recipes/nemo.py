@@ -11,7 +11,7 @@ from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
 from foredrive.models.planner import PathCorrectionConfig, PlannerConfig
 from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.scene import VoxelSpec
-from foredrive.training import LossWeights, NemoStage, PathFit, Schedule
+from foredrive.training import NemoStage, NemoWeights, PathFit, Schedule
 
 NemoRecipe = Recipe[NemoConfig, NemoStage]
 
@@ -24,7 +24,7 @@ def nemo_tiny() -> NemoRecipe:
     occupied voxels avoids this. Imagined frames have weight 1/4, because before motion is learned they only
     blur objects beside the road.
     """
-    few_steps = LossWeights(wpts=0.0, recon=0.0, occ=0.0, scal=1.0, bce=10.0, occupied=3.0, future=0.25)
+    few_steps = NemoWeights(wpts=0.0, recon=0.0, occ=0.0, scal=1.0, bce=10.0, occupied=3.0, future=0.25)
     return Recipe(
         name="nemo_tiny",
         about="NeMo small enough for two CPU cores: the demo",
@@ -157,13 +157,13 @@ def nemo_base() -> NemoRecipe:
         planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8)),
         pretrain=NemoStage(
             schedule=schedule,
-            weights=LossWeights(wpts=0.0, recon=1.0, occ=1.0),
+            weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=8,
             vgg16="download",
         ),
         finetune=NemoStage(
             schedule=schedule,
-            weights=LossWeights(wpts=1.0, recon=0.5, occ=0.5),
+            weights=NemoWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
             vgg16="download",
         ),

@@ -5,15 +5,55 @@ from typing import Any
 
 
 def upgraded(written: Any) -> Any:
-    """Return the values of a recipe in today's format. Anything else is returned unchanged.
-
-    Until November 2026 `model` was flat: it held the sizes of the planner and of all parts side by side. NeMo
-    and its stages had no `kind`, and some numbers were fixed in the code.
-    """
+    """Return the values of a recipe in today's format. Anything else is returned unchanged."""
     model = written.get("model") if isinstance(written, Mapping) else None
-    if not isinstance(model, Mapping) or "planner_width" not in model:
+    if not isinstance(model, Mapping):
         return written
-    flat = dict(model)
+    nested = _nested(written) if "planner_width" in model else written
+    return _with_module_configs(nested)
+
+
+def upgraded_reconstruction(written: Any) -> Any:
+    """Return the values of a reconstruction's recipe in today's format, as `upgraded` does."""
+    return _renamed(written, "schedule", most_gaussians="max_gaussians")
+
+
+_FLAT_PARTS = {"plane", "observation_hidden", "expanded", "volume_hidden", "statics", "prompt"}
+
+
+def _with_module_configs(written: Mapping[str, Any]) -> Any:
+    """Convert the first nested format. DriveWorld's parts had no configs, and entries had other names."""
+    model = dict(written["model"])
+    if model.keys() >= _FLAT_PARTS:
+        model["plane_channels"] = model.pop("plane")
+        model["to_vector"] = {"hidden": model.pop("observation_hidden")}
+        model["from_vector"] = {"widths": model.pop("expanded")}
+        model["to_volume"] = {"hidden": model.pop("volume_hidden")}
+        model["statics"] = {"channels": model["statics"]} if model["statics"] else None
+        prompt = model["prompt"]
+        if isinstance(prompt, Mapping) and "widths" in prompt:
+            rest = {key: value for key, value in prompt.items() if key != "widths"}
+            model["prompt"] = {"expand": {"widths": prompt["widths"]}, **rest}
+    written = _renamed({**written, "model": model}, "model", carry_statics="warp_statics")
+    planner = _renamed(written.get("planner"), "path", aside_m="lateral_m")
+    return {**written, "planner": planner} if "planner" in written else written
+
+
+def _renamed(written: Any, part: str, **names: str) -> Any:
+    """Return values with other names for some entries of a part. Anything else is returned unchanged."""
+    entries = written.get(part) if isinstance(written, Mapping) else None
+    if not isinstance(entries, Mapping):
+        return written
+    return {**written, part: {names.get(key, key): value for key, value in entries.items()}}
+
+
+def _nested(written: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the flat format to the nested one.
+
+    Until November 2026 `model` held the sizes of the planner and of all parts side by side. NeMo and its
+    stages had no `kind`, and some numbers were fixed in the code.
+    """
+    flat = dict(written["model"])
     kind = flat.pop("kind", "nemo")
     planner = _planner(flat)
     checkpoint = flat.pop("checkpoint", ())

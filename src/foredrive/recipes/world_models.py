@@ -16,7 +16,7 @@ from foredrive.scene import WorldModel
 from foredrive.training import DriveWorldObjective, DriveWorldStage, NemoObjective, NemoStage
 
 
-class WorldModelKind(NamedTuple):
+class WorldModelEntry(NamedTuple):
     """One kind of world model."""
 
     config: type
@@ -50,13 +50,7 @@ def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConf
             features = Vgg16Features(stage.vgg16)
         except (OSError, InputError) as error:
             warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
-    return NemoObjective(
-        agent,
-        stage.weights,
-        steps=clips.future_frames if stage.imagine else 0,
-        ray_stride=stage.ray_stride,
-        image_features=features,
-    )
+    return NemoObjective(agent, stage, steps=clips.future_frames, image_features=features)
 
 
 def build_driveworld(config: DriveWorldConfig, clips: ClipConfig, fetch: bool) -> DriveWorld:
@@ -68,16 +62,10 @@ def driveworld_objective(
     stage: DriveWorldStage, agent: PlanningAgent[DriveWorld], clips: ClipConfig
 ) -> DriveWorldObjective:
     """Build DriveWorld's objective."""
-    return DriveWorldObjective(
-        agent,
-        stage.weights,
-        steps=clips.future_frames,
-        temporal=stage.temporal,
-        statics_of=stage.statics_of,
-    )
+    return DriveWorldObjective(agent, stage, steps=clips.future_frames)
 
 
-WORLD_MODELS: dict[str, WorldModelKind] = {
-    "nemo": WorldModelKind(NemoConfig, NemoStage, build_nemo, nemo_objective),
-    "driveworld": WorldModelKind(DriveWorldConfig, DriveWorldStage, build_driveworld, driveworld_objective),
+WORLD_MODELS: dict[str, WorldModelEntry] = {
+    "nemo": WorldModelEntry(NemoConfig, NemoStage, build_nemo, nemo_objective),
+    "driveworld": WorldModelEntry(DriveWorldConfig, DriveWorldStage, build_driveworld, driveworld_objective),
 }

@@ -1,5 +1,7 @@
 """Views that were not recorded: any camera and any lidar, anywhere, at any time."""
 
+import dataclasses
+
 import torch
 
 from foredrive.geometry.se3 import sensor_twist
@@ -56,13 +58,9 @@ def novel_sweep_view(lidar: SpinningLidar, ego: EgoState) -> SweepView:
 def rendered_sweep(view: SweepView, picture: RenderedSweep) -> LidarSweep:
     """Return the beams of a view with rendered ranges and intensities, in the ego frame at its time."""
     beams, returned = view.beams, picture.returned.cpu()
-    return LidarSweep(
-        origin_ego=beams.origin_ego,
-        dir_ego=beams.dir_ego,
+    return dataclasses.replace(
+        beams,
         range_m=picture.hit_range_m.cpu() * returned,
         returned=returned,
         intensity=picture.intensity.cpu() * returned,
-        dt_s=beams.dt_s,
-        beam=beams.beam,
-        valid=beams.valid,
     )

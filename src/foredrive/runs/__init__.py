@@ -6,18 +6,18 @@ from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
     from foredrive.runs.demo import DemoSize, full_demo, quick_demo, run_demo
-    from foredrive.runs.evaluate.run import Inspection, evaluate_run, inspect_run
+    from foredrive.runs.evaluate.run import ExamplePrediction, evaluate_run, predict_examples
     from foredrive.runs.train.run import Run, load_agent, open_run, train_run
 
 __all__ = [
     "DemoSize",
-    "Inspection",
+    "ExamplePrediction",
     "Run",
     "evaluate_run",
     "full_demo",
-    "inspect_run",
     "load_agent",
     "open_run",
+    "predict_examples",
     "quick_demo",
     "run_demo",
     "train_run",
@@ -27,7 +27,7 @@ __getattr__ = on_demand(
     __name__,
     {
         "demo": ("DemoSize", "full_demo", "quick_demo", "run_demo"),
-        "evaluate.run": ("Inspection", "evaluate_run", "inspect_run"),
+        "evaluate.run": ("ExamplePrediction", "evaluate_run", "predict_examples"),
         "train.run": ("Run", "load_agent", "open_run", "train_run"),
     },
 )

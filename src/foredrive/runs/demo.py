@@ -10,9 +10,9 @@ from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.train.run import Run, train_run
-from foredrive.towns.recorder import LabelKinds, record, split_of
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 RATE_HZ = 2.0
 """Recording rate: one key frame every 0.5 s."""
@@ -87,5 +87,5 @@ def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
         folder,
         rate_hz=RATE_HZ,
         sensors=sensors,
-        labels=LabelKinds(occupancy=None, visibility=False, captions=False),
+        labels=LabelOptions(occupancy=None, visibility=False, captions=False),
     )

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance
+from foredrive.evaluation.provenance import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
@@ -24,7 +24,7 @@ from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip
 
-PROGRAM, MODEL, FACTS = "model.pt2", "model.onnx", "export.json"
+PROGRAM, MODEL, REPORT = "model.pt2", "model.onnx", "export.json"
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 ROUNDS = 3
 """Number of timed runs of each clip."""
@@ -58,7 +58,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
             compare.
     """
     if clips < 1:
-        raise InputError(f"parity needs at least one clip, got {clips}")
+        raise InputError(f"the comparison needs at least one clip, not {clips}")
     _check_packages()
     from foredrive.export.onnx import OPSET, write_onnx
 
@@ -74,10 +74,10 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     with atomic_path(out / MODEL) as temporary:
         write_onnx(program, temporary, GraphInputs._fields, GraphOutputs._fields)
 
-    truth = [_as_it_runs_here(agent, sample.observed, steps) for sample in samples]
+    truth = [GraphOutputs.from_agent(agent(sample.observed, steps)) for sample in samples]
     runtimes = {PROGRAM: _program(out / PROGRAM), MODEL: _session(out / MODEL)}
-    said = {name: [infer(sample.inputs) for sample in samples] for name, infer in runtimes.items()}
-    facts = {
+    outputs = {name: [infer(sample.inputs) for sample in samples] for name, infer in runtimes.items()}
+    report = {
         "recipe": run.recipe.name,
         "run": str(run.folder),
         "opset": OPSET,
@@ -89,22 +89,22 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
         "inputs": _describe(samples[0].inputs),
         "outputs": _describe(truth[0]),
         "clips": len(samples),
-        "largest_difference": {name: _largest_difference(truth, outputs) for name, outputs in said.items()},
+        "largest_difference": {name: _max_difference(truth, found) for name, found in outputs.items()},
         "latency_ms": _latency_ms(agent, runtimes, samples, steps),
         "threads": torch.get_num_threads(),
         **collect_provenance(),
         **{f"version.{name}": metadata.version(name) for name in PACKAGES},
     }
-    with atomic_path(out / FACTS) as temporary:
-        temporary.write_text(json.dumps(facts, indent=1))
-    return facts
+    with atomic_path(out / REPORT) as temporary:
+        temporary.write_text(json.dumps(report, indent=1))
+    return report
 
 
 def _samples(dataset: ClipDataset, agent: PlanningAgent[Any], count: int) -> list[_Sample]:
     """Return clips spread evenly over the logs."""
     every = len(dataset) / count if count else 0.0
     clips = [collate([dataset[int((k + 0.5) * every)]]).clip.observed() for k in range(count)]
-    return [_Sample(observed, GraphInputs.of(observed, agent)) for observed in clips]
+    return [_Sample(observed, GraphInputs.from_clip(observed, agent)) for observed in clips]
 
 
 def _check_packages() -> None:
@@ -112,19 +112,7 @@ def _check_packages() -> None:
         try:
             metadata.version(name)
         except metadata.PackageNotFoundError as error:
-            raise InputError(f"no package {name}: pip install 'foredrive[export]' brings it along") from error
-
-
-def _as_it_runs_here(agent: PlanningAgent[Any], observed: Clip, steps: int) -> GraphOutputs:
-    output = agent(observed, steps)
-    now = torch.eye(4)[None]
-    poses = [now if belief.T_now_ego is None else belief.T_now_ego for belief in output.beliefs]
-    return GraphOutputs(
-        waypoints_xy=output.plan.xy[:, 0],
-        waypoints_yaw=output.plan.yaw[:, 0],
-        occupancy_logit=torch.stack([decoded.occupancy_logit for decoded in output.decoded], dim=1),
-        T_now_ego=torch.stack(poses, dim=1),
-    )
+            raise InputError(f"package {name} is missing: pip install 'foredrive[export]'") from error
 
 
 def _program(path: Path) -> Infer:
@@ -152,16 +140,18 @@ def _session(path: Path) -> Infer:
     return infer
 
 
-def _largest_difference(truth: Sequence[GraphOutputs], said: Sequence[GraphOutputs]) -> dict[str, float]:
-    """Return the largest difference of each output over all clips, in the output's unit, and the share of
-    voxels whose logit changes its sign.
+def _max_difference(truth: Sequence[GraphOutputs], outputs: Sequence[GraphOutputs]) -> dict[str, float]:
+    """Return the maximum difference of each output over all clips, and the share of voxels that change sides.
+
+    Differences are in the unit of the output. A voxel changes sides if its logit changes sign.
     """
-    found = {}
-    for name in GraphOutputs._fields:
-        pairs = [(getattr(a, name), getattr(b, name)) for a, b in zip(truth, said, strict=True)]
-        found[name] = max(float(_difference(name, a, b).abs().max()) for a, b in pairs)
-    flips = [((a.occupancy_logit > 0) != (b.occupancy_logit > 0)) for a, b in zip(truth, said, strict=True)]
-    return found | {"share_of_voxels_that_flip": float(torch.stack(flips).double().mean())}
+    pairs = list(zip(truth, outputs, strict=True))
+    differences = {
+        name: max(float(_difference(name, getattr(a, name), getattr(b, name)).abs().max()) for a, b in pairs)
+        for name in GraphOutputs._fields
+    }
+    flips = [((a.occupancy_logit > 0) != (b.occupancy_logit > 0)) for a, b in pairs]
+    return differences | {"share_of_voxels_that_flip": float(torch.stack(flips).double().mean())}
 
 
 def _difference(name: str, a: Tensor, b: Tensor) -> Float[Tensor, "..."]:

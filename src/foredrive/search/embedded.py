@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.image_tower import ImageTower
-from foredrive.models.lidar_clip import LidarEncoder, PillarGrid, PointCloud
+from foredrive.models.image_tower import ImageTower, ImageTowerConfig
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.models.text_encoder import TextEncoder
 from foredrive.scene import LidarSweep
 from foredrive.search.pretrained import PretrainedTowers
@@ -29,39 +29,17 @@ AT_ONCE = 8
 
 
 @dataclass(frozen=True)
-class ImageSize:
-    """Size of an image tower, see `models.image_tower.ImageTower`."""
-
-    widths: tuple[int, ...]
-    depths: tuple[int, ...]
-    heads: int
-    side_px: int
-    """Length of the shorter side of the training images."""
-
-
-@dataclass(frozen=True)
-class LidarSize:
-    """Size of a lidar tower, see `models.lidar_clip.LidarEncoder`."""
-
-    width: int = 128
-    heads: int = 8
-    hidden: int = 256
-    blocks: int = 4
-    window: int = 12
-
-
-@dataclass(frozen=True)
 class TowerCard:
     """Description of a folder of towers."""
 
     dim: int
     text: str
     """Name of the sentence encoder, or of the CLIP or SigLIP model that the lidar tower belongs to."""
-    image: ImageSize | None
+    image: ImageTowerConfig | None
     """Size of the image tower. None if the image tower is that of the model `text`."""
     base_fingerprint: str
     """Fingerprint of the towers that the lidar tower was trained with."""
-    lidar: LidarSize | None
+    lidar: LidarEncoderConfig | None
     trained: dict[str, object]
     """Training data, duration and quality, for people to read."""
 
@@ -76,7 +54,7 @@ class SentenceTowers:
     has_lidar = False
 
     def __init__(
-        self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], size: ImageSize, text: str
+        self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], size: ImageTowerConfig, text: str
     ) -> None:
         self.name, self.tower, self.text_mean = name, tower.eval(), text_mean
         self.size, self.text = size, text
@@ -123,21 +101,11 @@ class LidarTowers:
         """Embed sweeps, see `Towers`."""
         rows = len(sweeps.valid)
         parts = [sweeps[start : start + AT_ONCE] for start in range(0, rows, AT_ONCE)]
-        return torch.cat([self.encoder(PointCloud.of_sweeps(part), len(part.valid)) for part in parts])
+        return torch.cat([self.encoder(PointCloud.from_sweeps(part), len(part.valid)) for part in parts])
 
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
         """Embed texts, see `Towers`."""
         return self.base.embed_text(texts)
-
-
-def build_image_tower(size: ImageSize, dim: int) -> ImageTower:
-    """Return an untrained image tower."""
-    return ImageTower(widths=size.widths, depths=size.depths, heads=size.heads, dim=dim)
-
-
-def build_lidar_tower(size: LidarSize, dim: int) -> LidarEncoder:
-    """Return an untrained lidar tower."""
-    return LidarEncoder(PillarGrid(), dim=dim, **asdict(size))
 
 
 def save_towers(
@@ -179,7 +147,7 @@ def load_towers(folder: Path) -> Towers:
         return base
     if base.fingerprint != card.base_fingerprint:
         raise InputError(f"{folder}: the lidar tower was trained beside other weights of {card.text}")
-    encoder = build_lidar_tower(card.lidar, card.dim)
+    encoder = LidarEncoder(card.lidar, dim=card.dim)
     _load_weights(encoder, folder / LIDAR)
     return LidarTowers(str(folder), base, encoder)
 
@@ -187,7 +155,7 @@ def load_towers(folder: Path) -> Towers:
 def _load_base(folder: Path, card: TowerCard) -> Towers:
     if card.image is None:
         return PretrainedTowers(card.text)
-    tower = build_image_tower(card.image, card.dim)
+    tower = ImageTower(card.image, dim=card.dim)
     text_mean = _load_weights(tower, folder / IMAGE).get(TEXT_MEAN)
     if text_mean is None:
         raise InputError(f"{folder / IMAGE}: no {TEXT_MEAN} in it")

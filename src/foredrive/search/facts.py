@@ -16,9 +16,9 @@ from foredrive.search.sectors import Sector
 from foredrive.towns.labels.captions import (
     ACROSS_COS,
     AHEAD_M,
+    MIN_VISIBILITY,
     MOVING_MPS,
     ONCOMING_COS,
-    SEEN,
     WALKING_MPS,
 )
 
@@ -103,7 +103,7 @@ def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, Vi
     reach_m = IN_FOG_M if told is not None and told.weather is Weather.FOG else AHEAD_M
     seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
     if visibility is not None:
-        seen = seen & (visibility >= SEEN)
+        seen = seen & (visibility >= MIN_VISIBILITY)
     return {
         name: ViewFacts(*setting, tuple(_things(boxes[seen & sector.contains(boxes.centre)])))
         for name, sector in sectors.items()

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.signal import savgol_filter
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState
@@ -65,6 +64,8 @@ def comfort_of(
     Raises:
         InputError: the drive is shorter than `JERK_S`.
     """
+    from scipy.signal import savgol_filter  # takes 0.3 s
+
     window = {seconds: 2 * round(0.5 * seconds / dt_s) + 1 for seconds in (ACCELERATION_S, JERK_S)}
     if len(states) < window[JERK_S]:
         raise InputError(f"comfort takes {window[JERK_S]} states or more, got {len(states)}")

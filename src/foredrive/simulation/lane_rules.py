@@ -1,4 +1,7 @@
-"""Lane rules of CARLA's leaderboard 1.0: red lights, stop signs, and driving outside of the lanes."""
+"""Lane rules of CARLA's leaderboard 1.0: red lights, stop signs, and driving outside of the lanes.
+
+The rules are the same in every simulator. `town_lanes` and `carla.road` read the lanes that they apply to.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -8,11 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene import BicycleState, Event
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.dynamics import EGO
-from foredrive.towns.map.town_map import StopZoneKind, TownMap
-from foredrive.towns.traffic.lane_index import LEVEL_M, LaneIndex
-from foredrive.towns.traffic.lights import Light
-from foredrive.towns.traffic.traffic import Traffic
 
 TAIL = 0.8
 """The vehicle runs a red light when a reference point crosses the line. This point lies behind the
@@ -24,11 +24,12 @@ STOP_WITHIN_M = 6.0
 vehicle."""
 LINE_MARGIN_M = 0.3
 LINES_WITHIN_M = EGO.length_m + STOP_WITHIN_M
+LEVEL_M = 2.5
+"""Height difference above which a line is on another level than the vehicle, m."""
 OUTSIDE_BY_M = 1.3
 WRONG_WAY_RAD = np.deg2rad(120.0)
 """CARLA's OutsideRouteLanesTest: the vehicle is more than `OUTSIDE_BY_M` beside all lanes, or its heading
 differs by more than `WRONG_WAY_RAD` from that of its lane."""
-LANES_WITHIN_M = 6.0
 LEAST_LEFT_M = 0.5
 """A shorter distance outside of the lanes, m, gives no event, but still counts in the score."""
 
@@ -65,69 +66,6 @@ class RuleState:
         return self.outside_m / max(self.driven_m, 1e-9)
 
 
-def stop_lines(town: TownMap) -> Lines:
-    """Return the stop lines at lights and at stop signs."""
-    lanes = {lane.lane_id: lane for lane in town.lanes}
-    kinds = (StopZoneKind.TRAFFIC_LIGHT, StopZoneKind.STOP_SIGN)
-    rows = [
-        (index, zone.kind is StopZoneKind.STOP_SIGN, lanes[name])
-        for index, zone in enumerate(town.stop_zones)
-        for name in zone.lane_ids
-        if zone.kind in kinds and name in lanes
-    ]
-    starts = np.array([lane.centreline_xyz[:2] for *_, lane in rows]).reshape(-1, 2, 3)
-    ahead = starts[:, 1, :2] - starts[:, 0, :2]
-    return Lines(
-        zone=np.array([zone for zone, *_ in rows], dtype=np.int64),
-        is_sign=np.array([sign for _, sign, _ in rows], dtype=np.bool_),
-        xyz=starts[:, 0],
-        ahead=ahead / np.linalg.norm(ahead, axis=1, keepdims=True),
-        half_width_m=0.5 * np.array([lane.width_m for *_, lane in rows]) + LINE_MARGIN_M,
-    )
-
-
-class LaneRules:
-    """Checks the rules for one drive in a town."""
-
-    def __init__(self, town: TownMap, traffic: Traffic) -> None:
-        self._lines = stop_lines(town)
-        self._near: LaneIndex = traffic.lane_index
-        self._graph = traffic.lanes
-
-    def check(
-        self,
-        before: BicycleState,
-        after: BicycleState,
-        z_m: float,
-        lights: Int[np.ndarray, "Z"],
-        state: RuleState,
-        t_s: float,
-    ) -> tuple[list[Event], RuleState]:
-        """Return the events of one step and the updated rule state.
-
-        Args:
-            lights: a `Light` for each of the town's stop zones.
-        """
-        events, stopped_at = lines_run(self._lines, before, after, z_m, lights, state.stopped_at, t_s)
-        outside = self._is_outside(np.append(body_middle(after), z_m), after.yaw_rad)
-        more, state = way_driven(state, before, after, outside, t_s)
-        return events + more, dataclasses.replace(state, stopped_at=stopped_at)
-
-    def _is_outside(self, xyz: Float64[np.ndarray, "3"], yaw_rad: float) -> bool:
-        samples = self._near.within(xyz, LANES_WITHIN_M)
-        if not len(samples):
-            return True
-        lane = self._near.lane[samples]
-        away_m = np.hypot(*(self._near.xyz[samples, :2] - xyz[:2]).T)
-        if (away_m - 0.5 * self._graph.width_m[lane]).min() > OUTSIDE_BY_M:
-            return True
-        inside = away_m < 0.5 * self._graph.width_m[lane]
-        if not inside.any() or (self._graph.junction[lane[inside]] >= 0).any():
-            return False  # between lanes, or in a junction, where lanes cross
-        turned = np.abs((yaw_rad - self._near.heading[samples[inside]] + np.pi) % (2 * np.pi) - np.pi)
-        return bool((turned > WRONG_WAY_RAD).all())
-
-
 def lines_run(
     lines: Lines,
     before: BicycleState,
@@ -143,7 +81,7 @@ def lines_run(
 
     Args:
         lines: stop lines of the road; those near the vehicle are checked.
-        lights: a `Light` for each stop zone.
+        lights: a `LightState` for each stop zone.
         stopped_at: stop zones returned by the last step.
     """
     middle = body_middle(after)
@@ -152,7 +90,7 @@ def lines_run(
         return [], frozenset()
     events, xy = [], (float(middle[0]), float(middle[1]))
     tail_m = EGO.axle_to_centre_m - TAIL * 0.5 * EGO.length_m
-    run = ~near.is_sign & (lights[near.zone] == Light.RED) & _crossed(near, before, after, tail_m)
+    run = ~near.is_sign & (lights[near.zone] == LightState.RED) & _crossed(near, before, after, tail_m)
     for zone in np.unique(near.zone[run]).tolist():
         events.append(Event("red_light", t_s, xy, f"at {after.speed_mps:.1f} m/s", f"light {zone}"))
     if not near.is_sign.any():

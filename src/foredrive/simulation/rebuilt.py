@@ -11,16 +11,15 @@ from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
 from foredrive.rendering.tracks import ActorTracks, boxes_at
 from foredrive.scene import BicycleState, Clip, Control, Event, Renderer, Standing, Step
+from foredrive.scene.actors import BOX_RANGE_M
 from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
 from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, make_clip, no_images
 from foredrive.simulation.replayed import comes_from_behind, users_at
 from foredrive.simulation.route_progress import Progress, RouteLine
-from foredrive.towns.recorder import BOXES_WITHIN_M
 
-FRAME_STEPS = round(FRAME_DT_S / STEP_S)
 REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
 the drive ends."""
@@ -198,7 +197,7 @@ class RebuiltSimulator:
             twist = torch.tensor([ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(ego)])
             seen = self.renderer.render(T_world_ego, twist, at_s)
             images, sweep = seen.images, seen.sweep
-        boxes = boxes_at(self._tracks, inverse_se3(self._T_world_scene) @ T_world_ego, at_s, BOXES_WITHIN_M)
+        boxes = boxes_at(self._tracks, inverse_se3(self._T_world_scene) @ T_world_ego, at_s, BOX_RANGE_M)
         frame = KeyFrame(t_s, T, ego.speed_mps, images, sweep, boxes)
         return (*frames, frame)[-1 - self._scenario.past_frames :]
 

@@ -10,18 +10,20 @@ from jaxtyping import Float64
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Clip, Control, Event, Standing, Step
+from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
+from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.collisions import CollisionSense, Contacts
 from foredrive.simulation.dynamics import EGO, STEP_S, step, yaw_rate_radps
-from foredrive.simulation.lane_rules import LaneRules, RuleState, left_lanes
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.lane_rules import RuleState, left_lanes
+from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users
 from foredrive.simulation.route_progress import Progress, RouteLine, first_step
+from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
 from foredrive.simulation.scenarios.kinds import Scenario
 from foredrive.simulation.scenarios.play import Director
 from foredrive.simulation.scenarios.scene import Ego, Play
-from foredrive.towns.conditions import Conditions
+from foredrive.simulation.town_lanes import LaneRules
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import BOXES_WITHIN_M, Crowd, boxes_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.external_ego import EgoPose, find_lane
 from foredrive.towns.traffic.fleet import ego_vehicle
@@ -33,35 +35,18 @@ TRAFFIC_STEPS = 2
 """The traffic decides at 10 Hz, as in recordings. Between decisions its road users move in a straight
 line."""
 DECISION_S = TRAFFIC_STEPS * STEP_S
-FRAME_STEPS = round(FRAME_DT_S / STEP_S)
 GUESTS = 6
 """Maximum number of scenario vehicles on the road at one time."""
-SETTLE_S = 3.0
-"""Time before a drive, s, in which the traffic leaves its unlikely initial state. The ego vehicle stands
-until then."""
 
 
 @dataclass(frozen=True, eq=False)
-class TownScenario:
-    """Where to drive, and under which conditions. The vehicle starts from rest at the route's beginning."""
+class TownScenario(RouteScenario):
+    """Set-up of a drive in an embedded town."""
 
-    town: str
-    route_xyz: Float64[np.ndarray, "M 3"]
-    """Route along the lanes, m, world frame."""
-    seed: int = 0
-    """Seed of the place, the traffic and all noise."""
+    sensors: SensorSuite | None = None
     lanes: tuple[int, ...] = ()
     """Lane of the route at the end of each stretch, as `TrafficState.route`. The traffic expects it.
     Without lanes the traffic expects the vehicle to go straight on."""
-    crowd: Crowd = field(default_factory=Crowd)
-    conditions: Conditions | None = None
-    """If None, bright daylight is drawn from the seed."""
-    sensors: SensorSuite | None = None
-    """If None, key frames have only boxes."""
-    past_frames: int = 1
-    """Number of key frames before now in an observation."""
-    limit_s: float = np.inf
-    """The drive ends after this time, s."""
     scenarios: tuple[Scenario, ...] = ()
     """Scenarios on the route, in the order in which they are met, as `scenarios_on` returns them for route
     and seed."""
@@ -231,13 +216,12 @@ class TownSimulator:
 
     def _prepare(self, scenario: TownScenario) -> None:
         self._scenario = scenario
-        town, crowd = load_town_map(scenario.town), scenario.crowd
         self._world = grow(scenario.town, scenario.seed)
-        self._traffic = _rules_of(scenario.town, scenario.seed, crowd)
+        self._traffic = _rules_of(scenario.town, scenario.seed, scenario.background_traffic)
         if scenario.conditions is not None:
             self._world = self._world.under(scenario.conditions)
         self._collisions = CollisionSense(self._world)
-        self._rules = LaneRules(town, self._traffic)
+        self._rules = LaneRules(load_town_map(scenario.town), self._traffic)
         self._route = RouteLine(scenario.route_xyz)
         self._director = Director(self._traffic, scenario.scenarios)
 
@@ -311,9 +295,7 @@ class TownSimulator:
         """Append the current key frame and return the latest frames, as many as an observation has."""
         T, sensors = self._pose(state.ego, state.z_m), self._scenario.sensors
         actors = self._traffic.actors(state.decided)
-        everyone = [*actors, *self._world.parked]
-        away_m = np.linalg.norm(np.array([a.centre_m for a in everyone]).reshape(-1, 3) - T[:3, 3], axis=1)
-        near = [everyone[i] for i in np.flatnonzero(away_m < BOXES_WITHIN_M)]
+        near = in_box_range([*actors, *self._world.parked], T)
         images, sweep = no_images(), None
         if sensors is not None:
             number = state.step_index // FRAME_STEPS + self._scenario.past_frames
@@ -323,7 +305,7 @@ class TownSimulator:
             seen = self._world.render(actors, sensors, T, twist, int(noise[0]), lights)
             images = torch.from_numpy(np.stack(list(seen.images.values()))).permute(0, 3, 1, 2).contiguous()
             sweep = seen.sweep
-        frame = KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_of(near, T))
+        frame = KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_in_ego_frame(near, T))
         return (*state.frames, frame)[-1 - self._scenario.past_frames :]
 
     def _make_clip(self, state: TownState) -> Clip:
@@ -341,8 +323,8 @@ def grow(town: str, seed: int) -> World:
 
 
 @lru_cache(maxsize=1)
-def _rules_of(town: str, seed: int, crowd: Crowd) -> Traffic:
-    return Traffic(load_town_map(town), seed, crowd.vehicles + 1, crowd.people, GUESTS)
+def _rules_of(town: str, seed: int, background: BackgroundTraffic) -> Traffic:
+    return Traffic(load_town_map(town), seed, background.vehicles + 1, background.pedestrians, GUESTS)
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:

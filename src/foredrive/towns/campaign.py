@@ -9,9 +9,9 @@ import numpy as np
 
 from foredrive.errors import InputError
 from foredrive.scene import Command
-from foredrive.towns.conditions import ANY_CONDITIONS, CONDITIONS, find_conditions
+from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS, BackgroundTraffic, find_conditions
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.recorder import MAX_RATE_HZ, Crowd
+from foredrive.towns.recorder import MAX_RATE_HZ
 from foredrive.towns.traffic.expert import SETTLE_S, ExpertDrive, plan_route
 from foredrive.towns.traffic.fleet import find_start_points
 from foredrive.towns.traffic.lane_graph import build_lane_graph
@@ -41,7 +41,7 @@ class DrivePlan:
         """Return the log's name from town, seed, and explicit conditions and crowd:
         Town01_seed3_night_45v10p."""
         conditions = "" if self.conditions is None else f"_{self.conditions}"
-        usual = (self.vehicles, self.people) == (Crowd.vehicles, Crowd.people)
+        usual = (self.vehicles, self.people) == (BackgroundTraffic.vehicles, BackgroundTraffic.pedestrians)
         return f"{self.town}_seed{self.seed}{conditions}" + (
             "" if usual else f"_{self.vehicles}v{self.people}p"
         )
@@ -67,9 +67,9 @@ class Campaign:
     conditions: tuple[str, ...] = ()
     """Names of `CONDITIONS`. `ANY_CONDITIONS` alone distributes all conditions evenly, one for each town and
     seed. Empty: bright daylight."""
-    vehicles: tuple[int, int] = (Crowd.vehicles, Crowd.vehicles)
+    vehicles: tuple[int, int] = (BackgroundTraffic.vehicles, BackgroundTraffic.vehicles)
     """Minimum and maximum, drawn for each town and seed."""
-    people: tuple[int, int] = (Crowd.people, Crowd.people)
+    people: tuple[int, int] = (BackgroundTraffic.pedestrians, BackgroundTraffic.pedestrians)
     seconds: float = 20.0
     rate_hz: float = 10.0
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
@@ -18,52 +17,42 @@ from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.data.maps import write_map
 from foredrive.errors import InputError
 from foredrive.ops.threads import prefetched
-from foredrive.scene import Boxes, CameraRig, VoxelSpec
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions
+from foredrive.scene import CameraRig, VoxelSpec
+from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
+from foredrive.scene.conditions import BackgroundTraffic, Conditions
+from foredrive.scene.traffic_light import LightState
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.labels.captions import caption
+from foredrive.towns.labels.frame_facts import FactCollector
 from foredrive.towns.labels.semantics import (
-    CategoryOfTrack,
+    TrackCategories,
     camera_labels,
     instance_labels,
     lidar_labels,
     z_depth,
 )
-from foredrive.towns.labels.situation import Narrator
-from foredrive.towns.labels.visibility import is_seen
+from foredrive.towns.labels.visibility import is_point_visible
 from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
 FIRST_TIME_US = 1_577_836_800_000_000
 """Midnight of 1 January 2020 UTC. The time in a log must not depend on when it was recorded."""
-BOXES_WITHIN_M = 80.0
 OCCUPANCY = VoxelSpec(lower_m=(-50.0, -50.0, -3.0), voxel_m=0.5, shape_zyx=(16, 200, 200))
 """Grid of NeMo."""
 MAX_RATE_HZ = 100.0
 STATUS_OF_LIGHT = {
-    Light.RED: TrafficLightStatus.RED,
-    Light.YELLOW: TrafficLightStatus.YELLOW,
-    Light.GREEN: TrafficLightStatus.GREEN,
+    LightState.RED: TrafficLightStatus.RED,
+    LightState.YELLOW: TrafficLightStatus.YELLOW,
+    LightState.GREEN: TrafficLightStatus.GREEN,
 }
 
 
 @dataclass(frozen=True)
-class Crowd:
-    """The numbers of other road users within about 140 m of the ego vehicle."""
-
-    vehicles: int = 30
-    people: int = 20
-    """Number of people, where the town has walkways."""
-
-
-@dataclass(frozen=True)
-class LabelKinds:
+class LabelOptions:
     """The exact labels of a recording, in addition to boxes with their lidar points, and traffic lights."""
 
     occupancy: VoxelSpec | None = OCCUPANCY
@@ -92,15 +81,15 @@ def record(
     out: Path,
     rate_hz: float = 10.0,
     sensors: SensorSuite | None = None,
-    crowd: Crowd | None = None,
-    labels: LabelKinds | None = None,
+    background_traffic: BackgroundTraffic | None = None,
+    labels: LabelOptions | None = None,
     conditions: Conditions | None = None,
     log_name: str | None = None,
 ) -> LogPath:
     """Record one drive. The same arguments give the same bytes on the same kind of processor.
 
     The log is written to out/logs/SPLIT/NAME and replaces a log of that name. The map is written to out/maps,
-    once for all logs of the town. There are boxes for all road users within `BOXES_WITHIN_M`, parked cars
+    once for all logs of the town. There are boxes for all road users within `BOX_RANGE_M`, parked cars
     included. The number of lidar returns from each one, and its visible share, distinguish hidden from
     visible ones.
 
@@ -111,8 +100,8 @@ def record(
         out: 123D data root.
         rate_hz: frames per second.
         sensors: by default six cameras of 144 × 256 px and a lidar of 32 × 720 beams.
-        crowd: `Crowd()` by default.
-        labels: `LabelKinds()` by default.
+        background_traffic: `BackgroundTraffic()` by default.
+        labels: `LabelOptions()` by default.
         conditions: time of day and weather. None draws bright daylight from the seed.
         log_name: TOWN_seedN by default.
 
@@ -128,19 +117,19 @@ def record(
         raise InputError(f"a seed is 0 or more, got {seed}")
     town_map = load_town_map(town)
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
-    crowd = crowd or Crowd()
-    labels = labels or LabelKinds()
+    background_traffic = background_traffic or BackgroundTraffic()
+    labels = labels or LabelOptions()
     world = World(town_map, seed, conditions)
-    traffic = Traffic(town_map, seed, crowd.vehicles + 1, crowd.people)
+    traffic = Traffic(town_map, seed, background_traffic.vehicles + 1, background_traffic.pedestrians)
     drive = ExpertDrive(traffic, seconds)
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
-    narrator = Narrator(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
-    sensed = prefetched(_sensed(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
+    collector = FactCollector(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
+    sensed = prefetched(_sense(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
-        for moment in track(sensed, description=f"recording {name}", total=count):
-            writer.write(_frame(world, moment, sensors, labels, narrator))
+        for snapshot in track(sensed, description=f"recording {name}", total=count):
+            writer.write(_frame(world, snapshot, sensors, labels, collector))
     return LogPath(writer.folder, maps)
 
 
@@ -159,122 +148,103 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
         yield item
 
 
-def lights_of_lanes(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:
+def traffic_light_states(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:
     """Return the states of the lights by the ids that the lanes behind them have in the written map.
 
     Args:
         town: the map.
-        lights: a `Light` for each of the town's stop zones.
+        lights: a `LightState` for each of the town's stop zones.
     """
     # The map's writer numbers lanes in the order of the parser, which is their order in the town.
     id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
     return {
-        id_of[lane]: STATUS_OF_LIGHT[Light(light)]
+        id_of[lane]: STATUS_OF_LIGHT[LightState(light)]
         for zone, light in zip(town.stop_zones, lights.tolist(), strict=True)
-        if light != Light.NONE
+        if light != LightState.NONE
         for lane in zone.lane_ids
     }
 
 
-class SensedMoment(NamedTuple):
+class SensedFrame(NamedTuple):
     """A moment of a drive with its sensor data."""
 
-    moment: DriveSnapshot
-    seen: SensorFrame
+    snapshot: DriveSnapshot
+    frame: SensorFrame
     seed: int
     """Seed of the random parts of the frame."""
 
 
-def _sensed(
-    world: World, moments: Iterator[DriveSnapshot], sensors: SensorSuite, seed: int
-) -> Iterator[SensedMoment]:
-    for index, moment in enumerate(moments):
-        seen = world.render(
-            moment.actors,
+def _sense(
+    world: World, snapshots: Iterator[DriveSnapshot], sensors: SensorSuite, seed: int
+) -> Iterator[SensedFrame]:
+    for index, snapshot in enumerate(snapshots):
+        frame = world.render(
+            snapshot.actors,
             sensors,
-            moment.T_world_ego,
-            moment.twist_ego,
+            snapshot.T_world_ego,
+            snapshot.twist_ego,
             noise_seed=np.random.SeedSequence((seed, index)).generate_state(1)[0].item(),
-            lights=moment.lights,
+            lights=snapshot.lights,
         )
-        yield SensedMoment(moment, seen, seed + index)
+        yield SensedFrame(snapshot, frame, seed + index)
 
 
 def _frame(
-    world: World, sensed: SensedMoment, sensors: SensorSuite, labels: LabelKinds, narrator: Narrator
+    world: World, sensed: SensedFrame, sensors: SensorSuite, labels: LabelOptions, collector: FactCollector
 ) -> Frame:
     """Return all recorded data of a moment."""
-    moment, seen, seed = sensed
-    everyone = [*moment.actors, *world.parked]
-    near = [a for a in everyone if _distance_m(a, moment) < BOXES_WITHIN_M]
-    returned = seen.beam_ids[seen.sweep.returned.numpy()]
+    snapshot, frame, seed = sensed
+    actors = [*snapshot.actors, *world.parked]
+    near = in_box_range(actors, snapshot.T_world_ego)
+    returned = frame.beam_ids[frame.sweep.returned.numpy()]
     visibility, setting, text = None, None, None
     if labels.visibility or labels.captions:
-        visibility = world.visibility(near, sensors, moment.T_world_ego, seen)
+        visibility = world.visibility(near, sensors, snapshot.T_world_ego, frame)
         if labels.captions:
-            range_m = np.stack(list(seen.pixel_range_m.values()))
-            situation = narrator.situation(
-                moment, near, visibility, lambda xyz: is_seen(xyz, sensors.rig, range_m)
+            range_m = np.stack(list(frame.pixel_range_m.values()))
+            facts = collector.facts(
+                snapshot, near, visibility, lambda xyz: is_point_visible(xyz, sensors.rig, range_m)
             )
-            setting, text = situation.setting, caption(situation, seed)
+            setting, text = facts.setting, caption(facts, seed)
     spec = labels.occupancy
     return Frame(
-        t_us=FIRST_TIME_US + round(moment.t_s * 1e6),
-        T_world_ego=moment.T_world_ego,
-        velocity_ego_mps=moment.twist_ego[:3],
-        acceleration_ego_mps2=moment.acceleration_ego_mps2,
-        images=seen.images,
-        sweep=seen.sweep,
-        boxes=boxes_of(near, moment.T_world_ego),
-        occupancy=None if spec is None else world.occupancy(moment.actors, moment.T_world_ego, spec),
+        t_us=FIRST_TIME_US + round(snapshot.t_s * 1e6),
+        T_world_ego=snapshot.T_world_ego,
+        velocity_ego_mps=snapshot.twist_ego[:3],
+        acceleration_ego_mps2=snapshot.acceleration_ego_mps2,
+        images=frame.images,
+        sweep=frame.sweep,
+        boxes=boxes_in_ego_frame(near, snapshot.T_world_ego),
+        occupancy=None if spec is None else world.occupancy(snapshot.actors, snapshot.T_world_ego, spec),
         lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         visibility=visibility if labels.visibility else None,
         setting=setting,
         caption=text,
-        traffic_lights=lights_of_lanes(world.town, moment.lights),
-        **_ray_labels(seen, everyone, sensors, labels),
+        traffic_lights=traffic_light_states(world.town, snapshot.lights),
+        **_ray_labels(frame, actors, sensors, labels),
     )
 
 
 def _ray_labels(
-    seen: SensorFrame, actors: list[ActorState], sensors: SensorSuite, labels: LabelKinds
+    frame: SensorFrame, actors: list[ActorState], sensors: SensorSuite, labels: LabelOptions
 ) -> dict[str, Any]:
     """Return the labels of pixels and beams by their names in `Frame`."""
     out: dict[str, Any] = {}
-    names = list(seen.images)
+    names = list(frame.images)
     if labels.depth:
-        range_m = np.stack(list(seen.pixel_range_m.values()))
+        range_m = np.stack(list(frame.pixel_range_m.values()))
         out["depth_m"] = dict(zip(names, z_depth(range_m, sensors.pixel_rays[1], sensors.rig), strict=True))
     if labels.semantic:
-        kinds = CategoryOfTrack(actors)
+        categories = TrackCategories(actors)
         out["semantic"] = {
-            name: camera_labels(seen.pixel_surface[name], kinds[seen.pixel_ids[name]]) for name in names
+            name: camera_labels(frame.pixel_surface[name], categories[frame.pixel_ids[name]])
+            for name in names
         }
-        out["beam_semantic"] = lidar_labels(seen.beam_surface, kinds[seen.beam_ids])
+        out["beam_semantic"] = lidar_labels(frame.beam_surface, categories[frame.beam_ids])
     if labels.instance:
-        out["instance"] = {name: instance_labels(seen.pixel_ids[name]) for name in names}
-        out["beam_instance"] = instance_labels(seen.beam_ids)
+        out["instance"] = {name: instance_labels(frame.pixel_ids[name]) for name in names}
+        out["beam_instance"] = instance_labels(frame.beam_ids)
     return out
-
-
-def boxes_of(actors: list[ActorState], T_world_ego: np.ndarray) -> Boxes:
-    """Return the boxes of road users in the ego frame, unbatched."""
-    T_ego_world = np.linalg.inv(T_world_ego)
-    centre = (
-        np.array([a.centre_m for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
-    )
-    yaw = np.array([a.yaw for a in actors])
-    heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1) @ T_ego_world[:3, :3].T
-    velocity = np.array([a.velocity_mps for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T
-    return Boxes(
-        centre=torch.from_numpy(centre).float(),
-        size_lwh=torch.from_numpy(np.array([a.size_lwh for a in actors]).reshape(-1, 3)).float(),
-        yaw=torch.from_numpy(np.arctan2(heading[:, 1], heading[:, 0])).float(),
-        velocity=torch.from_numpy(velocity[:, :2]).float(),
-        track_id=torch.tensor([a.track_id for a in actors], dtype=torch.int64),
-        category=torch.tensor([int(a.category) for a in actors], dtype=torch.int64),
-        valid=torch.ones(len(actors), dtype=torch.bool),
-    )
 
 
 def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
@@ -282,10 +252,6 @@ def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> In
     hit, count = np.unique(hit_ids, return_counts=True)
     counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
     return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
-
-
-def _distance_m(actor: ActorState, moment: DriveSnapshot) -> float:
-    return float(np.linalg.norm(actor.centre_m - moment.T_world_ego[:3, 3]))
 
 
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:

@@ -10,10 +10,11 @@ from jaxtyping import Float, Float32, Float64, Int, Int32, UInt8
 
 from foredrive.data.modalities import FullOccupancy
 from foredrive.scene import LidarSweep, VoxelSpec
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions, draw_daylight
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import Conditions, draw_daylight
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.labels.occupancy import full_occupancy
-from foredrive.towns.labels.semantics import NOBODY, SKY
+from foredrive.towns.labels.semantics import NO_ACTOR, SKY
 from foredrive.towns.labels.visibility import visibility
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
@@ -23,14 +24,14 @@ from foredrive.towns.place.buildings import build_buildings
 from foredrive.towns.place.fields import build_on_fields, lay_out_fields
 from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, join
-from foredrive.towns.place.parking import build_car_parks, numbered, park_on_strips
+from foredrive.towns.place.parking import build_car_parks, park_on_strips, with_track_ids
 from foredrive.towns.place.props import (
     SignalHead,
     StreetLamps,
-    ThinThings,
+    ThinPoints,
     build_posts,
     build_street_lamps,
-    join_thin,
+    join_thin_points,
 )
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
@@ -42,15 +43,14 @@ from foredrive.towns.sensing import capture, lens, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.columns import make_columns
+from foredrive.towns.sensing.hit_buffer import HitBuffer, surface_ids, track_ids
 from foredrive.towns.sensing.lamps import gather_lamps
-from foredrive.towns.sensing.light import Rgb, drive_lit, is_dark, make_light
-from foredrive.towns.sensing.seen import Seen, surface_ids, track_ids
-from foredrive.towns.traffic.lights import Light
+from foredrive.towns.sensing.light import Rgb, headlights_on, make_light, street_lamps_on
 
 ACTOR_REACH_M = 200.0
 """Distance from the vehicle beyond which road users are not rendered, m."""
 ACTOR_RADIUS_M = 8.0
-LAMP_ORDER = (Light.RED, Light.YELLOW, Light.GREEN)
+LAMP_ORDER = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 LAMP_LIT = srgb_to_linear(((1.0, 0.10, 0.06), (1.0, 0.62, 0.05), (0.10, 1.0, 0.45)))
 HEADLIGHT_LIT, TAIL_LIT, BRAKE_LIT, STREET_LAMP_LIT = srgb_to_linear(
     ((1.0, 0.98, 0.95), (0.42, 0.02, 0.01), (1.0, 0.10, 0.07), (1.0, 0.93, 0.80))
@@ -107,7 +107,7 @@ class StaticWorld:
     """Track id of the parked car to which a triangle belongs, NOBODY for all others."""
     parked: tuple[ActorState, ...]
     heads: tuple[SignalHead, ...]
-    thin: ThinThings
+    thin: ThinPoints
     lamps: StreetLamps
     vehicle_lights: VehicleLights
 
@@ -184,21 +184,21 @@ class World:
             T_world_ego: pose of the vehicle.
             twist_ego: velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes.
             noise_seed: seed of range noise, of lost beams and of image noise.
-            lights: a `Light` for each of the town's stop zones. None: all lamps are off.
+            lights: a `LightState` for each of the town's stop zones. None: all lamps are off.
         """
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
-        moment = self._moment(near, lights, T_world_ego)
+        tracer = self._ray_tracer(near, lights, T_world_ego)
         ego = capture.EgoMotion(T_world_ego, twist_ego)
-        images, seen = capture.see(moment, sensors, ego, np.random.default_rng((noise_seed, 1)))
+        images, buffer = capture.render_images(tracer, sensors, ego, np.random.default_rng((noise_seed, 1)))
         images = self._through_air_and_lens(images, sensors, noise_seed)
-        sweep, met = capture.sweep(moment, sensors.lidar, ego, np.random.default_rng(noise_seed))
+        sweep, met = capture.simulate_sweep(tracer, sensors.lidar, ego, np.random.default_rng(noise_seed))
         names = sensors.rig.names
         shape = (len(names), *sensors.rig.size_hw)
         return SensorFrame(
             images=dict(zip(names, images, strict=True)),
-            pixel_ids=dict(zip(names, self._track_ids(seen, near).reshape(shape), strict=True)),
-            pixel_surface=dict(zip(names, self._surfaces(seen).reshape(shape), strict=True)),
-            pixel_range_m=dict(zip(names, seen.range_m.reshape(shape), strict=True)),
+            pixel_ids=dict(zip(names, self._track_ids(buffer, near).reshape(shape), strict=True)),
+            pixel_surface=dict(zip(names, self._surfaces(buffer).reshape(shape), strict=True)),
+            pixel_range_m=dict(zip(names, buffer.range_m.reshape(shape), strict=True)),
             sweep=sweep,
             beam_ids=self._track_ids(met, near),
             beam_surface=self._surfaces(met),
@@ -257,36 +257,36 @@ class World:
             points[head.zone] = middle[first]
         return points
 
-    def _moment(
+    def _ray_tracer(
         self,
         actors: list[ActorState],
         lights: Int[np.ndarray, "Z"] | None,
         T_world_ego: Float64[np.ndarray, "4 4"],
-    ) -> capture.DriveSnapshot:
+    ) -> capture.RayTracer:
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
-        placed = raycast.PlacedShapes(tuple(shape.scene for shape in shapes), T, velocity_mps)
+        placed = raycast.ShapeInstances(tuple(shape.scene for shape in shapes), T, velocity_mps)
         rear = self.static.vehicle_lights
         paints = [self._shapes.paint_of(a, rear.brake if a.braking else rear.rear) for a in actors]
         paint = np.array(paints, dtype=np.int32).reshape(-1, SLOTS)
         first = np.array([shape.first for shape in shapes], dtype=np.int32)
-        scene = shading.Scene(
-            static=_soup(self.static.mesh),
-            shapes=_soup(self._shapes.soup),
+        scene = shading.SceneArrays(
+            static=_triangles(self.static.mesh),
+            shapes=_triangles(self._shapes.triangles),
             actors=shading.ActorArrays(placed.T_world_unit, first, paint),
             looks=self._lit_looks(lights),
         )
         light = self.light
-        if is_dark(self.conditions):
+        if street_lamps_on(self.conditions):
             light = light._replace(lamps=gather_lamps(self.static.lamps.xyz, actors, T_world_ego))
-        return capture.DriveSnapshot(scene, raycast.Surroundings(self._scene, placed), light)
+        return capture.RayTracer(scene, raycast.RaycastScene(self._scene, placed), light)
 
     def _through_air_and_lens(
         self, images: UInt8[np.ndarray, "C H W 3"], sensors: SensorSuite, noise_seed: int
     ) -> UInt8[np.ndarray, "C H W 3"]:
         """Add glare by night, and rain, to images."""
-        if is_dark(self.conditions):
+        if street_lamps_on(self.conditions):
             images = np.stack([lens.add_glare(image) for image in images])
         if self.conditions.rain_mmph == 0.0:
             return images
@@ -302,12 +302,12 @@ class World:
     def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
         """Return the looks with the lights that are on."""
         shining: dict[int, Rgb] = {self.static.vehicle_lights.brake: BRAKE_LIT}
-        if drive_lit(self.conditions):
+        if headlights_on(self.conditions):
             shining |= {
                 self.static.vehicle_lights.front: HEADLIGHT_LIT,
                 self.static.vehicle_lights.rear: TAIL_LIT,
             }
-        if is_dark(self.conditions):
+        if street_lamps_on(self.conditions):
             shining[self.static.lamps.look] = STREET_LAMP_LIT
         if lights is not None:
             for head in self.static.heads:
@@ -319,12 +319,12 @@ class World:
         albedo[list(shining)] = np.array(list(shining.values()))
         return self._looks._replace(texture=texture, albedo=albedo)
 
-    def _surfaces(self, seen: Seen) -> Int[np.ndarray, "N"]:
-        return surface_ids(seen, self._looks.surface, SKY)
+    def _surfaces(self, buffer: HitBuffer) -> Int[np.ndarray, "N"]:
+        return surface_ids(buffer, self._looks.surface, SKY)
 
-    def _track_ids(self, seen: Seen, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
+    def _track_ids(self, buffer: HitBuffer, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
         of_actor = np.array([actor.track_id for actor in actors], dtype=np.int64)
-        return track_ids(seen, of_actor, self.static.track, NOBODY)
+        return track_ids(buffer, of_actor, self.static.track, NO_ACTOR)
 
 
 def build_static(
@@ -339,7 +339,7 @@ def build_static(
     site = Site(plan, terrain)
     posts = build_posts(town, site, table)
     lots, cars = build_car_parks(site, table, rng)
-    parked = numbered(park_on_strips(town, site, rng) + cars)
+    parked = with_track_ids(park_on_strips(town, site, rng) + cars)
     place = join(
         [
             build_roads(town, plan, table),
@@ -357,14 +357,14 @@ def build_static(
     place = join([place, furniture, lamps.mesh, land, farm, plants])
     vehicle_lights = VehicleLights.of(table)
     vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
-    track = [np.full(len(place.look), NOBODY, dtype=np.int32)]
+    track = [np.full(len(place.look), NO_ACTOR, dtype=np.int32)]
     track += [np.full(len(v.look), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)]
     return StaticWorld(
         mesh=join([place, *vehicles]),
         track=np.concatenate(track),
         parked=parked,
         heads=posts.heads,
-        thin=join_thin([posts.thin, details, lamps.thin, fences, trunks]),
+        thin=join_thin_points([posts.thin, details, lamps.thin, fences, trunks]),
         lamps=lamps.lamps,
         vehicle_lights=vehicle_lights,
     )
@@ -380,8 +380,8 @@ def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> M
     return Mesh(moved.xyz, moved.uvw, look.astype(np.int32))
 
 
-def _soup(mesh: Mesh) -> shading.Soup:
-    return shading.Soup(mesh.xyz, mesh.uvw, mesh.look)
+def _triangles(mesh: Mesh) -> shading.Triangles:
+    return shading.Triangles(mesh.xyz, mesh.uvw, mesh.look)
 
 
 def _distance(actor: ActorState, T_world_ego: Float64[np.ndarray, "4 4"]) -> float:

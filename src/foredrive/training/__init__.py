@@ -11,10 +11,10 @@ if TYPE_CHECKING:
         DriveWorldStage,
         DriveWorldWeights,
     )
-    from foredrive.training.ego_mlp_fit import DrivenStatus, fit_ego_mlp, read_status
+    from foredrive.training.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
     from foredrive.training.fabric import make_fabric
     from foredrive.training.loop import CONDITIONS, Schedule, read_metrics, train
-    from foredrive.training.objective import LossWeights, NemoObjective, NemoStage
+    from foredrive.training.objective import NemoObjective, NemoStage, NemoWeights
     from foredrive.training.path_fit import PathDemonstrations, PathFit, fit_path
     from foredrive.training.rays import ImageRays, thinned_rays
 
@@ -23,14 +23,15 @@ __all__ = [
     "DriveWorldObjective",
     "DriveWorldStage",
     "DriveWorldWeights",
-    "DrivenStatus",
+    "EgoMLPFit",
     "ImageRays",
-    "LossWeights",
     "NemoObjective",
     "NemoStage",
+    "NemoWeights",
     "PathDemonstrations",
     "PathFit",
     "Schedule",
+    "StatusDemonstrations",
     "fit_ego_mlp",
     "fit_path",
     "load_weights",
@@ -47,10 +48,10 @@ __getattr__ = on_demand(
     {
         "checkpoints": ("load_weights", "save_weights"),
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
-        "ego_mlp_fit": ("DrivenStatus", "fit_ego_mlp", "read_status"),
+        "ego_mlp_fit": ("EgoMLPFit", "StatusDemonstrations", "fit_ego_mlp", "read_status"),
         "fabric": ("make_fabric",),
         "loop": ("CONDITIONS", "Schedule", "read_metrics", "train"),
-        "objective": ("LossWeights", "NemoObjective", "NemoStage"),
+        "objective": ("NemoObjective", "NemoStage", "NemoWeights"),
         "path_fit": ("PathDemonstrations", "PathFit", "fit_path"),
         "rays": ("ImageRays", "thinned_rays"),
     },

@@ -9,26 +9,31 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
-from foredrive.losses.contrast import contrast, true_of
+from foredrive.losses.contrastive import info_nce, is_true
 from foredrive.models.image_tower import ImageTower
 from foredrive.models.lidar_clip import LidarEncoder, PointCloud
 from foredrive.ops.precision import computes_bfloat16
 from foredrive.scene.record import Record
 
-FIRST_TEMPERATURE, SHARPEST = 0.07, 100.0
-"""Temperature at the start and maximum inverse temperature, from CLIP (Radford et al. 2021, section 2.4)."""
-CROP_SHARE = 0.1
-"""Share of height and width that cropping removes from a training image."""
+
+@dataclass(frozen=True)
+class ContrastConfig:
+    """Numbers of a `ContrastObjective`. The temperatures are CLIP's (Radford et al. 2021, section 2.4)."""
+
+    initial_temperature: float = 0.07
+    max_inverse_temperature: float = 100.0
+    crop_share: float = 0.1
+    """Share of height and width that random cropping removes from a training image."""
 
 
 @dataclass(frozen=True)
 class CaptionedImages(Record):
-    """Views, T true texts of each, and the facts each text states out of a vocabulary of V facts."""
+    """Views, T true texts of each, and which of V facts each text states."""
 
     images: UInt8[Tensor, "*n 3 H W"]
     texts: Float[Tensor, "*n T D"]
     """Embeddings of the texts, with the mean over all texts subtracted."""
-    said: Bool[Tensor, "*n T V"]
+    stated: Bool[Tensor, "*n T V"]
     holds: Bool[Tensor, "*n V"]
     """Facts that are true of the view."""
     key: tuple[str, ...]
@@ -50,10 +55,10 @@ class ContrastObjective(nn.Module):
     A text that is also true of another image of the batch is not a negative for that image.
     """
 
-    def __init__(self, tower: ImageTower) -> None:
+    def __init__(self, tower: ImageTower, config: ContrastConfig) -> None:
         super().__init__()
-        self.tower = tower
-        self.log_scale = nn.Parameter(torch.tensor(-math.log(FIRST_TEMPERATURE)))
+        self.tower, self.config = tower, config
+        self.log_scale = nn.Parameter(torch.tensor(-math.log(config.initial_temperature)))
 
     def forward(self, batch: CaptionedImages, generator: torch.Generator) -> dict[str, Tensor]:
         """Return losses with one random text per view. Mirroring and cropping the views changes no fact."""
@@ -61,15 +66,15 @@ class ContrastObjective(nn.Module):
         drawn = torch.randint(batch.texts.shape[1], (len(rows),), generator=generator).to(rows.device)
         device = batch.images.device.type
         with torch.autocast(device, torch.bfloat16, enabled=computes_bfloat16(device)):
-            found = self.tower(_jittered(batch.images, generator))
-        found = F.normalize(found.float(), dim=-1)
+            embedded = self.tower(_augmented(batch.images, self.config.crop_share, generator))
+        embedded = F.normalize(embedded.float(), dim=-1)
         texts = F.normalize(batch.texts[rows, drawn], dim=-1)
-        logits = self.log_scale.exp().clamp(max=SHARPEST) * found @ texts.T
-        loss, share = contrast(logits, true_of(batch.said[rows, drawn], batch.holds))
-        return {"loss": loss, "hits": share}
+        logits = self.log_scale.exp().clamp(max=self.config.max_inverse_temperature) * embedded @ texts.T
+        loss, accuracy = info_nce(logits, is_true(batch.stated[rows, drawn], batch.holds))
+        return {"loss": loss, "hits": accuracy}
 
 
-class DistilObjective(nn.Module):
+class DistillationObjective(nn.Module):
     """The loss of LidarCLIP (Hess et al. 2024, section 3): regress the image embedding of the same time.
 
     Args:
@@ -86,17 +91,19 @@ class DistilObjective(nn.Module):
         mirrored = (torch.rand(len(rows), generator=generator) < 0.5).to(rows.device)
         y = torch.where(mirrored[batch.cloud.item], -1.0, 1.0)
         points = torch.stack([torch.ones_like(y), y, torch.ones_like(y), torch.ones_like(y)], dim=-1)
-        found = self.encoder(PointCloud(batch.cloud.points * points, batch.cloud.item), len(rows))
+        embedded = self.encoder(PointCloud(batch.cloud.points * points, batch.cloud.item), len(rows))
         target = batch.targets[rows, mirrored.long()]
-        cosine = F.cosine_similarity(found, target, dim=-1).mean()
-        loss = F.mse_loss(found, target) if self.kind == "mse" else 1 - cosine
+        cosine = F.cosine_similarity(embedded, target, dim=-1).mean()
+        loss = F.mse_loss(embedded, target) if self.kind == "mse" else 1 - cosine
         return {"loss": loss, "cosine": cosine}
 
 
-def _jittered(images: UInt8[Tensor, "n 3 H W"], generator: torch.Generator) -> UInt8[Tensor, "n 3 h w"]:
+def _augmented(
+    images: UInt8[Tensor, "n 3 H W"], crop_share: float, generator: torch.Generator
+) -> UInt8[Tensor, "n 3 h w"]:
     """Crop all images of the batch equally and mirror each with probability 1/2."""
     height, width = images.shape[-2:]
-    kept_h, kept_w = height - round(CROP_SHARE * height), width - round(CROP_SHARE * width)
+    kept_h, kept_w = height - round(crop_share * height), width - round(crop_share * width)
     top = int(torch.randint(height - kept_h + 1, (1,), generator=generator))
     left = int(torch.randint(width - kept_w + 1, (1,), generator=generator))
     images = images[..., top : top + kept_h, left : left + kept_w]

@@ -38,11 +38,11 @@ class CaptionObjective(nn.Module):
         """Return losses for one of the two images, drawn, with noise. "hits" is the top-1 accuracy."""
         rows = len(batch.words)
         drawn = torch.randint(2, (rows,), generator=generator).to(batch.words.device)
-        given = batch.embedding[torch.arange(rows, device=drawn.device), drawn]
-        noise = torch.randn(given.shape, generator=generator).to(given.device) / math.sqrt(given.shape[1])
-        logits = self.decoder(F.normalize(given + NOISE * noise, dim=-1), batch.words[:, :-1])
-        there = batch.words != PAD
+        image = batch.embedding[torch.arange(rows, device=drawn.device), drawn]
+        noise = torch.randn(image.shape, generator=generator).to(image.device) / math.sqrt(image.shape[1])
+        logits = self.decoder(F.normalize(image + NOISE * noise, dim=-1), batch.words[:, :-1])
+        valid = batch.words != PAD
         return {
-            "loss": F.cross_entropy(logits[there], batch.words[there]),
-            "hits": (logits.argmax(-1) == batch.words)[there].float().mean(),
+            "loss": F.cross_entropy(logits[valid], batch.words[valid]),
+            "hits": (logits.argmax(-1) == batch.words)[valid].float().mean(),
         }

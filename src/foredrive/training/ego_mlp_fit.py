@@ -12,13 +12,24 @@ from foredrive.losses import l1_waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_status
 from foredrive.scene import Clip
 from foredrive.scene.record import Record
-from foredrive.training.row_fit import RowFit, fit_rows
-
-EGO_MLP_FIT = RowFit(steps=1000, batch_size=256, lr=1e-3, weight_decay=1e-2)
+from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
 
 @dataclass(frozen=True)
-class DrivenStatus(Record):
+class EgoMLPFit(FitSchedule):
+    """Schedule of the fit of an `EgoMLP`."""
+
+    steps: int = 1000
+    batch_size: int = 256
+    lr: float = 1e-3
+    weight_decay: float = 1e-2
+    seed: int = 0
+    """Seed of the weights and draws. MLPs with different seeds differ by as much as the use of images may
+    gain."""
+
+
+@dataclass(frozen=True)
+class StatusDemonstrations(Record):
     """Training data of the ego MLP: ego status at now and the driven future of N clips."""
 
     status: Float[Tensor, "N S"]
@@ -27,7 +38,7 @@ class DrivenStatus(Record):
     valid: Bool[Tensor, "N T"]
 
 
-def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False) -> DrivenStatus:
+def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False) -> StatusDemonstrations:
     """Return ego status and driven future of batches of clips.
 
     Args:
@@ -38,48 +49,46 @@ def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False
     Raises:
         InputError: there are no clips.
     """
-    rows = [_driven_status(clip, past_frames, target) for clip in clips]
+    rows = [_demonstrations(clip, past_frames, target) for clip in clips]
     if not rows:
         raise InputError("the training set is empty")
-    return DrivenStatus(
+    return StatusDemonstrations(
         torch.cat([row.status for row in rows]),
         torch.cat([row.driven for row in rows]),
         torch.cat([row.valid for row in rows]),
     )
 
 
-def _driven_status(clip: Clip, past_frames: int, target: bool) -> DrivenStatus:
+def _demonstrations(clip: Clip, past_frames: int, target: bool) -> StatusDemonstrations:
     future = clip.future
     driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
-    return DrivenStatus(ego_status(clip, past_frames, target=target), driven, future.valid[:, 0])
+    return StatusDemonstrations(ego_status(clip, past_frames, target=target), driven, future.valid[:, 0])
 
 
 def fit_ego_mlp(
-    data: DrivenStatus,
+    config: EgoMLPConfig,
+    data: StatusDemonstrations,
+    fit: EgoMLPFit,
     *,
     past_frames: int,
     dt_s: float,
-    seed: int,
-    fit: RowFit = EGO_MLP_FIT,
     target: bool = False,
 ) -> EgoMLP:
     """Fit an ego MLP by L1 on the driven steps. It takes seconds; the same seed gives the same weights."""
     horizon_steps = data.driven.shape[1]
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = EgoMLP(
-            EgoMLPConfig(), past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target
-        )
+        torch.manual_seed(fit.seed)
+        model = EgoMLP(config, past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target)
     _standardise(model, data)
 
     def loss(rows: Tensor) -> Tensor:
         return l1_waypoint_loss(model(data.status[rows]), data.driven[rows], data.valid[rows])
 
-    fit_rows(model, len(data.status), loss, fit, seed)
+    fit_in_memory(model, len(data.status), loss, fit, fit.seed)
     return model
 
 
-def _standardise(model: EgoMLP, data: DrivenStatus) -> None:
+def _standardise(model: EgoMLP, data: StatusDemonstrations) -> None:
     """Set means and spreads of inputs and outputs. Columns that hardly vary keep a spread of 1."""
     whole = data.driven[data.valid.all(dim=-1)].flatten(1)
     for name, rows in (("status", data.status), ("plan", whole)):

@@ -1,12 +1,19 @@
-"""Ctrl-C handling: interrupts take effect between training steps."""
+"""Interrupted and killed trainings: steps that are not cut in half, worker processes that do not stay."""
 
+import _thread
 import contextlib
 import multiprocessing
+import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
 
 from foredrive.interrupts import raises_interrupts
+
+CLEANUP_S = 10.0
+"""Time for a worker without a parent to remove its unfinished files."""
 
 
 @contextlib.contextmanager
@@ -56,3 +63,21 @@ def start_fork_server(preload: str) -> None:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_parent(worker_id: int) -> None:
+    """Make this worker process end when its parent has ended in any way, for example by `kill -9`.
+
+    Nobody else does it. A worker's parent in the eyes of the operating system, and so of PyTorch, is the fork
+    server, which lives as long as its workers.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        _thread.interrupt_main()
+        time.sleep(CLEANUP_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

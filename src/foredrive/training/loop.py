@@ -1,5 +1,6 @@
 """The training loop: Lightning Fabric, exact resume, progress, a clean stop."""
 
+import contextlib
 import itertools
 import json
 import math
@@ -17,10 +18,12 @@ from torch.utils.data import DataLoader, Dataset
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, naming
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
-from foredrive.training.interrupts import hold_interrupts, start_fork_server
+from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
+
+CHECKPOINTS = "checkpoints"
 
 
 @runtime_checkable
@@ -115,33 +118,71 @@ def train(
         lr=schedule.lr,
         weight_decay=schedule.weight_decay,
     )
-    checkpoints = folder / "checkpoints"
     model, fabric_optimizer = fabric.setup(objective, optimizer)
-    found = latest_checkpoint(checkpoints)
+    found = latest_checkpoint(folder / CHECKPOINTS)
     done = load_checkpoint(found, objective, optimizer) if found is not None else 0
     if done >= total:
         return
-    log = MetricsLog(folder / "metrics.jsonl", done) if fabric.is_global_zero else None
     if fabric.is_global_zero:
         write_conditions(folder, fabric)
     loader: Any = fabric.setup_dataloaders(
         _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
     )
     model.train()
-    step = done
-    with hold_interrupts() as interrupted, _progress(fabric) as progress:
-        task = progress.add_task(folder.name, total=total, completed=done, note="")
-        for example in loader:
+    with step_counter(
+        folder, objective, optimizer, done, total, schedule.checkpoint_every, writes=fabric.is_global_zero
+    ) as end_step:
+        for step, example in enumerate(loader, start=done):
             losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
+            if end_step(losses, f"loss {losses['loss'].item():.3f}"):
+                break
+
+
+@contextlib.contextmanager
+def step_counter(
+    folder: Path,
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    done: int,
+    total: int,
+    checkpoint_every: int,
+    *,
+    writes: bool = True,
+) -> Iterator[Callable[[dict[str, Tensor], str], bool]]:
+    """Count, log, show and save the steps of a training. Ctrl-C takes effect at the end of a step.
+
+    Args:
+        folder: folder for the metrics and checkpoints.
+        model, optimizer: what a checkpoint holds.
+        done: number of steps that are finished.
+        total: number of steps at the end.
+        checkpoint_every: steps between checkpoints. The last step has one too.
+        writes: whether this process writes files and shows progress.
+
+    Yields:
+        a function to call after each step with its losses and a note to show. It returns whether to stop.
+    """
+    log = MetricsLog(folder / "metrics.jsonl", done) if writes else None
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with (
+        hold_interrupts() as interrupted,
+        Progress(*columns, TextColumn("{task.fields[note]}"), disable=not writes) as progress,
+    ):
+        task = progress.add_task(folder.name, total=total, completed=done, note="")
+        step = done
+
+        def end_step(losses: dict[str, Tensor], note: str) -> bool:
+            nonlocal step
             step += 1
             if log is not None:
                 log.add(step, losses)
-            progress.update(task, completed=step, note=f"loss {losses['loss'].item():.3f}")
+            progress.update(task, completed=step, note=note)
             last = step == total or interrupted()
-            if (last or step % schedule.checkpoint_every == 0) and fabric.is_global_zero:
-                save_checkpoint(checkpoints, objective, optimizer, step)
-            if last:
-                break
+            if writes and (last or step % checkpoint_every == 0):
+                save_checkpoint(folder / CHECKPOINTS, model, optimizer, step)
+            return last
+
+        yield end_step
 
 
 def _loader(
@@ -159,18 +200,19 @@ def _loader(
     )
     if schedule.workers:
         start_fork_server(preload=type(dataset).__module__)
-    mine = [_share(batch, fabric.global_rank, fabric.world_size) for batch in batches]
+    mine = [_rank_part(batch, fabric.global_rank, fabric.world_size) for batch in batches]
     return DataLoader(
         dataset,
         batch_sampler=mine,
         collate_fn=collate,
         num_workers=schedule.workers,
+        worker_init_fn=end_with_parent,
         # Forked workers crash if numba's threads have run in the parent.
         multiprocessing_context="forkserver" if schedule.workers else None,
     )
 
 
-def _share(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
+def _rank_part(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
     """Return a rank's part of a batch. Every rank gets at least one item, also of a short last batch."""
     padded = list(itertools.islice(itertools.cycle(batch), max(len(batch), world_size)))
     return padded[rank::world_size]
@@ -190,9 +232,7 @@ def _one_step(
     seed = (schedule.seed * 1_000_003 + step) * 1009 + fabric.global_rank
     torch.manual_seed(seed)  # dropout
     losses: dict[str, Tensor] = model(example, torch.Generator().manual_seed(seed))
-    if not bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
-        bad = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
-        raise InputError(f"step {step + 1}: loss is not finite ({bad}) on the batch {', '.join(example.key)}")
+    check_finite(losses, step, f"the batch {', '.join(example.key)}")
     optimizer.zero_grad(set_to_none=True)
     fabric.backward(losses["loss"])
     fabric.clip_gradients(model, optimizer, max_norm=schedule.clip_grad_norm, error_if_nonfinite=False)
@@ -217,15 +257,15 @@ def write_conditions(folder: Path, fabric: "Fabric") -> None:
         temporary.write_text(json.dumps(conditions) + "\n")
 
 
-def _progress(fabric: "Fabric") -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        disable=not fabric.is_global_zero,
-    )
+def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:
+    """Check the losses of a step.
+
+    Raises:
+        InputError: a loss is not finite. The message names `source`, the data of the step.
+    """
+    if not bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
+        values = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
+        raise InputError(f"step {step + 1}: loss is not finite ({values}) on {source}")
 
 
 class MetricsLog:

@@ -18,7 +18,7 @@ from foredrive.training.rays import thinned_rays
 
 
 @dataclass(frozen=True)
-class LossWeights:
+class NemoWeights:
     """The λ of NeMo. The paper: recon 0.5, occ 0.5, wpts 1 in fine-tuning; scal 10, BCE 1; perc not given.
 
     In pre-training `wpts` is 0 and the planner is not trained.
@@ -41,7 +41,7 @@ class NemoStage:
     """One stage of NeMo's training."""
 
     schedule: Schedule
-    weights: LossWeights
+    weights: NemoWeights
     ray_stride: int
     """One pixel in `ray_stride` along rows and columns is rendered."""
     vgg16: str | None = None
@@ -56,27 +56,27 @@ class NemoObjective(nn.Module):
 
     Args:
         agent: world model and planner.
-        weights: λ.
-        steps: T_f, number of future key frames that are imagined and supervised; 0 trains only on now.
-        ray_stride: one pixel in `ray_stride` along rows and columns is rendered.
+        stage: λ, and what is trained.
+        steps: T_f, number of future key frames that are imagined and supervised, if the stage imagines.
         image_features: VGG-16 features with real weights for the perceptual loss, or None to disable it.
     """
 
     def __init__(
         self,
         agent: PlanningAgent[Nemo],
-        weights: LossWeights,
+        stage: NemoStage,
         *,
         steps: int,
-        ray_stride: int,
         image_features: ImageFeatures | None = None,
     ) -> None:
         super().__init__()
-        self.agent, self.weights, self.steps, self.ray_stride = agent, weights, steps, ray_stride
+        self.agent, self.weights, self.ray_stride = agent, stage.weights, stage.ray_stride
+        self.steps = steps if stage.imagine else 0
         self.image_features = image_features
-        world, plans = agent.world_model, weights.wpts > 0
-        train_planner(agent.planner, plans)
-        world.motion.requires_grad_(steps > 0 or (plans and agent.planner.looks_ahead > 0))
+        world, weights = agent.world_model, stage.weights
+        plans = weights.wpts > 0
+        set_planner_trainable(agent.planner, plans)
+        world.motion.requires_grad_(self.steps > 0 or (plans and agent.planner.imagined_frames > 0))
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)
 
@@ -90,7 +90,7 @@ class NemoObjective(nn.Module):
             output = self.agent(observed, self.steps)
             decoded, plan = output.decoded, output.plan
         else:
-            decoded = [world.decode(belief) for belief in self.agent.foresee(observed, self.steps)]
+            decoded = [world.decode(belief) for belief in self.agent.rollout(observed, self.steps)]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
@@ -128,8 +128,8 @@ class NemoObjective(nn.Module):
         return losses
 
 
-def train_planner(planner: VolumePlanner, trained: bool) -> None:
+def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:
     """Enable or disable the training of a planner. Its ego MLP is never trained here."""
-    planner.requires_grad_(trained)
+    planner.requires_grad_(trainable)
     if planner.ego_mlp is not None:
         planner.ego_mlp.requires_grad_(False)

@@ -6,13 +6,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.losses import l1_waypoint_loss
-from foredrive.models.planner import PathCorrection, PathReads
+from foredrive.models.planner import PathCorrection, PathSamples
 from foredrive.scene.record import Record
-from foredrive.training.row_fit import RowFit, fit_rows
+from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
 
 @dataclass(frozen=True)
-class PathFit(RowFit):
+class PathFit(FitSchedule):
     """Schedule of the fit of a `PathCorrection` and spacing of its clips."""
 
     steps: int = 1500
@@ -20,33 +20,34 @@ class PathFit(RowFit):
     lr: float = 1e-3
     weight_decay: float = 0.05
     stride_s: float = 1.0
-    """Time between the clips whose volumes are read, s."""
+    """Time between the clips whose volumes are sampled, s."""
 
 
 @dataclass(frozen=True)
 class PathDemonstrations(Record):
-    """Features read along N initial plans, these plans, and the driven waypoints."""
+    """Features sampled along N initial plans, these plans, and the driven waypoints."""
 
     values: Float[Tensor, "N D S F"]
-    places_m: Float[Tensor, "N D S 2"]
-    told: Float[Tensor, "N _told"]
+    positions_m: Float[Tensor, "N D S 2"]
+    status: Float[Tensor, "N _S"]
+    """Standardised ego status; no columns without an ego MLP."""
     planned_xy: Float[Tensor, "N T 2"]
     """Initial plans, which the correction is added to."""
     driven_xy: Float[Tensor, "N T 2"]
     valid: Bool[Tensor, "N T"]
 
 
-def fit_path(correction: PathCorrection, shown: PathDemonstrations, fit: PathFit, seed: int) -> None:
+def fit_path(correction: PathCorrection, data: PathDemonstrations, fit: PathFit, seed: int) -> None:
     """Fit the correction by L1 on the waypoints, and store means and spreads that standardise its inputs."""
-    shown = shown.to(correction.mean.device)
-    values = shown.values.float()
+    data = data.to(correction.mean.device)
+    values = data.values.float()
     correction.mean.copy_(values.mean(dim=(0, 1, 2)))
     correction.std.copy_(values.std(dim=(0, 1, 2)) + 1e-3)
     correction.requires_grad_(True)  # joint training disables it
 
     def loss(rows: Tensor) -> Tensor:
-        batch = shown[rows]
-        change = correction(PathReads(batch.values, batch.places_m), batch.told)
+        batch = data[rows]
+        change = correction(PathSamples(batch.values, batch.positions_m), batch.status)
         return l1_waypoint_loss(batch.planned_xy + change.cumsum(dim=1), batch.driven_xy, batch.valid)
 
-    fit_rows(correction, len(shown.told), loss, fit, seed)
+    fit_in_memory(correction, len(data.status), loss, fit, seed)

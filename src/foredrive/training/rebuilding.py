@@ -1,6 +1,7 @@
 """Training of a scene from the images and sweeps of a drive, one image or sweep per step."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.optim import Adam
 
@@ -23,13 +23,12 @@ from foredrive.losses.rendering import (
 from foredrive.rendering.rebuilt import PreparedSweep, RebuiltScene
 from foredrive.rendering.relocation import random_walk_m
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint
 from foredrive.training.gaussian_steps import grow, relocate
-from foredrive.training.interrupts import hold_interrupts
-from foredrive.training.loop import MetricsLog
+from foredrive.training.loop import CHECKPOINTS, check_finite, step_counter
 
-_SMOOTHING = 0.95
-"""Smoothing factor of the displayed PSNR."""
+_SMOOTHING = 0.05
+"""Weight of the newest image in the displayed PSNR."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,8 @@ class RebuildWeights:
     intensity: float = 1.0
     drop: float = 0.1
     line_of_sight: float = 0.1
+    depth_quantile: float = 0.95
+    """Share of the returned beams that count for `depth`. The worst hit something thin or moving."""
     scale: float = 1e-3
     opacity: float = 5e-3
 
@@ -71,7 +72,7 @@ class RebuildSchedule:
     """Length of a scene's training, and its growth."""
 
     steps: int
-    most_gaussians: int
+    max_gaussians: int
     rates: LearningRates = field(default_factory=LearningRates)
     weights: RebuildWeights = field(default_factory=RebuildWeights)
     images_per_sweep: int = 1
@@ -118,8 +119,7 @@ def rebuild(scene: RebuiltScene, views: SensorViews, schedule: RebuildSchedule, 
     """
     if not views.cameras and not views.sweeps:
         raise InputError("there is nothing to learn from: neither images nor sweeps")
-    checkpoints = folder / "checkpoints"
-    found = latest_checkpoint(checkpoints)
+    found = latest_checkpoint(folder / CHECKPOINTS)
     done = 0
     if found is not None:
         scene.resize(found / "model.safetensors")
@@ -128,24 +128,17 @@ def rebuild(scene: RebuiltScene, views: SensorViews, schedule: RebuildSchedule, 
         done = load_checkpoint(found, scene, optimizer)
     if done >= schedule.steps:
         return
-    log = MetricsLog(folder / "metrics.jsonl", done)
-    trainer = _Trainer(scene, views, schedule, optimizer)
-    with hold_interrupts() as interrupted, _progress() as progress:
-        task = progress.add_task(folder.name, total=schedule.steps, completed=done, note="")
-        shown_db: float | None = None
+    trainer, shown_db = _Trainer(scene, views, schedule, optimizer), math.nan
+    with step_counter(folder, scene, optimizer, done, schedule.steps, schedule.checkpoint_every) as end_step:
         for step in range(done, schedule.steps):
             before_s = time.process_time()
             losses = trainer.step(step)
-            log.add(step + 1, losses | {"computing_s": torch.tensor(time.process_time() - before_s)})
+            losses["computing_s"] = torch.tensor(time.process_time() - before_s)
             if "psnr_db" in losses:
                 now_db = float(losses["psnr_db"])
-                shown_db = now_db if shown_db is None else _SMOOTHING * shown_db + (1 - _SMOOTHING) * now_db
-            note = f"{len(scene.actor)} Gaussians" + ("" if shown_db is None else f"  PSNR {shown_db:.1f} dB")
-            progress.update(task, completed=step + 1, note=note)
-            last = step + 1 == schedule.steps or interrupted()
-            if last or (step + 1) % schedule.checkpoint_every == 0:
-                save_checkpoint(checkpoints, scene, optimizer, step + 1)
-            if last:
+                shown_db = now_db if math.isnan(shown_db) else shown_db + _SMOOTHING * (now_db - shown_db)
+            note = "" if math.isnan(shown_db) else f"  PSNR {shown_db:.1f} dB"
+            if end_step(losses, f"{len(scene.actor)} Gaussians{note}"):
                 break
 
 
@@ -161,16 +154,6 @@ def make_optimizer(scene: RebuiltScene, rates: LearningRates) -> Adam:
             parameters = [getattr(scene, rate.name)]
         groups.append({"params": parameters, "name": rate.name, "lr": getattr(rates, rate.name)})
     return Adam(groups, eps=1e-15)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
 
 
 class _Trainer:
@@ -196,9 +179,8 @@ class _Trainer:
         else:
             losses = self._sweep(number, mirror)
         losses["loss"] = losses["loss"] + self._regularisers()
-        if not bool(losses["loss"].isfinite()):
-            bad = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
-            raise InputError(f"step {step + 1}: loss is not finite ({bad}) on {kind} {number}")
+        descended = {name: value for name, value in losses.items() if name != "psnr_db"}  # may be infinite
+        check_finite(descended, step, f"{kind} {number}")
         self.optimizer.zero_grad(set_to_none=True)
         losses["loss"].backward()
         self.optimizer.step()
@@ -239,7 +221,9 @@ class _Trainer:
         rendered = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
         assert rendered.alpha_before_hit is not None
         losses = {
-            "depth": range_loss(rendered.range_m, beams.range_m, beams.returned),
+            "depth": range_loss(
+                rendered.range_m, beams.range_m, beams.returned, self.schedule.weights.depth_quantile
+            ),
             "intensity": intensity_loss(rendered.intensity, beams.intensity, beams.returned),
             "line_of_sight": line_of_sight_loss(rendered.alpha_before_hit, beams.returned),
         }
@@ -259,6 +243,6 @@ class _Trainer:
         schedule, scene = self.schedule, self.scene
         if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
             relocate(scene, self.optimizer, generator)
-            grow(scene, self.optimizer, schedule.most_gaussians, schedule.growth, generator)
+            grow(scene, self.optimizer, schedule.max_gaussians, schedule.growth, generator)
         rate = next(group["lr"] for group in self.optimizer.param_groups if group["name"] == "mean_m")
         scene.mean_m.add_(random_walk_m(scene.gaussians, schedule.walk * rate, generator))

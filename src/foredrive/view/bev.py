@@ -58,8 +58,19 @@ def start_bev(ax: Axes, reach_m: float) -> None:
     ax.tick_params(colors=palette.FAINT, labelsize=9, length=0)
     ax.set_xlabel("y, left (m)", color=palette.FAINT, fontsize=9)
     ax.set_ylabel("x, forward (m)", color=palette.FAINT, fontsize=9)
-    for spine in ax.spines.values():
-        spine.set_color(palette.GRID)
+    ax.spines[:].set_color(palette.GRID)
+
+
+def start_path_map(
+    ax: Axes, xy: Float[np.ndarray, "N 2"], margin_m: float, min_half_width_m: float
+) -> tuple[Float[np.ndarray, "2"], float]:
+    """Set the limits of a map to a square around a path, in world axes; return its centre and half width."""
+    low, high = xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m
+    (x, y), half = 0.5 * (low + high), max(0.5 * float((high - low).max()), min_half_width_m)
+    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", xticks=[], yticks=[])
+    ax.set_facecolor(palette.PANEL)
+    ax.spines[:].set_visible(False)
+    return np.array([x, y]), half
 
 
 def draw_map(ax: Axes, patch: MapPatch) -> None:

@@ -17,19 +17,20 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, read_map_patch
 from foredrive.scene import Command, MapKind, MapPatch
 from foredrive.view import palette
+from foredrive.view.bev import start_path_map
 from foredrive.view.sheet import Sheet
 
 THUMBNAIL_HW = (126, 224)
 THUMBNAILS = 5
 GAP_PX, HEAD_PX, TEXT_PX = 8, 52, 270
-LARGEST_PT, PT_OF_PX = 12.0, 0.86
+MAX_NAME_PT, PT_PER_PX = 12.0, 0.86
 """All names share one font size, at which the longest name fits: the maximum size, and points per pixel of
 letter width.
 """
 MAX_ROWS = 60
 """Maximum number of drives; more drives are thinned out evenly."""
-AROUND_M = 30.0
-SMALLEST_M = 50.0
+MARGIN_M = 30.0
+MIN_HALF_WIDTH_M = 50.0
 """Margin of the view from above around the path, and its minimum half width, m."""
 MAP_LINES = {MapKind.LANE_BOUNDARY: 0.5, MapKind.ROAD_EDGE: 0.9}
 HORIZON_STEPS, HORIZON_DT_S = 6, 0.5
@@ -51,7 +52,7 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
     height = HEAD_PX + len(chosen) * row_h
     sheet = Sheet(width, height)
     longest = max(len(drives[index][0].folder.name) for index in chosen)
-    name_pt = min(LARGEST_PT, PT_OF_PX * TEXT_PX / longest)
+    name_pt = min(MAX_NAME_PT, PT_PER_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()
     for row, index in enumerate(chosen):
         y, (drive, caption) = HEAD_PX + row * row_h, drives[index]
@@ -59,10 +60,10 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
         commands = _commands(log)
         commanded += commands
         sheet.write(2 * GAP_PX, y, log.path.folder.name, name_pt, weight="bold")
-        sheet.write(2 * GAP_PX, y + cell_h // 5, _told(log, caption, commands), 9.5, palette.FAINT)
+        sheet.write(2 * GAP_PX, y + cell_h // 5, _summary_text(log, caption, commands), 9.5, palette.FAINT)
         for column, frame in enumerate(_spread(len(log))):
             _show_front(sheet.place(TEXT_PX + column * (cell_w + GAP_PX), y, cell_w, cell_h), log, frame)
-        draw_way(sheet.place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
+        draw_drive_path(sheet.place(TEXT_PX + THUMBNAILS * (cell_w + GAP_PX), y, cell_h, cell_h), log)
     shown = (
         f"{len(drives)} drives" if len(chosen) == len(drives) else f"{len(chosen)} of {len(drives)} drives"
     )
@@ -91,7 +92,7 @@ def _shares(commands: Counter[str]) -> str:
     return "   ".join(f"{kind} {100 * commands[kind] / total:.0f} %" for kind in kinds)
 
 
-def _told(log: Log, caption: str, commands: Counter[str]) -> str:
+def _summary_text(log: Log, caption: str, commands: Counter[str]) -> str:
     length_m = float(np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1).sum())
     duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
     return f"{caption}\n{duration_s:.1f} s, {length_m:.0f} m\n{_shares(commands)}"
@@ -122,21 +123,11 @@ def _front_image(log: Log, frame: int) -> UInt8[np.ndarray, "H W 3"]:
     return np.full((*THUMBNAIL_HW, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
 
 
-def draw_way(ax: Axes, log: Log) -> None:
+def draw_drive_path(ax: Axes, log: Log) -> None:
     """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
-    low, high = xy.min(axis=0) - AROUND_M, xy.max(axis=0) + AROUND_M
-    half = max(float((high - low).max()) / 2, SMALLEST_M)
-    centre = (low + high) / 2
-    ax.set_facecolor(palette.PANEL)
-    ax.set(
-        xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal"
-    )
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-    for frame in _every(xy, RADIUS_M):
+    start_path_map(ax, xy, MARGIN_M, MIN_HALF_WIDTH_M)
+    for frame in _frames_every(xy, RADIUS_M):
         patch = read_map_patch(log, frame)
         for kind, width in MAP_LINES.items():
             lines = _lines_world(patch, kind, log.T_world_ego[frame])
@@ -145,7 +136,7 @@ def draw_way(ax: Axes, log: Log) -> None:
     ax.plot(*xy[0], "o", color=palette.EGO, markersize=5, zorder=4)
 
 
-def _every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
+def _frames_every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
     """Return the first frame, the last, and those that are `step_m` of driving apart."""
     driven_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=-1))])
     at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))

@@ -17,12 +17,13 @@ from foredrive.simulation.scores import InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
-from foredrive.view.html import INK_MARK
+from foredrive.view.bev import start_path_map
+from foredrive.view.html import style_axes
 
-AROUND_M, SMALLEST_M = 25.0, 45.0
-FASTEST_MPS = 14.0
+MARGIN_M, MIN_HALF_WIDTH_M = 25.0, 45.0
+MAX_SHOWN_MPS = 14.0
 SPEED_MAP, DARKEST = "plasma", -0.35
-"""Lower end of the speed colours, as a part of `FASTEST_MPS`. It keeps a standing vehicle away from the
+"""Lower end of the speed colours, as a part of `MAX_SHOWN_MPS`. It keeps a standing vehicle away from the
 darkest colours, which look like the road.
 """
 ROAD = "#333d4b"
@@ -39,7 +40,7 @@ LETTERS = {
 """The letter that marks each kind of infraction in the figures."""
 
 
-def draw_way(drive: DriveRecord) -> Figure:
+def draw_drive_path(drive: DriveRecord) -> Figure:
     """Draw the route over the town's lanes, and the driven path coloured by speed.
 
     North is up. Infractions and scenarios are marked. Without a town there are no lanes.
@@ -47,14 +48,8 @@ def draw_way(drive: DriveRecord) -> Figure:
     figure = Figure(figsize=(4.6, 4.6))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     route, track = np.array(drive.route_xy), np.array(drive.track.xy)
-    everything = np.concatenate([route, track])
-    low, high = everything.min(axis=0) - AROUND_M, everything.max(axis=0) + AROUND_M
-    centre, half = 0.5 * (low + high), max(SMALLEST_M, 0.5 * float((high - low).max()))
+    centre, half = start_path_map(ax, np.concatenate([route, track]), MARGIN_M, MIN_HALF_WIDTH_M)
     ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, facecolor=palette.PANEL, zorder=0))
-    ax.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
-    ax.set_aspect("equal")
-    ax.set_xticks([])
-    ax.set_yticks([])
     if drive.town is not None:
         _draw_lanes(ax, drive.town, centre, half)
     ax.plot(*route.T, color=palette.FAINT, linewidth=6.0, alpha=0.5, solid_capstyle="round", zorder=2)
@@ -64,7 +59,7 @@ def draw_way(drive: DriveRecord) -> Figure:
             list(np.stack([track[:-1], track[1:]], axis=1)),
             array=np.array(drive.track.speed_mps[1:]),
             cmap=SPEED_MAP,
-            norm=Normalize(DARKEST * FASTEST_MPS, FASTEST_MPS),
+            norm=Normalize(DARKEST * MAX_SHOWN_MPS, MAX_SHOWN_MPS),
             linewidth=2.4,
             capstyle="round",
             zorder=3,
@@ -94,13 +89,7 @@ def draw_timeline(drive: DriveRecord) -> Figure:
     for at_s, _, text, style in _marks(drive):
         ax.axvline(at_s, color=style["bbox"]["facecolor"], linewidth=1.4)
         ax.text(at_s, 0.96 * top, text, va="top", **style)
-    ax.set_xlabel("time, s", color=INK_MARK, fontsize=9)
-    ax.set_ylabel("speed, m/s", color=INK_MARK, fontsize=9)
-    ax.tick_params(colors=INK_MARK, labelsize=8)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color(INK_MARK)
+    style_axes(ax, xlabel="time, s", ylabel="speed, m/s")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""The report on a suite of closed-loop drives: scores, and path, speed and film of each drive."""
+"""The report on a suite of closed-loop drives: scores, and path, speed and video of each drive."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -9,17 +9,16 @@ from markupsafe import Markup
 
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
+from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
 from foredrive.simulation.drive_record import DriveRecord, ThreatMet
 from foredrive.simulation.scenarios.kinds import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
-from foredrive.view.drive_plots import LETTERS, draw_timeline, draw_way
+from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
 from foredrive.view.drive_video import write_drive_video
-from foredrive.view.html import Tile, inline_svg, write_page
-from foredrive.view.origin import Origin
+from foredrive.view.html import MetricTile, Provenance, inline_svg, write_page
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import (
     MISSING,
@@ -27,7 +26,6 @@ from foredrive.view.table import (
     Column,
     Row,
     Section,
-    Summary,
     Table,
     Value,
     number,
@@ -44,7 +42,7 @@ SCORES = {
 
 
 @dataclass(frozen=True)
-class Happening:
+class DriveEvent:
     """An infraction, a scenario or a threat in a drive."""
 
     t_s: float | None
@@ -61,19 +59,19 @@ class ShownDrive:
     score: str
     ending: str
     error: str | None
-    way: Markup
+    path_plot: Markup
     timeline: Markup
-    happenings: list[Happening]
-    film: str
-    """URL of the film, relative to the page."""
+    events: list[DriveEvent]
+    video: str
+    """URL of the video, relative to the page."""
 
 
 def score_table(summary: Summary) -> Table:
     """Return a table of the main metrics."""
-    again = _repeated(summary)
+    has_repetitions = _repeated(summary)
     scores = []
     for key, name in SCORES.items():
-        spread = f" ± {number(summary[f'{key}.spread'], 1)}" if again else ""
+        spread = f" ± {number(summary[f'{key}.spread'], 1)}" if has_repetitions else ""
         scores.append(Row([name, f"{number(summary[key], 1)}{spread}"]))
     wrong = [
         Row([words(kind), f"{number(count)}  ({number(per_km, 2)} / km)"])
@@ -85,15 +83,15 @@ def score_table(summary: Summary) -> Table:
         if ending is not Ending.COMPLETED and summary[f"endings.{ending}"]
     ]
     rest = [
-        Row(["Drives that the agent failed at", summary["failed"]]),
-        Row(["Time of a plan, ms", number(summary["plan_ms"], 0)]),
+        Row(["Failed drives", summary["failed"]]),
+        Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
     title = f"{number(summary['routes'])} routes, {number(summary['repetitions'])} repetitions"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
 
 def write_drive_report(out: Path) -> Path:
-    """Write the report page into a suite's folder, and a film of each drive.
+    """Write the report page into a suite's folder, and a video of each drive.
 
     Films that exist already are kept.
 
@@ -105,16 +103,16 @@ def write_drive_report(out: Path) -> Path:
     title = suite_title(out)
     drives = {path.stem: read_drive(path) for path in sorted((out / DRIVES).glob("*.json"), key=_order)}
     for name, drive in drives.items():
-        film = out / VIDEOS / f"{name}.webp"
-        if not film.is_file():
-            write_drive_video(film, LogPath(out / drive.log, out / "maps"), drive)
+        video = out / VIDEOS / f"{name}.webp"
+        if not video.is_file():
+            write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive)
     summary = read_summary(out / SUMMARY)
     worst_first = sorted(drives, key=lambda name: drives[name].driving_score_1_0)
     write_page(
         out / REPORT,
         "drive_report.html.j2",
         title=title,
-        origin=Origin.of(summary),
+        provenance=Provenance.of(summary),
         tiles=_tiles(summary),
         endings=_counted(summary, "endings", Ending),
         scenarios=_counted(summary, "scenarios", ScenarioKind),
@@ -122,24 +120,27 @@ def write_drive_report(out: Path) -> Path:
         letters={LETTERS[kind]: words(kind) for kind in LETTERS if summary[f"infractions.{kind}"]},
         table=_drive_table(drives),
         drives=[_show_drive(name, drives[name]) for name in worst_first],
-        every_figure=full_table(summary),
+        near_collision_s=f"{LEAST_S:g}",
+        all_metrics=full_table(summary),
     )
     return out / REPORT
 
 
-def _tiles(summary: Summary) -> list[Tile]:
-    again, tiles = _repeated(summary), []
+def _tiles(summary: Summary) -> list[MetricTile]:
+    has_repetitions, tiles = _repeated(summary), []
     for key, name in SCORES.items():
         spread = f"± {number(summary[f'{key}.spread'], 1)} over repetitions"
-        tiles.append(Tile(name, number(summary[key], 1), note=spread if again else "one repetition"))
+        tiles.append(
+            MetricTile(name, number(summary[key], 1), note=spread if has_repetitions else "one repetition")
+        )
     failed, near = number(summary["failed"]), _percent(summary["near_collision_share"])
     comfortable = _percent(summary["comfortable_share"])
     return [
         *tiles,
-        Tile("Drives the agent failed at", failed, note=f"of {number(summary['drives'])}"),
-        Tile("Comfortable time, %", comfortable, note="within nuPlan's bounds"),
-        Tile("Near collision, % of time", near, note=f"less than {LEAST_S:g} s away"),
-        Tile("Time of a plan", number(summary["plan_ms"], 0), "ms", "median"),
+        MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),
+        MetricTile("Comfortable time, %", comfortable, note="within nuPlan's bounds"),
+        MetricTile("Near collision, % of time", near, note=f"time to collision below {LEAST_S:g} s"),
+        MetricTile("Planning time", number(summary["plan_ms"], 0), "ms", "median"),
     ]
 
 
@@ -203,7 +204,7 @@ def _drive_row(name: str, drive: DriveRecord) -> list[Value | Cell]:
     ]
 
 
-def _told(infraction: Infraction) -> str:
+def _infraction_text(infraction: Infraction) -> str:
     """Return the object of an infraction and its detail; some details already begin with the object."""
     what, detail = infraction.what, infraction.detail
     return detail if detail.startswith(what) else f"{what} {detail}"
@@ -211,32 +212,31 @@ def _told(infraction: Infraction) -> str:
 
 def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
     score = drive.score
-    happenings = [Happening(each.t_s, words(each.kind), _told(each)) for each in score.infractions]
-    happenings += [
-        Happening(event.t_s, f"scenario {place}", words(event.what))
+    events = [DriveEvent(each.t_s, words(each.kind), _infraction_text(each)) for each in score.infractions]
+    events += [
+        DriveEvent(event.t_s, f"scenario {place}", words(event.what))
         for place, event in enumerate(drive.scenario_events, start=1)
     ]
-    happenings.sort(key=lambda each: each.t_s or 0.0)
+    events.sort(key=lambda each: each.t_s or 0.0)
     if drive.threat is not None:
-        happenings.append(_threat(drive.threat))
+        events.append(_threat(drive.threat))
     return ShownDrive(
         name=name,
         score=number(score.driving_score_1_0, 1),
         ending=words(score.ending),
         error=drive.error,
-        way=inline_svg(draw_way(drive)),
+        path_plot=inline_svg(draw_drive_path(drive)),
         timeline=inline_svg(draw_timeline(drive)),
-        happenings=happenings,
-        film=f"{VIDEOS}/{quote(name)}.webp",
+        events=events,
+        video=f"{VIDEOS}/{quote(name)}.webp",
     )
 
 
-def _threat(met: ThreatMet) -> Happening:
+def _threat(met: ThreatMet) -> DriveEvent:
     """Return the outcome of a threat as one entry of the list."""
     hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
-    by_the_log = f"{met.reference_mps:.1f} m/s by who goes on as the log did"
-    text = f"{hit} ({by_the_log}), score {met.score:.1f} of 5"
-    return Happening(None, f"{words(met.kind)} threat", text)
+    text = f"{hit} ({met.reference_mps:.1f} m/s if driven as logged), score {met.score:.1f} of 5"
+    return DriveEvent(None, f"{words(met.kind)} threat", text)
 
 
 def _order(path: Path) -> tuple[list[int], str]:

@@ -20,7 +20,7 @@ from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
 from foredrive.view.video import write_video
 
-FASTER = 2.0
+SPEEDUP = 2.0
 """Speed of the video relative to real time."""
 FRONT = ("pcam_l0", "pcam_f0", "pcam_r0")
 CAMERA_WH = (256, 144)
@@ -29,9 +29,9 @@ PX_PER_M, EGO_AT_X = 5.0, 0.3
 """Scale of the view from above, px per metre, and the ego's place as a part of the width. The ego faces
 right.
 """
-LEAST_PX = 3.5
+MIN_RADIUS_PX = 3.5
 """Minimum radius of an actor, px; pedestrians would otherwise be too small to see."""
-TOLD_S = 6.0
+SCENARIO_CAPTION_S = 6.0
 """Time for which a caption shows a scenario after its start, s."""
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
 
@@ -45,11 +45,13 @@ def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
     """
     opened = Log(log)
     frames = (_frame(opened, index, drive) for index in range(len(opened)))
-    write_video(path, frames, FRAME_DT_S / FASTER)
+    write_video(path, frames, FRAME_DT_S / SPEEDUP)
 
 
 def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
-    above = from_above(drive.town, np.array(drive.route_xy), log.T_world_ego[index], read_boxes(log, index))
+    above = draw_from_above(
+        drive.town, np.array(drive.route_xy), log.T_world_ego[index], read_boxes(log, index)
+    )
     _caption(ImageDraw.Draw(above), log, index, drive)
     cameras = pinhole_cameras(log)
     shown = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None]
@@ -64,7 +66,7 @@ def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
     return frame
 
 
-def from_above(
+def draw_from_above(
     town: str | None,
     route_xy: Float[np.ndarray, "N 2"],
     T_world_ego: Float[np.ndarray, "4 4"],
@@ -99,7 +101,7 @@ def from_above(
         for outline, category in zip(corners.double().numpy(), boxes.category.tolist(), strict=True):
             pen.polygon(pixels(outline), fill=palette.box_colour(category))
             middle = np.mean(pixels(outline), axis=0)
-            pen.circle((middle[0], middle[1]), twice * LEAST_PX, fill=palette.box_colour(category))
+            pen.circle((middle[0], middle[1]), twice * MIN_RADIUS_PX, fill=palette.box_colour(category))
     pen.polygon(pixels(EGO_OUTLINE_XY), fill=palette.EGO)
     return image.resize(ABOVE_WH, Image.Resampling.BOX)
 
@@ -108,7 +110,7 @@ def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: DriveRecord)
     t_s = float(log.t_us[index] - log.t_us[0]) * 1e-6
     font = ImageFont.load_default(size=16)
     pen.text((10, 8), f"{t_s:.1f} s   {log.speed_mps[index]:.1f} m/s", fill=palette.INK, font=font)
-    begun = [each for each in drive.scenario_events if 0.0 <= t_s - each.t_s < TOLD_S]
+    begun = [each for each in drive.scenario_events if 0.0 <= t_s - each.t_s < SCENARIO_CAPTION_S]
     for each in begun[-1:]:
         text = each.what.replace("_", " ")
         pen.text((ABOVE_WH[0] - 10, 8), text, fill=palette.SCENARIO, font=font, anchor="ra")

@@ -28,10 +28,10 @@ from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import states_at
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.view.rebuilt_nodes import ROOT, RebuiltNodes
-from foredrive.view.rebuilt_video import words_of
+from foredrive.view.rebuilt_video import describe_edit
 
-NOBODY = "none"
-BESIDE_M = (0.0, 3.0, 0.0)
+NO_ACTOR = "none"
+DUPLICATE_OFFSET_M = (0.0, 3.0, 0.0)
 """Offset of a copy from its original, m: one lane to the left."""
 GIZMO_M = 5.0
 RUNS_KEPT = 4
@@ -80,11 +80,11 @@ class EditPanel:
     @property
     def chosen(self) -> int | None:
         """Return the id of the edited actor; None: no actor is chosen."""
-        return None if self.actor.value == NOBODY else int(self.actor.value)
+        return None if self.actor.value == NO_ACTOR else int(self.actor.value)
 
     def choose(self, track_id: int | None) -> None:
         """Choose an actor, or none."""
-        self.actor.value = NOBODY if track_id is None else str(track_id)
+        self.actor.value = NO_ACTOR if track_id is None else str(track_id)
         self._show_chosen()
 
     def show(self, t_s: float) -> None:
@@ -103,9 +103,9 @@ class EditPanel:
             self.edits, self.edited = list(edits), edited
             ids = sorted(edited.graph.tracks.track_id.tolist())
             kept = self.actor.value
-            self.actor.options = (NOBODY, *map(str, ids))
-            self.actor.value = kept if kept in self.actor.options else NOBODY
-            self._list.content = "\n".join(f"1. {words_of(edit)}" for edit in self.edits) or "*no edits*"
+            self.actor.options = (NO_ACTOR, *map(str, ids))
+            self.actor.value = kept if kept in self.actor.options else NO_ACTOR
+            self._list.content = "\n".join(f"1. {describe_edit(edit)}" for edit in self.edits) or "*no edits*"
             self.undo.disabled = not self.edits
         self._on_change()
         return True
@@ -152,7 +152,7 @@ class EditPanel:
         ids = sorted(self._graph.tracks.track_id.tolist())
         with gui.add_folder("Edits"):
             self.actor = gui.add_dropdown(
-                "actor", (NOBODY, *map(str, ids)), hint="or click at one; then drag it by its arrows"
+                "actor", (NO_ACTOR, *map(str, ids)), hint="or click at one; then drag it by its arrows"
             )
             self.change = gui.add_button_group("change it", ("remove", "duplicate"))
             self.shift_m = gui.add_number("ego to the left, m", 2.0, step=0.5)
@@ -169,13 +169,13 @@ class EditPanel:
         self.change.on_click(lambda _: self._change(self.change.value))
         self.shift.on_click(lambda _: self._shift())
         self.insert.on_click(lambda _: self._insert())
-        self.undo.on_click(lambda _: self._take_back())
+        self.undo.on_click(lambda _: self._undo())
         self.keep.on_click(lambda _: self.save() if self.keep.value == "save" else self.load())
 
     def _shift(self) -> None:
         self.add(ShiftEgo((0.0, float(self.shift_m.value), 0.0)))
 
-    def _take_back(self) -> None:
+    def _undo(self) -> None:
         self.replace(self.edits[:-1])
 
     def _change(self, how: str) -> None:
@@ -184,16 +184,18 @@ class EditPanel:
         elif how == "remove":
             self.add(Remove(self.chosen))
         else:
-            self._copied(Duplicate(self.chosen, unused_id(self.edited.graph), BESIDE_M))
+            self._add_and_choose(Duplicate(self.chosen, unused_id(self.edited.graph), DUPLICATE_OFFSET_M))
 
     def _insert(self) -> None:
         if self.chosen is None:
             self._tell("choose the actor beside which the new one is to drive first")
             return
         copy, actor = unused_id(self.edited.graph), int(self.source_id.value)
-        self._copied(Insert(self.source.value, actor, copy, follows=self.chosen, offset_m=BESIDE_M))
+        self._add_and_choose(
+            Insert(self.source.value, actor, copy, follows=self.chosen, offset_m=DUPLICATE_OFFSET_M)
+        )
 
-    def _copied(self, edit: Duplicate | Insert) -> None:
+    def _add_and_choose(self, edit: Duplicate | Insert) -> None:
         if self.add(edit):
             self.choose(edit.copy)
 

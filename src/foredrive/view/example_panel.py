@@ -1,22 +1,23 @@
 """One example of a report: recorded images, rendered images, predictions and the plan."""
 
+import datetime
 import io
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
-from torch import Tensor
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
+from foredrive.runs import ExamplePrediction
 from foredrive.scene import Clip, Command, Example, Trajectory, VoxelSpec
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points
 from foredrive.view.html import Picture, picture
-from foredrive.view.image_drawing import Camera, draw_path_on_image, resize
+from foredrive.view.image_drawing import Camera, draw_path_on_image, resize, to_image
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.voxel_drawing import draw_comparison, draw_volume_pca, draw_voxels
 
@@ -28,31 +29,12 @@ COMPARISON_KEY = (
     (palette.FALSE_POSITIVE, "false alarm"),
     (palette.FALSE_NEGATIVE, "miss"),
     (palette.KNOWN_FREE, "known, free"),
-    (palette.GROUND, "never seen by a beam"),
+    (palette.GROUND, "unknown"),
 )
 
 
 @dataclass(frozen=True)
 class ExamplePanel:
-    """A model's predictions for one example, without leading batch dimension."""
-
-    title: str
-    example: Example
-    occupied: Bool[Tensor, "K Z Y X"]
-    """Voxels predicted occupied, at now and at the K - 1 key frames after it, each in its own ego frame."""
-    rendered: Float[Tensor, "C 3 h w"] | None
-    """The camera images at now as rendered from the volume, RGB 0 to 1, of any size."""
-    volume: Float[Tensor, "D Z Y X"] | None
-    plan: Trajectory | None
-
-    @property
-    def spec(self) -> VoxelSpec:
-        """Return the position and size of the voxel grids."""
-        return self.example.occupancy.spec
-
-
-@dataclass(frozen=True)
-class ShownPanel:
     """An example's pictures for the page template."""
 
     title: str
@@ -64,7 +46,7 @@ class ShownPanel:
     """Recorded images and, in the same order, rendered images; empty if the log has no camera."""
     camera_columns: Literal["two", "three"]
     occupancy: list[Picture]
-    """Occupancy at now in perspective: predicted, and seen by lidar."""
+    """Occupancy at now in perspective: predicted, and labelled."""
     above: list[Picture]
     later: list[Picture]
     """The imagined key frames, each in its own ego frame: in perspective, and compared from above."""
@@ -72,25 +54,32 @@ class ShownPanel:
     above_ground_m = f"{ABOVE_GROUND_M:g}"
 
 
-def show_panel(panel: ExamplePanel) -> ShownPanel:
+def draw_example(shown: ExamplePrediction) -> ExamplePanel:
     """Draw an example's pictures."""
-    clip = panel.example.clip
+    clip = shown.example.clip
     known_command, known_speed = bool(clip.command_valid), bool(clip.ego_speed_valid[clip.now])
-    cameras = _cameras(panel)
-    return ShownPanel(
-        title=panel.title,
+    cameras = _cameras(shown)
+    return ExamplePanel(
+        title=example_title(shown.example),
         command=palette.label(Command(int(clip.command))) if known_command else "unknown",
         speed=f"{float(clip.ego_speed_mps[clip.now]):.1f} m/s" if known_speed else "unknown",
-        plan=_plan(panel),
+        plan=_plan(shown),
         cameras=cameras,
         camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
         occupancy=[
-            picture(predicted_voxels(panel, 0), f"Predicted occupancy, {_how_much(panel, 0)}"),
-            picture(labelled_voxels(panel, 0), "Occupancy seen by the lidar, coloured by height"),
+            picture(predicted_voxels(shown, 0), f"Predicted occupancy, {_content_text(shown, 0)}"),
+            picture(labelled_voxels(shown, 0), "Labelled occupancy, coloured by height"),
         ],
-        above=_above(panel),
-        later=_later(panel),
+        above=_above(shown),
+        later=_later(shown),
     )
+
+
+def example_title(example: Example) -> str:
+    """Return the log of an example, and the time of its now."""
+    log, _, t_us = example.key[0].rpartition("@")
+    taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
+    return f"{log} at {taken:%Y-%m-%d %H:%M:%S}.{taken.microsecond // 10_000:02d} UTC"
 
 
 def front_camera(clip: Clip) -> int | None:
@@ -99,21 +88,18 @@ def front_camera(clip: Clip) -> int | None:
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
 
-def camera_with_paths(
-    clip: Clip, index: int, plan: Trajectory | None, width_px: int
-) -> UInt8[np.ndarray, "H W 3"]:
+def camera_with_paths(clip: Clip, index: int, plan: Trajectory, width_px: int) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the driven future (green) and the plan (red) on the ground of a camera's image at now."""
     image = clip.images[clip.now, index].permute(1, 2, 0).numpy()
     size_hw = (round(width_px * image.shape[0] / image.shape[1]), width_px)
     camera = Camera.of(clip.rig[clip.now], index).resized(size_hw)
     image = resize(image, size_hw)
-    paths = [(clip.future, palette.EXPERT)] + ([(plan, palette.PLAN)] if plan is not None else [])
-    for path, colour in paths:
+    for path, colour in ((clip.future, palette.EXPERT), (plan, palette.PLAN)):
         image = draw_path_on_image(image, path_points(path), camera, colour)
     return image
 
 
-def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[np.ndarray, "H W 3"]:
+def plan_picture(clip: Clip, plan: Trajectory, reach_m: float) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the scene from above with the driven future and the plan, legend below."""
     figure = Figure(figsize=(5.6, 6.3), dpi=MAP_PX / 5.6, facecolor=palette.GROUND)
     draw_bev(figure.add_axes((0.125, 0.17, 0.855, 0.76)), clip, reach_m, plan)
@@ -132,84 +118,83 @@ def plan_picture(clip: Clip, plan: Trajectory | None, reach_m: float) -> UInt8[n
     return np.asarray(Image.open(buffer).convert("RGB"))
 
 
-def comparison_picture(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
+def comparison_picture(shown: ExamplePrediction, step: int) -> UInt8[np.ndarray, "H W 3"]:
     """Draw hits, false alarms and misses from above, `step` key frames after now."""
-    grid, frame = panel.example.occupancy, panel.example.clip.now + step
+    grid, frame = shown.example.occupancy, shown.example.clip.now + step
     columns = draw_comparison(
-        panel.occupied[step],
+        shown.occupied[step],
         grid.values[frame, 0] > 0.5,
         grid.known[frame],
-        panel.spec,
+        shown.example.occupancy.spec,
         ABOVE_GROUND_M,
     )
-    return with_ego(columns, panel.spec)
+    return with_ego(columns, shown.example.occupancy.spec)
 
 
-def volume_picture(panel: ExamplePanel) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the volume's principal components from above."""
-    assert panel.volume is not None
-    return with_ego(draw_volume_pca(panel.volume), panel.spec)
-
-
-def predicted_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
+def predicted_voxels(shown: ExamplePrediction, step: int) -> UInt8[np.ndarray, "H W 3"]:
     """Draw predicted occupancy in perspective, `step` key frames after now."""
-    return draw_voxels(panel.occupied[step], panel.spec, VOXELS_HW)
+    return draw_voxels(shown.occupied[step], shown.example.occupancy.spec, VOXELS_HW)
 
 
-def labelled_voxels(panel: ExamplePanel, step: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw occupancy that the lidar saw in perspective, `step` key frames after now."""
-    grid, frame = panel.example.occupancy, panel.example.clip.now + step
-    return draw_voxels((grid.values[frame, 0] > 0.5) & grid.known[frame], panel.spec, VOXELS_HW)
+def labelled_voxels(shown: ExamplePrediction, step: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw labelled occupancy in perspective, `step` key frames after now."""
+    grid, frame = shown.example.occupancy, shown.example.clip.now + step
+    return draw_voxels(
+        (grid.values[frame, 0] > 0.5) & grid.known[frame], shown.example.occupancy.spec, VOXELS_HW
+    )
 
 
-def _plan(panel: ExamplePanel) -> list[Picture]:
-    clip, spec = panel.example.clip, panel.spec
+def _plan(shown: ExamplePrediction) -> list[Picture]:
+    clip, spec = shown.example.clip, shown.example.occupancy.spec
     reach_m = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
-    above = picture(plan_picture(clip, panel.plan, reach_m), "The same from above", "png")
+    above = picture(plan_picture(clip, shown.plan, reach_m), "The same from above", "png")
     front = front_camera(clip)
     if front is None:
         return [above]
     caption = f"{clip.rig.names[front]}: driven future (green) and plan (red)"
-    return [picture(camera_with_paths(clip, front, panel.plan, FRONT_WIDTH_PX), caption), above]
+    return [picture(camera_with_paths(clip, front, shown.plan, FRONT_WIDTH_PX), caption), above]
 
 
-def _cameras(panel: ExamplePanel) -> dict[str, list[Picture]]:
-    clip = panel.example.clip
+def _cameras(shown: ExamplePrediction) -> dict[str, list[Picture]]:
+    clip = shown.example.clip
     order = [camera for row in camera_rows(clip.rig[clip.now]) for camera in row]
     seen = [camera for camera in order if bool(clip.image_valid[clip.now, camera])]
     if not seen:
         return {}
-    halves = {"Camera images": clip.images[clip.now]}
-    if panel.rendered is not None:
-        halves["Rendered from the volume"] = (panel.rendered.clamp(0, 1) * 255).byte()
+    halves = {"Camera images": clip.images[clip.now].float() / 255}
+    if shown.rendered is not None:
+        halves["Rendered from the volume"] = shown.rendered
+    height, width = clip.rig.size_hw
+    size_hw = (round(CAMERA_WIDTH_PX * height / width), CAMERA_WIDTH_PX)
     return {
-        title: [picture(_as_wide(images[camera]), clip.rig.names[camera]) for camera in seen]
+        title: [picture(resize(to_image(images[camera]), size_hw), clip.rig.names[camera]) for camera in seen]
         for title, images in halves.items()
     }
 
 
-def _above(panel: ExamplePanel) -> list[Picture]:
+def _above(shown: ExamplePrediction) -> list[Picture]:
     """Draw occupancy at now from above, beside the volume."""
-    across = f"{panel.spec.shape_zyx[2] * panel.spec.voxel_m:.0f} m across"
-    above = [picture(comparison_picture(panel, 0), f"Prediction against lidar from above, {across}", "png")]
-    if panel.volume is not None:
-        caption = f"Volume: PCA to three channels, mean over height, {across}"
-        above.append(picture(volume_picture(panel), caption, "png"))
-    return above
+    spec = shown.example.occupancy.spec
+    across = f"{spec.shape_zyx[2] * spec.voxel_m:.0f} m across"
+    volume = with_ego(draw_volume_pca(shown.volume), spec)
+    return [
+        picture(comparison_picture(shown, 0), f"Prediction and labels from above, {across}", "png"),
+        picture(volume, f"Volume: PCA to three channels, mean over height, {across}", "png"),
+    ]
 
 
-def _how_much(panel: ExamplePanel, step: int) -> str:
-    """Return the end of a caption, which says whether any voxel is occupied; the picture is black without."""
-    return "coloured by height" if bool(panel.occupied[step].any()) else "of which there is none"
+def _content_text(shown: ExamplePrediction, step: int) -> str:
+    """Return the end of a caption; without occupied voxels the picture is black."""
+    return "coloured by height" if bool(shown.occupied[step].any()) else "no voxel is occupied"
 
 
-def _later(panel: ExamplePanel) -> list[Picture]:
-    clip, pictures = panel.example.clip, []
-    for step in range(1, len(panel.occupied)):
+def _later(shown: ExamplePrediction) -> list[Picture]:
+    clip, pictures = shown.example.clip, []
+    for step in range(1, len(shown.occupied)):
         when = f"+{float(clip.t_s[clip.now + step]):.1f} s"
-        caption = f"Imagined occupancy at {when}, {_how_much(panel, step)}"
-        pictures.append(picture(predicted_voxels(panel, step), caption))
-        pictures.append(picture(comparison_picture(panel, step), f"Against lidar at {when}", "png"))
+        caption = f"Imagined occupancy at {when}, {_content_text(shown, step)}"
+        pictures.append(picture(predicted_voxels(shown, step), caption))
+        pictures.append(picture(comparison_picture(shown, step), f"Prediction and labels at {when}", "png"))
     return pictures
 
 
@@ -225,8 +210,3 @@ def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.n
     ]
     ImageDraw.Draw(canvas).polygon(outline, outline=palette.rgb255(palette.EGO), width=2)
     return np.asarray(canvas)
-
-
-def _as_wide(image: UInt8[Tensor, "3 H W"]) -> UInt8[np.ndarray, "h w 3"]:
-    height, width = image.shape[1:]
-    return resize(image.permute(1, 2, 0).numpy(), (round(CAMERA_WIDTH_PX * height / width), CAMERA_WIDTH_PX))

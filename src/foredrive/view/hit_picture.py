@@ -71,12 +71,12 @@ def hit_name(hit: Hit) -> str:
     return f"{hit.row.log}@{hit.row.t_s:.2f}s/{hit.row.view}"
 
 
-def why_matched(hit: Hit) -> str:
+def score_text(hit: Hit) -> str:
     """Return the scores that ranked the hit, as text."""
     return "   ".join(f"{name} {score:.3f}" for name, score in hit.scores.items()) or f"{hit.score:.3f}"
 
 
-def what_is_there(hit: Hit) -> str:
+def content_text(hit: Hit) -> str:
     """Return place, weather, speed and objects as text, as far as they are known."""
     row = hit.row
     known = [fact for fact in (row.place, row.time_of_day, row.weather) if fact is not None]

@@ -13,9 +13,11 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from foredrive.evaluation.summary import Summary
 from foredrive.files import atomic_path
 from foredrive.view.table import Cell, Value, number, words
 
@@ -36,13 +38,40 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Tile:
+class MetricTile:
     """One of the main metrics of a page."""
 
     name: str
     value: str
     unit: str = ""
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The command, commit, machine and date of a summary."""
+
+    command: str
+    commit: str
+    machine: str
+    date: str = ""
+
+    @classmethod
+    def of(cls, summary: Summary, date: str = "") -> "Provenance":
+        """Return the provenance that a summary states."""
+        machine = [
+            f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
+            f"{summary.get('machine.ram_gib')} GiB",
+            summary.get("machine.gpu"),
+            f"Python {summary.get('version.python')}",
+            f"torch {summary.get('version.torch')}",
+        ]
+        return cls(
+            command=str(summary.get("command")),
+            commit=str(summary.get("commit") or "not a git checkout"),
+            machine=", ".join(str(part) for part in machine if part),
+            date=date,
+        )
 
 
 def write_page(path: Path, template: str, **content: object) -> None:
@@ -77,6 +106,17 @@ def inline_svg(figure: Figure) -> Markup:
     svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
     svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)
     return Markup(re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg))
+
+
+def style_axes(ax: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
+    """Give axes the page's colours, a faint grid and no frame."""
+    ax.set_title(title, color=INK_MARK, loc="left", fontsize=10)
+    ax.set_xlabel(xlabel, color=INK_MARK, fontsize=9)
+    ax.set_ylabel(ylabel, color=INK_MARK, fontsize=9)
+    ax.tick_params(which="both", colors=INK_MARK, length=0, labelsize=9)
+    ax.grid(color="#8888884d", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[:].set_visible(False)
 
 
 @functools.cache

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from foredrive.geometry.boxes import EDGES, box_corners
@@ -44,6 +44,16 @@ class Camera:
     def from_ego(self, points_ego: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Transform points to the camera frame."""
         return transform_points(inverse_se3(self.T_ego_cam).to(points_ego), points_ego)
+
+
+def to_image(rgb: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Return RGB from 0 to 1 as bytes."""
+    return (255 * rgb.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
+
+
+def write_text(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
+    """Write one line of text below and to the right of a point."""
+    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))
 
 
 def resize(image: UInt8[np.ndarray, "H W 3"], size_hw: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:

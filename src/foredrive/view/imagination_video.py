@@ -10,10 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
-from foredrive.runs.evaluate.imagination import Moment
+from foredrive.runs.evaluate.imagination import ImaginedFutures
 from foredrive.view import palette
 from foredrive.view.example_panel import COMPARISON_KEY, with_ego
-from foredrive.view.image_drawing import resize
+from foredrive.view.image_drawing import resize, write_text
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.video import write_video
 from foredrive.view.voxel_drawing import draw_comparison
@@ -24,31 +24,31 @@ HOLD = 2
 """Number of frames that show now; each later key frame is shown once."""
 
 
-def write_imagination_video(path: Path, moments: Iterable[Moment], frame_dt_s: float) -> int:
-    """Write one moment after another, each from now on in real time; return the number of frames."""
+def write_imagination_video(path: Path, moments: Iterable[ImaginedFutures], frame_dt_s: float) -> int:
+    """Write the futures from each time, one after another, in real time; return the number of frames."""
     frames = []
-    for moment in moments:
-        shown = [draw_imagined(moment, step, frame_dt_s) for step in range(moment.futures.shape[1])]
+    for imagined in moments:
+        shown = [draw_imagined(imagined, step, frame_dt_s) for step in range(imagined.futures.shape[1])]
         frames += [shown[0]] * HOLD + shown[1:]
     write_video(path, frames, frame_dt_s)
     return len(frames)
 
 
-def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
+def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Image.Image:
     """Draw the recorded and all imagined futures at one key frame: front cameras above, occupancy below.
 
     Args:
         step: index of the key frame; 0 is now.
     """
-    rows = _camera_strips(moment, step)
-    label = moment.example.occupancy
-    frame = moment.example.clip.now + step
+    rows = _camera_strips(imagined, step)
+    label = imagined.example.occupancy
+    frame = imagined.example.clip.now + step
     truth, known = label.values[frame, 0] > 0.5, label.known[frame]
-    panels = [("what happened", truth)]
-    count = len(moment.futures)
+    panels = [("recorded", truth)]
+    count = len(imagined.futures)
     panels += [
         (f"future {k + 1} of {count}" if count > 1 else "imagined", future[step])
-        for k, future in enumerate(moment.futures)
+        for k, future in enumerate(imagined.futures)
     ]
     lines = -(-len(panels) // COLUMNS)
     cell_h = TITLE_PX + PANEL_PX * truth.shape[2] // truth.shape[1] + GAP_PX
@@ -56,9 +56,9 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
     width = COLUMNS * (PANEL_PX + GAP_PX) + GAP_PX
     canvas = Image.new("RGB", (width, HEAD_PX + strips_h + lines * cell_h + KEY_PX), palette.GROUND)
     pen, y = ImageDraw.Draw(canvas), HEAD_PX
-    _write(pen, (GAP_PX, 9), _title(moment, step, frame_dt_s), 18, palette.INK)
+    write_text(pen, (GAP_PX, 9), _title(imagined, step, frame_dt_s), 18, palette.INK)
     for title, strip in rows:
-        _write(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
+        write_text(pen, (GAP_PX, y + 5), title, 13, palette.FAINT)
         canvas.paste(Image.fromarray(strip), (GAP_PX, y + TITLE_PX))
         y += TITLE_PX + strip.shape[0] + GAP_PX
     for number, (title, occupied) in enumerate(panels):
@@ -67,25 +67,25 @@ def draw_imagined(moment: Moment, step: int, frame_dt_s: float) -> Image.Image:
         columns = draw_comparison(occupied, truth, known, label.spec, ABOVE_GROUND_M)
         picture = with_ego(columns, label.spec)
         size_hw = (PANEL_PX * picture.shape[0] // picture.shape[1], PANEL_PX)
-        _write(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
+        write_text(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
         canvas.paste(Image.fromarray(resize(picture, size_hw)), (at[0], at[1] + TITLE_PX))
     _draw_key(pen, canvas.height - KEY_PX + 6)
     return canvas
 
 
-def _camera_strips(moment: Moment, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
+def _camera_strips(imagined: ImaginedFutures, step: int) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
     """Draw the three cameras that point most straight ahead: recorded images, and rendered ones if any."""
-    clip = moment.example.clip
+    clip = imagined.example.clip
     frame = clip.now + step
     order = camera_rows(clip.rig[frame])
     ahead = order[0][:COLUMNS] if order else []
     shown = [camera for camera in ahead if bool(clip.image_valid[frame, camera])]
     if not shown:
         return []
-    strips = [("what the cameras saw", _strip(clip.images[frame, shown]))]
-    if moment.rendered is not None:
-        rendered = (moment.rendered[step, shown].clamp(0, 1) * 255).byte()
-        strips.append(("what they see in the imagined volume", _strip(rendered)))
+    strips = [("recorded images", _strip(clip.images[frame, shown]))]
+    if imagined.rendered is not None:
+        rendered = (imagined.rendered[step, shown].clamp(0, 1) * 255).byte()
+        strips.append(("rendered from the imagined volume", _strip(rendered)))
     return strips
 
 
@@ -99,8 +99,8 @@ def _strip(images: Tensor) -> UInt8[np.ndarray, "h w 3"]:
     return np.concatenate(parts[:-1], axis=1)
 
 
-def _title(moment: Moment, step: int, frame_dt_s: float) -> str:
-    log, _, t_us = moment.example.key[0].rpartition("@")
+def _title(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> str:
+    log, _, t_us = imagined.example.key[0].rpartition("@")
     taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
     when = f"+{step * frame_dt_s:.1f} s" if step else "now"
     return f"{log}  {taken:%H:%M:%S}   {when}"
@@ -113,7 +113,3 @@ def _draw_key(pen: ImageDraw.ImageDraw, y: int) -> None:
         pen.rectangle((x, y + 2, x + 14, y + 16), fill=colour, outline=palette.GRID)
         pen.text((x + 20, y), name, fill=palette.FAINT, font=font)
         x += 20 + round(pen.textlength(name, font=font)) + 24
-
-
-def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

@@ -14,9 +14,9 @@ from foredrive.scene import CameraRig, Clip
 from foredrive.view import palette
 from foredrive.view.bev import draw_bev, legend_handles
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_points_on_image, resize
+from foredrive.view.log_frames import CAMERA_WIDTH_PX
 from foredrive.view.sheet import Sheet
 
-CAMERA_WIDTH_PX = 640
 GAP_PX, HEAD_PX, AXIS_PX, LEGEND_PX = 10, 64, 60, 230
 MIN_BEV_PX = 640
 
@@ -143,7 +143,7 @@ def _range_bar(ax: Axes) -> None:
     shown = LinearSegmentedColormap.from_list(
         "range", palette.RANGE_MAP(np.linspace(*palette.RANGE_SPAN, 64))
     )
-    scale = ScalarMappable(LogNorm(palette.NEAREST_M, palette.FARTHEST_M), shown)
+    scale = ScalarMappable(LogNorm(palette.MIN_RANGE_M, palette.MAX_RANGE_M), shown)
     bar = ax.figure.colorbar(scale, cax=ax, orientation="horizontal")
     bar.set_ticks([3, 10, 30, 80], labels=["3", "10", "30", "80 m"])
     bar.ax.minorticks_off()

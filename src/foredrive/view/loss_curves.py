@@ -9,7 +9,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from foredrive.view.html import INK_MARK, inline_svg
+from foredrive.view.html import INK_MARK, inline_svg, style_axes
 
 COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227", "#e5484d")
 NOT_LOSSES = ("step", "step_s", "lr")
@@ -47,11 +47,7 @@ def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]])
         ax.plot(steps, positive, color=colour, linewidth=0.8, alpha=0.3)
         ax.plot(steps, _running_mean(positive), color=colour, linewidth=1.9, label=key)
     ax.set_yscale("log")
-    ax.set_title(name, color=INK_MARK, loc="left", fontsize=11)
-    ax.set_xlabel("step", color=INK_MARK)
-    ax.grid(color="#8888884d", linewidth=0.6)
-    ax.tick_params(which="both", colors=INK_MARK, length=0, labelsize=9)
-    ax.spines[:].set_visible(False)
+    style_axes(ax, name, "step")
     if ax.lines:
         legend_rows = math.ceil(len(names) / LEGEND_COLUMNS)
         ax.legend(

@@ -13,7 +13,8 @@ from viser.transforms import SO3
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.scene import CameraRig
 from foredrive.view import palette
-from foredrive.view.log_times import LogTimes
+from foredrive.view.image_drawing import to_image
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.scene_nodes import FRUSTUM_M, show_path
 from foredrive.view.volume_nodes import show_flow, show_occupancy, shown_voxels
 
@@ -26,16 +27,16 @@ class ModelPanel:
 
     Args:
         server: server of the page.
-        times: a log with a run.
+        frames: a log with a run.
     """
 
-    def __init__(self, server: viser.ViserServer, times: LogTimes) -> None:
-        assert times.run is not None
-        assert times.observer is not None
-        self._server, self._times, self._observer = server, times, times.observer
-        self.spec, self._dt_s = times.run.recipe.clips.voxels, times.run.recipe.clips.frame_dt_s
+    def __init__(self, server: viser.ViserServer, frames: LogFrames) -> None:
+        assert frames.run is not None
+        assert frames.predictor is not None
+        self._server, self._frames, self._predictor = server, frames, frames.predictor
+        self.spec, self._dt_s = frames.run.recipe.clips.voxels, frames.run.recipe.clips.frame_dt_s
         self._index, self._drawing = 0, threading.Lock()
-        gui, steps, spec = server.gui, self._observer.steps, self.spec
+        gui, steps, spec = server.gui, self._predictor.steps, self.spec
         low_m, high_m = spec.lower_m[2], spec.upper_m[2] - spec.voxel_m
         above_road = low_m + spec.voxel_m * math.ceil((ABOVE_GROUND_M - low_m) / spec.voxel_m)
         with gui.add_folder("Model"):
@@ -49,8 +50,8 @@ class ModelPanel:
             )
             render = gui.add_button(
                 "Render from here",
-                hint="what the model would see with your eyes",
-                visible=self._observer.renders,
+                hint="render the predicted volume from this viewpoint",
+                visible=self._predictor.renders,
             )
             self._rendered = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
         for slider in (self.frame, self.above, self.lowest_m):
@@ -64,20 +65,20 @@ class ModelPanel:
         """Draw the model's predictions at a frame of the log."""
         with self._drawing:
             self._index = index
-            vision, k, scene = self._times.vision(index), self.frame.value, self._server.scene
-            self._note.content = self._when(k) if vision is not None else "too few frames before this one"
+            prediction, k, scene = self._frames.prediction(index), self.frame.value, self._server.scene
+            self._note.content = self._when(k) if prediction is not None else "too few frames before this one"
             with self._server.atomic():
-                if vision is not None:
+                if prediction is not None:
                     spec = self.spec
-                    shown = shown_voxels(vision, k, spec, self.above.value, self.lowest_m.value)
+                    shown = shown_voxels(prediction, k, spec, self.above.value, self.lowest_m.value)
                     colour_by = cast(Literal["height", "features"], self.colour_by.value)
-                    show_occupancy(scene, vision, k, spec, shown, colour_by)
-                    show_flow(scene, vision, k, spec, shown)
-                    show_path(scene, "plan", vision.plan, palette.PLAN)
+                    show_occupancy(scene, prediction, k, spec, shown, colour_by)
+                    show_flow(scene, prediction, k, spec, shown)
+                    show_path(scene, "plan", prediction.plan, palette.PLAN)
                 for name, box in self.boxes.items():
                     node = scene.get_handle_by_name(f"/{name}")
                     if node is not None:
-                        node.visible = box.value and vision is not None
+                        node.visible = box.value and prediction is not None
 
     def _when(self, k: int) -> str:
         return f"imagined, **{k * self._dt_s:g} s** ahead" if k else "observed **now**"
@@ -87,15 +88,15 @@ class ModelPanel:
         if event.client is None:
             return
         with self._drawing:
-            vision, k = self._times.vision(self._index), self.frame.value
-            if vision is None:
+            prediction, k = self._frames.prediction(self._index), self.frame.value
+            if prediction is None:
                 return
             camera = event.client.camera
             T_now_cam = np.eye(4)
             T_now_cam[:3, :3], T_now_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
-            T_ego_cam = np.linalg.inv(vision.T_now_ego[k].double().numpy()) @ T_now_cam
+            T_ego_cam = np.linalg.inv(prediction.T_now_ego[k].double().numpy()) @ T_now_cam
             rig = pinhole(T_ego_cam, camera.fov, camera.aspect, RENDERED_HEIGHT_PX)
-            rgb = (255 * self._observer.render(vision, k, rig)[0]).to(torch.uint8).numpy()
+            rgb = to_image(self._predictor.render(prediction, k, rig)[0].permute(2, 0, 1))
         self._rendered.image, self._rendered.visible = rgb, True
         self._server.scene.add_camera_frustum(
             "/rendered",

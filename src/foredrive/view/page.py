@@ -33,16 +33,8 @@ def free_port(host: str, port: int) -> int:
     raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
 
 
-def open_page(label: str, host: str, port: int) -> viser.ViserServer:
-    """Serve an empty dark page, seen from behind and above the ego vehicle; the server has its own threads.
-
-    Args:
-        label: title of the page.
-        host, port: address of the page; if the port is taken, the next free one.
-
-    Raises:
-        InputError: as `free_port`.
-    """
+def _open_server(label: str, host: str, port: int) -> viser.ViserServer:
+    """Serve an empty dark page, seen from behind and above the ego vehicle; it has its own threads."""
     port = free_port(host, port)  # viser would wait for a host that does not exist
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
@@ -54,12 +46,26 @@ def open_page(label: str, host: str, port: int) -> viser.ViserServer:
     return server
 
 
-def page_url(server: viser.ViserServer) -> str:
-    """Return a page's address."""
-    return f"http://{server.get_host()}:{server.get_port()}"
+class Page:
+    """A served page.
 
+    Args:
+        label: title of the page.
+        host, port: address of the page; if the port is taken, the next free one.
 
-def close_page(server: viser.ViserServer) -> None:
-    """Stop serving."""
-    with contextlib.suppress(RuntimeError):  # its thread may end before it has received everything
-        server.stop()
+    Raises:
+        InputError: as `free_port`.
+    """
+
+    def __init__(self, label: str, host: str, port: int) -> None:
+        self.server = _open_server(label, host, port)
+
+    @property
+    def url(self) -> str:
+        """Return the page's address."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stop serving."""
+        with contextlib.suppress(RuntimeError):  # its thread may end before it has received everything
+            self.server.stop()

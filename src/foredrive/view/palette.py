@@ -56,7 +56,7 @@ RANGE_MAP = matplotlib.colormaps["plasma"].reversed()
 HEIGHT_MAP = matplotlib.colormaps["viridis"]
 RANGE_SPAN = (0.05, 0.75)
 """The part of the colour map that stands out from the background."""
-NEAREST_M, FARTHEST_M = 3.0, 80.0
+MIN_RANGE_M, MAX_RANGE_M = 3.0, 80.0
 """Ends of the logarithmic range scale, m."""
 
 
@@ -76,7 +76,11 @@ def rgb255(colour: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def range_colours(range_m: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
+def range_colours(range_m: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n 3"]:
     """Return colours of ranges from bright (near) to dark (far), on a logarithmic scale from 3 to 80 m."""
-    scale = np.log(np.clip(range_m, NEAREST_M, FARTHEST_M) / NEAREST_M) / np.log(FARTHEST_M / NEAREST_M)
-    return (RANGE_MAP(RANGE_SPAN[0] + (RANGE_SPAN[1] - RANGE_SPAN[0]) * scale)[:, :3] * 255).astype(np.uint8)
+    scale = np.log(np.clip(range_m, MIN_RANGE_M, MAX_RANGE_M) / MIN_RANGE_M) / np.log(
+        MAX_RANGE_M / MIN_RANGE_M
+    )
+    return (RANGE_MAP(RANGE_SPAN[0] + (RANGE_SPAN[1] - RANGE_SPAN[0]) * scale)[..., :3] * 255).astype(
+        np.uint8
+    )

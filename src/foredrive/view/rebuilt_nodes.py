@@ -16,17 +16,17 @@ from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import states_at
 from foredrive.view import palette
-from foredrive.view.splat_nodes import show_splats, thinned
+from foredrive.view.splat_nodes import show_splats, thin_out
 
 ROOT = "/scene"
 """Name of the scene's frame; nodes beside it are in the ego frame at the time shown."""
-MOST_SPLATS = 400_000
-"""Maximum number of drawn splats; more are thinned out. These are 13 MB at 32 bytes each."""
-AWAY_M = (0.0, 0.0, -1e6)
+MAX_SPLATS = 400_000
+"""Maximum number of drawn splats; more are thin_out out. These are 13 MB at 32 bytes each."""
+HIDDEN_AT_M = (0.0, 0.0, -1e6)
 """Position of hidden splats, m: the browser draws the splats of invisible nodes too."""
-HERE_M = (0.0, 0.0, 0.0)
+SHOWN_AT_M = (0.0, 0.0, 0.0)
 FACE_OPACITY, CHOSEN_OPACITY = 0.06, 0.35
-PLACES = 16
+PATH_POINTS = 16
 """Number of points along the vehicle's path from which the distance to a Gaussian is measured."""
 EDGE_WIDTH, LABEL_SCALE, NUDGE_M = 2.0, 0.8, 1e-3
 
@@ -48,7 +48,7 @@ class RebuiltNodes:
     Args:
         scene: scene of the page.
         graph: initial scene graph.
-        way_m: positions of the ego vehicle, in the scene's frame.
+        path_m: positions of the ego vehicle, in the scene's frame.
         on_click: called with the id of a clicked actor.
     """
 
@@ -56,16 +56,16 @@ class RebuiltNodes:
         self,
         scene: viser.SceneApi,
         graph: SceneGraph,
-        way_m: Float[Tensor, "K 3"],
+        path_m: Float[Tensor, "K 3"],
         on_click: Callable[[int], None],
     ) -> None:
         self._scene, self._on_click = scene, on_click
-        self.share = min(1.0, MOST_SPLATS / max(len(graph.actor), 1))
+        self.share = min(1.0, MAX_SPLATS / max(len(graph.actor), 1))
         """Share of all Gaussians that is drawn."""
         self.layers = {"splats": True, "boxes": True, "ids": True}
         self._root = scene.add_frame(ROOT, show_axes=False)
-        standing = thinned(graph.of_actor(STATIC), self.share, way_m[:: -(-len(way_m) // PLACES)])
-        self._standing = show_splats(scene, f"{ROOT}/static", standing) if len(standing.mean_m) else None
+        static = thin_out(graph.of_actor(STATIC), self.share, path_m[:: -(-len(path_m) // PATH_POINTS)])
+        self._static = show_splats(scene, f"{ROOT}/static", static) if len(static.mean_m) else None
         self._actors: dict[int, _ActorNode] = {}
         self._chosen: int | None = None
 
@@ -88,7 +88,7 @@ class RebuiltNodes:
                 _place(node.frame, states.T_scene_actor[row])
                 node.frame.visible = there
                 if not there:
-                    node.frame.position = AWAY_M
+                    node.frame.position = HIDDEN_AT_M
         self.show_layers()
 
     def choose(self, track_id: int | None) -> None:
@@ -104,9 +104,9 @@ class RebuiltNodes:
 
     def show_layers(self) -> None:
         """Show the layers that are switched on."""
-        splats_at = HERE_M if self.layers["splats"] else AWAY_M
-        if self._standing is not None:
-            self._standing.position = splats_at
+        splats_at = SHOWN_AT_M if self.layers["splats"] else HIDDEN_AT_M
+        if self._static is not None:
+            self._static.position = splats_at
         for track_id, node in self._actors.items():
             chosen = track_id == self._chosen
             if node.splats is not None:
@@ -126,7 +126,7 @@ class RebuiltNodes:
         track_id, size = int(graph.tracks.track_id[row]), graph.tracks.size_lwh[row].cpu()
         name, colour = f"{ROOT}/actors/{track_id}", palette.box_colour(int(graph.tracks.category[row]))
         rgb = palette.rgb255(colour)
-        scene, shown = self._scene, thinned(own, self.share, own.mean_m.new_zeros(1, 3))
+        scene, shown = self._scene, thin_out(own, self.share, own.mean_m.new_zeros(1, 3))
         frame = scene.add_frame(name, show_axes=False)
         corners = box_corners(torch.zeros(3), size, torch.tensor(0.0))
         edges = corners[torch.tensor([*EDGES, (0, 5), (1, 4)])]  # corners 0, 1, 5, 4 are the front

@@ -5,16 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from foredrive.files import atomic_path
-from foredrive.metrics import psnr_db
+from foredrive.metrics.images import psnr_db
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView
-from foredrive.view.palette import FARTHEST_M, NEAREST_M, range_colours
+from foredrive.view.image_drawing import to_image
+from foredrive.view.palette import MAX_RANGE_M, MIN_RANGE_M, range_colours
 
 ROWS = 4
 WIDTH_IN = 4.0
@@ -50,10 +49,12 @@ def write_rebuilt_sheet(
         known = torch.ones(1, *view.size_hw, dtype=torch.bool)
         quality = float(psnr_db(rgb[None], real[None], known))
         shown = {
-            f"seen at {view.t_s:.1f} s": _bytes(real),
-            f"rendered, {quality:.1f} dB": _bytes(rgb),
-            "difference": _bytes((rgb - real).abs()),
-            f"range, {NEAREST_M:g} m bright to {FARTHEST_M:g} m dark": _ranges(picture.range_m.cpu()),
+            f"recorded at {view.t_s:.1f} s": to_image(real),
+            f"rendered, {quality:.1f} dB": to_image(rgb),
+            "difference": to_image((rgb - real).abs()),
+            f"range, {MIN_RANGE_M:g} m bright to {MAX_RANGE_M:g} m dark": range_colours(
+                picture.range_m.cpu().numpy()
+            ),
         }
         for axis, (name, image) in zip(row, shown.items(), strict=True):
             axis.imshow(image)
@@ -61,12 +62,3 @@ def write_rebuilt_sheet(
             axis.set_axis_off()
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
-
-
-def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    return (image * 255).round().byte().permute(1, 2, 0).numpy()
-
-
-def _ranges(range_m: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    flat = range_m.flatten().numpy()
-    return range_colours(flat).reshape(*range_m.shape, 3)

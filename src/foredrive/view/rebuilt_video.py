@@ -18,7 +18,7 @@ from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_fram
 from foredrive.scene import Boxes, CameraRig, LidarSweep
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
-from foredrive.view.image_drawing import resize
+from foredrive.view.image_drawing import resize, write_text
 from foredrive.view.log_sheet import camera_rows
 from foredrive.view.video import check_video, write_video
 
@@ -34,7 +34,7 @@ ABOVE_M = 100.0
 """Width of the view from above, m."""
 LOW_M, HIGH_M = -0.5, 4.0
 """Ends of the colour scale of heights above the ground, m."""
-MOST_EDITS = 3
+MAX_NAMED_EDITS = 3
 """Maximum number of edits that a caption names."""
 
 
@@ -49,7 +49,7 @@ def write_rebuilt_video(
     check_video(path)
     takes = [("as it was", apply_edits(run.scene.graph, []))]
     if edits:
-        takes.append((caption_of(edits), edited_scene(run.scene, edits)))
+        takes.append((describe_edits(edits), edited_scene(run.scene, edits)))
     make_folder(path.parent)
     rig, chosen = run.vehicle.rig, list(plan.cameras)
     rig = dataclasses.replace(rig[chosen], names=tuple(rig.names[camera] for camera in chosen))
@@ -80,23 +80,23 @@ def draw_shots(
     width = sum(column.width for column in columns) + GAP_PX * (len(columns) + 1)
     canvas = Image.new("RGB", (width, columns[0].height + 2 * TITLE_PX + GAP_PX), palette.GROUND)
     pen = ImageDraw.Draw(canvas)
-    _write(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
+    write_text(pen, (GAP_PX, 5), f"{name}   {shots[0][1].t_s:.1f} s", 15, palette.INK)
     x = GAP_PX
     for (caption, _), column in zip(shots, columns, strict=True):
-        _write(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
+        write_text(pen, (x, TITLE_PX + 5), caption, 13, palette.FAINT)
         canvas.paste(column, (x, 2 * TITLE_PX))
         x += column.width + GAP_PX
     return canvas
 
 
-def caption_of(edits: Sequence[Edit]) -> str:
+def describe_edits(edits: Sequence[Edit]) -> str:
     """Describe edits."""
-    words = [words_of(edit) for edit in edits[:MOST_EDITS]]
-    more = len(edits) - MOST_EDITS
+    words = [describe_edit(edit) for edit in edits[:MAX_NAMED_EDITS]]
+    more = len(edits) - MAX_NAMED_EDITS
     return "edited: " + ", ".join([*words, f"and {more} more"] if more > 0 else words)
 
 
-def words_of(edit: Edit) -> str:
+def describe_edit(edit: Edit) -> str:
     """Describe an edit."""
     if isinstance(edit, Remove):
         return f"without {edit.actor}"
@@ -118,7 +118,7 @@ def _column(shot: RenderedFrame, rig: CameraRig, colour: Colour) -> Image.Image:
     each_px = ONE_CAMERA_PX if longest == 1 else CAMERA_PX
     width = longest * (each_px + GAP_PX) - GAP_PX
     height = each_px * rig.size_hw[0] // rig.size_hw[1]
-    above = None if shot.sweep is None else _from_above(shot.sweep, shot.boxes, width, colour)
+    above = None if shot.sweep is None else _draw_from_above(shot.sweep, shot.boxes, width, colour)
     whole = len(rows) * (height + GAP_PX) + (0 if above is None else above.height)
     canvas = Image.new("RGB", (width, whole), palette.GROUND)
     for line, row in enumerate(rows):
@@ -130,7 +130,7 @@ def _column(shot: RenderedFrame, rig: CameraRig, colour: Colour) -> Image.Image:
     return canvas
 
 
-def _from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
+def _draw_from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
     """Draw coloured returns, low ones first, and the outlines of the actors with their ids."""
     twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of lines
     height_px = round(ABOVE_HW[0] * width_px)
@@ -176,7 +176,3 @@ def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]
         share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # most returns are faint
         mapped = palette.RANGE_MAP(faint + (bright - faint) * share)
     return (mapped[:, :3] * 255).astype(np.uint8)
-
-
-def _write(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))

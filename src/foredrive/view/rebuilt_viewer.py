@@ -9,9 +9,9 @@ import viser
 
 from foredrive.rendering.edits import Edit
 from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction
-from foredrive.view.background import Background
 from foredrive.view.edit_panel import EditPanel
-from foredrive.view.page import close_page, open_page, page_url
+from foredrive.view.job_runner import JobRunner
+from foredrive.view.page import Page
 from foredrive.view.rebuilt_nodes import RebuiltNodes
 from foredrive.view.rebuilt_pictures import RebuiltPictures
 from foredrive.view.scene_nodes import show_ego
@@ -25,7 +25,7 @@ NUDGES_S = (2.0, 6.0)
 NOTE_S = 8.0
 
 
-class RebuiltViewer:
+class RebuiltViewer(Page):
     """A page with a slider for time, sensors rendered at that time, and edits.
 
     The browser draws the Gaussians' albedo by itself. Sensor images are rendered in the background, the
@@ -45,28 +45,23 @@ class RebuiltViewer:
     def __init__(
         self, run: OpenedReconstruction, edits: Sequence[Edit], file: Path, host: str, port: int
     ) -> None:
+        super().__init__(run.folder.name, host, port)
         self.run = run
-        self.server = open_page(run.folder.name, host, port)
         self.server.initial_camera.far = FAR_M
         self._showing = threading.RLock()
-        self.background = Background(self.tell)
+        self.jobs = JobRunner(self.tell)
         show_ego(self.server.scene)
         graph = run.scene.graph.map_tensors(lambda tensor: tensor.detach())
-        way_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
+        path_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
         self.nodes = RebuiltNodes(
-            self.server.scene, graph, way_m, lambda track_id: self.edits.choose(track_id)
+            self.server.scene, graph, path_m, lambda track_id: self.edits.choose(track_id)
         )
         self._add_controls()
         self.edits = EditPanel(self.server, graph, self.nodes, file, self.tell, self.show_now)
-        self.pictures = RebuiltPictures(self.server, run, self.background)
+        self.pictures = RebuiltPictures(self.server, run, self.jobs)
         self.server.on_client_connect(self._welcome)
         if not self.edits.replace(edits):
             self.show_now()
-
-    @property
-    def url(self) -> str:
-        """Return the page's address."""
-        return page_url(self.server)
 
     def show(self, t_s: float) -> None:
         """Go to a time since the start of the log, s."""
@@ -99,8 +94,8 @@ class RebuiltViewer:
 
     def close(self) -> None:
         """Stop rendering and serving."""
-        self.background.close()
-        close_page(self.server)
+        self.jobs.close()
+        super().close()
 
     def _add_controls(self) -> None:
         gui, vehicle = self.server.gui, self.run.vehicle
@@ -148,10 +143,10 @@ class RebuiltViewer:
     def _show_own_views(self) -> None:
         if self.own.value:
             for client in self.server.get_clients().values():
-                self.pictures.ask_own_view(client)
+                self.pictures.request_own_view(client)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self.pictures.ask_own_view(client) if self.own.value else None)
+        client.camera.on_update(lambda _: self.pictures.request_own_view(client) if self.own.value else None)
         for pause_s in NUDGES_S:
             time.sleep(pause_s)
             self.nodes.nudge()

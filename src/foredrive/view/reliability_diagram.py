@@ -4,10 +4,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from foredrive.metrics.reliability import Reliability
-from foredrive.view.html import INK_MARK
+from foredrive.view.html import INK_MARK, style_axes
 
 TITLES = {
-    "d_ece": "Scores and hits (2 m, or overlap 0.5)",
+    "d_ece": "Score and hits (2 m, or overlap 0.5)",
     "existence": "Existence and associations",
 }
 
@@ -22,12 +22,7 @@ def draw_reliability(name: str, diagram: Reliability) -> Figure:
     axes.bar(centre, share, 0.9 / len(centre), color="#3f8efc40")
     axes.plot([0, 1], [0, 1], color=INK_MARK, linewidth=0.8, alpha=0.5)
     axes.plot(diagram.confidence[full], diagram.outcome[full], "o-", color="#3f8efc", markersize=4)
-    title = f"{TITLES.get(name, name)}: error {diagram.error:.3f}"
-    axes.set_title(title, color=INK_MARK, loc="left", fontsize=10)
-    axes.set_xlabel("confidence", color=INK_MARK)
-    axes.set_ylabel("came true", color=INK_MARK)
     axes.set(xlim=(0, 1), ylim=(0, 1))
-    axes.tick_params(colors=INK_MARK, labelsize=9)
-    axes.grid(color="#8888884d", linewidth=0.6)
-    axes.spines[:].set_visible(False)
+    title = f"{TITLES.get(name, name)}: error {diagram.error:.3f}"
+    style_axes(axes, title, "confidence", "observed frequency")
     return figure

@@ -1,77 +1,149 @@
-"""The report of an evaluated run."""
+"""The report of an evaluated run: metrics, tables, loss curves and examples on one self-contained page."""
 
 import datetime
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.evaluation import Failure
-from foredrive.runs import Inspection, Run
+from foredrive.evaluation.run import Failure
+from foredrive.evaluation.summary import Summary
+from foredrive.runs import ExamplePrediction, Run
 from foredrive.runs.train.run import STAGES
 from foredrive.training import read_metrics
-from foredrive.view.example_panel import ExamplePanel
-from foredrive.view.loss_curves import Losses
-from foredrive.view.origin import Origin
-from foredrive.view.report import ReportData
-from foredrive.view.table import Summary
+from foredrive.view.example_panel import draw_example
+from foredrive.view.html import MetricTile, Provenance, write_page
+from foredrive.view.loss_curves import Losses, draw_loss_curves
+from foredrive.view.summary_tables import (
+    flow_table,
+    full_table,
+    image_table,
+    occupancy_table,
+    planning_overview,
+    planning_table,
+    prior_comparison,
+)
+from foredrive.view.table import Value, number, words
 
-OCCUPIED_ABOVE = 0.5
-FAILURES_NAMED = 5
+COMMAND_SOURCES = {
+    "route": "Commands from the log's route",
+    "driven_future": "Commands from the driven future, which leaks part of the answer",
+    "none": "Unknown commands",
+}
+REFERENCE = "constant_velocity"
+"""The baseline that stands beside the model in the tiles."""
+MAX_NAMED_FAILURES = 5
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """The content of a report; a part without content is left out."""
+
+    title: str
+    provenance: Provenance
+    summary: Summary
+    losses: Losses
+    examples: Sequence[ExamplePrediction]
+    notes: Sequence[str] = ()
+    """Facts that a reader needs in order to interpret the metrics correctly."""
+
+
+@dataclass(frozen=True)
+class Alert:
+    """A line above the metrics; a warning stands out."""
+
+    text: str
+    is_warning: bool = False
 
 
 def report_on_run(
     run: Run,
     logs: Sequence[LogPath],
     summary: Summary,
-    inspections: Sequence[Inspection],
+    examples: Sequence[ExamplePrediction],
     failures: Sequence[Failure] = (),
-) -> ReportData:
+) -> RunReport:
     """Collect the content of a run's report on some logs; the first few failures are named."""
     losses = {stage: read_metrics(run.folder / stage / "metrics.jsonl") for stage in STAGES}
-    return ReportData(
-        title=f"{run.recipe.name} on {_names(logs)}",
-        origin=Origin.of(summary, datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
+    names = [log.name for log in logs]
+    named = ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more logs"
+    return RunReport(
+        title=f"{run.recipe.name} on {named}",
+        provenance=Provenance.of(summary, datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
         summary=summary,
         losses=losses,
-        panels=[inspection_panel(inspection) for inspection in inspections],
+        examples=examples,
         notes=_notes(run, logs, failures, losses),
     )
 
 
-def inspection_panel(inspection: Inspection) -> ExamplePanel:
-    """Return the panel of an example."""
-    log, _, t_us = inspection.example.key[0].rpartition("@")
-    taken = datetime.datetime.fromtimestamp(int(t_us) * 1e-6, datetime.UTC)
-    return ExamplePanel(
-        title=f"{log} at {taken:%Y-%m-%d %H:%M:%S}.{taken.microsecond // 10_000:02d} UTC",
-        example=inspection.example,
-        occupied=inspection.occupancy_prob > OCCUPIED_ABOVE,
-        rendered=inspection.rendered,
-        volume=inspection.volume,
-        plan=inspection.plan,
+def write_run_report(path: Path, report: RunReport) -> None:
+    """Write the page."""
+    summary = report.summary
+    tables = (occupancy_table(summary), flow_table(summary), image_table(summary))
+    write_page(
+        path,
+        "run_report.html.j2",
+        title=report.title,
+        provenance=report.provenance,
+        alerts=_alerts(report),
+        tiles=_tiles(summary),
+        planning_overview=planning_overview(summary),
+        planning=planning_table(summary),
+        tables=[table for table in tables if table is not None],
+        curves=draw_loss_curves(report.losses),
+        panels=[draw_example(example) for example in report.examples],
+        all_metrics=full_table(summary),
     )
 
 
-def _names(logs: Sequence[LogPath]) -> str:
-    names = [log.name for log in logs]
-    return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more logs"
-
-
-def _notes(
-    run: Run,
-    logs: Sequence[LogPath],
-    failures: Sequence[Failure],
-    losses: Losses,
-) -> list[str]:
-    """Return the facts that a reader needs in order to interpret the metrics correctly."""
+def _notes(run: Run, logs: Sequence[LogPath], failures: Sequence[Failure], losses: Losses) -> list[str]:
     notes = []
-    seen = {log.folder for log in run.logs} & {log.folder for log in logs}
-    if seen:
+    trained_on = {log.folder for log in run.logs} & {log.folder for log in logs}
+    if trained_on:
         notes.append(
-            f"{len(seen)} of the {len(logs)} evaluated logs were trained on: these figures show that "
+            f"{len(trained_on)} of the {len(logs)} evaluated logs were trained on: these figures show that "
             "the model fits, not that it generalises."
         )
     rendered = [lines for lines in losses.values() if lines and "perc" in lines[0]]
     if any(not any(line["perc"] for line in lines) for lines in rendered):
         notes.append("The perceptual loss was off in training (no VGG-16 weights, or weight 0).")
-    notes += [f"Failed: {failure.key}: {failure.reason}" for failure in failures[:FAILURES_NAMED]]
-    return notes
+    return notes + [f"Failed: {failure.key}: {failure.reason}" for failure in failures[:MAX_NAMED_FAILURES]]
+
+
+def _alerts(report: RunReport) -> list[Alert]:
+    """Return lines about failed clips, the sources of the commands, and the notes."""
+    alerts = []
+    for key, count in report.summary.items():
+        if key == "failed" or (key.endswith(".failed") and count):
+            method = "this model" if key == "failed" else words(key.split(".")[-2])
+            alerts.append(Alert(f"Failed clips of {method}: {number(count)}.", bool(count)))
+    for source, title in COMMAND_SOURCES.items():
+        if count := report.summary.get(f"command_source.{source}"):
+            alerts.append(Alert(f"{title}: {number(count)}.", source == "driven_future"))
+    return alerts + [Alert(note) for note in report.notes]
+
+
+def _tiles(summary: Summary) -> list[MetricTile]:
+    """Return tiles of the main metrics."""
+    tiles = []
+
+    def add(name: str, value: Value, digits: int, unit: str = "", note: str = "") -> None:
+        if value is not None:
+            tiles.append(MetricTile(name, number(value, digits), unit, note))
+
+    for scope, title in (("above_ground.", "above ground"), ("", "all voxels")):
+        key = f"occupancy.{scope}iou_now"
+        add(f"Occupancy IoU now, {title}", summary.get(key), 3, "", prior_comparison(summary, key))
+    for metric, title, unit in (
+        ("uniad.l2_avg_m", "Planning L2, UniAD, average", "m"),
+        ("uniad.collision_avg_pct", "Planning collisions, UniAD, average", "%"),
+    ):
+        other = summary.get(f"planning.{REFERENCE}.{metric}")
+        note = "" if other is None else f"{words(REFERENCE)}: {number(other, 2)} {unit}"
+        add(title, summary.get(f"planning.{metric}"), 2, unit, note)
+    psnr = next((value for key, value in summary.items() if key.endswith(".psnr_db")), None)
+    add("Rendered images, PSNR", psnr, 1, "dB")
+    add("Evaluation time", summary.get("wall_s"), 0, "s")
+    add("Peak memory", summary.get("peak_rss_gib"), 1, "GiB")
+    return tiles

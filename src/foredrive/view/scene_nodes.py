@@ -7,15 +7,16 @@ nothing to draw.
 import numpy as np
 import torch
 import viser
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
 from foredrive.geometry.boxes import EDGES, box_corners
-from foredrive.scene import Clip, MapKind, Trajectory
+from foredrive.scene import CameraRig, Clip, MapKind, Trajectory
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, path_points
 
+CAMERAS = "/cameras"
 POINT_M = 0.06
 FRUSTUM_M = 1.2
 EGO_HEIGHT_M = 1.5
@@ -65,25 +66,30 @@ def show_map(scene: viser.SceneApi, clip: Clip) -> None:
 def show_cameras(scene: viser.SceneApi, clip: Clip) -> None:
     """Draw every camera with an image as a frustum with the image in it, without lens distortion."""
     rig, now = clip.rig[clip.now], clip.now
-    height, width = rig.size_hw
     for c, name in enumerate(rig.names):
-        if not bool(clip.image_valid[now, c]):
-            clear(scene, f"/cameras/{name}")
-            continue
-        pose = rig.T_ego_cam[c].double().numpy()
-        scene.add_camera_frustum(
-            f"/cameras/{name}",
-            fov=2 * float(np.arctan(height / 2 / float(rig.K[c, 1, 1]))),
-            aspect=width / height,
-            scale=FRUSTUM_M,
-            color=palette.rgb255(palette.FAINT),
-            image=clip.images[now, c].permute(1, 2, 0).numpy(),
-            jpeg_quality=85,
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
-            position=pose[:3, 3],
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        if bool(clip.image_valid[now, c]):
+            show_camera(scene, rig, c, clip.images[now, c].permute(1, 2, 0).numpy())
+        else:
+            clear(scene, f"{CAMERAS}/{name}")
+
+
+def show_camera(scene: viser.SceneApi, rig: CameraRig, index: int, image: UInt8[np.ndarray, "H W 3"]) -> None:
+    """Draw one camera of a rig without leading dimensions."""
+    height, width = rig.size_hw
+    pose = rig.T_ego_cam[index].double().numpy()
+    scene.add_camera_frustum(
+        f"{CAMERAS}/{rig.names[index]}",
+        fov=2 * float(np.arctan(height / 2 / float(rig.K[index, 1, 1]))),
+        aspect=width / height,
+        scale=FRUSTUM_M,
+        color=palette.rgb255(palette.FAINT),
+        image=image,
+        jpeg_quality=85,
+        wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+        position=pose[:3, 3],
+        cast_shadow=False,
+        receive_shadow=False,
+    )
 
 
 def show_path(scene: viser.SceneApi, name: str, path: Trajectory, colour: str) -> None:

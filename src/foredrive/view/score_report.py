@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from foredrive.evaluation.detections import FrameScore
-from foredrive.evaluation.detections.score import PARTS
+from foredrive.evaluation.detections.score import PARTS, FrameScore
+from foredrive.evaluation.summary import Summary
 from foredrive.runs.score.run import ScoredDetections
-from foredrive.view.frame_of_detections import draw_frame
+from foredrive.view.detection_frame_plot import draw_detection_frame
 from foredrive.view.html import inline_svg, write_page
 from foredrive.view.reliability_diagram import draw_reliability
 from foredrive.view.summary_tables import full_table
-from foredrive.view.table import Column, Summary, Table, number, simple_table, words
+from foredrive.view.table import Column, Table, number, simple_table, words
 
 REPORT = "report.html"
 SHOWN = {
@@ -18,23 +18,23 @@ SHOWN = {
     "detections": "Detections",
     "pmb_nll.mean": "PMB-NLL, nats a frame",
     **{f"pmb_nll.{part}": f"  {part.replace('_', ' ')}" for part in PARTS},
-    "pmb_nll.gap": "  too large by no more than",
-    "pmb_nll.frames_infinite": "Frames of infinite NLL",
+    "pmb_nll.gap": "  maximum error of the approximation",
+    "pmb_nll.frames_infinite": "Frames with infinite NLL",
     "map": "mAP",
     "gospa.distance": "GOSPA",
     "pgospa.distance": "P-GOSPA",
     "calibration.d_ece": "D-ECE",
-    "calibration.existence": "Calibration of existence, by associations",
+    "calibration.existence": "Calibration error of existence",
     "calibration.object_level": "Object-level calibration error",
-    "std.best_factor": "Factor on standard deviations that fits best",
+    "std.best_factor": "Best-fitting factor on standard deviations",
     "conformal.coverage_90": "Coverage of conformal 90 % boxes",
 }
 COMPARED = {
-    "against.difference": "PMB-NLL less that of the other file, nats a frame",
+    "against.difference": "Difference of PMB-NLL, nats a frame",
     "against.difference_low_95": "  95 % interval, from",
     "against.difference_high_95": "  to",
     "against.p_value": "  p-value",
-    "against.frames_not_compared": "Frames in which either is infinite, not compared",
+    "against.frames_not_compared": "Frames not compared, as one NLL is infinite",
 }
 
 
@@ -42,7 +42,7 @@ def score_table(figures: Summary) -> Table:
     """Return a table of the main metrics, beside those of the other file if there is one."""
     other = figures.get("against")
     prefixes = ("",) if other is None else ("", "against.")
-    names = ("",) if other is None else ("these", Path(str(other)).name)
+    names = ("",) if other is None else ("results", Path(str(other)).name)
     rows = [
         (title, *(figures.get(prefix + key) for prefix in prefixes))
         for key, title in SHOWN.items()
@@ -70,10 +70,10 @@ def write_score_report(
         table=score_table(figures),
         diagrams=[inline_svg(draw_reliability(*each)) for each in scored.summary.diagrams.items()],
         frames=[
-            (inline_svg(draw_frame(frame, score, scored.detections.upright)), _caption(score))
+            (inline_svg(draw_detection_frame(frame, score, scored.detections.is_3d)), _caption(score))
             for frame, score in ranked[:worst]
         ],
-        every_figure=full_table(figures),
+        all_metrics=full_table(figures),
     )
 
 

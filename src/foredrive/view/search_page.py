@@ -22,7 +22,7 @@ from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import FACTS, IndexRow
 from foredrive.search.tables import quoted_list
-from foredrive.view.hit_picture import hit_name, hit_picture, what_is_there, why_matched
+from foredrive.view.hit_picture import content_text, hit_name, hit_picture, score_text
 from foredrive.view.html import render_page
 
 JPEG_QUALITY = 85
@@ -38,15 +38,15 @@ class ShownHit:
 
     key: str
     name: str
-    why: str
-    there: str
+    score: str
+    content: str
     caption: str | None
 
     @classmethod
     def of(cls, hit: Hit) -> "ShownHit":
         """Return the shown values of a hit."""
-        why = why_matched(hit) if hit.scores else ""
-        return cls(_key(hit.row), hit_name(hit), why, what_is_there(hit), hit.row.caption)
+        score = score_text(hit) if hit.scores else ""
+        return cls(_key(hit.row), hit_name(hit), score, content_text(hit), hit.row.caption)
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ class ShownHits:
     """Hits, and a line about the search."""
 
     hits: list[ShownHit]
-    told: str
+    message: str
 
 
 @dataclass(frozen=True)
-class Point:
+class MapPoint:
     """A whole scene on the map: its position, -1 to 1, and the facts that can colour it."""
 
     x: float
@@ -72,26 +72,26 @@ class Point:
     time_of_day: str | None
 
     @classmethod
-    def of(cls, xy: Sequence[float], row: IndexRow) -> "Point":
+    def of(cls, xy: Sequence[float], row: IndexRow) -> "MapPoint":
         """Return the point of a row of the index."""
         facts = (row.log, row.place, row.weather, row.time_of_day)
         return cls(xy[0], xy[1], _key(row), row.key, f"{row.log}@{row.t_s:.1f}s", *facts)
 
 
 @dataclass(frozen=True)
-class Map:
+class SceneMap:
     """All scenes on a plane, and the share of their variance that the plane shows."""
 
-    points: list[Point]
+    points: list[MapPoint]
     share: float
     total: int
 
 
 @dataclass(frozen=True)
-class Done:
+class StatusMessage:
     """A line about a finished action."""
 
-    told: str
+    message: str
 
 
 class SearchPage:
@@ -156,7 +156,7 @@ class SearchPage:
                 return _send_json(request, get[url.path](asked))
             if body is not None and url.path in post:
                 return _send_json(request, post[url.path](json.loads(body)))
-            _send_json(request, {"error": f"{url.path}: there is no such thing"}, HTTPStatus.NOT_FOUND)
+            _send_json(request, {"error": f"{url.path}: no such page"}, HTTPStatus.NOT_FOUND)
         except (InputError, ValueError, LookupError, TypeError) as error:
             _send_json(request, {"error": " ".join(str(error).split())}, HTTPStatus.BAD_REQUEST)
 
@@ -167,10 +167,10 @@ class SearchPage:
         how = "all compared" if found.exact else f"{found.compared} compared"
         return ShownHits([*map(ShownHit.of, found.hits)], f"{len(found.hits)} hits, {how}")
 
-    def _map(self, _: Mapping[str, str]) -> Map:
+    def _map(self, _: Mapping[str, str]) -> SceneMap:
         plane = project_scenes(self._index)
         scenes = zip(plane.xy.tolist(), plane.rows, strict=True)
-        return Map([Point.of(xy, row) for xy, row in scenes], plane.share, plane.total)
+        return SceneMap([MapPoint.of(xy, row) for xy, row in scenes], plane.share, plane.total)
 
     def _picture(self, asked: Mapping[str, str]) -> bytes:
         (hit,) = self._rows([_parse_key(asked["key"])])
@@ -178,29 +178,29 @@ class SearchPage:
         Image.fromarray(hit_picture(hit)).save(buffer, format="jpeg", quality=JPEG_QUALITY)
         return buffer.getvalue()
 
-    def _moments(self, told: Mapping[str, Any]) -> ShownHits:
-        hits = self._rows([_parse_key(key) for key in told["keys"][:MAX_SHOWN]])
-        return ShownHits([*map(ShownHit.of, hits)], f"{len(told['keys'])} scenes, {len(hits)} shown")
+    def _moments(self, body: Mapping[str, Any]) -> ShownHits:
+        hits = self._rows([_parse_key(key) for key in body["keys"][:MAX_SHOWN]])
+        return ShownHits([*map(ShownHit.of, hits)], f"{len(body['keys'])} scenes, {len(hits)} shown")
 
-    def _tag(self, told: Mapping[str, Any]) -> Done:
-        name = str(told["tag"]).strip()
+    def _tag(self, body: Mapping[str, Any]) -> StatusMessage:
+        name = str(body["tag"]).strip()
         if not name:
             raise InputError("a tag has a name")
-        add_tag(self._index.uri, name, [_parse_key(key)[0] for key in told["keys"]])
-        return Done(f"{len(told['keys'])} moments are tagged {name}")
+        add_tag(self._index.uri, name, [_parse_key(key)[0] for key in body["keys"]])
+        return StatusMessage(f"{len(body['keys'])} moments are tagged {name}")
 
-    def _clips(self, told: Mapping[str, Any]) -> Mapping[str, object]:
-        hits = self._rows([_parse_key(key) for key in told["keys"]])
-        return listed_clips(hits, float(told["before"]), float(told["after"]))
+    def _clips(self, body: Mapping[str, Any]) -> Mapping[str, object]:
+        hits = self._rows([_parse_key(key) for key in body["keys"]])
+        return listed_clips(hits, float(body["before"]), float(body["after"]))
 
-    def _save(self, told: Mapping[str, Any]) -> Done:
-        save_query(self._index.uri, str(told["name"]), query_of(told["asked"]).to_json())
-        return Done(f"kept as {told['name']}")
+    def _save(self, body: Mapping[str, Any]) -> StatusMessage:
+        save_query(self._index.uri, str(body["name"]), query_of(body["asked"]).to_json())
+        return StatusMessage(f"saved as {body['name']}")
 
     def _rows(self, keys: Sequence[Key]) -> list[Hit]:
         """Return the rows of some keys, in their order, as hits without scores."""
         if not keys:
-            raise InputError("nothing is chosen")
+            raise InputError("nothing is selected")
         where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
         rows = {_key(row): row for row in IndexRow.all_of(self._index.select(where, FACTS.names))}
         return [Hit(rows["|".join(key)], 0.0, {}) for key in keys]
@@ -214,8 +214,8 @@ def query_of(asked: Mapping[str, Any]) -> Query:
     """
     kinds: dict[str, Callable[[Any], Any]] = {"top": int, "gap_s": float, "mix": float}
     known = {field.name for field in fields(Query)}
-    told = {name: value for name, value in asked.items() if name in known and str(value).strip()}
-    return Query(**{name: kinds.get(name, str)(value) for name, value in told.items()})
+    given = {name: value for name, value in asked.items() if name in known and str(value).strip()}
+    return Query(**{name: kinds.get(name, str)(value) for name, value in given.items()})
 
 
 @functools.cache
@@ -233,8 +233,8 @@ def _parse_key(key: str) -> Key:
     return moment, view
 
 
-def _send_json(request: BaseHTTPRequestHandler, told: object, status: HTTPStatus = HTTPStatus.OK) -> None:
-    _send(request, "application/json", json.dumps(told, default=asdict).encode(), status)
+def _send_json(request: BaseHTTPRequestHandler, content: object, status: HTTPStatus = HTTPStatus.OK) -> None:
+    _send(request, "application/json", json.dumps(content, default=asdict).encode(), status)
 
 
 def _send(

@@ -11,10 +11,10 @@ from foredrive.view.hit_picture import (
     GAP_PX,
     HEIGHT_PX,
     WIDTH_PX,
+    content_text,
     hit_name,
     hit_picture,
-    what_is_there,
-    why_matched,
+    score_text,
 )
 from foredrive.view.html import picture, write_page
 from foredrive.view.sheet import Sheet
@@ -41,7 +41,7 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
         _write_picture(path, query, hits[:MAX_ON_PICTURE])
         return
     shown = [
-        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), why_matched(hit), _told(hit))
+        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), score_text(hit), _told(hit))
         for number, hit in enumerate(hits, 1)
     ]
     write_page(path, "search_sheet.html.j2", title=query_line(query), hits=shown)
@@ -83,8 +83,8 @@ def _write_picture(path: Path, query: Query, hits: Sequence[Hit]) -> None:
         ax.set_axis_off()
         below = y + HEIGHT_PX + 4
         sheet.write(x, below, f"{number + 1}   {hit_name(hit)}", 10.0)
-        sheet.write(x, below + LINE_PX, why_matched(hit), 9.0, palette.EXPERT)
-        sheet.write(x, below + 2 * LINE_PX, what_is_there(hit), 9.0, palette.FAINT)
+        sheet.write(x, below + LINE_PX, score_text(hit), 9.0, palette.EXPERT)
+        sheet.write(x, below + 2 * LINE_PX, content_text(hit), 9.0, palette.FAINT)
     sheet.save(path)
 
 
@@ -92,11 +92,11 @@ def hits_table(hits: Sequence[Hit]) -> Table:
     """Return the hits as a table."""
     columns = (
         Column(),
-        *(Column(name, align="left") for name in ("moment and view", "why", "what is there")),
+        *(Column(name, align="left") for name in ("moment and view", "score", "content")),
     )
-    rows = [(n, hit_name(hit), why_matched(hit), what_is_there(hit)) for n, hit in enumerate(hits, 1)]
+    rows = [(n, hit_name(hit), score_text(hit), content_text(hit)) for n, hit in enumerate(hits, 1)]
     return simple_table(columns, rows)
 
 
 def _told(hit: Hit) -> list[str]:
-    return [what_is_there(hit)] + ([] if hit.row.caption is None else [hit.row.caption])
+    return [content_text(hit)] + ([] if hit.row.caption is None else [hit.row.caption])

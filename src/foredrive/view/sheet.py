@@ -9,7 +9,7 @@ from foredrive.files import atomic_path
 from foredrive.view import palette
 
 DPI = 100
-PT_OF_PX = 1.15
+PT_PER_PX = 1.15
 """Points of font size per pixel of letter width, at which a title fits."""
 
 
@@ -40,7 +40,7 @@ class Sheet:
 
     def head(self, x: int, height: int, text: str, size_pt: float) -> None:
         """Write a title into the middle of the upper margin; shrink a long one to fit."""
-        size_pt = min(size_pt, PT_OF_PX * self.width / max(len(text), 1))
+        size_pt = min(size_pt, PT_PER_PX * self.width / max(len(text), 1))
         at = (x / self.width, 1 - height / 2 / self.height)
         self.figure.text(*at, text, color=palette.INK, fontsize=size_pt, va="center", parse_math=False)
 

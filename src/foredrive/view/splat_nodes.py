@@ -8,15 +8,15 @@ from torch import Tensor
 
 from foredrive.rendering.gaussians import Gaussians
 
-LARGEST_M = 200.0
+MAX_STD_M = 200.0
 """Maximum standard deviation, m: the browser keeps variances in half precision, which ends at 65504."""
-FAINTEST = 1 / 255
+MIN_OPACITY = 1 / 255
 """Minimum opacity of a visible Gaussian at its centre."""
-NEAREST_M = 5.0
+MIN_DISTANCE_M = 5.0
 """Minimum distance in the estimate of coverage, m; nearer Gaussians count as if at this distance."""
 
 
-def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -> Gaussians:
+def thin_out(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -> Gaussians:
     """Choose the visible Gaussians that cover most, by opacity, largest section and distance.
 
     Args:
@@ -25,11 +25,11 @@ def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) ->
         from_m: viewpoints, in the frame of the Gaussians; of two equal Gaussians the farther covers less.
     """
     opacity = gaussians.opacity_logit.sigmoid()
-    seen = (opacity >= FAINTEST).nonzero()[:, 0]
+    seen = (opacity >= MIN_OPACITY).nonzero()[:, 0]
     most = round(share * len(opacity))
     if len(seen) > most:
         scale_m = gaussians.log_scale.exp().sort(dim=-1).values
-        range_m = torch.cdist(gaussians.mean_m, from_m).amin(-1).clamp_min(NEAREST_M)
+        range_m = torch.cdist(gaussians.mean_m, from_m).amin(-1).clamp_min(MIN_DISTANCE_M)
         covers = opacity * scale_m[:, 1] * scale_m[:, 2] / range_m**2
         seen = seen[covers[seen].topk(most).indices].sort().values
     return gaussians[seen]
@@ -39,7 +39,7 @@ def thinned(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) ->
 def show_splats(scene: viser.SceneApi, name: str, gaussians: Gaussians) -> viser.GaussianSplatHandle:
     """Draw Gaussians in the frame of the parent node."""
     factor = gaussians.factor().permute(2, 0, 1)
-    held = (LARGEST_M / gaussians.log_scale.exp().amax(-1)).clamp_max(1.0)
+    held = (MAX_STD_M / gaussians.log_scale.exp().amax(-1)).clamp_max(1.0)
     factor = factor * held[:, None, None]
     return scene.add_gaussian_splats(
         name,

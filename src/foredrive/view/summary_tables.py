@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from foredrive.evaluation.summary import occupancy_baselines
+from foredrive.evaluation.summary import Summary
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (
@@ -15,7 +15,6 @@ from foredrive.view.table import (
     Column,
     Row,
     Section,
-    Summary,
     Table,
     Value,
     number,
@@ -26,22 +25,28 @@ from foredrive.view.table import (
 
 ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it."
 BASELINES_NOTE = (
-    "Copy: the predicted present in place of the future. Carried copy: moved by the path that was driven, "
-    "which no model knows. Best and mean of k: futures drawn by chance."
+    "Occupancy prior: the fixed grid that scores best on the training logs. Persistence: the predicted "
+    "present in place of the future. Ego-compensated persistence: the same, moved along the driven path, "
+    "which the model is not told. Best and mean of K: sampled futures."
 )
-BEST_NOTE = (
-    "Green: the best of a column. Protocols measure different things: compare within a column, never across."
-)
+BEST_NOTE = "Green: best of its column. The protocols differ: compare values of one column only."
 INVALID_NOTE = (
-    "Invalid frames have no complete driven future: UniAD's protocol counts what there is of them, the "
+    "Invalid frames have no complete driven future. UniAD's protocol counts the steps that they have, the "
     "others leave them out."
 )
 MODEL = ""
-AGENT_TITLES = {MODEL: "this model", "ego_mlp": "MLP of ego status alone"}
+AGENT_TITLES = {MODEL: "this model", "ego_mlp": "ego-only MLP"}
 WHENS = (*HORIZON_NAMES, "avg")
 SCOPE_TITLES = {"": "all voxels", "above_ground.": "above the ground"}
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
-CONSTANT = "best_constant"
+PRIOR = "best_constant"
+BASELINE_TITLES = {
+    PRIOR: "occupancy prior",
+    "copy": "persistence",
+    "carried_copy": "ego-compensated persistence",
+}
+"""Titles of the baselines by their keys in summary.json."""
+_BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
 _FLOW = re.compile(r"flow\.epe_moving_(\w+)_mps")
@@ -62,7 +67,7 @@ def print_summary(summary: Summary, console: Console, model: str) -> None:
     )
 
 
-def when_title(name: str) -> str:
+def time_title(name: str) -> str:
     """Return the title of a time: `future_500ms` becomes "+500 ms"; `now` stays."""
     later = re.fullmatch(r"future_(\d+)(ms|s)", name)
     return f"+{later[1]} {later[2]}" if later else name
@@ -70,13 +75,13 @@ def when_title(name: str) -> str:
 
 def planning_overview(summary: Summary) -> Table | None:
     """Compare agents by their average scores under all protocols; mark the best value of each column."""
-    agents, protocols = _planned(summary)
+    agents, protocols = _planning_methods(summary)
     if not protocols:
         return None
     scores = [
         (Column(title, PROTOCOLS[protocol].title, 2), f"{protocol}.{metric}")
         for protocol in protocols
-        for title, metric in (("L2, m", "l2_avg_m"), ("coll., %", "collision_avg_pct"))
+        for title, metric in (("L2, m", "l2_avg_m"), ("collisions, %", "collision_avg_pct"))
     ]
     columns = [Column(align="left"), *(column for column, _ in scores)]
     rows = _planning_rows(summary, agents, [key for _, key in scores])
@@ -85,11 +90,11 @@ def planning_overview(summary: Summary) -> Table | None:
 
 def planning_table(summary: Summary) -> Table | None:
     """Compare agents at every horizon under each protocol; mark the best value of each column."""
-    agents, protocols = _planned(summary)
+    agents, protocols = _planning_methods(summary)
     if not protocols:
         return None
     scores = [(Column(when, "L2, m", 2), f"l2_{when}_m") for when in WHENS]
-    scores += [(Column(when, "coll., %", 2), f"collision_{when}_pct") for when in WHENS]
+    scores += [(Column(when, "collisions, %", 2), f"collision_{when}_pct") for when in WHENS]
     scores += [
         (Column(words(kind), "frames"), f"frames_{kind}") for kind in ("counted", "invalid", "without_boxes")
     ]
@@ -109,13 +114,14 @@ def occupancy_table(summary: Summary) -> Table | None:
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
         return None
-    others = [name for name in occupancy_baselines(summary) if name != CONSTANT]
+    found = dict.fromkeys(match[1] for key in summary if (match := _BASELINE.fullmatch(key)))
+    others = [name for name in found if name != PRIOR and "threshold" not in name]
     columns = [
         Column(align="left"),
         *(Column(title, "this model") for title in OCCUPANCY_TITLES.values()),
-        *(Column(title, "best constant") for title in OCCUPANCY_TITLES.values()),
-        Column("IoU ratio"),
-        *(Column(words(name), "baselines' IoU") for name in others),
+        *(Column(title, BASELINE_TITLES[PRIOR]) for title in OCCUPANCY_TITLES.values()),
+        Column("IoU ratio to prior"),
+        *(Column(BASELINE_TITLES.get(name, words(name)), "IoU of baselines") for name in others),
     ]
     sections = []
     for scope, title in SCOPE_TITLES.items():
@@ -123,26 +129,29 @@ def occupancy_table(summary: Summary) -> Table | None:
         for when in whens:
             iou = f"occupancy.{scope}iou_{when}"
             keys = [f"occupancy.{scope}{metric}_{when}" for metric in OCCUPANCY_TITLES]
-            keys += [f"{key}.{CONSTANT}" for key in keys]
-            ratio = ratio_to_constant(summary, iou)
+            keys += [f"{key}.{PRIOR}" for key in keys]
+            ratio = ratio_to_prior(summary, iou)
             cells = [summary.get(key) for key in keys]
             cells.append(MISSING if ratio is None else f"{ratio:.2f} \N{MULTIPLICATION SIGN}")
             cells += [summary.get(f"{iou}.{name}") for name in others]
-            rows.append(Row([when_title(when), *cells]))
+            rows.append(Row([time_title(when), *cells]))
         sections.append(Section(rows, title))
-    notes = [ABOVE_NOTE, BASELINES_NOTE] if others else [ABOVE_NOTE]
-    return Table(columns, sections, "Occupancy on voxels the lidar knows", notes)
+    return Table(columns, sections, "Occupancy on known voxels", [ABOVE_NOTE, BASELINES_NOTE])
 
 
 def flow_table(summary: Summary) -> Table | None:
     """Compare flow errors on moving voxels, now and later, with the errors of predicting no motion."""
     rows = [
-        (when_title(found[1]), value, summary.get(f"{key}.no_motion"))
+        (time_title(found[1]), value, summary.get(f"{key}.no_motion"))
         for key, value in summary.items()
         if (found := _FLOW.fullmatch(key))
     ]
-    columns = (Column(align="left"), Column("error, m/s", digits=2), Column("predicting none, m/s", digits=2))
-    return simple_table(columns, rows, "Flow on voxels that move") if rows else None
+    columns = (
+        Column(align="left"),
+        Column("error, m/s", digits=2),
+        Column("error of predicting no motion, m/s", digits=2),
+    )
+    return simple_table(columns, rows, "Flow on moving voxels") if rows else None
 
 
 def image_table(summary: Summary) -> Table | None:
@@ -150,26 +159,34 @@ def image_table(summary: Summary) -> Table | None:
     rows = []
     for prefix in (match[1] for key in summary if (match := _IMAGES.fullmatch(key))):
         when = prefix.rpartition(".")[2]
-        when = when_title(when) if when.startswith("future") else "now"
+        when = time_title(when) if when.startswith("future") else "now"
         rows.append((when, summary[f"{prefix}.psnr_db"], summary.get(f"{prefix}.ssim")))
     columns = (Column(align="left"), Column("PSNR, dB", digits=2), Column("SSIM"))
     return simple_table(columns, rows, "Rendered images") if rows else None
 
 
 def full_table(summary: Summary) -> Table:
-    """List every key of the summary, as it stands in summary.json."""
+    """List all keys and values of summary.json."""
     return simple_table((Column("key", align="left"), Column("value", digits=5)), sorted(summary.items()))
 
 
-def ratio_to_constant(summary: Summary, key: str) -> float | None:
+def ratio_to_prior(summary: Summary, key: str) -> float | None:
     """Return the model's value divided by that of the occupancy prior; None if a value is missing."""
-    value, constant = summary.get(key), summary.get(f"{key}.{CONSTANT}")
-    if not isinstance(value, float) or not isinstance(constant, float) or not constant > 0:
+    value, prior = summary.get(key), summary.get(f"{key}.{PRIOR}")
+    if not isinstance(value, float) or not isinstance(prior, float) or not prior > 0:
         return None
-    return value / constant
+    return value / prior
 
 
-def _planned(summary: Summary) -> tuple[list[str], list[str]]:
+def prior_comparison(summary: Summary, key: str) -> str:
+    """Compare the model's value with that of the occupancy prior in words; nothing if a value is missing."""
+    ratio, prior = ratio_to_prior(summary, key), number(summary.get(f"{key}.{PRIOR}"))
+    return (
+        "" if ratio is None else f"{ratio:.1f} \N{MULTIPLICATION SIGN} the {BASELINE_TITLES[PRIOR]}'s {prior}"
+    )
+
+
+def _planning_methods(summary: Summary) -> tuple[list[str], list[str]]:
     """Return the agents, the model first, and the protocols that have planning metrics."""
     found = [match for key in summary if (match := _PLANNING.match(key))]
     agents = sorted({match[1] or MODEL for match in found}, key=lambda agent: (agent != MODEL, agent))
@@ -188,8 +205,8 @@ def _planning_rows(summary: Summary, agents: Sequence[str], keys: Sequence[str])
             [
                 AGENT_TITLES.get(agent, words(agent)),
                 *(
-                    Cell(value, "best" if value is not None and value == least else "")
-                    for value, least in zip(values[agent], best, strict=True)
+                    Cell(value, "best" if value is not None and value == smallest else "")
+                    for value, smallest in zip(values[agent], best, strict=True)
                 ),
             ],
             is_strong=agent == MODEL,

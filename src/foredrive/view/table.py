@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,9 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
-Value = float | int | str | None
-Summary = Mapping[str, Value]
-"""A summary's metrics under flat dotted keys, as in summary.json."""
+from foredrive.evaluation.summary import Value
 
 MISSING = "\N{EN DASH}"
 MIN_TEXT_WIDTH, MAX_WIDTH = 16, 1000

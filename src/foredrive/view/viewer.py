@@ -4,42 +4,37 @@ import threading
 import time
 
 from foredrive.view import palette
-from foredrive.view.log_times import LogTimes
+from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import ModelPanel
-from foredrive.view.page import close_page, open_page, page_url
+from foredrive.view.page import Page
 from foredrive.view.scene_nodes import show_boxes, show_cameras, show_ego, show_lidar, show_map, show_path
 
 LAYERS = ("lidar", "boxes", "map", "cameras", "driven")
 PLAY_PERIOD_S = 0.1
 
 
-class Viewer:
+class Viewer(Page):
     """A page with a slider for time and, with a run, a slider for the imagined time ahead.
 
     All nodes are in the ego frame at the time shown, so that the view follows the vehicle. The server runs in
     its own threads until `close`.
 
     Args:
-        times: the shown log, with or without a run.
+        frames: the shown log, with or without a run.
         host, port: address of the page; if the port is taken, the next free one.
 
     Raises:
         InputError: the page cannot be served there.
     """
 
-    def __init__(self, times: LogTimes, host: str, port: int) -> None:
-        self.times = times
+    def __init__(self, frames: LogFrames, host: str, port: int) -> None:
+        self.frames = frames
         self._drawing, self._drawn = threading.Lock(), -1
-        self.server = open_page(times.name, host, port)
+        super().__init__(frames.name, host, port)
         show_ego(self.server.scene)
         self._add_controls()
-        self.model = None if times.observer is None else ModelPanel(self.server, times)
+        self.model = None if frames.predictor is None else ModelPanel(self.server, frames)
         self.show(0)
-
-    @property
-    def url(self) -> str:
-        """Return the page's address."""
-        return page_url(self.server)
 
     def show(self, index: int) -> None:
         """Go to a frame of the log."""
@@ -51,14 +46,10 @@ class Viewer:
         while True:
             time.sleep(PLAY_PERIOD_S)
             if self._play.value:
-                self.show((self._frame.value + 1) % len(self.times))
-
-    def close(self) -> None:
-        """Stop serving."""
-        close_page(self.server)
+                self.show((self._frame.value + 1) % len(self.frames))
 
     def _add_controls(self) -> None:
-        gui, count = self.server.gui, len(self.times)
+        gui, count = self.server.gui, len(self.frames)
         with gui.add_folder("Time"):
             self._clock = gui.add_markdown("")
             self._frame = gui.add_slider("frame", 0, max(count - 1, 1), 1, 0, disabled=count == 1)
@@ -72,17 +63,17 @@ class Viewer:
             box.on_update(lambda _: self._show_layers())
 
     def _step(self, change: int) -> None:
-        self.show(min(max(self._frame.value + change, 0), len(self.times) - 1))
+        self.show(min(max(self._frame.value + change, 0), len(self.frames) - 1))
 
     def _draw(self) -> None:
         """Draw the newest requested frame; frames requested in between are dropped."""
         with self._drawing:
-            index = min(self._frame.value, len(self.times) - 1)
+            index = min(self._frame.value, len(self.frames) - 1)
             if index == self._drawn:
                 return
-            clip = self.times.clip(index)
+            clip = self.frames.clip(index)
             with self.server.atomic():
-                self._clock.content = f"**{self.times.t_s[index]:.2f} s** of {self.times.duration_s:.2f} s"
+                self._clock.content = f"**{self.frames.t_s[index]:.2f} s** of {self.frames.duration_s:.2f} s"
                 for show in (show_lidar, show_boxes, show_map, show_cameras):
                     show(self.server.scene, clip)
                 show_path(self.server.scene, "driven", clip.future, palette.EXPERT)

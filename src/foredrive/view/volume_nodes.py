@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from viser.transforms import SO3
 
-from foredrive.runs.evaluate.vision import Vision
+from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import VoxelSpec
 from foredrive.view import palette
 from foredrive.view.scene_nodes import clear
@@ -31,7 +31,7 @@ _CUBE_FACES = np.array(
 
 
 def shown_voxels(
-    vision: Vision, k: int, spec: VoxelSpec, above: float, lowest_m: float
+    prediction: DisplayPrediction, k: int, spec: VoxelSpec, above: float, lowest_m: float
 ) -> Bool[Tensor, "Z Y X"]:
     """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
@@ -39,12 +39,12 @@ def shown_voxels(
         lowest_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
     """
     z = spec.centres_m()[..., 2]
-    return (vision.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
+    return (prediction.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
 
 
 def show_occupancy(
     scene: viser.SceneApi,
-    vision: Vision,
+    prediction: DisplayPrediction,
     k: int,
     spec: VoxelSpec,
     shown: Bool[Tensor, "Z Y X"],
@@ -52,9 +52,9 @@ def show_occupancy(
 ) -> None:
     """Draw voxels of frame k as cubes in the ego frame now, where the model expects them."""
     colours: UInt8[np.ndarray, "Z Y X 3"] = (
-        height_colours(spec) if colour_by == "height" else pca_colours(vision.volume[k], shown)
+        height_colours(spec) if colour_by == "height" else pca_colours(prediction.volume[k], shown)
     )
-    pose = vision.T_now_ego[k].double().numpy()
+    pose = prediction.T_now_ego[k].double().numpy()
     count = int(shown.sum())
     if count == 0:
         return clear(scene, "/occupancy")
@@ -76,10 +76,14 @@ def show_occupancy(
 
 
 def show_flow(
-    scene: viser.SceneApi, vision: Vision, k: int, spec: VoxelSpec, shown: Bool[Tensor, "Z Y X"]
+    scene: viser.SceneApi,
+    prediction: DisplayPrediction,
+    k: int,
+    spec: VoxelSpec,
+    shown: Bool[Tensor, "Z Y X"],
 ) -> None:
     """Draw the movement of shown voxels since frame k - 1 as arrows over the ground; none for now."""
-    movement = None if k == 0 else vision.movement_m(k, spec)
+    movement = None if k == 0 else prediction.movement_m(k, spec)
     if movement is None:
         return clear(scene, "/flow")
     start, end = movement

@@ -21,7 +21,7 @@ SUPERSAMPLING = 2
 
 
 @dataclass(frozen=True)
-class Eye:
+class Viewpoint:
     """A virtual camera that looks at a grid in the ego frame."""
 
     position_m: tuple[float, float, float]
@@ -30,8 +30,8 @@ class Eye:
     """Focal length in units of the picture's height."""
 
     @classmethod
-    def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Eye":
-        """Return an eye above and behind the vehicle, so that the grid fills a picture of that size."""
+    def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Viewpoint":
+        """Return an viewpoint above and behind the vehicle, so that the grid fills a picture of that size."""
         reach = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
         low, high = np.array(spec.lower_m), np.array(spec.upper_m)
         middle = (low + high) / 2
@@ -51,7 +51,7 @@ class Eye:
         return np.stack([right, np.cross(forward, right), forward])
 
     def project(self, points: Float[np.ndarray, "N 3"], size_hw: tuple[int, int]) -> Float[np.ndarray, "N 2"]:
-        """Project points in front of the eye to pixels."""
+        """Project points in front of the viewpoint to pixels."""
         local = (points - np.array(self.position_m)) @ self.axes().T
         scale = self.focal * size_hw[0]
         return local[:, :2] / local[:, 2:] * scale + np.array([size_hw[1] / 2, size_hw[0] / 2])
@@ -61,7 +61,7 @@ def draw_voxels(
     occupied: Bool[Tensor, "Z Y X"],
     spec: VoxelSpec,
     size_hw: tuple[int, int],
-    eye: Eye | None = None,
+    viewpoint: Viewpoint | None = None,
     colours: UInt8[np.ndarray, "Z Y X 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw occupied voxels as lit cubes with shadows; rays are cast through the grid.
@@ -70,15 +70,15 @@ def draw_voxels(
         occupied: the voxels to draw.
         spec: position and size of the grid.
         size_hw: size of the picture, px.
-        eye: viewpoint; by default above and behind the vehicle.
+        viewpoint: viewpoint; by default above and behind the vehicle.
         colours: RGB per voxel; by default by height.
     """
-    eye = eye or Eye.behind(spec, size_hw)
+    viewpoint = viewpoint or Viewpoint.behind(spec, size_hw)
     tint = height_colours(spec) if colours is None else colours
     large_hw = (SUPERSAMPLING * size_hw[0], SUPERSAMPLING * size_hw[1])
     picture = np.full((*large_hw, 3), palette.rgb255(palette.GROUND), dtype=np.uint8)
-    origin = (np.array(eye.position_m) - np.array(spec.lower_m)) / spec.voxel_m
-    _cast(occupied.numpy(), tint, origin, eye.axes(), eye.focal * large_hw[0], SUN, picture)
+    origin = (np.array(viewpoint.position_m) - np.array(spec.lower_m)) / spec.voxel_m
+    _cast(occupied.numpy(), tint, origin, viewpoint.axes(), viewpoint.focal * large_hw[0], SUN, picture)
     return np.asarray(Image.fromarray(picture).resize(size_hw[::-1], Image.Resampling.BOX))
 
 
@@ -208,7 +208,7 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
 @numba.njit(cache=True, error_model="numpy")
 @no_type_check
 def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
-    """Paint the pixels [H W 3] whose ray hits a voxel; the eye's `origin` is in voxels."""
+    """Paint the pixels [H W 3] whose ray hits a voxel; the viewpoint's `origin` is in voxels."""
     height, width = picture.shape[:2]
     direction, hit, above = np.empty(3), np.empty(3), np.empty(3)
     cell, step = np.empty(3, np.int64), np.empty(3, np.int64)

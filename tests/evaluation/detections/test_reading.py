@@ -9,7 +9,7 @@ import pytest
 from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections import read_detections
+from foredrive.evaluation.detections.files import read_detections
 
 
 def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
     said = box(1004.0, 504.0, yaw=-3.0, detection_score=0.5, covariance=[0.1] * 6, yaw_std=0.5)
     results = write_nuscenes(tmp_path / "found.json", {"a": [said]})
     read = read_detections(results, truth)
-    assert read.upright
+    assert read.is_3d
     assert read.classes == ["car"]
     assert read.counts == {"frames_without_detections": 1, "boxes_without_covariance": 0}
     frame, empty = read.frames
@@ -54,7 +54,7 @@ def test_coco_boxes_and_class_probabilities(tmp_path: Path) -> None:
     record = {"image_id": 2, "category_id": 7, "bbox": [10, 20, 100, 40], "score": 1.0}
     record["class_probabilities"] = {"dog": 0.75, "car": 0.25}
     read = read_detections(write_list(tmp_path / "found.json", [record]), truth)
-    assert not read.upright
+    assert not read.is_3d
     assert read.counts["crowds_left_out"] == read.counts["boxes_without_covariance"] == 1
     frame = read.frames[1]
     assert frame.objects.state.tolist() == [[10, 20, 40, 60]]

@@ -8,13 +8,10 @@ import pytest
 from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections import (
-    DetectionSet,
-    compare_scores,
-    read_detections,
-    score_frames,
-    summarise_scores,
-)
+from foredrive.evaluation.detections.files import read_detections
+from foredrive.evaluation.detections.frames import DetectionSet
+from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.summary import compare_scores, summarise_scores
 
 
 def drives(folder: Path, *, error_m: float, seed: int = 0) -> DetectionSet:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.scene.conditions import CONDITIONS
 from foredrive.simulation.carla.client import connect, import_carla, require_same_version
 from foredrive.simulation.carla.frames import CarlaPose, matrix_of
 from foredrive.simulation.carla.road import CarlaRoad
 from foredrive.simulation.carla.session import Session
 from foredrive.simulation.carla.weather import weather_of
-from foredrive.towns.conditions import CONDITIONS
 from foredrive.towns.map.town_map import load_town_map
 
 from carla_stand_in import Client, World  # isort: skip

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.frames import (
     MIRROR,
     camera_pose,
@@ -23,7 +24,6 @@ from foredrive.simulation.carla.sensors import (
     sweep_of,
 )
 from foredrive.simulation.dynamics import EGO
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 
 def turned(yaw_deg: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:

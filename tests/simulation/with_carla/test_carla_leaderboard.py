@@ -12,11 +12,11 @@ from carla_stand_in import lat_lon
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Clip, Command, Trajectory
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.global_plan import GlobalPlan
 from foredrive.simulation.carla.leaderboard import GPS, IMU, LIDAR, SPEED, LeaderboardDriver
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.route_progress import Progress
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 SIZE = (9, 16)
 

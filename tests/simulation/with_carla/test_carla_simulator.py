@@ -10,19 +10,16 @@ from carla_stand_in import Client, Light, World
 
 from foredrive.errors import InputError
 from foredrive.scene import Category, Command, Control
+from foredrive.scene.conditions import BackgroundTraffic, find_conditions
+from foredrive.sensors.vehicle import VehicleSensors, camera_rig, roof_lidar
 from foredrive.simulation.carla.simulator import CarlaSimulator
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.simulation.route_scenario import RouteScenario
 from foredrive.simulation.scores import Ending
 from foredrive.simulation.simple_agents import Straight
-from foredrive.simulation.town import TownScenario
-from foredrive.towns.conditions import find_conditions
-from foredrive.towns.recorder import Crowd
-from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
-SENSORS = SensorSuite(camera_rig((9, 16)), roof_lidar(channels=2, azimuth_steps=60))
+SENSORS = VehicleSensors(camera_rig((9, 16)), roof_lidar(channels=2, azimuth_steps=60))
 
 
 @pytest.fixture
@@ -46,17 +43,19 @@ def lane(carla: Any, town02: Any) -> list[Any]:
 
 
 @pytest.fixture
-def scenario(lane: list[Any]) -> TownScenario:
+def scenario(lane: list[Any]) -> RouteScenario:
     at = [wp.transform.location for wp in lane]
     route = np.array([[place.x, -place.y, place.z] for place in at])
-    return TownScenario("Town02", route, seed=7, crowd=Crowd(vehicles=0, people=0))
+    return RouteScenario(
+        "Town02", route, seed=7, background_traffic=BackgroundTraffic(vehicles=0, pedestrians=0)
+    )
 
 
 def is_left_as_found(world: World, client: Client) -> bool:
     return not world.settings.synchronous_mode and not client.traffic.synchronous and not world.actors
 
 
-def test_a_drive_begins_at_rest_at_the_start_of_the_route(world: World, scenario: TownScenario) -> None:
+def test_a_drive_begins_at_rest_at_the_start_of_the_route(world: World, scenario: RouteScenario) -> None:
     client = Client(world)
     with CarlaSimulator(client) as simulator:
         clip = simulator.reset(dataclasses.replace(scenario, past_frames=2, sensors=SENSORS))
@@ -78,16 +77,8 @@ def test_a_drive_begins_at_rest_at_the_start_of_the_route(world: World, scenario
     assert is_left_as_found(world, client)
 
 
-def test_scenarios_are_the_towns_alone(world: World, scenario: TownScenario) -> None:
-    client = Client(world)
-    happens = dataclasses.replace(scenario, scenarios=(Scenario(ScenarioKind.CUT_IN, 30.0, 10.0),))
-    with CarlaSimulator(client) as simulator, pytest.raises(InputError, match="no scenarios"):
-        simulator.reset(happens)
-    assert is_left_as_found(world, client)
-
-
 def test_what_is_asked_for_is_driven_although_the_engine_is_weaker(
-    world: World, scenario: TownScenario
+    world: World, scenario: RouteScenario
 ) -> None:
     with CarlaSimulator(Client(world)) as simulator:
         clip = simulator.reset(dataclasses.replace(scenario, sensors=SENSORS))
@@ -109,7 +100,7 @@ def test_what_is_asked_for_is_driven_although_the_engine_is_weaker(
         assert simulator.ego().speed_mps == 0.0
 
 
-def test_the_route_ends_where_it_ends(world: World, scenario: TownScenario) -> None:
+def test_the_route_ends_where_it_ends(world: World, scenario: RouteScenario) -> None:
     with CarlaSimulator(Client(world)) as simulator:
         simulator.reset(dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:20]))
         steps = [simulator.step(Control(2.0, 0.0)) for _ in range(80) if simulator.state.ended is None]
@@ -122,7 +113,7 @@ def test_the_route_ends_where_it_ends(world: World, scenario: TownScenario) -> N
 
 @pytest.mark.parametrize(("shows", "runs"), [("Red", True), ("Green", False), ("Yellow", False)])
 def test_a_red_light_is_run(
-    carla: Any, world: World, scenario: TownScenario, lane: list[Any], shows: str, runs: bool
+    carla: Any, world: World, scenario: RouteScenario, lane: list[Any], shows: str, runs: bool
 ) -> None:
     world.furniture = [Light(5, lane[25], getattr(carla.TrafficLightState, shows))]
     with CarlaSimulator(Client(world)) as simulator:
@@ -133,7 +124,7 @@ def test_a_red_light_is_run(
 
 @pytest.mark.parametrize("stops", [True, False])
 def test_a_stop_sign_wants_a_stop(
-    carla: Any, world: World, scenario: TownScenario, lane: list[Any], stops: bool
+    carla: Any, world: World, scenario: RouteScenario, lane: list[Any], stops: bool
 ) -> None:
     volume = carla.BoundingBox(carla.Location(0, 0, 0), carla.Vector3D(1.5, 1.5, 1.0))
     at = lane[25].transform
@@ -153,7 +144,7 @@ def test_a_stop_sign_wants_a_stop(
     assert [e.kind for e in events if e.kind == "stop_sign"] == ["stop_sign"] * (not stops)
 
 
-def test_an_agent_drives_and_is_scored_as_in_a_town(world: World, scenario: TownScenario) -> None:
+def test_an_agent_drives_and_is_scored_as_in_a_town(world: World, scenario: RouteScenario) -> None:
     route = dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:40])
     with CarlaSimulator(Client(world)) as simulator:
         drive = drive_route(simulator, route, Straight(5.0), route="0")
@@ -167,7 +158,7 @@ def waited(simulator: CarlaSimulator) -> bool:
     return bool(simulator.state.rules.stopped_at)
 
 
-def test_lanes_are_left(world: World, scenario: TownScenario) -> None:
+def test_lanes_are_left(world: World, scenario: RouteScenario) -> None:
     with CarlaSimulator(Client(world)) as simulator:
         simulator.reset(scenario)
         for _ in range(160):
@@ -176,7 +167,7 @@ def test_lanes_are_left(world: World, scenario: TownScenario) -> None:
         assert simulator.state.rules.outside_m > 1.0
 
 
-def test_who_is_hit_is_told_once(carla: Any, world: World, scenario: TownScenario) -> None:
+def test_who_is_hit_is_told_once(carla: Any, world: World, scenario: RouteScenario) -> None:
     def other(number: int, type_id: str, base_type: str = "") -> Any:
         velocity = carla.Vector3D(0.0, 0.0, 0.0)
         attributes = {"base_type": base_type} if base_type else {}
@@ -204,7 +195,7 @@ def test_who_is_hit_is_told_once(carla: Any, world: World, scenario: TownScenari
         assert [e.kind for e in simulator.step(Control(0.0, 0.0)).events] == ["collision_pedestrian"]
 
 
-def test_others_are_seen_as_boxes(carla: Any, world: World, scenario: TownScenario, lane: list[Any]) -> None:
+def test_others_are_seen_as_boxes(carla: Any, world: World, scenario: RouteScenario, lane: list[Any]) -> None:
     """A bicycle stands on the route, 20 m ahead of the start."""
     thing = world.get_blueprint_library().find("vehicle.bh.crossbike")
     thing.set_attribute("base_type", "bicycle")
@@ -221,11 +212,15 @@ def test_others_are_seen_as_boxes(carla: Any, world: World, scenario: TownScenar
     assert world.actors == [bicycle]  # what was there before us stays
 
 
-def test_traffic_and_people_are_added(world: World, scenario: TownScenario) -> None:
+def test_traffic_and_people_are_added(world: World, scenario: RouteScenario) -> None:
     client = Client(world)
     night = find_conditions("night_rain")
     with CarlaSimulator(client) as simulator:
-        simulator.reset(dataclasses.replace(scenario, crowd=Crowd(vehicles=4, people=3), conditions=night))
+        simulator.reset(
+            dataclasses.replace(
+                scenario, background_traffic=BackgroundTraffic(vehicles=4, pedestrians=3), conditions=night
+            )
+        )
         kinds = [actor.type_id.split(".")[0] for actor in world.actors]
         assert (kinds.count("walker"), kinds.count("controller")) == (3, 3)
         drivers = [actor for actor in world.actors if actor.attributes.get("role_name") == "autopilot"]
@@ -238,7 +233,7 @@ def test_traffic_and_people_are_added(world: World, scenario: TownScenario) -> N
     assert is_left_as_found(world, client)
 
 
-def test_whatever_goes_wrong_the_server_is_left_as_it_was(world: World, scenario: TownScenario) -> None:
+def test_whatever_goes_wrong_the_server_is_left_as_it_was(world: World, scenario: RouteScenario) -> None:
     client, quick = Client(world), dataclasses.replace(scenario, sensors=SENSORS)
     simulator = CarlaSimulator(client, timeout_s=0.05)
     world.full = True

@@ -18,17 +18,17 @@ from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import (
     STD_OF_SIDE,
     STD_PX,
+    DetectionFrame,
     DetectionSet,
     Family,
-    Frame,
-    all_numbers_of,
-    around,
-    class_distributions,
-    covariances_of,
-    detections_of_file,
-    numbers_of,
-    objects_of_file,
-    relevance_of,
+    enclosing_region,
+    make_detections,
+    make_objects,
+    read_class_probabilities,
+    read_covariances,
+    read_number_rows,
+    read_numbers,
+    read_relevance,
 )
 
 Record = Mapping[str, Any]
@@ -81,34 +81,34 @@ def read_coco(
 
 def _frame(
     image: Record,
-    said: Sequence[tuple[int, Record]],
+    predicted: Sequence[tuple[int, Record]],
     true: Sequence[tuple[int, Record]],
     label_of: Mapping[Any, int],
     classes: Sequence[str],
     path: Path,
     truth_path: Path,
     family: Family,
-) -> Frame:
+) -> DetectionFrame:
     where, true_where = f"{path}: image {image['id']}", f"{truth_path}: image {image['id']}"
-    corners, true_corners = _corners(said, path), _corners(true, truth_path)
-    records = [record for _, record in said]
-    names = [f"{path}: record {n}" for n, _ in said]
-    share = class_distributions(
+    corners, true_corners = _corners(predicted, path), _corners(true, truth_path)
+    records = [record for _, record in predicted]
+    names = [f"{path}: record {n}" for n, _ in predicted]
+    share = read_class_probabilities(
         records, [label_of[record["category_id"]] for record in records], classes, names
     )
-    covariance = covariances_of(records, _defaults(corners), names)
-    score = all_numbers_of(records, "score", 1, names)[:, 0]
+    covariance = read_covariances(records, _defaults(corners), names)
+    score = read_number_rows(records, "score", 1, names)[:, 0]
     labels = [label_of[record["category_id"]] for _, record in true]
-    height, width = (numbers_of(image, key, 1, true_where)[0] for key in ("height", "width"))
+    height, width = (read_numbers(image, key, 1, true_where)[0] for key in ("height", "width"))
     if not (height > 0 and width > 0):
         raise InputError(f"{true_where} has the size {width:g} x {height:g}")
-    return Frame(
+    return DetectionFrame(
         str(image.get("file_name", image["id"])),
         str(image.get("sequence", image["id"])),
-        detections_of_file(where, score, share, corners, covariance, family=family),
-        objects_of_file(true_where, labels, true_corners),
-        *around(np.zeros(4), np.array([width, height, width, height]), true_corners),
-        relevance=relevance_of([record for _, record in true], true_where),
+        make_detections(where, score, share, corners, covariance, family=family),
+        make_objects(true_where, labels, true_corners),
+        *enclosing_region(np.zeros(4), np.array([width, height, width, height]), true_corners),
+        relevance=read_relevance([record for _, record in true], true_where),
     )
 
 
@@ -119,7 +119,7 @@ def _key(record: Any, name: str) -> int | str | None:
 
 
 def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray, "n 4"]:
-    bbox = all_numbers_of(
+    bbox = read_number_rows(
         [record for _, record in records], "bbox", 4, [f"{path}: record {n}" for n, _ in records]
     )
     wrong = np.flatnonzero(~(bbox[:, 2:] > 0).all(1))

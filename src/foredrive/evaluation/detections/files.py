@@ -1,6 +1,8 @@
-"""Reading files of detections of any known format."""
+"""Read files of detections of any known format, and write the scores of their frames."""
 
 import json
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,8 @@ from foredrive.evaluation.detections.coco_results import read_coco
 from foredrive.evaluation.detections.frames import DetectionSet, Family
 from foredrive.evaluation.detections.kitti_labels import read_kitti
 from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
+from foredrive.evaluation.detections.score import FrameScore
+from foredrive.files import atomic_path
 
 
 def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
@@ -19,13 +23,13 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
     else:
-        said, true = _read_json(results), _read_json(truth)
+        predicted, true = _read_json(results), _read_json(truth)
         if not isinstance(true, dict):
             raise InputError(f"{truth}: neither an object with `results` (nuScenes) nor with `images` (COCO)")
-        if isinstance(said, dict):
-            read = read_nuscenes(said, true, results, truth, family)
-        elif isinstance(said, list):
-            read = read_coco(said, true, results, truth, family)
+        if isinstance(predicted, dict):
+            read = read_nuscenes(predicted, true, results, truth, family)
+        elif isinstance(predicted, list):
+            read = read_coco(predicted, true, results, truth, family)
         else:
             raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
     if not read.frames:
@@ -33,6 +37,18 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if not read.classes:
         raise InputError(f"neither {results} nor {truth} holds any box")
     return read
+
+
+def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
+    """Write one JSON object a line for `search.scores`: a frame's name, its NLL and the NLL's parts, in nats.
+
+    Infinity, which JSON lacks, is written as text ("inf").
+    """
+    with atomic_path(path) as temporary, temporary.open("w") as file:
+        for score in scores:
+            parts = {"nll": score.nll, **score.parts}
+            values = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
+            file.write(json.dumps({"frame": score.name, **values}) + "\n")
 
 
 def _read_json(path: Path) -> Any:

@@ -30,7 +30,7 @@ MAX_NUMBER = 1e12
 
 
 @dataclass(frozen=True)
-class Frame:
+class DetectionFrame:
     """Detections and objects of one frame."""
 
     name: str
@@ -53,16 +53,16 @@ class Frame:
 class DetectionSet:
     """Frames of one file of detections. Upright boxes have a heading and are in m, others in pixels."""
 
-    frames: Sequence[Frame]
+    frames: Sequence[DetectionFrame]
     classes: Sequence[str]
-    upright: bool
+    is_3d: bool
     counts: dict[str, int]
     """Number of assumed or missing values, by name."""
     true_classes: int
     """Number of classes of the truth, which come first; detections alone name the others."""
 
 
-def detections_of_file(
+def make_detections(
     where: str,
     score: Float[ndarray, "M"],
     class_probability: Float[ndarray, "M K"],
@@ -102,7 +102,7 @@ def detections_of_file(
     return MultiBernoulli(r.log(), torch.log1p(-r), log_class, boxes)
 
 
-def objects_of_file(
+def make_objects(
     where: str,
     label: Sequence[int],
     state: Float[ndarray, "N D"],
@@ -127,15 +127,15 @@ def _cholesky(
             return np.linalg.cholesky(covariance), finite
     except np.linalg.LinAlgError:
         pass
-    least = np.zeros(len(covariance))
-    least[finite] = np.linalg.eigvalsh(covariance[finite]).min(-1)
-    definite = least > 0
+    min_eigenvalue = np.zeros(len(covariance))
+    min_eigenvalue[finite] = np.linalg.eigvalsh(covariance[finite]).min(-1)
+    definite = min_eigenvalue > 0
     if definite.all():  # but for rounding, which the factor does not forgive
-        definite[least.argmin()] = False
+        definite[min_eigenvalue.argmin()] = False
     return np.zeros_like(covariance), definite
 
 
-def covariances_of(
+def read_covariances(
     records: Sequence[Mapping[str, Any]], default: Float[ndarray, "n D D"], names: Sequence[str]
 ) -> Float[ndarray, "n D D"]:
     """Return the covariances in records, given as matrices or variances; the default where there is none."""
@@ -172,7 +172,7 @@ def _covariance_matrices(
     return np.concatenate(each)
 
 
-def class_distributions(
+def read_class_probabilities(
     records: Sequence[Mapping[str, Any]],
     labels: Sequence[int],
     classes: Sequence[str],
@@ -196,7 +196,7 @@ def class_distributions(
     return share
 
 
-def classes_in_order(true: set[str], found: set[str]) -> tuple[list[str], int]:
+def order_classes(true: set[str], found: set[str]) -> tuple[list[str], int]:
     """Return the truth's classes, then those of detections alone, and the number of the truth's.
 
     All are the truth's if it has none.
@@ -204,7 +204,7 @@ def classes_in_order(true: set[str], found: set[str]) -> tuple[list[str], int]:
     return sorted(true) + sorted(found - true), len(true) or len(found)
 
 
-def around(
+def enclosing_region(
     lower: Float[ndarray, "D"], upper: Float[ndarray, "D"], states: Float[ndarray, "N D"]
 ) -> tuple[Float[ndarray, "D"], Float[ndarray, "D"]]:
     """Return a region, enlarged to hold all states."""
@@ -213,7 +213,7 @@ def around(
     return np.minimum(lower, states.min(0)), np.maximum(upper, states.max(0))
 
 
-def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
+def read_numbers(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
     """Return numbers that a record must have: finite, none beyond `MAX_NUMBER`."""
     try:
         value = np.atleast_1d(np.asarray(record[key], dtype=np.float64))
@@ -228,10 +228,10 @@ def numbers_of(record: Mapping[str, Any], key: str, count: int, where: str) -> F
     return value
 
 
-def all_numbers_of(
+def read_number_rows(
     records: Sequence[Mapping[str, Any]], key: str, count: int, names: Sequence[str]
 ) -> Float[ndarray, "n count"]:
-    """Return `numbers_of` every record."""
+    """Return `read_numbers` every record."""
     try:
         values = np.array([record[key] for record in records], dtype=np.float64)
         shape = (len(records), count) if count > 1 else (len(records),)
@@ -239,18 +239,18 @@ def all_numbers_of(
             return values.reshape(-1, count)
     except (KeyError, TypeError, ValueError, OverflowError):
         pass
-    found = [numbers_of(record, key, count, names[n]) for n, record in enumerate(records)]
+    found = [read_numbers(record, key, count, names[n]) for n, record in enumerate(records)]
     return np.array(found).reshape(-1, count)
 
 
-def relevance_of(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:
+def read_relevance(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:
     """Return the weights of objects; 1 for those without, None if none has one."""
     if not any("relevance" in record for record in objects):
         return None
     weight = np.ones(len(objects))
     for n, record in enumerate(objects):
         if "relevance" in record:
-            weight[n] = numbers_of(record, "relevance", 1, f"{where}, object {n}")[0]
+            weight[n] = read_numbers(record, "relevance", 1, f"{where}, object {n}")[0]
             if weight[n] < 0:
                 raise InputError(f"{where}, object {n} has a relevance below 0")
     return weight

@@ -15,13 +15,13 @@ from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import (
     MAX_NUMBER,
     STD_YAW_RAD,
+    DetectionFrame,
     DetectionSet,
     Family,
-    Frame,
-    around,
-    classes_in_order,
-    detections_of_file,
-    objects_of_file,
+    enclosing_region,
+    make_detections,
+    make_objects,
+    order_classes,
 )
 from foredrive.evaluation.detections.nuscenes_results import DEFAULT_COVARIANCE
 
@@ -40,7 +40,7 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
         raise InputError(f"{folder / unknown[0]}: there is no such frame in {truth}")
     true = {path.name: _lines(path, 15) for path in true_paths}
     found = {name: _lines(folder / name, 16) if name in paths else [] for name in true}
-    classes, true_classes = classes_in_order(
+    classes, true_classes = order_classes(
         *({kind for lines in each.values() for kind, _ in lines} for each in (true, found))
     )
     counts = {
@@ -49,24 +49,24 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     }
     frames = []
     for name, lines in true.items():
-        said = found[name]
-        state, yaw = _states(said, folder / name)
+        predicted = found[name]
+        state, yaw = _states(predicted, folder / name)
         true_state, true_yaw = _states(lines, truth / name)
-        share = np.eye(len(classes))[[classes.index(kind) for kind, _ in said]]
-        covariance = np.tile(DEFAULT_COVARIANCE, (len(said), 1, 1))
-        score = np.array([values[14] for _, values in said])
-        detected = detections_of_file(
-            str(folder / name), score, share, state, covariance, yaw, np.full(len(said), STD_YAW_RAD),
+        share = np.eye(len(classes))[[classes.index(kind) for kind, _ in predicted]]
+        covariance = np.tile(DEFAULT_COVARIANCE, (len(predicted), 1, 1))
+        score = np.array([values[14] for _, values in predicted])
+        detected = make_detections(
+            str(folder / name), score, share, state, covariance, yaw, np.full(len(predicted), STD_YAW_RAD),
             family=family,
         )  # fmt: skip
         labels = [classes.index(kind) for kind, _ in lines]
         frames.append(
-            Frame(
+            DetectionFrame(
                 name.removesuffix(".txt"),
                 name.removesuffix(".txt"),
                 detected,
-                objects_of_file(str(truth / name), labels, true_state, true_yaw),
-                *around(LOWER, UPPER, true_state),
+                make_objects(str(truth / name), labels, true_state, true_yaw),
+                *enclosing_region(LOWER, UPPER, true_state),
                 range_m=np.linalg.norm(true_state[:, :2], axis=1),
                 visibility=np.array([values[1] for _, values in lines]),
             )

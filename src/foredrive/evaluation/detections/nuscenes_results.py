@@ -19,18 +19,18 @@ from foredrive.evaluation.detections.frames import (
     STD_LOG_SIZE,
     STD_M,
     STD_YAW_RAD,
+    DetectionFrame,
     DetectionSet,
     Family,
-    Frame,
-    all_numbers_of,
-    around,
-    class_distributions,
-    classes_in_order,
-    covariances_of,
-    detections_of_file,
-    numbers_of,
-    objects_of_file,
-    relevance_of,
+    enclosing_region,
+    make_detections,
+    make_objects,
+    order_classes,
+    read_class_probabilities,
+    read_covariances,
+    read_number_rows,
+    read_numbers,
+    read_relevance,
 )
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
@@ -49,65 +49,65 @@ def read_nuscenes(
     unknown = sorted(set(found) - set(true))
     if unknown:
         raise InputError(f"{path}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth_path}")
-    classes, true_classes = classes_in_order(
+    classes, true_classes = order_classes(
         *({box["detection_name"] for boxes in each.values() for box in boxes} for each in (true, found))
     )
     counts = {"frames_without_detections": len(set(true) - set(found)), "boxes_without_covariance": 0}
     frames = []
     for token, boxes in true.items():
-        said = found.get(token, ())
-        counts["boxes_without_covariance"] += sum(box.get("covariance") is None for box in said)
-        frames.append(_frame(token, said, boxes, classes, path, truth_path, family))
+        predicted = found.get(token, ())
+        counts["boxes_without_covariance"] += sum(box.get("covariance") is None for box in predicted)
+        frames.append(_frame(token, predicted, boxes, classes, path, truth_path, family))
     return DetectionSet(frames, classes, True, counts, true_classes)
 
 
 def _frame(
     token: str,
-    said: Sequence[Box],
+    predicted: Sequence[Box],
     true: Sequence[Box],
     classes: Sequence[str],
     path: Path,
     truth_path: Path,
     family: Family,
-) -> Frame:
+) -> DetectionFrame:
     where, true_where = f"{path}: frame {token}", f"{truth_path}: frame {token}"
-    state, yaw = _states(said, where)
+    state, yaw = _states(predicted, where)
     true_state, true_yaw = _states(true, true_where)
     ego = _ego(true, true_state, true_where)
     every = np.concatenate([true_state, state])[:, :3]
     origin = ego if ego is not None else every.mean(0) if len(every) else np.zeros(3)
     state[:, :3] -= origin
     true_state[:, :3] -= origin
-    label = [classes.index(box["detection_name"]) for box in said]
-    names = [f"{where}, box {n}" for n in range(len(said))]
-    yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in said]
-    detected = detections_of_file(
+    label = [classes.index(box["detection_name"]) for box in predicted]
+    names = [f"{where}, box {n}" for n in range(len(predicted))]
+    yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in predicted]
+    detected = make_detections(
         where,
-        all_numbers_of(said, "detection_score", 1, names)[:, 0],
-        class_distributions(said, label, classes, names),
+        read_number_rows(predicted, "detection_score", 1, names)[:, 0],
+        read_class_probabilities(predicted, label, classes, names),
         state,
-        covariances_of(said, np.tile(DEFAULT_COVARIANCE, (len(said), 1, 1)), names),
+        read_covariances(predicted, np.tile(DEFAULT_COVARIANCE, (len(predicted), 1, 1)), names),
         yaw,
-        all_numbers_of(yaw_std, "yaw_std", 1, names)[:, 0],
+        read_number_rows(yaw_std, "yaw_std", 1, names)[:, 0],
         family=family,
     )
-    objects = objects_of_file(
+    objects = make_objects(
         true_where, [classes.index(box["detection_name"]) for box in true], true_state, true_yaw
     )
     true_names = [f"{true_where}, box {n}" for n in range(len(true))]
     seen = [
-        numbers_of(box, "num_pts", 1, name)[0] if "num_pts" in box else np.nan
+        read_numbers(box, "num_pts", 1, name)[0] if "num_pts" in box else np.nan
         for box, name in zip(true, true_names, strict=True)
     ]
-    return Frame(
+    return DetectionFrame(
         token,
         str(true[0].get("scene_token", token)) if true else token,
         detected,
         objects,
-        *around(LOWER, UPPER, true_state),
+        *enclosing_region(LOWER, UPPER, true_state),
         range_m=None if ego is None else np.linalg.norm(true_state[:, :2], axis=1),
         visibility=np.array(seen),
-        relevance=relevance_of(true, true_where),
+        relevance=read_relevance(true, true_where),
     )
 
 
@@ -126,7 +126,7 @@ def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Fl
     """Return centre and log length, width, height; and heading."""
     names = [f"{where}, box {n}" for n in range(len(boxes))]
     centre, size, rotation = (
-        all_numbers_of(boxes, key, count, names)
+        read_number_rows(boxes, key, count, names)
         for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
     )
     wrong = np.flatnonzero(~(size > 0).all(1))
@@ -144,4 +144,4 @@ def _ego(true: Sequence[Box], true_state: Float[ndarray, "N 6"], where: str) -> 
     """Return the ego vehicle's place, if the truth has it: the devkit writes boxes relative to it."""
     if not true or "ego_translation" not in true[0]:
         return None
-    return true_state[0, :3] - numbers_of(true[0], "ego_translation", 3, f"{where}, box 0")
+    return true_state[0, :3] - read_numbers(true[0], "ego_translation", 3, f"{where}, box 0")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.evaluation.detections.frames import DetectionSet, Frame
+from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
 from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
 from foredrive.metrics.gospa import Gospa, gospa, wasserstein_distance
 from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
@@ -56,7 +56,7 @@ class DetectionScores:
     hit: Bool[ndarray, "T M"]
     """Whether it hits an object at each threshold of average precision, by greedy matching."""
     overlap: Float[ndarray, "M"]
-    """Overlap with the object that it hits, else 0; NaN for upright boxes."""
+    """Overlap with the object that it hits, else 0; NaN for is_3d boxes."""
 
 
 @dataclass(frozen=True)
@@ -79,19 +79,19 @@ class FrameScore:
 
 
 def score_frames(
-    read: DetectionSet, *, k: int = 25, told: Callable[[int], None] | None = None
+    detection_set: DetectionSet, *, k: int = 25, on_frame: Callable[[int], None] | None = None
 ) -> list[FrameScore]:
-    """Score every frame. `told` is called with the number of frames that are done."""
+    """Score every frame. `on_frame` is called with the number of frames that are done."""
     scores = []
     with torch.no_grad():
-        for done, frame in enumerate(read.frames, 1):
-            scores.append(_score_frame(frame, read, k))
-            if told is not None:
-                told(done)
+        for done, frame in enumerate(detection_set.frames, 1):
+            scores.append(_score_frame(frame, detection_set, k))
+            if on_frame is not None:
+                on_frame(done)
     return scores
 
 
-def predicted_set(frame: Frame, classes: int, true_classes: int) -> PoissonMultiBernoulli:
+def predicted_set(frame: DetectionFrame, classes: int, true_classes: int) -> PoissonMultiBernoulli:
     """Return a frame's detections as a PMB, with a background of unsure ones and a uniform process.
 
     The uniform process is over the first `true_classes` alone: other classes that a detector names do not
@@ -108,27 +108,27 @@ def predicted_set(frame: Frame, classes: int, true_classes: int) -> PoissonMulti
     return PoissonMultiBernoulli.from_detections(frame.detected, LOW_CONFIDENCE, uniform)
 
 
-def _score_frame(frame: Frame, read: DetectionSet, k: int) -> FrameScore:
-    pmb = predicted_set(frame, len(read.classes), read.true_classes)
+def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, k: int) -> FrameScore:
+    pmb = predicted_set(frame, len(detection_set.classes), detection_set.true_classes)
     result = set_nll(pmb, frame.objects, k=k)
     sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(LOW_CONFIDENCE))
-    closeness = _closeness(frame, read.upright)
-    detections = _detections(frame, result, sure, closeness, read.upright)
-    brier = _object_brier(frame, sure, closeness, read.upright)
+    closeness = _closeness(frame, detection_set.is_3d)
+    detections = _detections(frame, result, sure, closeness, detection_set.is_3d)
+    brier = _object_brier(frame, sure, closeness, detection_set.is_3d)
     return FrameScore(
         frame.name,
         frame.sequence,
         float(result.nll),
         float(result.nll) - result.lower if result.nll.isfinite() else 0.0,
         {part: float(getattr(result, part)) for part in PARTS},
-        *_gospas(frame, detections, read.upright),
+        *_gospas(frame, detections, detection_set.is_3d),
         detections,
         _objects(frame, result, sure, brier),
-        None if read.upright else _pdq(frame, detections),
+        None if detection_set.is_3d else _pdq(frame, detections),
     )
 
 
-def _pdq(frame: Frame, detections: DetectionScores) -> PdqCounts:
+def _pdq(frame: DetectionFrame, detections: DetectionScores) -> PdqCounts:
     """Count pairs for PDQ; label quality is existence times class probability."""
     boxes = frame.detected.boxes
     std = boxes.chol.square().sum(-1).sqrt().numpy()
@@ -138,7 +138,7 @@ def _pdq(frame: Frame, detections: DetectionScores) -> PdqCounts:
 
 
 def _objects(
-    frame: Frame,
+    frame: DetectionFrame,
     result: SetNll,
     sure: Int[ndarray, "_"],
     brier: Float[ndarray, "N"],
@@ -161,53 +161,53 @@ def _objects(
 
 
 def _object_brier(
-    frame: Frame, sure: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], upright: bool
+    frame: DetectionFrame, sure: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], is_3d: bool
 ) -> Float[ndarray, "N"]:
     detected, label = frame.detected, frame.objects.label.numpy()
     probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[sure]
-    thresholds = [-distance for distance in NEAR_M] if upright else NEAR_OVERLAP
+    thresholds = [-distance for distance in NEAR_M] if is_3d else NEAR_OVERLAP
     each = [object_brier(probability, closeness[sure] >= nearness, label) for nearness in thresholds]
     return np.mean(each, axis=0)
 
 
 def _detections(
-    frame: Frame,
+    frame: DetectionFrame,
     result: SetNll,
     sure: Int[ndarray, "_"],
     closeness: Float[ndarray, "M N"],
-    upright: bool,
+    is_3d: bool,
 ) -> DetectionScores:
     detected, objects = frame.detected, frame.objects
     label = detected.log_class.argmax(-1).numpy()
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
     has_object[sure] = 1.0 - result.associations.absent
-    thresholds = [-distance for distance in NUSCENES_DISTANCES_M] if upright else COCO_OVERLAPS
+    thresholds = [-distance for distance in NUSCENES_DISTANCES_M] if is_3d else COCO_OVERLAPS
     hit, overlap = np.zeros((len(thresholds), len(label)), bool), np.full(len(label), np.nan)
-    if not upright:
+    if not is_3d:
         overlap[:] = 0.0
     true = objects.label.numpy()
     near = np.where(label[:, None] == true, closeness, -np.inf)
     for t, threshold in enumerate(thresholds):
         hit[t] = match_greedily(score, near, threshold) >= 0
-    if not upright:
+    if not is_3d:
         taken = match_greedily(score, near, np.nextafter(0.0, 1.0))
         which = np.flatnonzero(taken >= 0)
         overlap[which] = near[which, taken[which]]
     return DetectionScores(label, score, detected.log_existence.exp().numpy(), has_object, hit, overlap)
 
 
-def _closeness(frame: Frame, upright: bool) -> Float[ndarray, "M N"]:
+def _closeness(frame: DetectionFrame, is_3d: bool) -> Float[ndarray, "M N"]:
     """Return minus the distance of centres over ground in m, or the overlap."""
     mean, state = frame.detected.boxes.mean.numpy(), frame.objects.state.numpy()
-    if not upright:
+    if not is_3d:
         return overlaps(mean, state)
     return -np.linalg.norm(mean[:, None, :2] - state[:, :2], axis=-1)
 
 
-def _gospas(frame: Frame, detections: DetectionScores, upright: bool) -> tuple[Gospa, Gospa]:
+def _gospas(frame: DetectionFrame, detections: DetectionScores, is_3d: bool) -> tuple[Gospa, Gospa]:
     """Return GOSPA of detections above a half, and P-GOSPA of all; likeliest classes must agree."""
-    dims, cutoff = (3, GOSPA_CUTOFF_M) if upright else (4, GOSPA_CUTOFF_PX)
+    dims, cutoff = (3, GOSPA_CUTOFF_M) if is_3d else (4, GOSPA_CUTOFF_PX)
     boxes, objects = frame.detected.boxes, frame.objects
     same = detections.label[:, None] == objects.label.numpy()
     apart = np.linalg.norm(boxes.mean.numpy()[:, None, :dims] - objects.state.numpy()[:, :dims], axis=-1)

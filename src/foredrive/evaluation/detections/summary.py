@@ -10,8 +10,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import DetectionSet, Frame
+from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
 from foredrive.evaluation.detections.score import PARTS, FrameScore
+from foredrive.evaluation.summary import Figures
 from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
 from foredrive.metrics.detection import (
     COCO_OVERLAPS,
@@ -30,27 +31,28 @@ SIDES_PX = (0.0, 32.0, 96.0, np.inf)
 """Roots of areas: COCO's small, medium and large."""
 RANGES_M = (0.0, 20.0, 40.0, 60.0, np.inf)
 COVERAGE = 0.9
-Summary = dict[str, float | int | str | None]
 
 
 @dataclass(frozen=True)
 class ScoreSummary:
     """Flat figures and reliability diagrams."""
 
-    figures: Summary
+    figures: Figures
     diagrams: Mapping[str, Reliability]
 
 
-def summarise_scores(read: DetectionSet, scores: Sequence[FrameScore], seed: int = 0) -> ScoreSummary:
-    """Return the figures of `FIGURES`, and the reliability diagrams.
+def summarise_scores(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], seed: int = 0
+) -> ScoreSummary:
+    """Return the figures of `FIGURE_FUNCTIONS`, and the reliability diagrams.
 
     Likelihoods are averaged over frames where they are finite; the others are counted.
     """
     rng = np.random.default_rng(seed)
-    figures: Summary = {}
-    for figures_of in FIGURES:
-        figures |= figures_of(read, scores, rng)
-    return ScoreSummary(figures, _diagrams(read, scores))
+    figures: Figures = {}
+    for compute in FIGURE_FUNCTIONS:
+        figures |= compute(detection_set, scores, rng)
+    return ScoreSummary(figures, _diagrams(detection_set, scores))
 
 
 def compare_scores(
@@ -76,18 +78,20 @@ def _joined(scores: Sequence[FrameScore], part: str, field: str) -> ndarray:
     return np.concatenate([getattr(getattr(score, part), field) for score in scores], axis=-1)
 
 
-def _counts(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _counts(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Count frames, objects, detections, and what was assumed or missing."""
     return {
         "frames": len(scores),
         "objects": sum(len(score.objects.label) for score in scores),
         "detections": sum(len(score.detections.label) for score in scores),
         "pmb_nll.frames_infinite": int((~np.isfinite([score.nll for score in scores])).sum()),
-        **read.counts,
+        **detection_set.counts,
     }
 
 
-def _likelihood(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _likelihood(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
+) -> Figures:
     """Average the likelihood and its parts over frames where it is finite."""
     nll = np.array([score.nll for score in scores])
     finite = np.isfinite(nll)
@@ -95,7 +99,7 @@ def _likelihood(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random
         return {}
     sequences = [score.sequence for score in scores]
     interval = bootstrap_mean(nll[finite], np.array(sequences)[finite].tolist(), rng)
-    figures: Summary = {
+    figures: Figures = {
         "pmb_nll.mean": interval.mean,
         "pmb_nll.low_95": interval.low,
         "pmb_nll.high_95": interval.high,
@@ -107,7 +111,9 @@ def _likelihood(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random
     return figures
 
 
-def _distances(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _distances(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
+) -> Figures:
     """Average GOSPA and P-GOSPA, and their parts, over frames."""
     return {
         f"{name}.{part}": float(np.mean([getattr(getattr(score, name), part) for score in scores]))
@@ -116,42 +122,48 @@ def _distances(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.
     }
 
 
-def _precision(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _precision(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
+) -> Figures:
     """Return average precision by class and threshold, as the data sets define it."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
-    thresholds = NUSCENES_DISTANCES_M if read.upright else COCO_OVERLAPS
-    average = average_precision_nuscenes if read.upright else average_precision_coco
+    thresholds = NUSCENES_DISTANCES_M if detection_set.is_3d else COCO_OVERLAPS
+    average = average_precision_nuscenes if detection_set.is_3d else average_precision_coco
     table = np.array(
         [
             [average(score[label == c], row[label == c], int((true == c).sum())) for row in hit]
-            for c in range(len(read.classes))
+            for c in range(len(detection_set.classes))
         ]
     )
-    figures: Summary = {"map": mean_of_valid(table.ravel().tolist())}
+    figures: Figures = {"map": mean_of_valid(table.ravel().tolist())}
     for t, threshold in enumerate(thresholds):
-        unit = f"{threshold:g}_m" if read.upright else f"{threshold:.2f}"
+        unit = f"{threshold:g}_m" if detection_set.is_3d else f"{threshold:.2f}"
         figures[f"map_at.{unit}"] = mean_of_valid(table[:, t].tolist())
-    for c, name in enumerate(read.classes):
+    for c, name in enumerate(detection_set.classes):
         figures[f"ap.{name}"] = mean_of_valid(table[c].tolist())
     return figures
 
 
-def _pdq(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _pdq(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return PDQ of image boxes."""
     counts = [score.pdq for score in scores if score.pdq is not None]
     return {"pdq": pdq(counts)} if counts else {}
 
 
-def _reliability(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _reliability(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
+) -> Figures:
     """Return the errors of the reliability diagrams."""
-    return {f"calibration.{name}": diagram.error for name, diagram in _diagrams(read, scores).items()}
+    return {
+        f"calibration.{name}": diagram.error for name, diagram in _diagrams(detection_set, scores).items()
+    }
 
 
-def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
+def _diagrams(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
     """Return diagrams of hits (at 2 m or overlap 0.5) and of existence against associations."""
     score, hit = _joined(scores, "detections", "score"), _joined(scores, "detections", "hit")
-    at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
+    at = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
     diagrams = {"d_ece": reliability(score, hit[at])}
     existence = _joined(scores, "detections", "existence")
     has_object = _joined(scores, "detections", "has_object")
@@ -160,35 +172,40 @@ def _diagrams(read: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Rel
     return diagrams
 
 
-def _calibration(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _calibration(
+    detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
+) -> Figures:
     """Return D-ECE by class and range, object-level error, and LaECE (hits at 0.5), LaECE₀ of image boxes."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
-    at = NUSCENES_DISTANCES_M.index(2.0) if read.upright else 0
+    at = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
     of_objects = _joined(scores, "objects", "brier")
-    figures: Summary = {
+    figures: Figures = {
         "brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None,
         "calibration.object_level": float(of_objects.mean()) if len(of_objects) else None,
     }
-    outcomes = {} if read.upright else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
-    for c, name in enumerate(read.classes):
+    outcomes = {} if detection_set.is_3d else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
+    for c, name in enumerate(detection_set.classes):
         figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[at][label == c]).error
-    if any(frame.range_m is not None for frame in read.frames):
-        where = np.concatenate([_range_of_detections_m(frame) for frame in read.frames])
+    if any(frame.range_m is not None for frame in detection_set.frames):
+        where = np.concatenate([_detection_range_m(frame) for frame in detection_set.frames])
         for low, high in pairwise(RANGES_M):
             inside = (where >= low) & (where < high)
             error = reliability(score[inside], hit[at][inside]).error
             figures[f"calibration.d_ece.from_{low:g}_m"] = error
     for key, outcome in outcomes.items():
-        errors = [reliability(score[label == c], outcome[label == c]).error for c in range(len(read.classes))]
+        errors = [
+            reliability(score[label == c], outcome[label == c]).error
+            for c in range(len(detection_set.classes))
+        ]
         figures[f"calibration.{key}"] = mean_of_valid(errors)
     return figures
 
 
-def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return proper scores, scale of σ and coverage of boxes and objects in the likeliest associations."""
     boxes, objects = [], []
-    for frame, score in zip(read.frames, scores, strict=True):
+    for frame, score in zip(detection_set.frames, scores, strict=True):
         has = np.flatnonzero(score.objects.best >= 0)
         if len(has):
             boxes.append(frame.detected.boxes[score.objects.best[has]])
@@ -199,8 +216,8 @@ def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.G
     mean, state = density.mean.numpy(), truth.state.numpy()
     std = density.chol.square().sum(-1).sqrt().numpy()
     crps = crps_gaussian if density.family == "gaussian" else crps_laplace
-    axes = ("x_m", "y_m", "z_m") if read.upright else ("x1_px", "y1_px", "x2_px", "y2_px")
-    figures: Summary = {
+    axes = ("x_m", "y_m", "z_m") if detection_set.is_3d else ("x1_px", "y1_px", "x2_px", "y2_px")
+    figures: Figures = {
         f"crps.{axis}": float(crps(mean[:, d], std[:, d], state[:, d]).mean()) for d, axis in enumerate(axes)
     }
     some = rng.permutation(len(mean))[:2000]
@@ -213,26 +230,29 @@ def _of_pairs(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.G
     return figures
 
 
-def _slices(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Summary:
+def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
     """Return the cost of objects by class, size, range and visibility, nats an object."""
     label = _joined(scores, "objects", "label")
-    figures: Summary = _relevance(read, scores)
-    size = np.concatenate([_size(frame.objects, read.upright) for frame in read.frames])
-    steps, unit = (LENGTHS_M, "m") if read.upright else (SIDES_PX, "px")
+    figures: Figures = _relevance(detection_set, scores)
+    size = np.concatenate([_size(frame.objects, detection_set.is_3d) for frame in detection_set.frames])
+    steps, unit = (LENGTHS_M, "m") if detection_set.is_3d else (SIDES_PX, "px")
     for low, high in pairwise(steps):
         inside = np.flatnonzero((size >= low) & (size < high))
         figures |= _slice(f"by_size.from_{low:g}_{unit}", scores, inside)
-    for c, name in enumerate(read.classes):
+    for c, name in enumerate(detection_set.classes):
         figures |= _slice(f"by_class.{name}", scores, np.flatnonzero(label == c))
-    if any(frame.range_m is not None for frame in read.frames):
-        unknown = [np.full(len(frame.objects.label), np.nan) for frame in read.frames]
+    if any(frame.range_m is not None for frame in detection_set.frames):
+        unknown = [np.full(len(frame.objects.label), np.nan) for frame in detection_set.frames]
         range_m = np.concatenate(
-            [nan if f.range_m is None else f.range_m for f, nan in zip(read.frames, unknown, strict=True)]
+            [
+                nan if f.range_m is None else f.range_m
+                for f, nan in zip(detection_set.frames, unknown, strict=True)
+            ]
         )
         for low, high in pairwise(RANGES_M):
             inside = np.flatnonzero((range_m >= low) & (range_m < high))
             figures |= _slice(f"by_range.from_{low:g}_m", scores, inside)
-    seen = [frame.visibility for frame in read.frames if frame.visibility is not None]
+    seen = [frame.visibility for frame in detection_set.frames if frame.visibility is not None]
     if len(seen) == len(scores) and not np.isnan(np.concatenate(seen)).any():
         visibility = np.concatenate(seen)
         edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else visibility
@@ -242,37 +262,39 @@ def _slices(read: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Gen
     return figures
 
 
-def _relevance(read: DetectionSet, scores: Sequence[FrameScore]) -> Summary:
+def _relevance(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> Figures:
     """Return the mean cost of an object, plain and weighted where the truth has weights."""
     cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
     if not np.size(cost):
         return {}
-    figures: Summary = {"object_cost": float(np.mean(cost))}
-    weights = [np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in read.frames]
-    if any(frame.relevance is not None for frame in read.frames):
+    figures: Figures = {"object_cost": float(np.mean(cost))}
+    weights = [
+        np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in detection_set.frames
+    ]
+    if any(frame.relevance is not None for frame in detection_set.frames):
         weight = np.concatenate(weights)
         weighted = float((weight * cost).sum() / weight.sum()) if weight.any() else None
         figures["object_cost.by_relevance"] = weighted
     return figures
 
 
-def _range_of_detections_m(frame: Frame) -> Float[ndarray, "M"]:
+def _detection_range_m(frame: DetectionFrame) -> Float[ndarray, "M"]:
     """Return distances over ground; NaN where the ego vehicle's place is unknown."""
     if frame.range_m is None:
         return np.full(len(frame.detected.log_existence), np.nan)
     return frame.detected.boxes.mean[:, :2].norm(dim=-1).numpy()
 
 
-def _size(objects: LabelledBoxes, upright: bool) -> Float[ndarray, "N"]:
+def _size(objects: LabelledBoxes, is_3d: bool) -> Float[ndarray, "N"]:
     """Return lengths in m, or roots of areas in px."""
     state = objects.state.double().numpy()
-    if upright:
+    if is_3d:
         return np.exp(state[:, 3])
     return np.sqrt((state[:, 2:] - state[:, :2]).prod(-1))
 
 
-def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Summary:
-    figures: Summary = {f"{name}.objects": len(which)}
+def _slice(name: str, scores: Sequence[FrameScore], which: Int[ndarray, "_"]) -> Figures:
+    figures: Figures = {f"{name}.objects": len(which)}
     for part in ("localisation", "classification", "missed", "missed_probability"):
         values: Float[ndarray, _] = _joined(scores, "objects", part)[which]
         figures[f"{name}.{part}"] = float(values.mean()) if len(values) else None
@@ -291,7 +313,7 @@ def _stacked_objects(parts: Sequence[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(torch.cat([part.label for part in parts]), torch.cat([part.state for part in parts]))
 
 
-FIGURES: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator], Summary], ...] = (
+FIGURE_FUNCTIONS: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator], Figures], ...] = (
     _counts,
     _likelihood,
     _distances,
@@ -299,7 +321,7 @@ FIGURES: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.Generator
     _pdq,
     _reliability,
     _calibration,
-    _of_pairs,
+    _pairs,
     _slices,
 )
 """All figures, in the order of a summary; the generator is drawn from in this order, too."""

@@ -2,7 +2,7 @@
 
 from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import FlowErrors, flow_errors
+from foredrive.metrics.occupancy import FlowErrors, flow_errors
 from foredrive.scene import Example
 
 

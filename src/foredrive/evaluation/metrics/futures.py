@@ -2,7 +2,8 @@
 
 from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import FuturesCounts, above_ground, count_futures
+from foredrive.metrics.forecasts import FuturesCounts, count_futures
+from foredrive.metrics.occupancy import above_ground
 from foredrive.scene import Example
 
 

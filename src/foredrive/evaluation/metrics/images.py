@@ -5,7 +5,7 @@ from torch import Tensor
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import psnr_db, ssim
+from foredrive.metrics.images import psnr_db, ssim
 from foredrive.scene import Example
 
 

@@ -8,7 +8,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.metrics import OccupancyCounts, above_ground, count_occupancy, ego_compensated
+from foredrive.metrics.forecasts import ego_compensated
+from foredrive.metrics.occupancy import OccupancyCounts, above_ground, count_occupancy
 from foredrive.scene import Example, VoxelSpec
 
 PERSISTENCE, EGO_COMPENSATED = ".copy", ".carried_copy"

@@ -5,8 +5,9 @@ from torch import Tensor
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics import PROTOCOLS, future_obstacles, score_plan
-from foredrive.metrics.protocols import HORIZON_NAMES, STEP_S, STEPS
+from foredrive.metrics.obstacles import future_obstacles
+from foredrive.metrics.planning import score_plan
+from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Example
 
 COLLISIONS = ("collision", "collision_centre", "driven_collision")
@@ -44,7 +45,9 @@ class PlanningMetric:
             self._collisions[name] += torch.stack(kinds).cpu()
             self._frames[name] += int(scores.counted.sum())
             self._frames_with_boxes[name] += int(scores.collision_counted.sum())
-            invalid = int((scores.planned & ~scores.complete).sum())  # the same under every protocol
+            invalid = int(
+                (scores.plan_complete & ~scores.future_complete).sum()
+            )  # the same under every protocol
         self._frames_invalid += invalid
 
     def result(self) -> Figures:

@@ -2,13 +2,13 @@
 
 from foredrive.models.driveworld.actions import actions_of, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence
-from foredrive.models.driveworld.world_model import DriveWorld, DriveWorldConfig, Seen, Unrolled
+from foredrive.models.driveworld.world_model import DriveWorld, DriveWorldConfig, LiftedFrames, Unrolled
 
 __all__ = [
     "DiagonalGaussian",
     "DriveWorld",
     "DriveWorldConfig",
-    "Seen",
+    "LiftedFrames",
     "Unrolled",
     "actions_of",
     "balanced_kl",

@@ -8,10 +8,6 @@ from torch import Tensor
 
 from foredrive.scene.record import Record
 
-LEAST_STD = 0.1
-"""Smallest standard deviation. It keeps the divergence between two states finite, as in MILE (Hu et al.
-2022)."""
-
 
 @dataclass(frozen=True)
 class DiagonalGaussian(Record):
@@ -21,10 +17,10 @@ class DiagonalGaussian(Record):
     std: Float[Tensor, "*b S"]
 
     @classmethod
-    def of(cls, raw: Float[Tensor, "*b _R"]) -> "DiagonalGaussian":
-        """Build it from a network's output: mean, and std = 2 sigmoid(raw / 2) + 0.1, which is 1.1 at 0."""
-        mean, spread = raw.float().chunk(2, dim=-1)
-        return cls(mean, 2 * torch.sigmoid(spread / 2) + LEAST_STD)
+    def from_output(cls, raw: Float[Tensor, "*b _R"], min_std: float) -> "DiagonalGaussian":
+        """Build it from a network's output: mean, and std = 2 sigmoid(raw / 2) + `min_std` (as in MILE)."""
+        mean, raw_std = raw.float().chunk(2, dim=-1)
+        return cls(mean, 2 * torch.sigmoid(raw_std / 2) + min_std)
 
     @classmethod
     def standard(cls, like: Float[Tensor, "*b S"]) -> "DiagonalGaussian":

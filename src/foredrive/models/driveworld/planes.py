@@ -1,6 +1,6 @@
 """Networks between planes and vectors: the inputs and outputs of DriveWorld's latent dynamics."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -27,32 +27,54 @@ class AdaptiveNorm(nn.Module):
         return (1 + scale) * self.norm(plane) + shift
 
 
+@dataclass(frozen=True)
+class PlaneToVectorConfig:
+    """Sizes of a `PlaneToVector`."""
+
+    hidden: int
+    """Channels of the first convolution. The second has twice as many."""
+    norm_groups: int = 4
+    pool_yx: tuple[int, int] = (4, 4)
+    """Size of the plane that is flattened."""
+
+
 class PlaneToVector(nn.Module):
     """A plane reduced to one vector x_t by strided convolutions, flattened only at the end.
 
     Args:
+        config: sizes.
         channels: channels of the plane.
-        hidden: channels of the first convolution.
         vector: width of x_t (512 in the paper).
     """
 
-    def __init__(self, channels: int, hidden: int, vector: int) -> None:
+    def __init__(self, config: PlaneToVectorConfig, *, channels: int, vector: int) -> None:
         super().__init__()
+        hidden, pool_yx = config.hidden, config.pool_yx
         self.net = nn.Sequential(
             nn.Conv2d(channels, hidden, 3, stride=2, padding=1),
-            nn.GroupNorm(4, hidden),
+            nn.GroupNorm(config.norm_groups, hidden),
             nn.ReLU(),
             nn.Conv2d(hidden, 2 * hidden, 3, stride=2, padding=1),
-            nn.GroupNorm(4, 2 * hidden),
+            nn.GroupNorm(config.norm_groups, 2 * hidden),
             nn.ReLU(),
-            nn.AdaptiveAvgPool2d((4, 4)),
+            nn.AdaptiveAvgPool2d(pool_yx),
             nn.Flatten(),
-            nn.Linear(32 * hidden, vector),
+            nn.Linear(2 * hidden * pool_yx[0] * pool_yx[1], vector),
         )
 
     def forward(self, plane: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b V"]:
         """Return the vector."""
         return self.net(plane)
+
+
+@dataclass(frozen=True)
+class VectorToPlaneConfig:
+    """Sizes of a `VectorToPlane`."""
+
+    widths: tuple[int, ...]
+    """Channels of each step, coarsest first. The last is that of the plane."""
+    negative_slope: float = 0.2
+    """Slope of the leaky ReLU below 0."""
 
 
 class VectorToPlane(nn.Module):
@@ -61,13 +83,14 @@ class VectorToPlane(nn.Module):
     A learned constant is upsampled by a factor of two per step and styled by the vector at each step.
 
     Args:
+        config: sizes.
         vector: width of the input.
-        widths: channels of each step, coarsest first; the last is that of the plane.
         size_yx: size of the plane.
     """
 
-    def __init__(self, vector: int, widths: Sequence[int], size_yx: tuple[int, int]) -> None:
+    def __init__(self, config: VectorToPlaneConfig, *, vector: int, size_yx: tuple[int, int]) -> None:
         super().__init__()
+        widths, self.negative_slope = config.widths, config.negative_slope
         shrunk = 2 ** (len(widths) - 1)
         self.sizes = [tuple(-(-n * 2**k // shrunk) for n in size_yx) for k in range(len(widths))]
         self.constant = nn.Parameter(torch.randn(1, widths[0], *self.sizes[0]))
@@ -83,18 +106,28 @@ class VectorToPlane(nn.Module):
         for size, convolve, style in zip(self.sizes, self.convolve, self.style, strict=True):
             if plane.shape[-2:] != size:
                 plane = F.interpolate(plane, size=size, mode="bilinear", align_corners=False)
-            plane = F.leaky_relu(style(convolve(plane), vector), 0.2)
+            plane = F.leaky_relu(style(convolve(plane), vector), self.negative_slope)
         return plane
+
+
+@dataclass(frozen=True)
+class StaticSceneConfig:
+    """Sizes of a `StaticScene`."""
+
+    channels: int
+    """Channels of the latent statics."""
+    norm_groups: int = 4
 
 
 class StaticScene(nn.Module):
     """Static features b̂ = z_θ(b'), read from the plane of one frame and passed on without warping (§3.1)."""
 
-    def __init__(self, channels: int, out: int) -> None:
+    def __init__(self, config: StaticSceneConfig, *, channels: int) -> None:
         super().__init__()
+        out = config.channels
         self.net = nn.Sequential(
             nn.Conv2d(channels, out, 3, padding=1),
-            nn.GroupNorm(4, out),
+            nn.GroupNorm(config.norm_groups, out),
             nn.ReLU(),
             nn.Conv2d(out, out, 3, padding=1),
         )
@@ -104,7 +137,7 @@ class StaticScene(nn.Module):
         return self.net(plane)
 
 
-def carried_plane(
+def warp_plane(
     plane: Float[Tensor, "b C Y X"], T_src_dst: Float[Tensor, "b 4 4"], spec: VoxelSpec
 ) -> Float[Tensor, "b C Y X"]:
     """Warp a plane from the frame src to the frame dst.
@@ -125,19 +158,27 @@ def carried_plane(
         return F.grid_sample(plane, grid, align_corners=False)
 
 
+@dataclass(frozen=True)
+class PlanesToVolumeConfig:
+    """Sizes of a `PlanesToVolume`."""
+
+    hidden: int
+    """Channels of the volume before the last convolution."""
+
+
 class PlanesToVolume(nn.Module):
     """Planes, concatenated along channels, unfolded into a feature volume: l_θ without its last layer.
 
     Args:
+        config: sizes.
         channels: channels of all planes together.
-        hidden: channels of the volume before the last convolution.
         out: D.
         height: Z.
     """
 
-    def __init__(self, channels: int, hidden: int, out: int, height: int) -> None:
+    def __init__(self, config: PlanesToVolumeConfig, *, channels: int, out: int, height: int) -> None:
         super().__init__()
-        self.height = height
+        self.height, hidden = height, config.hidden
         self.unfold = nn.Sequential(
             nn.Conv2d(channels, hidden * height, 3, padding=1),
             nn.GroupNorm(height, hidden * height),

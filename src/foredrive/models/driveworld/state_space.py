@@ -11,8 +11,6 @@ from foredrive.scene.record import Record
 
 ACTIONS = 2
 """Number of action channels: velocity (m/s) and steering angle (rad) of the bicycle."""
-ACTION_SCALE = (10.0, 0.1)
-"""Scale of the actions: inputs are divided by it and outputs multiplied by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +37,12 @@ class StateSpaceConfig:
     """Attend to the memory. If False, h̃ is h."""
     motion_norm: bool = True
     """Use motion-aware layer normalisation. If False, s̃ is s."""
+    min_std: float = 0.1
+    """Minimum standard deviation of a state. It keeps the divergence between two states finite, as in
+    MILE."""
+    speed_scale_mps: float = 10.0
+    steering_scale_rad: float = 0.1
+    """Scales of actions and velocities: inputs are divided by them and outputs multiplied by them."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Latent(Record):
     """s_t, stochastic."""
     memory: Float[Tensor, "b M H"]
     """h_1 … h_t, newest last. Only the last M are kept."""
-    remembered: Bool[Tensor, "b M"]
+    memory_valid: Bool[Tensor, "b M"]
     """True for the filled places of the memory."""
 
 
@@ -63,10 +67,12 @@ class MotionAwareNorm(nn.Module):
     Args:
         state: S.
         objects: K.
+        speed_scale_mps: scale by which velocities are divided.
     """
 
-    def __init__(self, state: int, objects: int) -> None:
+    def __init__(self, state: int, objects: int, speed_scale_mps: float) -> None:
         super().__init__()
+        self.speed_scale_mps = speed_scale_mps
         self.norm = nn.LayerNorm(state, elementwise_affine=False)
         self.reduce = nn.Sequential(nn.Linear(2 * objects + 1, state), nn.ReLU())
         self.gamma, self.beta = nn.Linear(state, state), nn.Linear(state, state)
@@ -78,11 +84,12 @@ class MotionAwareNorm(nn.Module):
         self, state: Float[Tensor, "b S"], velocity_mps: Float[Tensor, "b K 2"], dt_s: Float[Tensor, "b"]
     ) -> Float[Tensor, "b S"]:
         """Return the motion-aware state."""
-        motion = self.reduce(torch.cat([velocity_mps.flatten(1) / ACTION_SCALE[0], dt_s[:, None]], dim=-1))
+        scaled = velocity_mps.flatten(1) / self.speed_scale_mps
+        motion = self.reduce(torch.cat([scaled, dt_s[:, None]], dim=-1))
         return self.gamma(motion) * self.norm(state) + self.beta(motion)
 
 
-class Recall(nn.Module):
+class MemoryAttention(nn.Module):
     """The history refined by attention to the whole memory: h̃_t (§3.1).
 
     Args:
@@ -97,11 +104,11 @@ class Recall(nn.Module):
 
     def forward(self, latent: Latent) -> Float[Tensor, "b H"]:
         """Return the refined history."""
-        asked = latent.history[:, None]
-        read, _ = self.attention(
-            asked, latent.memory, latent.memory, key_padding_mask=~latent.remembered, need_weights=False
+        query = latent.history[:, None]
+        attended, _ = self.attention(
+            query, latent.memory, latent.memory, key_padding_mask=~latent.memory_valid, need_weights=False
         )
-        return self.norm(asked + read)[:, 0]
+        return self.norm(query + attended)[:, 0]
 
 
 class StateSpace(nn.Module):
@@ -119,21 +126,24 @@ class StateSpace(nn.Module):
         history, state, objects = config.history, config.state, config.objects
         observation, action, hidden = config.observation, config.action, config.hidden
         self.sizes = (history, state, config.memory)
-        self.objects = objects
+        self.objects, self.min_std, self.speed_scale_mps = objects, config.min_std, config.speed_scale_mps
         self.action_in = nn.Linear(ACTIONS, action)
         self.posterior_net = _mlp(history + action + observation, hidden, 2 * state)
         self.prior_net = _mlp(history + action, hidden, 2 * state)
         self.policy = _mlp(history + state, hidden, ACTIONS)
         self.velocity = nn.Linear(state, 2 * objects)
-        self.motion_norm = MotionAwareNorm(state, objects) if config.motion_norm else None
-        self.recall = Recall(history, config.heads) if config.memory_bank else None
+        self.motion_norm = (
+            MotionAwareNorm(state, objects, config.speed_scale_mps) if config.motion_norm else None
+        )
+        self.recall = MemoryAttention(history, config.heads) if config.memory_bank else None
         self.into = nn.Sequential(nn.Linear(state, history), nn.LeakyReLU())
         self.cell = nn.GRUCell(history, history)
-        self.register_buffer("action_scale", torch.tensor(ACTION_SCALE), persistent=False)
+        action_scale = torch.tensor([config.speed_scale_mps, config.steering_scale_rad])
+        self.register_buffer("action_scale", action_scale, persistent=False)
 
     action_scale: Tensor
 
-    def begin(self, batch: int, device: torch.device) -> Latent:
+    def initial(self, batch: int, device: torch.device) -> Latent:
         """Return the initial latent: h_1 = 0, and a memory that holds only h_1."""
         history, state, memory = self.sizes
         zeros = torch.zeros(batch, history, device=device)
@@ -141,9 +151,9 @@ class StateSpace(nn.Module):
             history=zeros,
             state=torch.zeros(batch, state, device=device),
             memory=torch.zeros(batch, memory, history, device=device),
-            remembered=torch.zeros(batch, memory, dtype=torch.bool, device=device),
+            memory_valid=torch.zeros(batch, memory, dtype=torch.bool, device=device),
         )
-        return _remembering(latent, zeros)
+        return _with_history(latent, zeros)
 
     def transition(self, latent: Latent, dt_s: Float[Tensor, "b"]) -> Latent:
         """Return the latent with h_{t+1} = f(h̃_t, s̃_t), added to the memory. The state stays s_t."""
@@ -151,19 +161,19 @@ class StateSpace(nn.Module):
         if self.motion_norm is not None:
             state = self.motion_norm(state, self.velocities_mps(state), dt_s)
         refined = latent.history if self.recall is None else self.recall(latent)
-        return _remembering(latent, self.cell(self.into(state), refined))
+        return _with_history(latent, self.cell(self.into(state), refined))
 
     def posterior(
         self, latent: Latent, last_action: Float[Tensor, "b 2"], x: Float[Tensor, "b X"]
     ) -> DiagonalGaussian:
         """Return q(s_t | o_≤t, a_<t) from (h_t, a_{t-1}, x_t) (eq. 1)."""
-        told = torch.cat([latent.history, self.action_in(last_action / self.action_scale), x], dim=-1)
-        return DiagonalGaussian.of(self.posterior_net(told))
+        inputs = torch.cat([latent.history, self.action_in(last_action / self.action_scale), x], dim=-1)
+        return DiagonalGaussian.from_output(self.posterior_net(inputs), self.min_std)
 
     def prior(self, latent: Latent, last_action: Float[Tensor, "b 2"]) -> DiagonalGaussian:
         """Return p(s_t | h_{t-1}, s_{t-1}) from (h_t, â_{t-1}) (eq. 2)."""
-        told = torch.cat([latent.history, self.action_in(last_action / self.action_scale)], dim=-1)
-        return DiagonalGaussian.of(self.prior_net(told))
+        inputs = torch.cat([latent.history, self.action_in(last_action / self.action_scale)], dim=-1)
+        return DiagonalGaussian.from_output(self.prior_net(inputs), self.min_std)
 
     def action(self, latent: Latent) -> Float[Tensor, "b 2"]:
         """Return â_t = π(h_t, s_t): velocity (m/s) and steering angle (rad)."""
@@ -171,17 +181,17 @@ class StateSpace(nn.Module):
 
     def velocities_mps(self, state: Float[Tensor, "b S"]) -> Float[Tensor, "b K 2"]:
         """Return estimated velocities over ground (m/s, ego axes) of the K nearest moving objects."""
-        return self.velocity(state).unflatten(-1, (self.objects, 2)).float() * ACTION_SCALE[0]
+        return self.velocity(state).unflatten(-1, (self.objects, 2)).float() * self.speed_scale_mps
 
 
-def _remembering(latent: Latent, history: Float[Tensor, "b H"]) -> Latent:
+def _with_history(latent: Latent, history: Float[Tensor, "b H"]) -> Latent:
     """Return the latent with a new history, which is added to the memory."""
-    filled = torch.ones_like(latent.remembered[:, :1])
+    valid = torch.ones_like(latent.memory_valid[:, :1])
     return Latent(
         history=history,
         state=latent.state,
         memory=torch.cat([latent.memory[:, 1:], history[:, None].to(latent.memory)], dim=1),
-        remembered=torch.cat([latent.remembered[:, 1:], filled], dim=1),
+        memory_valid=torch.cat([latent.memory_valid[:, 1:], valid], dim=1),
     )
 
 

@@ -1,13 +1,12 @@
 """Task prompts: the text encoding of a task tells the features which task they serve (§3.3)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.driveworld.planes import VectorToPlane
+from foredrive.models.driveworld.planes import VectorToPlane, VectorToPlaneConfig
 from foredrive.models.text_encoder import TextEncoder
 
 PROMPTS = {
@@ -22,8 +21,7 @@ PROMPTS = {
 class PromptConfig:
     """Sizes of a `TaskPrompt`."""
 
-    widths: tuple[int, ...]
-    """Channels of the steps of the expansion; the last is that of the plane."""
+    expand: VectorToPlaneConfig
     encoding: int
     """Width of the output of the text encoder."""
     text_encoder: str
@@ -39,8 +37,8 @@ def encode_prompts(config: PromptConfig) -> Float[Tensor, "P E"]:
     encoded: Tensor = TextEncoder(config.text_encoder)(list(PROMPTS.values()))
     if encoded.shape[1] != config.encoding:
         raise InputError(
-            f"the text encoder {config.text_encoder!r} makes {encoded.shape[1]} numbers of a sentence, the "
-            f"recipe has {config.encoding}"
+            f"the text encoder {config.text_encoder!r} returns {encoded.shape[1]} numbers per sentence, but "
+            f"model.prompt.encoding is {config.encoding}"
         )
     return encoded.detach()
 
@@ -52,20 +50,20 @@ class TaskPrompt(nn.Module):
     model does not need it.
 
     Args:
+        config: sizes.
         encodings: g(p) of each prompt.
-        widths: channels of the steps of the expansion; the last is that of the plane.
         size_yx: size of the plane.
     """
 
     encodings: Tensor
 
     def __init__(
-        self, encodings: Float[Tensor, "P E"], widths: Sequence[int], size_yx: tuple[int, int]
+        self, config: PromptConfig, encodings: Float[Tensor, "P E"], size_yx: tuple[int, int]
     ) -> None:
         super().__init__()
         self.tasks = tuple(PROMPTS)
         self.register_buffer("encodings", encodings)
-        self.expand = VectorToPlane(encodings.shape[1], widths, size_yx)
+        self.expand = VectorToPlane(config.expand, vector=config.encoding, size_yx=size_yx)
 
     def forward(self, task: str, batch: int) -> Float[Tensor, "b C Y X"]:
         """Return the plane of one task."""

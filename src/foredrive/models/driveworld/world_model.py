@@ -18,14 +18,19 @@ from foredrive.models.driveworld.actions import actions_in, motion_of
 from foredrive.models.driveworld.gaussian import DiagonalGaussian
 from foredrive.models.driveworld.planes import (
     PlanesToVolume,
+    PlanesToVolumeConfig,
     PlaneToVector,
+    PlaneToVectorConfig,
     StaticScene,
+    StaticSceneConfig,
     VectorToPlane,
-    carried_plane,
+    VectorToPlaneConfig,
+    warp_plane,
 )
 from foredrive.models.driveworld.state_space import Latent, StateSpace, StateSpaceConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig, TaskPrompt, encode_prompts
 from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
+from foredrive.models.lifting import lift_frames
 from foredrive.models.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
 from foredrive.scene.record import Record
@@ -35,8 +40,8 @@ ENCODERS: Mapping[type, Callable[..., Encoder]] = {
     LiftSplatConfig: LiftSplatEncoder,
     PooledLiftingConfig: PooledLiftingEncoder,
 }
-"""Encoder class per config. Each takes the config, the grid, the channels D, the width of the plane and the
-number of image feature levels."""
+"""Encoder class per config. Each takes the config, the grid, the channels of image features and of the plane,
+and the number of image feature levels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,19 +53,19 @@ class DriveWorldConfig:
     states: StateSpaceConfig
     channels: int
     """D, channels of the volume and of the image features."""
-    plane: int
+    plane_channels: int
     """C, channels of the plane that images are lifted to."""
-    observation_hidden: int
-    """Channels of the convolutions from a plane to x_t."""
-    expanded: tuple[int, ...]
-    """Channels of the steps from a state to a plane (m_θ)."""
-    volume_hidden: int
-    """Channels of the volume before its last convolution (l_θ)."""
-    statics: int
-    """Channels of the latent statics; 0 disables Static Scene Propagation."""
+    to_vector: PlaneToVectorConfig
+    """From a plane to x_t."""
+    from_vector: VectorToPlaneConfig
+    """From a state to a plane (m_θ)."""
+    to_volume: PlanesToVolumeConfig
+    """From planes to the volume (l_θ)."""
+    statics: StaticSceneConfig | None
+    """Latent statics; None disables Static Scene Propagation."""
     prompt: PromptConfig | None
     """Task prompts; None disables them."""
-    carry_statics: bool = False
+    warp_statics: bool = False
     """Warp the latent statics by the ego motion: the driven path and, in imagination, the actions. The paper
     passes them on without warping."""
     occupied_prior: float = 0.02
@@ -69,8 +74,8 @@ class DriveWorldConfig:
 
 
 @dataclass(frozen=True)
-class Seen(Record):
-    """Encodings of the last T frames of a clip, before any processing in time."""
+class LiftedFrames(Record):
+    """The last T frames of a clip, lifted to planes, before any processing in time."""
 
     planes: Float[Tensor, "b T C Y X"]
     """One plane per frame, each in its own ego frame."""
@@ -119,26 +124,29 @@ class DriveWorld(nn.Module):
         self, config: DriveWorldConfig, spec: VoxelSpec, *, past_frames: int, dt_s: float, fetch: bool = True
     ) -> None:
         super().__init__()
-        channels, plane, states = config.channels, config.plane, config.states
+        channels, plane, states = config.channels, config.plane_channels, config.states
         height, size_yx = spec.shape_zyx[0], spec.shape_zyx[1:]
         self.spec, self.channels, self.past_frames, self.dt_s = spec, channels, past_frames, dt_s
-        self.carry_statics = config.carry_statics
+        self.warp_statics = config.warp_statics
         self.backbone = ImageBackbone(config.backbone, channels=channels, fetch=fetch)
         self.encoder = ENCODERS[type(config.encoder)](
-            config.encoder, spec, channels=channels, width=plane, levels=len(config.backbone.stages)
+            config.encoder, spec, channels=channels, plane_channels=plane, levels=len(config.backbone.stages)
         )
         self.states = StateSpace(states)
-        self.to_vector = PlaneToVector(plane, config.observation_hidden, states.observation)
-        self.from_vector = VectorToPlane(states.history + states.state, config.expanded, size_yx)
-        prompted = 0 if config.prompt is None else config.prompt.widths[-1]
-        planes = config.expanded[-1] + config.statics + prompted
-        self.to_volume = PlanesToVolume(planes, config.volume_hidden, channels, height)
-        self.statics = StaticScene(plane, config.statics) if config.statics else None
+        self.to_vector = PlaneToVector(config.to_vector, channels=plane, vector=states.observation)
+        self.from_vector = VectorToPlane(
+            config.from_vector, vector=states.history + states.state, size_yx=size_yx
+        )
+        planes = config.from_vector.widths[-1]
+        planes += 0 if config.statics is None else config.statics.channels
+        planes += 0 if config.prompt is None else config.prompt.expand.widths[-1]
+        self.to_volume = PlanesToVolume(config.to_volume, channels=planes, out=channels, height=height)
+        self.statics = None if config.statics is None else StaticScene(config.statics, channels=plane)
         self.prompt: TaskPrompt | None = None
         if config.prompt is not None:
             encodings = torch.zeros(len(PROMPTS), config.prompt.encoding)
             encodings = encode_prompts(config.prompt) if fetch else encodings
-            self.prompt = TaskPrompt(encodings, config.prompt.widths, size_yx)
+            self.prompt = TaskPrompt(config.prompt, encodings, size_yx)
         self.occupancy = nn.Linear(channels, 1)
         prior = config.occupied_prior
         nn.init.constant_(self.occupancy.bias, math.log(prior / (1 - prior)))
@@ -156,21 +164,17 @@ class DriveWorld(nn.Module):
 
     def encode(self, frames: Frames) -> Belief:
         """Do the work of `observe`. No step depends on the values of the data."""
-        return self.believe(self.see(frames))
+        return self.belief_about_now(self.lift_frames(frames))
 
-    def see(self, frames: Frames) -> Seen:
+    def lift_frames(self, frames: Frames) -> LiftedFrames:
         """Lift each of the last T frames to a plane."""
-        b, t, c = frames.image_valid.shape
-        levels = self.backbone(frames.images.flatten(0, 2))
-        features = [level.unflatten(0, (b * t, c)) for level in levels]
-        per_image = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-        planes = self.encoder(features, per_image, frames.image_valid.flatten(0, 1)).unflatten(0, (b, t))
-        return Seen(planes, actions_in(frames), frames.T_now_ego.float())
+        planes = lift_frames(frames, self.backbone, self.encoder)
+        return LiftedFrames(planes, actions_in(frames), frames.T_now_ego.float())
 
-    def believe(self, seen: Seen) -> Belief:
+    def belief_about_now(self, lifted: LiftedFrames) -> Belief:
         """Return the belief of `observe` from frames that are already lifted."""
-        latents, *_ = self._filter(seen, None)
-        return self._decoded(latents[-1], self._statics(seen.planes[:, -1]), "occupancy", None)
+        latents, *_ = self._filter(lifted, None)
+        return self._belief(latents[-1], self._statics(lifted.planes[:, -1]), "occupancy", None)
 
     def imagine(
         self,
@@ -189,22 +193,22 @@ class DriveWorld(nn.Module):
             InputError: the belief is not from this model, or there are too few actions.
         """
         if belief.state is None or belief.statics is None:
-            raise InputError("DriveWorld imagines from beliefs of its own")
+            raise InputError("DriveWorld imagines only from beliefs that it made itself")
         if steps < 1 or (actions is not None and actions.shape[1] < steps):
-            told = "its own" if actions is None else f"{actions.shape[1]} given"
-            raise InputError(f"DriveWorld imagines a step or more, {steps} of them with {told} actions")
-        latent, statics = self._unpacked(belief.state), belief.statics
+            given = "its own" if actions is None else f"{actions.shape[1]} given"
+            raise InputError(f"DriveWorld imagines one step or more; asked for {steps} with {given} actions")
+        latent, statics = self._unpack(belief.state), belief.statics
         T_now_ego = belief.T_now_ego
         if T_now_ego is None:
             T_now_ego = torch.eye(4, device=statics.device).expand(len(statics), 4, 4)
         futures = []
         for k in range(steps):
             action = self.states.action(latent) if actions is None else actions[:, k]
-            latent, prior = self._ahead(latent, action)
+            latent, prior = self._step(latent, action)
             state = prior.mean if generator is None else prior.sample(generator)
             latent = _with_state(latent, state)
             T_now_ego = compose_se3(T_now_ego, motion_of(action, self.dt_s))
-            futures.append(self._decoded(latent, statics, "forecast", T_now_ego))
+            futures.append(self._belief(latent, statics, "forecast", T_now_ego))
         return futures
 
     def decode(self, belief: Belief) -> Decoded:
@@ -213,9 +217,9 @@ class DriveWorld(nn.Module):
         # would make a step a tenth longer.
         heads = (self.occupancy, self.flow)
         weight = torch.cat([head.weight for head in heads])[:, :, None, None, None]
-        read = conv3d(belief.volume, weight, torch.cat([head.bias for head in heads])).float()
-        logit, flow = read[:, 0], read[:, 1:]
-        action = None if belief.state is None else self.states.action(self._unpacked(belief.state))
+        both = conv3d(belief.volume, weight, torch.cat([head.bias for head in heads])).float()
+        logit, flow = both[:, 0], both[:, 1:]
+        action = None if belief.state is None else self.states.action(self._unpack(belief.state))
         return Decoded(occupancy_logit=logit, feature=belief.volume, flow=flow, action=action)
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
@@ -223,13 +227,13 @@ class DriveWorld(nn.Module):
         if self.prompt is None:
             return belief.volume
         if belief.state is None or belief.statics is None:
-            raise InputError("DriveWorld prompts beliefs of its own")
-        statics = self._carried(belief.statics, belief.T_now_ego)
-        return self._volume(self._unpacked(belief.state), statics, task)
+            raise InputError("DriveWorld reads only beliefs that it made itself")
+        statics = self._warped_statics(belief.statics, belief.T_now_ego)
+        return self._volume(self._unpack(belief.state), statics, task)
 
     def unroll(
         self,
-        seen: Seen,
+        lifted: LiftedFrames,
         steps: int,
         generator: torch.Generator | None,
         statics_of: Literal["random", "now"] = "random",
@@ -240,26 +244,26 @@ class DriveWorld(nn.Module):
             generator: samples the states. Without it, states are means and the statics are those of now.
             statics_of: frame whose statics all frames are decoded with (§3.1: a random one, drawn per item).
         """
-        latents, posteriors, priors = self._filter(seen, generator)
+        latents, posteriors, priors = self._filter(lifted, generator)
         frames = len(latents)
-        batch = len(seen.planes)
-        shown = torch.full((batch,), frames - 1)
+        batch = len(lifted.planes)
+        source = torch.full((batch,), frames - 1)
         if generator is not None and statics_of == "random":
-            shown = torch.randint(frames, (batch,), generator=generator)
-        chosen = torch.arange(batch), shown
-        statics = self._statics(seen.planes[chosen])
-        T_shown_now = inverse_se3(seen.T_now_ego[chosen])
-        T_shown_ego = compose_se3(T_shown_now[:, None], seen.T_now_ego)
+            source = torch.randint(frames, (batch,), generator=generator)
+        chosen = torch.arange(batch), source
+        statics = self._statics(lifted.planes[chosen])
+        T_source_now = inverse_se3(lifted.T_now_ego[chosen])
+        T_source_ego = compose_se3(T_source_now[:, None], lifted.T_now_ego)
         beliefs = [
-            self._decoded(latent, statics, "occupancy", T_shown_ego[:, k]) for k, latent in enumerate(latents)
+            self._belief(latent, statics, "occupancy", T_source_ego[:, k]) for k, latent in enumerate(latents)
         ]
         policy = [self.states.action(each) for each in latents]
-        latent, T = latents[-1], T_shown_now
+        latent, T = latents[-1], T_source_now
         for _ in range(steps):
             T = compose_se3(T, motion_of(policy[-1], self.dt_s))
-            latent, prior = self._ahead(latent, policy[-1])
+            latent, prior = self._step(latent, policy[-1])
             latent = _with_state(latent, prior.mean if generator is None else prior.sample(generator))
-            beliefs.append(self._decoded(latent, statics, "forecast", T))
+            beliefs.append(self._belief(latent, statics, "forecast", T))
             policy.append(self.states.action(latent))
         return Unrolled(
             beliefs=tuple(beliefs),
@@ -269,30 +273,30 @@ class DriveWorld(nn.Module):
             velocities_mps=torch.stack([self.states.velocities_mps(each.state) for each in latents], dim=1),
         )
 
-    def without_time(self, seen: Seen) -> list[Belief]:
-        """Decode each observed frame from its own plane only, as in single-frame pre-training."""
-        nothing = self.states.begin(len(seen.planes), seen.planes.device)
+    def single_frame_beliefs(self, lifted: LiftedFrames) -> list[Belief]:
+        """Return a belief about each frame from its own plane only, as in single-frame pre-training."""
+        latent = self.states.initial(len(lifted.planes), lifted.planes.device)
         return [
-            self._decoded(nothing, self._statics(plane), "occupancy", None)
-            for plane in seen.planes.unbind(dim=1)
+            self._belief(latent, self._statics(plane), "occupancy", None)
+            for plane in lifted.planes.unbind(dim=1)
         ]
 
     def _filter(
-        self, seen: Seen, generator: torch.Generator | None
+        self, lifted: LiftedFrames, generator: torch.Generator | None
     ) -> tuple[list[Latent], list[DiagonalGaussian], list[DiagonalGaussian]]:
         """Return latents, posteriors and priors of the observed frames. The first prior is N(0, I).
 
         States are sampled with `generator`; without it, they are the means of the posteriors.
         """
-        b, frames = seen.planes.shape[:2]
-        vectors = self.to_vector(seen.planes.flatten(0, 1)).unflatten(0, (b, frames))
-        latent = self.states.begin(b, seen.planes.device)
-        prior, last = DiagonalGaussian.standard(latent.state), torch.zeros_like(seen.actions[:, 0])
+        b, frames = lifted.planes.shape[:2]
+        vectors = self.to_vector(lifted.planes.flatten(0, 1)).unflatten(0, (b, frames))
+        latent = self.states.initial(b, lifted.planes.device)
+        prior, last = DiagonalGaussian.standard(latent.state), torch.zeros_like(lifted.actions[:, 0])
         latents, posteriors, priors = [], [], []
         for t in range(frames):
             if t > 0:
-                latent, prior = self._ahead(latent, self.states.action(latent))
-                last = seen.actions[:, t - 1]
+                latent, prior = self._step(latent, self.states.action(latent))
+                last = lifted.actions[:, t - 1]
             posterior = self.states.posterior(latent, last, vectors[:, t])
             state = posterior.mean if generator is None else posterior.sample(generator)
             latent = _with_state(latent, state)
@@ -301,8 +305,8 @@ class DriveWorld(nn.Module):
             priors.append(prior)
         return latents, posteriors, priors
 
-    def _ahead(self, latent: Latent, action: Float[Tensor, "b 2"]) -> tuple[Latent, DiagonalGaussian]:
-        """Go one key frame ahead. Return the latent with its new history and the prior of its state."""
+    def _step(self, latent: Latent, action: Float[Tensor, "b 2"]) -> tuple[Latent, DiagonalGaussian]:
+        """Advance by one key frame. Return the latent with its new history and the prior of its state."""
         dt_s = torch.full_like(latent.history[:, 0], self.dt_s)
         latent = self.states.transition(latent, dt_s)
         return latent, self.states.prior(latent, action)
@@ -311,23 +315,23 @@ class DriveWorld(nn.Module):
         """Return the statics b̂ of a plane; no channels without Static Scene Propagation."""
         return plane[:, :0] if self.statics is None else self.statics(plane)
 
-    def _carried(
-        self, statics: Float[Tensor, "b _S Y X"], T_shown_ego: Float[Tensor, "b 4 4"] | None
+    def _warped_statics(
+        self, statics: Float[Tensor, "b _S Y X"], T_source_ego: Float[Tensor, "b 4 4"] | None
     ) -> Float[Tensor, "b _S Y X"]:
-        """Return the statics in the frame of another belief: warped if `carry_statics`, else unchanged."""
-        if not self.carry_statics or T_shown_ego is None:
+        """Return the statics in the frame of another belief: warped if `warp_statics`, else unchanged."""
+        if not self.warp_statics or T_source_ego is None:
             return statics
-        return carried_plane(statics, T_shown_ego, self.spec)
+        return warp_plane(statics, T_source_ego, self.spec)
 
-    def _decoded(
+    def _belief(
         self,
         latent: Latent,
         statics: Float[Tensor, "b _S Y X"],
         task: Task,
         T_now_ego: Float[Tensor, "b 4 4"] | None,
     ) -> Belief:
-        volume = self._volume(latent, self._carried(statics, T_now_ego), task)
-        return Belief(volume=volume, state=_packed(latent), statics=statics, T_now_ego=T_now_ego)
+        volume = self._volume(latent, self._warped_statics(statics, T_now_ego), task)
+        return Belief(volume=volume, state=_pack(latent), statics=statics, T_now_ego=T_now_ego)
 
     def _volume(
         self, latent: Latent, statics: Float[Tensor, "b _S Y X"], task: Task
@@ -340,18 +344,18 @@ class DriveWorld(nn.Module):
         volume: Tensor = self.to_volume(torch.cat(planes, dim=1))
         return volume
 
-    def _unpacked(self, state: Float[Tensor, "b _P"]) -> Latent:
-        """Undo `_packed`."""
+    def _unpack(self, state: Float[Tensor, "b _P"]) -> Latent:
+        """Undo `_pack`."""
         history, size, memory = self.states.sizes
         parts = state.split([history, size, memory * history, memory], dim=-1)
         return Latent(parts[0], parts[1], parts[2].unflatten(-1, (memory, history)), parts[3] > 0.5)
 
 
-def _packed(latent: Latent) -> Float[Tensor, "b _P"]:
+def _pack(latent: Latent) -> Float[Tensor, "b _P"]:
     """Pack a latent into one vector, for a `Belief`."""
-    parts = (latent.history, latent.state, latent.memory.flatten(1), latent.remembered.to(latent.state))
+    parts = (latent.history, latent.state, latent.memory.flatten(1), latent.memory_valid.to(latent.state))
     return torch.cat(parts, dim=-1)
 
 
 def _with_state(latent: Latent, state: Float[Tensor, "b S"]) -> Latent:
-    return Latent(latent.history, state, latent.memory, latent.remembered)
+    return Latent(latent.history, state, latent.memory, latent.memory_valid)

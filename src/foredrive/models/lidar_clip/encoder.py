@@ -1,6 +1,7 @@
 """An encoder of lidar sweeps into the embedding space of an image tower."""
 
 import math
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,9 +11,24 @@ from foredrive.models.attention_pool import AttentionPool
 from foredrive.models.lidar_clip.pillars import PillarEncoder, PillarGrid, PointCloud
 from foredrive.models.lidar_clip.windows import WindowAttention
 
-POINT_WIDTH = 64
-WAVES = 8
-"""Sines and cosines per coordinate. The longest period is twice the grid, the shortest a few cells."""
+
+@dataclass(frozen=True)
+class LidarEncoderConfig:
+    """Sizes of a `LidarEncoder`."""
+
+    width: int = 128
+    heads: int = 8
+    hidden: int = 256
+    """Width of the feed-forward layers."""
+    blocks: int = 4
+    window: int = 12
+    """Side of a window of attention, in pillars."""
+    point_width: int = 64
+    """Width of the features of points."""
+    waves: int = 8
+    """Sines and cosines per coordinate. The longest period is twice the grid, the shortest a few cells."""
+    grid: PillarGrid = field(default_factory=PillarGrid)
+    """Ground area that is read."""
 
 
 class LidarEncoder(nn.Module):
@@ -22,32 +38,23 @@ class LidarEncoder(nn.Module):
     any lidar.
 
     Args:
-        grid: the ground area that is read.
+        config: sizes.
         dim: D of the image tower.
-        width, heads, hidden, blocks: sizes of the attention.
-        window: side of a window, in pillars.
     """
 
     cell_waves: Tensor
 
-    def __init__(
-        self,
-        grid: PillarGrid,
-        *,
-        dim: int,
-        width: int = 128,
-        heads: int = 8,
-        hidden: int = 256,
-        blocks: int = 4,
-        window: int = 12,
-    ) -> None:
+    def __init__(self, config: LidarEncoderConfig, *, dim: int) -> None:
         super().__init__()
-        self.pillars = PillarEncoder(grid, (POINT_WIDTH, width))
-        cells = (torch.arange(grid.cells) + 0.5) / grid.cells
-        angle = cells[:, None] * math.pi * 2.0 ** (torch.arange(WAVES) * 0.5)
+        width, heads, cells = config.width, config.heads, config.grid.cells
+        self.pillars = PillarEncoder(config.grid, (config.point_width, width))
+        middle = (torch.arange(cells) + 0.5) / cells
+        angle = middle[:, None] * math.pi * 2.0 ** (torch.arange(config.waves) * 0.5)
         self.register_buffer("cell_waves", torch.cat([angle.sin(), angle.cos()], dim=-1), persistent=False)
-        self.place = nn.Linear(4 * WAVES, width)
-        self.attention = WindowAttention(blocks=blocks, width=width, heads=heads, hidden=hidden, side=window)
+        self.place = nn.Linear(4 * config.waves, width)
+        self.attention = WindowAttention(
+            blocks=config.blocks, width=width, heads=heads, hidden=config.hidden, side=config.window
+        )
         self.pool = AttentionPool(width, heads, dim)
 
     def forward(self, cloud: PointCloud, items: int) -> Float[Tensor, "n D"]:
@@ -64,6 +71,6 @@ def _padded(
     """Return the tokens grouped by item, padded, and a mask of the real ones."""
     count = torch.bincount(item, minlength=items)
     place = torch.arange(len(item), device=item.device) - (count.cumsum(0) - count)[item]
-    longest = int(count.max())
-    tokens = features.new_zeros(items, longest, features.shape[1]).index_put((item, place), features)
-    return tokens, torch.arange(longest, device=item.device) < count[:, None]
+    max_count = int(count.max())
+    tokens = features.new_zeros(items, max_count, features.shape[1]).index_put((item, place), features)
+    return tokens, torch.arange(max_count, device=item.device) < count[:, None]

@@ -36,7 +36,7 @@ class PointCloud(Record):
     """Index of the sweep of each point in the batch."""
 
     @classmethod
-    def of_sweeps(cls, sweeps: LidarSweep) -> "PointCloud":
+    def from_sweeps(cls, sweeps: LidarSweep) -> "PointCloud":
         """Gather the returns of sweeps [n N], without padding and non-finite points."""
         points = torch.cat([sweeps.points_ego, sweeps.intensity[..., None]], dim=-1)
         kept = sweeps.valid & sweeps.returned & points.isfinite().all(-1)
@@ -84,10 +84,10 @@ class PillarEncoder(nn.Module):
         pillar = (count > 0).cumsum(0)[flat] - 1
 
         mean = place.new_zeros(len(occupied), 3).index_add_(0, pillar, place) / count[occupied, None]
-        told = torch.cat(
+        inputs = torch.cat(
             [place[:, :2] - cell_xy - 0.5, place - mean[pillar], place[:, 2:] / upper[2]], dim=-1
         )
-        features = self.first(torch.cat([told, intensity, count[flat, None].log() / 4], dim=-1))
+        features = self.first(torch.cat([inputs, intensity, count[flat, None].log() / 4], dim=-1))
         features = self._second(features, pillar, len(occupied))
         cell = occupied % grid.cells**2
         cell_yx = torch.stack([cell // grid.cells, cell % grid.cells], dim=-1)

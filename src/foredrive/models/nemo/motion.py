@@ -15,7 +15,9 @@ class MotionConfig:
     """Sizes of a `MotionFlow`."""
 
     hidden: int
-    """Channels of the ConvNets."""
+    """Channels of the ConvNets. Those of the SE(3) head double at each of its two steps."""
+    pool_yx: tuple[int, int] = (4, 4)
+    """Size of the plane that the SE(3) head flattens. It keeps coarse positions, which rotation needs."""
     xi_scale: float = 0.1
     """Factor from outputs of the rigid head to metres and radians. It keeps early warps small."""
 
@@ -63,9 +65,9 @@ class MotionFlow(nn.Module):
             nn.ReLU(),
             nn.Conv3d(hidden, 2 * hidden, 3, padding=1, stride=2),
             nn.ReLU(),
-            nn.AdaptiveAvgPool3d((1, 4, 4)),  # keeps coarse positions, which rotation needs
+            nn.AdaptiveAvgPool3d((1, *config.pool_yx)),
             nn.Flatten(),
-            nn.Linear(2 * hidden * 16, 4 * hidden),
+            nn.Linear(2 * hidden * config.pool_yx[0] * config.pool_yx[1], 4 * hidden),
             nn.ReLU(),
             to_xi,
         )

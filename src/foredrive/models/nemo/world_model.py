@@ -15,7 +15,7 @@ from foredrive.geometry.se3 import compose_se3, inverse_se3, rotate_vectors
 from foredrive.models.averaging import AveragingConfig, AveragingEncoder
 from foredrive.models.backbone import BackboneConfig, ImageBackbone
 from foredrive.models.bev import BevConfig, BevEncoder
-from foredrive.models.lifting import LiftingConfig, LiftingEncoder
+from foredrive.models.lifting import LiftingConfig, LiftingEncoder, lift_frames
 from foredrive.models.nemo.motion import MotionConfig, MotionFlow
 from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
 from foredrive.ops.volume import compose_flows, warp_volume
@@ -97,11 +97,7 @@ class Nemo(nn.Module):
 
     def encode(self, frames: Frames) -> Belief:
         """Do the work of `observe`. No step depends on the values of the data."""
-        b, t, c = frames.image_valid.shape
-        levels = self.backbone(frames.images.flatten(0, 2))
-        features = [level.unflatten(0, (b * t, c)) for level in levels]
-        per_image = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
-        volumes = self.encoder(features, per_image, frames.image_valid.flatten(0, 1)).unflatten(0, (b, t))
+        volumes = lift_frames(frames, self.backbone, self.encoder)
         return Belief(volume=volumes[:, -1], history=volumes)
 
     def imagine(
@@ -121,9 +117,9 @@ class Nemo(nn.Module):
             InputError: the belief is an imagined one, actions are given, or `steps` is out of range.
         """
         if belief.history is None:
-            raise InputError("NeMo imagines from what `observe` returned, not from an imagined belief")
+            raise InputError("NeMo imagines only from an observed belief, not from an imagined one")
         if actions is not None:
-            raise InputError("NeMo predicts the ego motion by itself and takes no actions")
+            raise InputError("NeMo predicts the ego motion itself and takes no actions")
         if not 0 < steps <= self.max_steps:
             raise InputError(f"this NeMo imagines 1 to {self.max_steps} steps, not {steps}")
         motion = self.motion(belief.history)

@@ -127,4 +127,4 @@ def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
     planner, clips = run.recipe.planner, run.recipe.clips
     past_frames = clips.past_frames if planner.ego_mlp is None else planner.history
-    return fit_baselines(run.logs, clips, run.cache_dir, past_frames, planner.target)[1]
+    return fit_baselines(run.logs, run.recipe, run.cache_dir, past_frames)[1]

@@ -2,39 +2,39 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import make_driver
-from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.agents import make_driver, needs_of
+from foredrive.runs.drive.route_source import RouteSource
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.vehicle import VehicleSensors, camera_rig, roof_lidar
 from foredrive.simulation.carla.client import connect
 from foredrive.simulation.carla.simulator import CarlaSimulator
-from foredrive.simulation.drive_log import carla_key_frame, drive_log
+from foredrive.simulation.drive_log import drive_log, log_frame
+from foredrive.simulation.route_scenario import RouteScenario
+from foredrive.simulation.scores import timeout_s
 
 PORT = 2000
 
 
 @dataclass(frozen=True)
-class CarlaRoutes:
+class CarlaRoutes(RouteSource):
     """A `Source` of routes that are driven on a CARLA server, without scenarios."""
 
-    server: str
+    server: str = dataclasses.field(kw_only=True)
     """Address: HOST or HOST:PORT."""
-    towns: TownRoutes
+
     in_turn = True
+    grows = ("repetitions", "carla")
+    """The server's address may change later."""
 
     def __post_init__(self) -> None:
-        if self.towns.scenarios:
-            raise InputError("CARLA plays no scenarios of ours: leave them out (--no-scenarios)")
+        super().__post_init__()
         self.address()
-
-    @property
-    def grows(self) -> tuple[str, ...]:
-        """Return the fields that towns allow to grow, and the server, whose address may change later."""
-        return (*self.towns.grows, "carla")
 
     def address(self) -> tuple[str, int]:
         """Return host and port of the server."""
@@ -45,20 +45,28 @@ class CarlaRoutes:
 
     def noted(self) -> Mapping[str, object]:
         """Return the fields of the routes and the server."""
-        return {**dataclasses.asdict(self.towns), "carla": self.server}
-
-    def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """Return one drive for each route and repetition."""
-        return self.towns.jobs(driver)
+        fields = dict(super().noted())
+        return {**fields, "scenarios": False, "carla": fields.pop("server")}
 
     @contextlib.contextmanager
     def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
         """Set up a drive on the server; restore the server's state afterwards."""
-        route = self.towns.route_of(job)
-        scenario = self.towns.scenario_of(route, job.repetition, suite)
+        route, needs = self.route_of(job), needs_of(suite.driver)
+        seed = self.seed + job.repetition
+        rig = camera_rig(self.image_hw) if needs.lidar or suite.sensors else None
+        scenario = RouteScenario(
+            town=route.town,
+            route_xyz=route.xyz,
+            seed=seed,
+            background_traffic=BackgroundTraffic(self.vehicles, self.people),
+            conditions=self.conditions_of(route.id, seed),
+            sensors=None if rig is None else VehicleSensors(rig, roof_lidar()),
+            past_frames=needs.past_frames,
+            limit_s=timeout_s(route.length_m),
+        )
         with CarlaSimulator(connect(*self.address())) as simulator:
             agent = make_driver(suite.driver, lambda: simulator.state.t_s)
-            with drive_log(scenario, out, job.name) as log:
+            with drive_log(out, job.name, route.xyz, rig, route.town) as log:
                 yield Stage(
                     simulator,
                     scenario,
@@ -66,6 +74,6 @@ class CarlaRoutes:
                     route.xyz,
                     route.length_m,
                     log,
-                    lambda: carla_key_frame(simulator, scenario),
+                    lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                     route.town,
                 )

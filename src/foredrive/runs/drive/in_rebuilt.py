@@ -23,7 +23,7 @@ from foredrive.runs.rebuild.rebuilt_run import (
 )
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.drive import Drive
-from foredrive.simulation.drive_log import rebuilt_drive_log, rebuilt_key_frame
+from foredrive.simulation.drive_log import drive_log, log_frame
 from foredrive.simulation.drive_record import ThreatMet
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
@@ -89,7 +89,8 @@ class RebuiltRoutes:
         sensors = suite.sensors or (suite.driver != REPLAY and needs_of(suite.driver).lidar)
         agent = _driver(suite.driver, simulator)
         route_xyz = drive.route_from(start_s)
-        with rebuilt_drive_log(renderer.rig if sensors else None, route_xyz, out, job.name) as log:
+        rig = renderer.rig if sensors else None
+        with drive_log(out, job.name, route_xyz, rig) as log:
             yield Stage(
                 simulator,
                 RebuiltScenario(start_s, sensors, past_frames),
@@ -97,7 +98,7 @@ class RebuiltRoutes:
                 route_xyz,
                 RouteLine(route_xyz).length_m,
                 log,
-                lambda: rebuilt_key_frame(simulator),
+                lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes is not None,
                 judge=lambda driven: (
                     None

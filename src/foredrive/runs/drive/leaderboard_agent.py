@@ -12,10 +12,10 @@ from typing import Any
 
 from foredrive.files import atomic_path
 from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.route_source import RouteSource
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.leaderboard import LeaderboardDriver
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 SEPARATOR = "+"
 """The separator that Bench2Drive puts between the configuration and the route name. It adds both again with
@@ -56,7 +56,7 @@ class ForedriveAgent(_AutonomousAgent):
         driver, self._route_name = driver_of(path_to_conf_file)
         needs, self._t_s = needs_of(driver), 0.0
         agent = make_driver(driver, lambda: self._t_s)
-        rig = camera_rig(TownRoutes.image_hw) if needs.cameras else None
+        rig = camera_rig(RouteSource.image_hw) if needs.cameras else None
         self._driver = LeaderboardDriver(agent, rig, roof_lidar() if needs.lidar else None, needs.past_frames)
         self._make_control = import_carla().VehicleControl
         self._has_route = False

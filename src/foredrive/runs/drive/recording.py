@@ -17,11 +17,11 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.fan_out import fan_out, reason
+from foredrive.scene.conditions import BackgroundTraffic, find_conditions
+from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.campaign import DrivePlan
-from foredrive.towns.conditions import find_conditions
-from foredrive.towns.recorder import Crowd, record, split_of
+from foredrive.towns.recorder import record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.sensing.rig import camera_rig, roof_lidar
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: 
         out,
         plan.rate_hz,
         SensorSuite(camera_rig(image_hw), roof_lidar()),
-        Crowd(plan.vehicles, plan.people),
+        BackgroundTraffic(plan.vehicles, plan.people),
         conditions=None if plan.conditions is None else find_conditions(plan.conditions),
         log_name=plan.log_name,
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance
+from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 from foredrive.runs.folder import SUITE
 from foredrive.simulation.drive_record import DriveRecord

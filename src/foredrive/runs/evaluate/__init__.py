@@ -1,1 +1,1 @@
-"""Evaluate a run on logs, and inspect its predictions."""
+"""Evaluate a run on logs, and predict single examples for pictures."""

@@ -19,7 +19,7 @@ SEED = 0
 
 
 @dataclass(frozen=True)
-class Moment:
+class ImaginedFutures:
     """One time of a log, unbatched, with F key frames, now first."""
 
     example: Example
@@ -33,7 +33,7 @@ class Moment:
 @torch.no_grad()
 def imagine_run(
     run: Run, log: LogPath, *, seconds: float, samples: int, moments: int, ray_stride: int = 1
-) -> Iterator[Moment]:
+) -> Iterator[ImaginedFutures]:
     """Imagine futures from times spread evenly over a log.
 
     Args:
@@ -67,7 +67,7 @@ def imagine_run(
         drawn = [[now, *world.imagine(now, steps, generator=generator)] for _ in range(futures)]
         renderer = world.renderer
         rendered = None if renderer is None else _views(world, renderer, drawn[0], observed, ray_stride)
-        yield Moment(item, torch.stack([_occupied(world, beliefs) for beliefs in drawn]), rendered)
+        yield ImaginedFutures(item, torch.stack([_occupied(world, beliefs) for beliefs in drawn]), rendered)
 
 
 def _occupied(world: WorldModel, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X"]:

@@ -12,17 +12,13 @@ from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
-from foredrive.evaluation import (
-    Figures,
-    Part,
-    Prediction,
-    Predictor,
-    collect_provenance,
-    evaluate,
-    write_summary,
-)
+from foredrive.evaluation.metric import Figures
 from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, PERSISTENCE
-from foredrive.metrics import psnr_db
+from foredrive.evaluation.predictor import Part, Prediction, Predictor
+from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.summary import write_summary
+from foredrive.metrics.images import psnr_db
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.views import CameraView
@@ -76,7 +72,7 @@ def measure_gap(
     if not moments:
         raise InputError(f"{rebuilt}: no clip of the run's length lies at a moment that was held out")
     predictor = AgentPredictor(load_agent(run), clips.future_frames, 0)
-    seen = Comparison(predictor, clips.image_hw)
+    seen = RealToSimComparison(predictor, clips.image_hw)
     for done, index in enumerate(moments):
         real = dataset[index]
         now_s = (dataset.now_us(index) - int(t_us[0])) * 1e-6
@@ -126,13 +122,13 @@ def _own_names(log: Log, names: Sequence[str]) -> list[str]:
     return [name if camera is None else camera.camera_name for name, camera in zip(names, found, strict=True)]
 
 
-class Comparison:
+class RealToSimComparison:
     """Collects a model's predictions on real and on rendered images of the same times."""
 
     def __init__(self, predictor: Predictor, image_hw: tuple[int, int]) -> None:
         self._predictor, self._image_hw = predictor, image_hw
         self._examples: list[Example] = []
-        self._said: dict[str, list[Prediction]] = {REAL: [], RENDERED: []}
+        self._predictions: dict[str, list[Prediction]] = {REAL: [], RENDERED: []}
         self._psnr_db: list[Tensor] = []
 
     def add(self, example: Example, rendered: Clip) -> None:
@@ -141,8 +137,10 @@ class Comparison:
         for name, clip in ((REAL, example.clip), (RENDERED, rendered)):
             small = dataclasses.replace(example, clip=shrink_images(clip, self._image_hw))
             observed = collate([small]).clip.observed()
-            said = self._predictor.predict(observed, ASKED)
-            self._said[name].append(Prediction(occupancy_logit=said.occupancy_logit, plan=said.plan))
+            prediction = self._predictor.predict(observed, ASKED)
+            self._predictions[name].append(
+                Prediction(occupancy_logit=prediction.occupancy_logit, plan=prediction.plan)
+            )
         shown, real = (clip.images[now].float() / 255 for clip in (rendered, example.clip))
         known = example.clip.image_valid[now][:, None, None].expand(-1, *example.clip.rig.size_hw)
         self._psnr_db.append(psnr_db(shown, real, known))
@@ -150,14 +148,14 @@ class Comparison:
 
     def figures(self, frame_dt_s: float) -> Figures:
         """Return the metrics of all comparisons, with the name of the comparison as prefix."""
-        agreed = list(map(_as_truth, self._examples, self._said[REAL]))
+        agreed = list(map(_as_truth, self._examples, self._predictions[REAL]))
         out: Figures = {"psnr_db": float(torch.cat(self._psnr_db).nanmean())}
-        for name, said, truth in (
-            (REAL, self._said[REAL], self._examples),
-            (RENDERED, self._said[RENDERED], self._examples),
-            (AGREEMENT, self._said[RENDERED], agreed),
+        for name, prediction, truth in (
+            (REAL, self._predictions[REAL], self._examples),
+            (RENDERED, self._predictions[RENDERED], self._examples),
+            (AGREEMENT, self._predictions[RENDERED], agreed),
         ):
-            found = evaluate(_Said(iter(said)), truth, frame_dt_s=frame_dt_s).summary
+            found = evaluate(_StoredPredictions(iter(prediction)), truth, frame_dt_s=frame_dt_s).summary
             kinds = (".iou_", ".l2_") if name == AGREEMENT else (".iou_", ".l2_", ".collision_")
             kept = {key: value for key, value in found.items() if any(kind in key for kind in kinds)}
             persistence = (PERSISTENCE, EGO_COMPENSATED)
@@ -165,7 +163,7 @@ class Comparison:
         return out
 
 
-class _Said:
+class _StoredPredictions:
     """A predictor that returns given predictions in order."""
 
     def __init__(self, predictions: Iterator[Prediction]) -> None:
@@ -176,18 +174,18 @@ class _Said:
         return next(self._predictions)
 
 
-def _as_truth(example: Example, said: Prediction) -> Example:
+def _as_truth(example: Example, prediction: Prediction) -> Example:
     """Return an example whose labels are replaced by a prediction."""
-    assert said.occupancy_logit is not None
-    assert said.plan is not None
+    assert prediction.occupancy_logit is not None
+    assert prediction.plan is not None
     values, known = example.occupancy.values.clone(), example.occupancy.known.clone()
     now = example.clip.now
-    span = slice(now, now + said.occupancy_logit.shape[1])
-    values[:, span, 0] = (said.occupancy_logit > 0).to(values)
+    span = slice(now, now + prediction.occupancy_logit.shape[1])
+    values[:, span, 0] = (prediction.occupancy_logit > 0).to(values)
     known[:, span] = True
     return dataclasses.replace(
         example,
-        clip=dataclasses.replace(example.clip, future=said.plan),
+        clip=dataclasses.replace(example.clip, future=prediction.plan),
         occupancy=VoxelGrid(example.occupancy.spec, values, known),
     )
 

@@ -6,20 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.progress import Progress
 from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.evaluation import (
-    ConstantVelocity,
-    EvaluationResult,
-    StandStill,
-    collect_provenance,
-    evaluate,
-    write_summary,
-)
+from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.run import EvaluationResult, evaluate
+from foredrive.evaluation.summary import write_summary
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
@@ -35,14 +31,14 @@ FUTURES = 5
 
 
 @dataclass(frozen=True)
-class Inspection:
+class ExamplePrediction:
     """One unbatched example and the model's predictions, for pictures."""
 
     example: Example
-    occupancy_prob: Float[Tensor, "F Z Y X"]
-    """Occupancy probability at F key frames: now first, then the imagined ones."""
+    occupied: Bool[Tensor, "F Z Y X"]
+    """Voxels predicted occupied at now and at the F - 1 key frames after it, each in its own ego frame."""
     rendered: Float[Tensor, "C 3 h w"] | None
-    """The rendered views at now, RGB 0 to 1; None from a world model that does not render."""
+    """The rendered views at now, RGB 0 to 1, of any size; None from a world model that does not render."""
     volume: Float[Tensor, "D Z Y X"]
     plan: Trajectory
     """The plan; batch shape [1 T]."""
@@ -101,9 +97,7 @@ def evaluate_run(
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)
-    prior, ego_mlp = fit_baselines(
-        run.logs, clips, run.cache_dir, clips.past_frames, run.recipe.planner.target
-    )
+    prior, ego_mlp = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)
@@ -129,7 +123,7 @@ def evaluate_run(
 
 
 @torch.no_grad()
-def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspection]:
+def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[ExamplePrediction]:
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
     agent = load_agent(run)
     clips = run.recipe.clips
@@ -147,9 +141,9 @@ def inspect_run(run: Run, logs: Sequence[LogPath], count: int) -> list[Inspectio
         assert prediction.occupancy_logit is not None
         assert prediction.plan is not None
         found.append(
-            Inspection(
+            ExamplePrediction(
                 example=item,
-                occupancy_prob=prediction.occupancy_logit[0].sigmoid(),
+                occupied=prediction.occupancy_logit[0] > 0,
                 rendered=None if prediction.images is None else prediction.images[0, 0],
                 volume=agent.world_model.observe(observed).volume[0],
                 plan=prediction.plan[0],

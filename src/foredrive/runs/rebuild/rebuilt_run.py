@@ -10,8 +10,7 @@ from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.recipes.config import load_values
-from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
 from foredrive.rendering.edits import Edit, EditedScene, apply_edits
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
@@ -40,7 +39,7 @@ def open_rebuilt(folder: Path) -> OpenedReconstruction:
     """
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
-    recipe = load_values(RebuildRecipe, folder / CONFIG)
+    recipe = load_rebuild_recipe(folder / CONFIG)
     if not (folder / WEIGHTS).is_file():
         raise InputError(f"{folder}: not finished; go on with `foredrive reconstruct`")
     if not (folder / VEHICLE).is_file():
@@ -97,7 +96,7 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
         raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
     if not path.folder.is_dir():
         raise InputError(f"{folder}: the log it was made of is gone: {path.folder}")
-    return load_values(RebuildRecipe, folder / CONFIG), path
+    return load_rebuild_recipe(folder / CONFIG), path
 
 
 def camera_indices(there: Sequence[str], wanted: Sequence[str]) -> list[int]:

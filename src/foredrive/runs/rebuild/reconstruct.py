@@ -15,11 +15,12 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.evaluation import collect_provenance, peak_rss_gib, read_summary, write_summary
-from foredrive.evaluation.rendering import judge_cameras, judge_sweeps
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
+from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.evaluation.summary import read_summary, write_summary
 from foredrive.files import atomic_path
-from foredrive.recipes.config import load_values, save_recipe
-from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.recipes.config import save_recipe
+from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
 from foredrive.rendering.initial import initial_scene
 from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
@@ -197,7 +198,7 @@ def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
     if needed_gib > free_gib:
         raise InputError(
             f"{recipe.name} needs about {needed_gib:.1f} GiB for {cameras} cameras of {pixels * 1e-6:.1f} MP "
-            f"and {len(log)} frames with {recipe.schedule.most_gaussians} Gaussians; "
+            f"and {len(log)} frames with {recipe.schedule.max_gaussians} Gaussians; "
             f"{free_gib:.1f} GiB are free"
         )
 
@@ -206,7 +207,7 @@ def memory_needed_gib(recipe: RebuildRecipe, *, frames: int, cameras: int) -> fl
     """Estimate the memory of a reconstruction, GiB."""
     pixels = recipe.image_hw[0] * recipe.image_hw[1]
     of_one = 3 + 4 + 3 + 1 + 3 + recipe.initial.features
-    learning = 4 * (recipe.schedule.most_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
+    learning = 4 * (recipe.schedule.max_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
     kept = frames * (cameras * pixels * 3 + _BEAMS_A_SWEEP * _OF_A_BEAM)
     return (learning + kept) / 1024**3
 
@@ -258,8 +259,8 @@ def _summary(
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
         "peak_memory_gib": peak_rss_gib(),
-        **judge_cameras(scene, held.cameras, data.train.cameras),
-        **judge_sweeps(scene, held.sweeps, drop=recipe.drop),
+        **evaluate_cameras(scene, held.cameras, data.train.cameras),
+        **evaluate_sweeps(scene, held.sweeps, drop=recipe.drop),
         **collect_provenance(),
     }
 
@@ -270,7 +271,7 @@ def _folder_of(recipe: RebuildRecipe, path: LogPath, folder: Path) -> RunFolder:
     def read() -> dict[str, object] | None:
         if not (folder / CONFIG).is_file():
             return None
-        there = load_values(RebuildRecipe, folder / CONFIG)
+        there = load_rebuild_recipe(folder / CONFIG)
         try:
             return {other_recipe: there, other_log: json.loads((folder / LOG).read_text())["folder"]}
         except (OSError, ValueError, LookupError, TypeError) as error:

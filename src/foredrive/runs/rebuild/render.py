@@ -77,10 +77,10 @@ def plan_frames(
         if lidar not in LIDARS:
             raise InputError(f"no lidar {lidar!r}; there are: {', '.join(LIDARS)}")
         if vehicle.T_ego_lidar is None:
-            raise InputError("the log had no lidar, so that nothing was learned of what one sees")
+            raise InputError("the log had no lidar, so this scene has no learned lidar")
         beams = LIDARS[lidar](vehicle.T_ego_lidar)
     if not chosen and beams is None:
-        raise InputError("neither cameras nor a lidar to film; name a lidar with --lidar")
+        raise InputError("neither cameras nor a lidar to render; name a lidar with --lidar")
     vehicle.check_time(start_s)
     last_s = float(vehicle.t_s[-1])
     end_s = last_s if seconds is None else start_s + seconds

@@ -6,19 +6,12 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from foredrive.evaluation import collect_provenance, peak_rss_gib, write_summary
-from foredrive.evaluation.detections import (
-    DetectionSet,
-    FrameScore,
-    ScoreSummary,
-    compare_scores,
-    read_detections,
-    score_frames,
-    summarise_scores,
-    write_frame_scores,
-)
-from foredrive.evaluation.detections.frames import Family
-from foredrive.evaluation.detections.summary import Summary
+from foredrive.evaluation.detections.files import read_detections, write_frame_scores
+from foredrive.evaluation.detections.frames import DetectionSet, Family
+from foredrive.evaluation.detections.score import FrameScore, score_frames
+from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
+from foredrive.evaluation.summary import Figures, write_summary
 
 SUMMARY, FRAMES = "summary.json", "frames.jsonl"
 
@@ -40,7 +33,7 @@ def score_detections(
     against: Path | None = None,
     family: Family = "gaussian",
     k: int = 25,
-) -> tuple[ScoredDetections, Summary]:
+) -> tuple[ScoredDetections, Figures]:
     """Score detections; write `out/summary.json` and `out/frames.jsonl`.
 
     Args:
@@ -71,11 +64,11 @@ def _score(results: Path, truth: Path, family: Family, k: int) -> ScoredDetectio
     detections = read_detections(results, truth, family)
     with Progress(transient=True) as progress:
         task = progress.add_task(results.name, total=len(detections.frames))
-        frames = score_frames(detections, k=k, told=lambda done: progress.update(task, completed=done))
+        frames = score_frames(detections, k=k, on_frame=lambda done: progress.update(task, completed=done))
     return ScoredDetections(detections, frames, summarise_scores(detections, frames))
 
 
-def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Summary:
+def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Figures:
     """Return the other file's figures, and the difference to them."""
     difference, uncompared = compare_scores(scored.frames, other.frames)
     return {f"against.{key}": value for key, value in other.summary.figures.items()} | {

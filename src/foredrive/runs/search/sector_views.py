@@ -123,7 +123,7 @@ def _write_views(log: Log, stride_s: float, side_px: int, folder: Path) -> None:
 def _points(view: View) -> Float[Tensor, "P 4"]:
     if view.sweep is None:
         return torch.zeros(0, 4)
-    return PointCloud.of_sweeps(stack_records([view.sweep])).points
+    return PointCloud.from_sweeps(stack_records([view.sweep])).points
 
 
 def _row_of(log: str, frame: int, view: str, facts: Sequence[Any]) -> Row:

@@ -86,7 +86,7 @@ class CaptionedViews(Dataset[CaptionedImages]):
         true = [rows[index].facts.facts for index in self._known]
         vocabulary = {fact: n for n, fact in enumerate(sorted(set[str]().union(*true)))}
         self._holds = torch.stack([_several_hot(facts, vocabulary) for facts in true])
-        self._said = torch.stack(
+        self._stated = torch.stack(
             [
                 torch.stack([_several_hot(phrase.facts, vocabulary) for phrase in told[index]])
                 for index in self._known
@@ -101,7 +101,7 @@ class CaptionedViews(Dataset[CaptionedImages]):
         return CaptionedImages(
             images=log.image(row),
             texts=self._texts[self._text_of[self._known[index]]],
-            said=self._said[index],
+            stated=self._stated[index],
             holds=self._holds[index],
             key=(log.rows[row].name,),
         )

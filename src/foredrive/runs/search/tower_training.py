@@ -3,16 +3,19 @@
 import functools
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import TypeAdapter
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.text_encoder import IN_A_PACKAGE
+from foredrive.models.image_tower import ImageTower, ImageTowerConfig
+from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
+from foredrive.models.text_encoder import PACKAGED_MODEL
 from foredrive.runs.folder import RECIPE, RunFolder
 from foredrive.runs.search.sector_views import LogViews, gather_views
 from foredrive.runs.search.tower_data import (
@@ -24,20 +27,10 @@ from foredrive.runs.search.tower_data import (
     text_targets,
 )
 from foredrive.runs.search.towers import find_towers
-from foredrive.search.embedded import (
-    ImageSize,
-    LidarSize,
-    LidarTowers,
-    SentenceTowers,
-    TowerCard,
-    build_image_tower,
-    build_lidar_tower,
-    load_towers,
-    save_towers,
-)
+from foredrive.search.embedded import LidarTowers, SentenceTowers, TowerCard, load_towers, save_towers
 from foredrive.search.towers import Towers
 from foredrive.training import Schedule, train
-from foredrive.training.alignment import ContrastObjective, DistilObjective
+from foredrive.training.alignment import ContrastConfig, ContrastObjective, DistillationObjective
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -52,16 +45,18 @@ class TowerRecipe:
 
     contrast: Schedule
     distil: Schedule
-    image: ImageSize
-    lidar: LidarSize
+    image: ImageTowerConfig
+    lidar: LidarEncoderConfig
     stride_s: float = 0.2
     """Time between the moments of a log that are used, s."""
     texts: int = 16
     """Number of true texts of each view; a training step uses one of them."""
     loss: Literal["mse", "cosine"] = "mse"
     """Loss of the lidar tower."""
-    text: str = IN_A_PACKAGE
+    text: str = PACKAGED_MODEL
     """Name of the sentence encoder, as for `TextEncoder`."""
+    alignment: ContrastConfig = field(default_factory=ContrastConfig)
+    """Temperatures and cropping of the image tower's training."""
 
 
 def embedded_recipe(
@@ -78,8 +73,8 @@ def embedded_recipe(
     return TowerRecipe(
         contrast=_with_steps(contrast, image_steps),
         distil=_with_steps(distil, lidar_steps),
-        image=ImageSize(widths=(32, 64, 128, 256), depths=(2, 2, 2, 2), heads=8, side_px=128),
-        lidar=LidarSize(),
+        image=ImageTowerConfig(widths=(32, 64, 128, 256), depths=(2, 2, 2, 2), heads=8, side_px=128),
+        lidar=LidarEncoderConfig(),
         loss=loss,
     )
 
@@ -133,8 +128,9 @@ def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabri
         embed = functools.partial(text_targets, model=recipe.text, folder=stage)
         dataset = CaptionedViews(views, embed, recipe.texts)
         torch.manual_seed(recipe.contrast.seed)
-        tower = build_image_tower(recipe.image, len(dataset.text_mean))
-        train(ContrastObjective(tower), dataset, collate_captioned, recipe.contrast, stage, fabric)
+        tower = ImageTower(recipe.image, dim=len(dataset.text_mean))
+        objective = ContrastObjective(tower, recipe.alignment)
+        train(objective, dataset, collate_captioned, recipe.contrast, stage, fabric)
         card = TowerCard(
             dim=len(dataset.text_mean),
             text=recipe.text,
@@ -159,8 +155,8 @@ def _train_lidar(
     if not final.is_dir():
         dataset = ImagedViews(views, image_targets(views, base, folder / LIDAR_STAGE))
         torch.manual_seed(recipe.distil.seed)
-        encoder = build_lidar_tower(recipe.lidar, base.dim)
-        objective = DistilObjective(encoder, recipe.loss)
+        encoder = LidarEncoder(recipe.lidar, dim=base.dim)
+        objective = DistillationObjective(encoder, recipe.loss)
         train(objective, dataset, collate_imaged, recipe.distil, folder / LIDAR_STAGE, fabric)
         sentences = base if isinstance(base, SentenceTowers) else None
         card = TowerCard(
@@ -184,22 +180,22 @@ def _told(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
 
 def _folder_of(folder: Path, recipe: TowerRecipe, logs: Sequence[LogPath], beside: str | None) -> RunFolder:
     file = folder / RECIPE
-    asked = {"recipe": asdict(recipe), "logs": [str(log.folder) for log in logs], "beside": beside}
-    noted: dict[str, object] = json.loads(json.dumps(asked))
+    wanted = {"recipe": recipe, "logs": [str(log.folder) for log in logs], "beside": beside}
 
     def named(values: dict[str, object]) -> dict[str, object]:
-        return {f"a run with another {what}": values.get(what) for what in noted}
+        return {f"a run with another {what}": values.get(what) for what in wanted}
 
     def read() -> dict[str, object] | None:
         if not file.is_file():
             return None
         try:
-            return named(json.loads(file.read_text()))
-        except (OSError, ValueError, AttributeError) as error:
+            found = json.loads(file.read_text())
+            return named({**found, "recipe": TypeAdapter(TowerRecipe).validate_python(found["recipe"])})
+        except (OSError, ValueError, LookupError, TypeError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from error
 
     def write() -> None:
         with atomic_path(file) as temporary:
-            temporary.write_text(json.dumps(noted, indent=1))
+            temporary.write_text(json.dumps({**wanted, "recipe": asdict(recipe)}, indent=1))
 
-    return RunFolder(folder, named(noted), read, write)
+    return RunFolder(folder, named(wanted), read, write)

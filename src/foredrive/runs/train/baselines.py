@@ -4,45 +4,48 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from torch.utils.data import DataLoader
 
-from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
-from foredrive.evaluation import labels_from_now
-from foredrive.metrics import OccupancyPrior
-from foredrive.models.ego_mlp import EgoMLP
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.evaluation.metric import labels_from_now
+from foredrive.metrics.occupancy import OccupancyPrior
+from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
+from foredrive.recipes.config import Recipe
 from foredrive.scene import Clip, Example
-from foredrive.training import DrivenStatus, fit_ego_mlp, read_status
+from foredrive.training import StatusDemonstrations, fit_ego_mlp, read_status
 
 
 @lru_cache(maxsize=1)  # training, evaluation and the next arm of a study use the same baselines
 def fit_baselines(
-    logs: tuple[LogPath, ...], clips: ClipConfig, cache_dir: Path, past_frames: int, target: bool = False
+    logs: tuple[LogPath, ...], recipe: Recipe[Any, Any], cache_dir: Path, past_frames: int
 ) -> tuple[OccupancyPrior, EgoMLP]:
     """Return the occupancy prior of the labels and an ego MLP; reads all clips, without images.
 
-    The MLP's seed is fixed: MLPs with different seeds differ by as much as the use of images may gain.
-
     Args:
         logs: logs of the training set.
-        clips: clip configuration of the model.
+        recipe: recipe of the model.
         cache_dir: folder of the cached labels.
         past_frames: number of past frames in the ego status.
-        target: whether the ego status contains the route target.
 
     Raises:
         InputError: a log cannot be read.
     """
-    blind = dataclasses.replace(clips, cameras=(), future_images=False)
-    loader = DataLoader(ClipDataset(logs, blind, cache_dir), batch_size=16, collate_fn=collate)
+    clips, target = recipe.clips, recipe.planner.target
+    without_images = dataclasses.replace(clips, cameras=(), future_images=False)
+    loader = DataLoader(ClipDataset(logs, without_images, cache_dir), batch_size=16, collate_fn=collate)
     prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
-    mlp = fit_ego_mlp(status, past_frames=past_frames, dt_s=clips.horizon_dt_s, seed=0, target=target)
+    sizes = recipe.planner.ego_mlp or EgoMLPConfig()
+    mlp = fit_ego_mlp(
+        sizes, status, recipe.ego_mlp, past_frames=past_frames, dt_s=clips.horizon_dt_s, target=target
+    )
     return prior, mlp
 
 
 def read_training_set(
     loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False
-) -> tuple[OccupancyPrior, DrivenStatus]:
+) -> tuple[OccupancyPrior, StatusDemonstrations]:
     """Read the training data of the baselines in one pass; images are not used.
 
     Args:

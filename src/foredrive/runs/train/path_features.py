@@ -1,4 +1,4 @@
-"""Path features of every demonstration, sampled along plans that do not use the volume; cached on disk."""
+"""Path features of every demonstration, sampled along the initial plans and cached on disk."""
 
 import dataclasses
 import hashlib
@@ -16,67 +16,66 @@ from torch.utils.data import DataLoader
 from foredrive.data import ClipConfig, LogPath, collate
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
-from foredrive.models.ego_mlp import ego_motion, route_lead
+from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.runs.open_clips import open_clips
 from foredrive.scene import Example
 from foredrive.training import PathDemonstrations
 
-BATCH = 8
+BATCH_SIZE = 8
 
 
 @torch.no_grad()
-def read_paths(
+def sample_paths(
     agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path, stride_s: float
 ) -> PathDemonstrations:
-    """Sample the present volume of clips `stride_s` apart along the plans that do not use the volume.
+    """Sample the present volume of clips `stride_s` apart along their initial plans.
 
     The features are stored in half precision. Runs with the same logs and the same weights share one file.
 
     Raises:
         InputError: a log cannot be read.
     """
-    file = cache_dir / "paths" / f"{_key(agent, logs, clips, stride_s)}.safetensors"
+    file = cache_dir / "path_features" / f"{_key(agent, logs, clips, stride_s)}.safetensors"
     try:
-        kept = load_file(file)
+        cached = load_file(file)
     except (OSError, SafetensorError):
-        kept = _read(agent, logs, dataclasses.replace(clips, now_stride_s=stride_s), cache_dir)
+        cached = _sample(agent, logs, dataclasses.replace(clips, now_stride_s=stride_s), cache_dir)
         with atomic_path(file) as temporary:
-            save_file(kept, temporary)
-    return PathDemonstrations(**kept)
+            save_file(cached, temporary)
+    return PathDemonstrations(**cached)
 
 
-def _read(
+def _sample(
     agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, cache_dir: Path
 ) -> dict[str, Tensor]:
     dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
-    loader: Iterable[Example] = DataLoader(dataset, batch_size=BATCH, collate_fn=collate)
+    loader: Iterable[Example] = DataLoader(dataset, batch_size=BATCH_SIZE, collate_fn=collate)
     agent.eval()
     device = agent.planner.plan.device
     rows = [
-        _row(agent, example.to(device))
-        for example in track(loader, description="reading along plans", total=-(-len(dataset) // BATCH))
+        _sample_batch(agent, example.to(device))
+        for example in track(loader, description="sampling along plans", total=-(-len(dataset) // BATCH_SIZE))
     ]
     return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
 
-def _row(agent: PlanningAgent[Any], example: Example) -> dict[str, Tensor]:
+def _sample_batch(agent: PlanningAgent[Any], example: Example) -> dict[str, Tensor]:
     planner = agent.planner
     assert planner.path is not None
     clip = example.clip.observed()
-    beliefs = agent.foresee(clip, planner.looks_ahead)
+    beliefs = agent.rollout(clip, planner.imagined_frames)
     plan = agent.plan(clip, beliefs)
     poses, speeds = ego_motion(clip, planner.history)
     past = torch.cat([poses, speeds[:, :-1, None]], dim=-1)
-    unseen_xy, told = planner.without_looking(
-        clip.command, clip.command_valid, speeds[:, -1], past, route_lead(clip) if planner.target else None
-    )
-    reads = planner.path.read(agent.planned_on(beliefs[0]), unseen_xy)
-    change = planner.path(reads, told).cumsum(dim=1)
+    target = route_target(clip) if planner.target else None
+    initial_xy, status = planner.initial_plan(clip.command, clip.command_valid, speeds[:, -1], past, target)
+    samples = planner.path.sample(agent.planner_volume(beliefs[0]), initial_xy)
+    change = planner.path(samples, status).cumsum(dim=1)
     future = example.clip.future
     row = {
-        "values": reads.values.half(),
-        "places_m": reads.places_m,
-        "told": told,
+        "values": samples.values.half(),
+        "positions_m": samples.positions_m,
+        "status": status,
         "planned_xy": plan.xy[:, 0] - change,
         "driven_xy": future.xy[:, 0],
         "valid": future.valid[:, 0],
@@ -86,12 +85,13 @@ def _row(agent: PlanningAgent[Any], example: Example) -> dict[str, Tensor]:
 
 def _key(agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, stride_s: float) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    read = (str(logs), repr(dataclasses.asdict(clips)), repr(stride_s))
-    digest.update("\n".join(read).encode())
+    path = agent.planner.path
+    assert path is not None
+    sampled = (str(logs), repr(dataclasses.asdict(clips)), repr(stride_s))
+    places = (path.distances_m.tolist(), path.lateral_m.tolist())
+    digest.update("\n".join([*sampled, repr(places)]).encode())
     for name, tensor in sorted(agent.state_dict().items()):
         if not name.startswith("planner.path."):
             digest.update(name.encode())
             digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    assert agent.planner.path is not None
-    digest.update(agent.planner.path.distances_m.cpu().numpy().tobytes())
     return digest.hexdigest()

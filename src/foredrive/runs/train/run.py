@@ -18,7 +18,7 @@ from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
-from foredrive.runs.train.path_features import read_paths
+from foredrive.runs.train.path_features import sample_paths
 from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabri
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
-        _, fitted = fit_baselines(run.logs, recipe.clips, run.cache_dir, base.past_frames, base.target)
+        _, fitted = fit_baselines(run.logs, recipe, run.cache_dir, base.past_frames)
         base.load_state_dict(fitted.state_dict())
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:
@@ -145,8 +145,8 @@ def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric
         return
     if fabric.is_global_zero:
         agent.to(fabric.device)
-        shown = read_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
-        fit_path(path, shown, fit, run.recipe.finetune.schedule.seed)
+        demonstrations = sample_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
+        fit_path(path, demonstrations, fit, run.recipe.finetune.schedule.seed)
         with atomic_path(weights) as temporary:
             save_weights(agent, temporary)
     fabric.barrier()

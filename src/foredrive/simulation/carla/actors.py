@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.scene import Category, Event
+from foredrive.scene.actors import ActorState
 from foredrive.simulation.carla.frames import matrix_of, xyz_of
-from foredrive.towns.actors import ActorState
 
 CATEGORY_OF_BASE_TYPE = {
     "car": Category.CAR,

@@ -17,6 +17,7 @@ from torch import Tensor
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, CameraRig, Clip
+from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
 from foredrive.simulation.carla.frames import ego_in_actor, pose_of, yaw_of_compass
@@ -34,7 +35,6 @@ from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_progress import Progress
-from foredrive.towns.recorder import boxes_of
 
 GPS, IMU, SPEED, LIDAR = "GPS", "IMU", "SPEED", "LIDAR"
 COMPASS_AT = 6
@@ -143,7 +143,7 @@ class LeaderboardDriver:
             points = np.concatenate(self._points)
             sweep = sweep_of(points, np.array([len(points)]), self._lidar)
         T = at.T_world_ego
-        frame = KeyFrame(at.t_s, T, speed_mps, images, sweep, boxes_of([], T))
+        frame = KeyFrame(at.t_s, T, speed_mps, images, sweep, boxes_in_ego_frame([], T))
         self._frames = (*self._frames, frame)[-1 - self._past_frames :]
 
     def _clip(self) -> Clip:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from foredrive.scene import BicycleState, Event
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.frames import matrix_of
 from foredrive.simulation.lane_rules import (
@@ -21,7 +22,6 @@ from foredrive.simulation.lane_rules import (
     lines_run,
     way_driven,
 )
-from foredrive.towns.traffic.lights import Light
 
 
 class CarlaRoad:
@@ -39,7 +39,11 @@ class CarlaRoad:
         self._map = world.get_map()
         self._location, self._lane_type = carla.Location, carla.LaneType
         states = carla.TrafficLightState
-        self._shows = {states.Red: Light.RED, states.Yellow: Light.YELLOW, states.Green: Light.GREEN}
+        self._shows = {
+            states.Red: LightState.RED,
+            states.Yellow: LightState.YELLOW,
+            states.Green: LightState.GREEN,
+        }
         actors = world.get_actors()
         self._lights: list[Any] = list(actors.filter("traffic.traffic_light*"))
         signs = list(actors.filter("traffic.stop*"))
@@ -51,9 +55,9 @@ class CarlaRoad:
         self._signs = len(signs)
 
     def lights(self) -> Int[np.ndarray, "Z"]:
-        """Return the current `Light` of each light. The stop signs come after the lights, with NONE."""
-        shown = [self._shows.get(light.get_state(), Light.NONE) for light in self._lights]
-        return np.array([*shown, *[Light.NONE] * self._signs], dtype=np.int64)
+        """Return the current `LightState` of each light. The stop signs come after the lights, with NONE."""
+        shown = [self._shows.get(light.get_state(), LightState.NONE) for light in self._lights]
+        return np.array([*shown, *[LightState.NONE] * self._signs], dtype=np.int64)
 
     def check(
         self, before: BicycleState, after: BicycleState, z_m: float, state: RuleState, t_s: float

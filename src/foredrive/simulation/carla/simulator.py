@@ -1,4 +1,4 @@
-"""CARLA as a simulator (`scene.Simulator`), with the scenarios, steps and events of a town."""
+"""CARLA as a simulator (`scene.Simulator`), with the steps and events of a town."""
 
 import dataclasses
 import math
@@ -13,23 +13,23 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Boxes, Clip, Control, Event, LidarSweep, Standing, Step
+from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
+from foredrive.scene.conditions import draw_daylight
 from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla import sensors as carla_sensors
 from foredrive.simulation.carla.actors import Contact, actor_state, collision
+from foredrive.simulation.carla.background_traffic import ABOVE_M, add_background_traffic
 from foredrive.simulation.carla.client import answering, import_carla
 from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
-from foredrive.simulation.carla.crowd import ABOVE_M, add_crowd
 from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of, pose_of, xyz_of
 from foredrive.simulation.carla.road import CarlaRoad
 from foredrive.simulation.carla.session import TRAFFIC_PORT, Receiver, Session
 from foredrive.simulation.carla.weather import weather_of
 from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.lane_rules import RuleState, left_lanes
-from foredrive.simulation.observation import KeyFrame, make_clip, no_images
+from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
 from foredrive.simulation.route_progress import Progress, RouteLine, first_step
-from foredrive.simulation.town import FRAME_STEPS, SETTLE_S, TownScenario
-from foredrive.towns.conditions import draw_daylight
-from foredrive.towns.recorder import BOXES_WITHIN_M, boxes_of
+from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2020"
 """Vehicle with the dimensions of `dynamics.EGO`."""
@@ -95,17 +95,14 @@ class CarlaSimulator:
         completion = min(1.0, self.state.progress.done_m / self._route.length_m)
         return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
 
-    def reset(self, scenario: TownScenario) -> Clip:
+    def reset(self, scenario: RouteScenario) -> Clip:
         """Load the town and start a drive. The vehicle stands until traffic has started to move.
 
         Raises:
             InputError: the server lacks the town, a blueprint or an answer; there is no room for the vehicle;
-                CARLA has no such cameras as the rig's; or there are scenarios to play, which only town
-                simulators do.
+                or CARLA has no such cameras as the rig's.
         """
         self.close()
-        if scenario.scenarios:
-            raise InputError("CARLA plays no scenarios of ours: leave them out, or drive on its leaderboard")
         self._scenario, self._route = scenario, RouteLine(scenario.route_xyz)
         start = _start(scenario.route_xyz)
         self._session = Session(self._client, scenario.town, scenario.seed, self._traffic_port)
@@ -151,7 +148,7 @@ class CarlaSimulator:
         session.world.set_weather(weather_of(scenario.conditions or draw_daylight(rng)))
         session.world.reset_all_traffic_lights()
         self._ego = self._spawn_ego(session, start)
-        add_crowd(session, scenario.crowd, scenario.route_xyz, rng)
+        add_background_traffic(session, scenario.background_traffic, scenario.route_xyz, rng)
         session.tick()  # actors of a new world are listed from the next frame on
         self._road = CarlaRoad(session.world)
         before = max(round(SETTLE_S / STEP_S), scenario.past_frames * FRAME_STEPS)
@@ -256,12 +253,8 @@ class CarlaSimulator:
 
     def _boxes(self, session: Session, T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
         found = [actor_state(a) for a in session.world.get_actors() if a.id != self._ego.vehicle.id]
-        near = [
-            actor
-            for actor in found
-            if actor is not None and np.linalg.norm(actor.centre_m - T_world_ego[:3, 3]) < BOXES_WITHIN_M
-        ]
-        return boxes_of(near, T_world_ego)
+        near = in_box_range([actor for actor in found if actor is not None], T_world_ego)
+        return boxes_in_ego_frame(near, T_world_ego)
 
     def _make_clip(self, state: CarlaState) -> Clip:
         suite = self._scenario.sensors

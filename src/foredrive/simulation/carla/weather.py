@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
+from foredrive.scene.conditions import Conditions
 from foredrive.simulation.carla.client import import_carla
-from foredrive.towns.conditions import Conditions
 
 HIGHEST_SUN_DEG, LOWEST_SUN_DEG = 75.0, -60.0
 """Altitude of the sun at noon and at midnight, degrees. It is 0 at 6 and at 18 o'clock."""

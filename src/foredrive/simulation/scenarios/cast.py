@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.scenarios.ground import Ground
 from foredrive.simulation.scenarios.kinds import MEETINGS, ScenarioKind, Way
 from foredrive.simulation.scenarios.scene import Scene
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, points_along
 from foredrive.towns.traffic.spawning import SPAWN_MIN_M
 
@@ -99,7 +99,7 @@ def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float 
 def is_let_go(scene: Scene, after_s: float) -> bool:
     """Return whether the ego vehicle will have no red light at the scenario's junction."""
     shows = scene.traffic.signals.light_states(scene.state.time_s + after_s)
-    return bool(shows[scene.scenario.ego_lane] != Light.RED)
+    return bool(shows[scene.scenario.ego_lane] != LightState.RED)
 
 
 def _called(scene: Scene, number: int, begin_m: float, speed_mps: float, at_start: bool) -> Scene | None:

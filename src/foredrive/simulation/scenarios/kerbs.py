@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.scene import Category
+from foredrive.scene.actors import ActorState
 from foredrive.simulation.collisions import SOLID
 from foredrive.simulation.scenarios.ground import Ground, pose
 from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
-from foredrive.towns.actors import ActorState
 from foredrive.towns.traffic.scripted_actors import FIRST_TRACK_ID, ScriptedActor
 from foredrive.towns.world import World
 

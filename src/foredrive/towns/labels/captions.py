@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
-from foredrive.towns.conditions import FOG_M
+from foredrive.scene.conditions import FOG_M
 
-SEEN = 0.4
+MIN_VISIBILITY = 0.4
 """Minimum visibility of road users that are mentioned: nuScenes' lowest visibility level."""
 NEAR_M, AHEAD_M = 30.0, 50.0
 """Maximum distance of road users that are mentioned, m: beside and behind, and ahead."""
@@ -22,7 +22,7 @@ BOTH_SIDES = "on both sides"
 
 
 @dataclass(frozen=True)
-class Thing:
+class CaptionActor:
     """A road user in the vehicle's ego frame."""
 
     kind: ObjectKind
@@ -37,24 +37,24 @@ class Thing:
 
 
 @dataclass(frozen=True)
-class Situation:
+class FrameFacts:
     """The facts of one moment."""
 
     setting: Setting
-    things: Sequence[Thing]
+    actors: Sequence[CaptionActor]
 
 
-def caption(situation: Situation, seed: int) -> str:
+def caption(facts: FrameFacts, seed: int) -> str:
     """Compose a caption of two to six sentences. The seed selects phrasings, never facts."""
-    words, setting = _Words(np.random.default_rng(seed)), situation.setting
-    seen = [thing for thing in situation.things if _is_seen(thing, setting)]
+    words, setting = _Words(np.random.default_rng(seed)), facts.setting
+    visible = [actor for actor in facts.actors if _is_visible(actor, setting)]
     sentences = [
         _setting(setting, words),
         _action(setting, words),
-        *_traffic(seen, setting, words),
-        *_crossing(seen, words),
-        _on_foot(seen, words),
-        _parked(seen),
+        *_traffic(visible, setting, words),
+        *_crossing(visible, words),
+        _on_foot(visible, words),
+        _parked(visible),
         _light(setting, words),
     ]
     return " ".join(f"{s[0].upper()}{s[1:]}." for s in sentences if s)
@@ -68,14 +68,14 @@ class _Words:
         return ways[int(self.rng.integers(len(ways)))]
 
 
-def _is_seen(thing: Thing, setting: Setting) -> bool:
-    distance_m = float(np.hypot(*thing.xy_m))
-    reach_m = AHEAD_M if _sector(thing) == "ahead" else NEAR_M
-    return thing.visibility >= SEEN and distance_m < min(reach_m, FOG_SHARE * setting.visibility_m)
+def _is_visible(actor: CaptionActor, setting: Setting) -> bool:
+    distance_m = float(np.hypot(*actor.xy_m))
+    reach_m = AHEAD_M if _sector(actor) == "ahead" else NEAR_M
+    return actor.visibility >= MIN_VISIBILITY and distance_m < min(reach_m, FOG_SHARE * setting.visibility_m)
 
 
-def _sector(thing: Thing) -> str:
-    azimuth = float(np.arctan2(thing.xy_m[1], thing.xy_m[0]))
+def _sector(actor: CaptionActor) -> str:
+    azimuth = float(np.arctan2(actor.xy_m[1], actor.xy_m[0]))
     if abs(azimuth) <= AHEAD_RAD:
         return "ahead"
     if abs(azimuth) >= BEHIND_RAD:
@@ -93,7 +93,7 @@ def _setting(setting: Setting, words: _Words) -> str:
         facts.append(words.pick(*(_DAY_SKIES if setting.time_of_day in _DAY else _SKIES)[setting.weather]))
     if setting.wetness > 0.3 and not rain_mmph:
         facts.append(words.pick("wet road", "the road is wet"))
-    return ", ".join([*facts, _where(setting.place, words)])
+    return ", ".join([*facts, _place_phrase(setting.place, words)])
 
 
 _DAY = (TimeOfDay.MORNING, TimeOfDay.MIDDAY, TimeOfDay.AFTERNOON)
@@ -113,7 +113,7 @@ _DAY_SKIES = {
 _SKIES = _DAY_SKIES | {Weather.OVERCAST: ("overcast",), Weather.CLEAR: ("clear", "dry")}
 
 
-def _where(place: Place, words: _Words) -> str:
+def _place_phrase(place: Place, words: _Words) -> str:
     return {
         Place.STREET: words.pick("on a street", "on the road", "along a street"),
         Place.JUNCTION: words.pick("at a junction", "at an intersection", "in a junction"),
@@ -157,11 +157,11 @@ def _a(noun: str) -> str:
     return f"{'an' if noun[0] in 'aeio' else 'a'} {noun}"
 
 
-def _counted(things: Sequence[Thing], adjective: str = "") -> str:
+def _counted(actors: Sequence[CaptionActor], adjective: str = "") -> str:
     """Return a phrase such as "two oncoming cars and a bus"."""
     parts = []
     for kind in ObjectKind:
-        count = sum(thing.kind is kind for thing in things)
+        count = sum(actor.kind is kind for actor in actors)
         if count == 1:
             parts.append(_a(f"{adjective}{kind.value}"))
         elif count:
@@ -177,22 +177,22 @@ def _listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}" if parts else ""
 
 
-def _traffic(seen: Sequence[Thing], setting: Setting, words: _Words) -> list[str]:
+def _traffic(visible: Sequence[CaptionActor], setting: Setting, words: _Words) -> list[str]:
     """Describe the moving vehicles by their position and direction."""
-    vehicles = [t for t in seen if not t.parked and t.kind is not ObjectKind.PEDESTRIAN]
-    there = {where: [t for t in vehicles if _whereabouts(t, setting) == where] for where in _WHEREABOUTS}
+    vehicles = [t for t in visible if not t.parked and t.kind is not ObjectKind.PEDESTRIAN]
+    groups = {where: [t for t in vehicles if _direction(t, setting) == where] for where in _DIRECTIONS}
     phrases = [
-        _counted(things, "oncoming ") if where == "oncoming" else f"{_counted(things)} {words.pick(*ways)}"
-        for (where, ways), things in zip(_WHEREABOUTS.items(), there.values(), strict=True)
-        if things
+        _counted(actors, "oncoming ") if where == "oncoming" else f"{_counted(actors)} {words.pick(*ways)}"
+        for (where, ways), actors in zip(_DIRECTIONS.items(), groups.values(), strict=True)
+        if actors
     ]
     if phrases:
         return [", ".join(phrases)]
-    alone = not seen and setting.leader is None
+    alone = not visible and setting.leader is None
     return [words.pick("no one else nearby", "no other traffic nearby")] if alone else []
 
 
-_WHEREABOUTS = {
+_DIRECTIONS = {
     "ahead": ("ahead", "in front"),
     "across": ("crossing ahead", "passing across the road ahead"),
     "oncoming": ("",),
@@ -203,28 +203,28 @@ _WHEREABOUTS = {
 """Possible positions of vehicles, and phrases for them."""
 
 
-def _whereabouts(thing: Thing, setting: Setting) -> str:
-    """Return one of `_WHEREABOUTS`. In bends no vehicle ahead counts as crossing."""
-    sector = _sector(thing)
-    if sector != "ahead" or np.hypot(*thing.velocity_mps) <= MOVING_MPS:
+def _direction(actor: CaptionActor, setting: Setting) -> str:
+    """Return one of `_DIRECTIONS`. In bends no vehicle ahead counts as crossing."""
+    sector = _sector(actor)
+    if sector != "ahead" or np.hypot(*actor.velocity_mps) <= MOVING_MPS:
         return sector
-    if np.cos(thing.yaw) < ONCOMING_COS:
+    if np.cos(actor.yaw) < ONCOMING_COS:
         return "oncoming"
     bends = setting.place is Place.ROUNDABOUT or setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT)
-    return "across" if abs(np.cos(thing.yaw)) < ACROSS_COS and not bends else "ahead"
+    return "across" if abs(np.cos(actor.yaw)) < ACROSS_COS and not bends else "ahead"
 
 
-def _crosses(thing: Thing) -> bool:
-    vx, vy = thing.velocity_mps.tolist()
+def _crosses(actor: CaptionActor) -> bool:
+    vx, vy = actor.velocity_mps.tolist()
     walks_across = abs(vy) > WALKING_MPS and abs(vy) > abs(vx)
-    return thing.kind is ObjectKind.PEDESTRIAN and thing.on_road and walks_across and float(thing.xy_m[0]) > 0
+    return actor.kind is ObjectKind.PEDESTRIAN and actor.on_road and walks_across and float(actor.xy_m[0]) > 0
 
 
-def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
+def _crossing(visible: Sequence[CaptionActor], words: _Words) -> list[str]:
     """Describe the people who walk across the road in front, and the side from which they come."""
     sentences = []
     for sign, side in ((1.0, "right"), (-1.0, "left")):
-        group = [t for t in seen if _crosses(t) and np.sign(t.velocity_mps[1]) == sign]
+        group = [t for t in visible if _crosses(t) and np.sign(t.velocity_mps[1]) == sign]
         if group:
             verb = words.pick("cross", "cross the road", "walk across")
             verb = verb.replace("cross", "crosses", 1) if len(group) == 1 and verb[0] == "c" else verb
@@ -233,9 +233,9 @@ def _crossing(seen: Sequence[Thing], words: _Words) -> list[str]:
     return sentences
 
 
-def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
+def _on_foot(visible: Sequence[CaptionActor], words: _Words) -> str:
     """Describe the people who do not cross."""
-    people = [t for t in seen if t.kind is ObjectKind.PEDESTRIAN and not _crosses(t)]
+    people = [t for t in visible if t.kind is ObjectKind.PEDESTRIAN and not _crosses(t)]
     if not people:
         return ""
     where = _sides(people)
@@ -245,15 +245,15 @@ def _on_foot(seen: Sequence[Thing], words: _Words) -> str:
     return f"{_counted(people)} {words.pick(f'{walkway} ', '')}{where}"
 
 
-def _parked(seen: Sequence[Thing]) -> str:
-    cars = [t for t in seen if t.parked]
+def _parked(visible: Sequence[CaptionActor]) -> str:
+    cars = [t for t in visible if t.parked]
     if not cars:
         return ""
     return f"{_counted(cars, 'parked ')} {_sides(cars)}"
 
 
-def _sides(things: Sequence[Thing]) -> str:
-    sides = {"left" if t.xy_m[1] > 0 else "right" for t in things}
+def _sides(actors: Sequence[CaptionActor]) -> str:
+    sides = {"left" if t.xy_m[1] > 0 else "right" for t in actors}
     return f"on the {sides.pop()}" if len(sides) == 1 else BOTH_SIDES
 
 

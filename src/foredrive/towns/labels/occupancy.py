@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int
 from foredrive.data.modalities import FullOccupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.columns import COLUMN_M, TownColumns
@@ -60,7 +60,7 @@ def full_occupancy(
     ends = zip(spec.lower_m, spec.upper_m, strict=True)
     corners = np.array([(*corner, 1.0) for corner in itertools.product(*ends)])
     yaw = float(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
-    for tile in town.below((corners @ T_world_ego.T)[:, :2], yaw):
+    for tile in town.tiles_around((corners @ T_world_ego.T)[:, :2], yaw):
         _fill(*tile, _CODE_OF_SURFACE, T_index_world, grid)
     for number, (actor, shape) in enumerate(actors):
         code = np.full(len(Surface), _FIRST_ACTOR + number, dtype=np.int16)

@@ -9,12 +9,12 @@ from py123d.datatypes import DefaultLidarSegmentationLabel as LidarLabel
 
 from foredrive.errors import InputError
 from foredrive.scene import CameraRig, Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.looks import Surface
 
 SKY = -1
 """Value in place of a `Surface` where a ray hit nothing."""
-NOBODY = -1
+NO_ACTOR = -1
 """Value in place of a track id or a `Category` where a ray hit no road user."""
 
 _CAMERA_LABEL = {
@@ -83,12 +83,12 @@ def _tables() -> tuple[UInt8[np.ndarray, "K S"], UInt8[np.ndarray, "K S"]]:
 _CAMERA_TABLE, _LIDAR_TABLE = _tables()
 
 
-class CategoryOfTrack:
+class TrackCategories:
     """A lookup of the `Category` of track ids, -1 for ids that belong to no road user."""
 
     def __init__(self, actors: Sequence[ActorState]) -> None:
-        tracks = np.array([NOBODY, *(actor.track_id for actor in actors)], dtype=np.int64)
-        category = np.array([NOBODY, *(int(actor.category) for actor in actors)], dtype=np.int64)
+        tracks = np.array([NO_ACTOR, *(actor.track_id for actor in actors)], dtype=np.int64)
+        category = np.array([NO_ACTOR, *(int(actor.category) for actor in actors)], dtype=np.int64)
         order = np.argsort(tracks)
         self._tracks, self._category = tracks[order], category[order]
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
 from foredrive.scene import CameraRig
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 
@@ -14,7 +14,7 @@ RAYS_PER_CAMERA = 1024
 """Approximate maximum number of rays per camera and road user. A larger road user is sampled by an even grid
 of its pixels."""
 NEAR_M = 0.1
-THING_M = 0.5
+OBJECT_RADIUS_M = 0.5
 """Maximum distance from the middle of a small object to its surface, m."""
 _CORNERS = np.array([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -58,7 +58,7 @@ def visibility(
     return out
 
 
-def is_seen(
+def is_point_visible(
     point_ego: Float64[np.ndarray, "3"], rig: CameraRig, range_m: Float32[np.ndarray, "C H W"]
 ) -> bool:
     """Return whether a small object is in an image with nothing in front of it.
@@ -78,7 +78,7 @@ def is_seen(
         if 0 <= u < width and 0 <= v < height:
             row, column = int(v), int(u)
             around = ranges[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
-            if around.max() > np.linalg.norm(in_cam) - THING_M:
+            if around.max() > np.linalg.norm(in_cam) - OBJECT_RADIUS_M:
                 return True
     return False
 

@@ -56,4 +56,4 @@ PEOPLE: dict[str, Callable[[MeshLooks], Mesh]] = {
         for pose in range(people_meshes.POSES)
     },
 }
-THINGS: dict[str, Callable[[MeshLooks], Mesh]] = {"cone": _cone, "block": _block}
+OBJECTS: dict[str, Callable[[MeshLooks], Mesh]] = {"cone": _cone, "block": _block}

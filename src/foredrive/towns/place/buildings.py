@@ -19,7 +19,7 @@ CLEARANCE_M = 0.8
 GARDEN_M = 2.2
 """Distance from a garden's fence to the line where the houses may begin, m."""
 SKYLINE_TRIES_PER_M2 = 1 / 900.0
-SKYLINE_NEAREST_M, SKYLINE_FURTHEST_M = 16.0, 75.0
+SKYLINE_MIN_M, SKYLINE_MAX_M = 16.0, 75.0
 
 _WIDTH_M = {
     "house": (8.0, 13.0),
@@ -78,7 +78,7 @@ class _Builder:
             if plot is None or not self.site.is_free(plot.polygon(CLEARANCE_M)):
                 s += 3.0
                 continue
-            parts.append(self._raise(plot, kind, detail=True))
+            parts.append(self._build_on(plot, kind, detail=True))
             if kind == "house" and frontage.walkway:
                 parts += self._garden(plot, back_m)
             s += width + (rng.uniform(0.2, 1.0) if kind == "block" else rng.uniform(2.0, 7.0)) + CLEARANCE_M
@@ -92,7 +92,7 @@ class _Builder:
         count = int(extent.prod() * SKYLINE_TRIES_PER_M2)
         spots = lower + rng.random((count, 2)) * extent
         away = self.site.distance_to_road(spots)
-        near = (away > SKYLINE_NEAREST_M) & (away < SKYLINE_FURTHEST_M)
+        near = (away > SKYLINE_MIN_M) & (away < SKYLINE_MAX_M)
         parts = []
         for xy in spots[near & (rng.random(count) < self.style.skyline)]:
             kind = self._draw_kind()
@@ -101,7 +101,7 @@ class _Builder:
             along = np.array([np.cos(angle), np.sin(angle)])
             plot = Plot(xy, along, width, depth)
             if self.site.is_free(plot.polygon(3.0)):
-                parts.append(self._raise(plot, kind, detail=False))
+                parts.append(self._build_on(plot, kind, detail=False))
         return parts
 
     def _draw_kind(self) -> str:
@@ -122,7 +122,7 @@ class _Builder:
         along = chord / width
         return Plot(start + back_m * np.array([-along[1], along[0]]), along, width, depth)
 
-    def _raise(self, plot: Plot, kind: str, detail: bool) -> Mesh:
+    def _build_on(self, plot: Plot, kind: str, detail: bool) -> Mesh:
         self.site.take(plot.polygon(0.3))
         corners = plot.world(
             np.array([[0, 0], [plot.width_m, 0], [plot.width_m, plot.depth_m], [0, plot.depth_m]], float)

@@ -9,14 +9,14 @@ from jaxtyping import Float
 
 from foredrive.towns.place.looks import Look, LookTable, Surface, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, boxes, frustum, join
-from foredrive.towns.place.props import POLE_SAMPLE_M, ThinThings, along_pole, thin_things
+from foredrive.towns.place.props import POLE_SAMPLE_M, ThinPoints, pole_points, thin_points
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.terrain import CELL_M, Field
 
 PARCEL_M = (55.0, 130.0)
 ROAD_SETBACK_M, CLEARANCE_M, HEDGE_M = 6.0, 4.0, 3.0
 """Distances of fields, m: from roads, from standing objects, and half the gap between two fields."""
-LEAST_M2, LEAST_WIDTH_M = 700.0, 16.0
+MIN_AREA_M2, MIN_WIDTH_M = 700.0, 16.0
 POST_STEP_M, POST_M, RAILS_M = 3.0, 1.15, (0.55, 1.0)
 GATE_M = 6.0
 BALES_PER_M2 = 1 / 350.0
@@ -47,10 +47,10 @@ def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tu
     for parcel in _parcels(low, high, rng):
         taken = [area.buffer(CLEARANCE_M) for area in site.near(parcel)]
         free = shapely.difference(parcel.buffer(-HEDGE_M), shapely.union_all([paved, *taken]))
-        free = free.buffer(-0.5 * LEAST_WIDTH_M).buffer(0.5 * LEAST_WIDTH_M, join_style="mitre")
+        free = free.buffer(-0.5 * MIN_WIDTH_M).buffer(0.5 * MIN_WIDTH_M, join_style="mitre")
         for area in shapely.get_parts(free.intersection(parcel)):
             kind = str(rng.choice(names, p=[*shares, 1.0 - sum(shares)]))
-            if area.area < LEAST_M2:
+            if area.area < MIN_AREA_M2:
                 continue
             site.take(area)
             fields.append(Field(area.simplify(0.5), _direction(area), kind, _look(kind, table)))
@@ -59,7 +59,7 @@ def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tu
 
 def build_on_fields(
     fields: Sequence[Field], site: Site, table: LookTable, rng: np.random.Generator
-) -> tuple[Mesh, ThinThings]:
+) -> tuple[Mesh, ThinPoints]:
     """Build fences around meadows and bales on stubble."""
     wood = table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.47, 0.40, 0.32), 0.4, params=(1.5,)))
     straw = table.add(Look(Surface.VEGETATION, Texture.PLAIN, (0.74, 0.63, 0.36), 0.5, params=(2.0,)))
@@ -71,7 +71,7 @@ def build_on_fields(
             points.append(thin)
         elif field.kind == "stubble":
             parts += _bales(field, site, straw, rng)
-    return join(parts), thin_things(points, Surface.STRUCTURE)
+    return join(parts), thin_points(points, Surface.STRUCTURE)
 
 
 def _parcels(
@@ -115,7 +115,7 @@ def _fence(area: shapely.Polygon, site: Site, look: int) -> tuple[Mesh, Float[np
     feet = np.column_stack([xy, site.height(xy)])
     half = np.array([0.05, 0.05, 0.0])
     parts = [boxes(feet - half - [0.0, 0.0, 0.4], feet + half + [0.0, 0.0, POST_M], look)]
-    points = [along_pole(foot[:2], foot[2], POST_M) for foot in feet]
+    points = [pole_points(foot[:2], foot[2], POST_M) for foot in feet]
     for a, b in itertools.pairwise(feet):
         steps = np.linspace(0.0, 1.0, int(np.linalg.norm(b - a) / POLE_SAMPLE_M) + 2)[:, None]
         for z in RAILS_M:

@@ -19,7 +19,7 @@ BARRIER_HEIGHT_M = 3.2
 
 
 @dataclass(frozen=True)
-class Thing:
+class FurnitureItem:
     """A piece of furniture that is ready to be placed."""
 
     mesh: Mesh
@@ -80,17 +80,17 @@ def plate(x: float, y: tuple[float, float], z: tuple[float, float]) -> Float[np.
     return np.column_stack([np.full(grid_y.size, x), grid_y.ravel(), grid_z.ravel()])
 
 
-def things(looks: FurnitureLooks) -> dict[str, Thing]:
+def furniture_items(looks: FurnitureLooks) -> dict[str, FurnitureItem]:
     """Return all furniture that consists of one piece."""
     return {
         "bench": _bench(looks),
-        "bin": Thing(_post((0.22, 0.26), 0.9, looks.green, looks.iron), (0.4, 0.4)),
+        "bin": FurnitureItem(_post((0.22, 0.26), 0.9, looks.green, looks.iron), (0.4, 0.4)),
         "hydrant": _hydrant(looks),
         "mail_box": _mail_box(looks),
         "parking_meter": _parking_meter(looks),
         "bollards": _bollards(looks),
         "shelter": _shelter(looks),
-        "cabinet": Thing(box((-0.5, -0.22, -SINK_M), (0.5, 0.22, 1.15), looks.white), (0.7, 0.45)),
+        "cabinet": FurnitureItem(box((-0.5, -0.22, -SINK_M), (0.5, 0.22, 1.15), looks.white), (0.7, 0.45)),
         "speed_sign": _round_sign(looks),
         "information_sign": _board(looks, looks.sign_blue, (-0.4, 0.4), (1.6, 2.4), (0.0,)),
         "direction_sign": _board(looks, looks.sign_green, (-1.8, 1.8), (1.8, 3.8), (-1.2, 1.2)),
@@ -105,47 +105,49 @@ def _post(radii: tuple[float, float], height: float, look: int, lid: int) -> Mes
     return join([*parts, frustum((0, 0, height), (0, 0, height + 0.06), (radii[1] + 0.03, 0.1), 8, lid)])
 
 
-def _bench(looks: FurnitureLooks) -> Thing:
+def _bench(looks: FurnitureLooks) -> FurnitureItem:
     parts = [box((-0.9, y - 0.06, 0.42), (0.9, y + 0.06, 0.47), looks.wood) for y in (-0.15, 0.0, 0.15)]
     parts += [box((-0.9, -0.28, z), (0.9, -0.24, z + 0.12), looks.wood) for z in (0.6, 0.78)]
     for x in (-0.7, 0.65):
         parts.append(box((x, -0.2, -SINK_M), (x + 0.06, 0.2, 0.42), looks.iron))
         parts.append(box((x, -0.24, 0.4), (x + 0.06, -0.19, 0.92), looks.iron))
-    return Thing(join(parts), (1.0, 0.5))
+    return FurnitureItem(join(parts), (1.0, 0.5))
 
 
-def _hydrant(looks: FurnitureLooks) -> Thing:
+def _hydrant(looks: FurnitureLooks) -> FurnitureItem:
     parts = [
         frustum((0, 0, -SINK_M), (0, 0, 0.6), (0.13, 0.11), 8, looks.red),
         frustum((0, 0, 0.6), (0, 0, 0.78), (0.13, 0.04), 8, looks.red),
         frustum((0, -0.2, 0.45), (0, 0.2, 0.45), (0.06, 0.06), 6, looks.yellow),
     ]
-    return Thing(join(parts), (0.35, 0.35))
+    return FurnitureItem(join(parts), (0.35, 0.35))
 
 
-def _mail_box(looks: FurnitureLooks) -> Thing:
+def _mail_box(looks: FurnitureLooks) -> FurnitureItem:
     parts = [box((-0.25, -0.2, 0.12), (0.25, 0.2, 1.1), looks.blue)]
     parts += [box((-0.2, -0.15, -SINK_M), (0.2, 0.15, 0.12), looks.iron)]
     parts += [frustum((-0.25, 0, 1.08), (0.25, 0, 1.08), (0.2, 0.2), 10, looks.blue)]
-    return Thing(join([*parts, box((-0.18, 0.19, 0.9), (0.18, 0.21, 0.97), looks.white)]), (0.45, 0.4))
+    return FurnitureItem(
+        join([*parts, box((-0.18, 0.19, 0.9), (0.18, 0.21, 0.97), looks.white)]), (0.45, 0.4)
+    )
 
 
-def _parking_meter(looks: FurnitureLooks) -> Thing:
+def _parking_meter(looks: FurnitureLooks) -> FurnitureItem:
     parts = [frustum((0, 0, -SINK_M), (0, 0, 1.0), (0.03, 0.03), 6, looks.pole)]
     parts += [box((-0.1, -0.07, 1.0), (0.1, 0.07, 1.35), looks.iron)]
-    return Thing(join(parts), (0.3, 0.3), ((Surface.POLE, upright(0.0, 0.0, 1.3)),))
+    return FurnitureItem(join(parts), (0.3, 0.3), ((Surface.POLE, upright(0.0, 0.0, 1.3)),))
 
 
-def _bollards(looks: FurnitureLooks) -> Thing:
+def _bollards(looks: FurnitureLooks) -> FurnitureItem:
     parts, points = [], []
     for x in (-1.5, 0.0, 1.5):
         parts.append(frustum((x, 0, -SINK_M), (x, 0, 0.85), (0.08, 0.08), 8, looks.iron))
         parts.append(frustum((x, 0, 0.68), (x, 0, 0.78), (0.084, 0.084), 8, looks.white))
         points.append(upright(x, 0.0, 0.85))
-    return Thing(join(parts), (1.8, 0.3), ((Surface.STRUCTURE, np.concatenate(points)),))
+    return FurnitureItem(join(parts), (1.8, 0.3), ((Surface.STRUCTURE, np.concatenate(points)),))
 
 
-def _shelter(looks: FurnitureLooks) -> Thing:
+def _shelter(looks: FurnitureLooks) -> FurnitureItem:
     """Build a bus shelter that is open to the road, with a seat, a poster and the sign of the stop."""
     parts = [
         box((-2.0, -0.75, 2.35), (2.0, 0.75, 2.5), looks.steel),
@@ -160,10 +162,10 @@ def _shelter(looks: FurnitureLooks) -> Thing:
             parts.append(box((x, y, -SINK_M), (x + 0.06, y + 0.06, 2.4), looks.iron))
     sign = (Surface.SIGN, plate(2.62, (0.28, 0.68), (2.1, 2.7)))
     advert = (Surface.SIGN, plate(-1.89, (-0.6, 0.35), (0.15, 2.2)))
-    return Thing(join(parts), (2.9, 0.85), (sign, advert, (Surface.POLE, upright(2.62, 0.48, 2.1))))
+    return FurnitureItem(join(parts), (2.9, 0.85), (sign, advert, (Surface.POLE, upright(2.62, 0.48, 2.1))))
 
 
-def _round_sign(looks: FurnitureLooks) -> Thing:
+def _round_sign(looks: FurnitureLooks) -> FurnitureItem:
     z = 2.2
     parts = [
         frustum((0, 0, -SINK_M), (0, 0, z + 0.2), (0.035, 0.035), 6, looks.pole),
@@ -174,7 +176,7 @@ def _round_sign(looks: FurnitureLooks) -> Thing:
         parts.append(box((-0.07, y - 0.06, z - 0.13), (-0.06, y + 0.06, z + 0.13), looks.sign_black))
         parts.append(box((-0.072, y - 0.02, z - 0.09), (-0.069, y + 0.025, z + 0.09), looks.sign_white))
     sign = (Surface.SIGN, plate(-0.05, (-0.25, 0.25), (z - 0.25, z + 0.25)))
-    return Thing(join(parts), (0.3, 0.45), ((Surface.POLE, upright(0.0, 0.0, z)), sign))
+    return FurnitureItem(join(parts), (0.3, 0.45), ((Surface.POLE, upright(0.0, 0.0, z)), sign))
 
 
 def _board(
@@ -183,7 +185,7 @@ def _board(
     y: tuple[float, float],
     z: tuple[float, float],
     posts: tuple[float, ...],
-) -> Thing:
+) -> FurnitureItem:
     """Build a sign with lines of text that faces the traffic."""
     parts = [box((-0.07, y[0], z[0]), (-0.04, y[1], z[1]), look)]
     lines = max(1, int(np.ptp(z) / 0.5))
@@ -202,13 +204,13 @@ def _board(
     for at in posts:
         parts.append(frustum((0, at, -SINK_M), (0, at, z[1]), (0.05, 0.05), 6, looks.pole))
         thin.append((Surface.POLE, upright(0.0, at, z[0])))
-    return Thing(join(parts), (0.4, 0.5 * wide + 0.1), tuple(thin))
+    return FurnitureItem(join(parts), (0.4, 0.5 * wide + 0.1), tuple(thin))
 
 
 POWER_POLE_M, CROSSARM_M, WIRE_M = 9.0, 1.1, 0.025
 
 
-def _power_pole(looks: FurnitureLooks) -> Thing:
+def _power_pole(looks: FurnitureLooks) -> FurnitureItem:
     arm = POWER_POLE_M - 0.5
     parts = [
         frustum((0, 0, -SINK_M), (0, 0, POWER_POLE_M), (0.16, 0.11), 7, looks.mast),
@@ -216,7 +218,7 @@ def _power_pole(looks: FurnitureLooks) -> Thing:
     ]
     for y in (-CROSSARM_M, 0.0, CROSSARM_M):
         parts.append(frustum((0, y, arm + 0.12), (0, y, arm + 0.3), (0.05, 0.04), 6, looks.white))
-    return Thing(join(parts), (0.4, 0.4), ((Surface.POLE, upright(0.0, 0.0, POWER_POLE_M)),))
+    return FurnitureItem(join(parts), (0.4, 0.4), ((Surface.POLE, upright(0.0, 0.0, POWER_POLE_M)),))
 
 
 def wires(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], look: int) -> Mesh:
@@ -234,7 +236,7 @@ def wires(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], look: int)
     return join(parts)
 
 
-def _billboard(looks: FurnitureLooks) -> Thing:
+def _billboard(looks: FurnitureLooks) -> FurnitureItem:
     y, z = (-3.0, 3.0), (2.6, 5.6)
     a, b, c, d = looks.posters
     parts = [
@@ -249,10 +251,10 @@ def _billboard(looks: FurnitureLooks) -> Thing:
     for at in (-1.8, 1.8):
         parts.append(frustum((0.05, at, -2 * SINK_M), (0.05, at, z[1]), (0.14, 0.12), 8, looks.pole))
         thin.append((Surface.POLE, upright(0.05, at, z[0])))
-    return Thing(join(parts), (0.5, 3.2), tuple(thin))
+    return FurnitureItem(join(parts), (0.5, 3.2), tuple(thin))
 
 
-def _building_site(looks: FurnitureLooks) -> Thing:
+def _building_site(looks: FurnitureLooks) -> FurnitureItem:
     """Build a building site: a heap of earth and a container behind striped barriers and cones."""
     parts = [
         frustum((1.6, -0.3, -0.2), (1.6, -0.3, 1.1), (1.5, 0.3), 9, looks.earth),
@@ -268,7 +270,7 @@ def _building_site(looks: FurnitureLooks) -> Thing:
         parts.append(frustum((x, y, 0.05), (x, y, 0.35), (0.15, 0.1), 8, looks.orange))
         parts.append(frustum((x, y, 0.35), (x, y, 0.5), (0.1, 0.075), 8, looks.white))
         parts.append(frustum((x, y, 0.5), (x, y, 0.75), (0.075, 0.03), 8, looks.orange))
-    return Thing(join(parts), (4.9, 1.8))
+    return FurnitureItem(join(parts), (4.9, 1.8))
 
 
 def guard_rail(feet: Float[np.ndarray, "N 3"], looks: FurnitureLooks) -> Mesh:

@@ -5,7 +5,7 @@ import shapely
 from jaxtyping import Float
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.place.looks import ASPHALT_RGB, Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
@@ -73,7 +73,7 @@ def footprint(actor: ActorState) -> shapely.Polygon:
     return shapely.Polygon([centre + x + y, centre - x + y, centre - x - y, centre + x - y])
 
 
-def numbered(cars: list[ActorState]) -> tuple[ActorState, ...]:
+def with_track_ids(cars: list[ActorState]) -> tuple[ActorState, ...]:
     """Return parked cars with their track ids."""
     return tuple(
         ActorState(**{**vars(car), "track_id": FIRST_TRACK_ID + number}) for number, car in enumerate(cars)

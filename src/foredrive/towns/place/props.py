@@ -15,7 +15,7 @@ from foredrive.towns.place.site import Site, frontages
 LAMP_SPACING_M, LAMP_HEIGHT_M, LAMP_ARM_M = 30.0, 7.5, 1.6
 LAMP_SETBACK_M = 0.5
 MAST_HEIGHT_M, HEAD_GAP_M = 5.6, 3.0
-LONGEST_ARM_M = 9.0
+MAX_ARM_M = 9.0
 SIGN_HEIGHT_M = 2.3
 POST_CLEARANCE_M = 0.3
 POLE_SAMPLE_M = 0.2
@@ -45,12 +45,12 @@ class Props:
 
     mesh: Mesh
     heads: tuple[SignalHead, ...]
-    thin: "ThinThings"
+    thin: "ThinPoints"
     lamps: StreetLamps
 
 
 @dataclass(frozen=True)
-class ThinThings:
+class ThinPoints:
     """Points along posts and trunks, which a grid of vertical rays would miss."""
 
     xyz: Float[np.ndarray, "N 3"]
@@ -89,12 +89,12 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
             lamps = _lamp_looks(table, index)
             parts.append(_traffic_light(town, zone, np.array([*foot[:2], z]), lamps, looks))
             heads.append(SignalHead(index, lamps))
-            poles.append(along_pole(foot, z, MAST_HEIGHT_M))
+            poles.append(pole_points(foot, z, MAST_HEIGHT_M))
         else:
             parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
-            poles.append(along_pole(foot, z, SIGN_HEIGHT_M))
+            poles.append(pole_points(foot, z, SIGN_HEIGHT_M))
     unlit = StreetLamps(np.zeros((0, 3)), looks.lamp)
-    return Props(join(parts), tuple(heads), thin_things(poles, Surface.POLE), unlit)
+    return Props(join(parts), tuple(heads), thin_points(poles, Surface.POLE), unlit)
 
 
 def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
@@ -111,8 +111,8 @@ def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -
                 parts.append(_lamp(foot, z, ahead, looks))
                 over_road = (LAMP_ARM_M + 0.2) * np.array([-ahead[1], ahead[0]]) / np.linalg.norm(ahead)
                 lamps.append([*(foot + over_road), z + LAMP_HEIGHT_M + 0.1])
-                poles.append(along_pole(foot, z, LAMP_HEIGHT_M))
-    thin = thin_things(poles, Surface.POLE)
+                poles.append(pole_points(foot, z, LAMP_HEIGHT_M))
+    thin = thin_points(poles, Surface.POLE)
     return Props(join(parts), (), thin, StreetLamps(np.array(lamps).reshape(-1, 3), looks.lamp))
 
 
@@ -162,7 +162,7 @@ def _traffic_light(
     left = np.array([-np.sin(zone.post_yaw), np.cos(zone.post_yaw)])
     starts = np.array([lanes[i].centreline_xyz[0, :2] for i in zone.lane_ids])
     across = np.unique(((starts - foot[:2]) @ left).round(1))
-    reach = across[(np.abs(across) > 2.0) & (np.abs(across) < LONGEST_ARM_M)]
+    reach = across[(np.abs(across) > 2.0) & (np.abs(across) < MAX_ARM_M)]
     if len(reach):
         tip = reach[np.abs(reach).argmax()]
         end = (0.0, float(tip), MAST_HEIGHT_M - 0.1)
@@ -210,18 +210,18 @@ def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"],
     return _turned(join(parts), np.array([*foot, z]), float(np.arctan2(ahead[1], ahead[0])))
 
 
-def along_pole(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
+def pole_points(foot: Float[np.ndarray, "_"], z: float, height: float) -> Float[np.ndarray, "n 3"]:
     """Return points up a pole."""
     up = np.arange(0.0, height, POLE_SAMPLE_M)
     return np.column_stack([np.full_like(up, foot[0]), np.full_like(up, foot[1]), z + up])
 
 
-def thin_things(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinThings:
+def thin_points(lines: list[Float[np.ndarray, "_ 3"]], surface: Surface) -> ThinPoints:
     """Return thin points of one surface."""
     xyz = np.concatenate([np.zeros((0, 3)), *lines])
-    return ThinThings(xyz, np.full(len(xyz), int(surface)))
+    return ThinPoints(xyz, np.full(len(xyz), int(surface)))
 
 
-def join_thin(parts: Sequence[ThinThings]) -> ThinThings:
+def join_thin_points(parts: Sequence[ThinPoints]) -> ThinPoints:
     """Join thin points."""
-    return ThinThings(np.concatenate([p.xyz for p in parts]), np.concatenate([p.surface for p in parts]))
+    return ThinPoints(np.concatenate([p.xyz for p in parts]), np.concatenate([p.surface for p in parts]))

@@ -9,17 +9,17 @@ from jaxtyping import Bool, Float
 
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place import furniture_meshes
-from foredrive.towns.place.furniture_meshes import RAIL_STEP_M, FurnitureLooks, Thing
+from foredrive.towns.place.furniture_meshes import RAIL_STEP_M, FurnitureItem, FurnitureLooks
 from foredrive.towns.place.looks import LookTable, Surface
 from foredrive.towns.place.mesh import Mesh, join
-from foredrive.towns.place.props import ThinThings, join_thin, thin_things
+from foredrive.towns.place.props import ThinPoints, join_thin_points, thin_points
 from foredrive.towns.place.site import Frontage, Site, frontages
 from foredrive.towns.place.styles import STYLES, Style
 
 SETBACK_M = 1.2
 WALKWAY_STEP_M, OPEN_STEP_M = (7.0, 22.0), (45.0, 140.0)
-POLE_STEP_M, POLE_ASIDE_M = 34.0, 2.0
-BILLBOARD_ASIDE_M, SITE_ASIDE_M = 5.0, 2.5
+POLE_STEP_M, POLE_OFFSET_M = 34.0, 2.0
+BILLBOARD_OFFSET_M, SITE_OFFSET_M = 5.0, 2.5
 FAST_MPS, FAST_WITHIN_M = 27.0, 14.0
 """Speed limit above which a road is a motorway, m/s, and the distance from it within which guard rails stand,
 m."""
@@ -45,38 +45,38 @@ _ON_OPEN_ROADS = {"speed_sign": 0.5, "direction_sign": 0.25, "information_sign":
 
 def build_street_furniture(
     town: TownMap, site: Site, table: LookTable, rng: np.random.Generator
-) -> tuple[Mesh, ThinThings]:
+) -> tuple[Mesh, ThinPoints]:
     """Build guard rails, barriers, power lines, billboards, then small objects.
 
     Their places are taken from the site.
     """
     fast = [x.centreline_xyz[:, :2] for x in town.lanes if (x.speed_limit_mps or 0.0) > FAST_MPS]
     motorways = shapely.STRtree([shapely.LineString(line) for line in fast])
-    fitter = _Fitter(site, motorways, STYLES[town.name], FurnitureLooks(table), rng)
+    placer = _FurniturePlacer(site, motorways, STYLES[town.name], FurnitureLooks(table), rng)
     lines = frontages(site.plan, SETBACK_M)
     for frontage in lines:
         if not frontage.walkway:
-            fitter.rails(frontage)
+            placer.rails(frontage)
     for frontage in lines:
-        if frontage.line.length > 3 * POLE_STEP_M and rng.random() < fitter.style.power_lines:
-            fitter.power_line(frontage)
-        fitter.large(frontage)
-        fitter.small(frontage)
-    return join(fitter.parts), join_thin([thin_things([], Surface.POLE), *fitter.thin])
+        if frontage.line.length > 3 * POLE_STEP_M and rng.random() < placer.style.power_lines:
+            placer.power_line(frontage)
+        placer.large(frontage)
+        placer.small(frontage)
+    return join(placer.parts), join_thin_points([thin_points([], Surface.POLE), *placer.thin])
 
 
 @dataclass
-class _Fitter:
+class _FurniturePlacer:
     site: Site
     motorways: shapely.STRtree
     style: Style
     looks: FurnitureLooks
     rng: np.random.Generator
     parts: list[Mesh] = field(default_factory=list)
-    thin: list[ThinThings] = field(default_factory=list)
+    thin: list[ThinPoints] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._things = furniture_meshes.things(self.looks)
+        self._things = furniture_meshes.furniture_items(self.looks)
 
     def rails(self, frontage: Frontage) -> None:
         """Build guard rails or sound barriers along a motorway, section by section."""
@@ -114,7 +114,7 @@ class _Fitter:
         """Build poles with wires from each pole to the next."""
         last: Float[np.ndarray, 3] | None = None
         for s in np.arange(self.rng.uniform(0.0, POLE_STEP_M), frontage.line.length, POLE_STEP_M):
-            foot = self._place("power_pole", frontage, float(s), POLE_ASIDE_M)
+            foot = self._place("power_pole", frontage, float(s), POLE_OFFSET_M)
             near = foot is not None and last is not None and np.linalg.norm(foot - last) < 1.3 * POLE_STEP_M
             if near and foot is not None and last is not None:
                 self.parts.append(furniture_meshes.wires(last, foot, self.looks.wire))
@@ -123,8 +123,8 @@ class _Fitter:
     def large(self, frontage: Frontage) -> None:
         """Build billboards and building sites."""
         for name, per_km, aside in (
-            ("billboard", self.style.billboards, BILLBOARD_ASIDE_M),
-            ("building_site", 0.5, SITE_ASIDE_M),
+            ("billboard", self.style.billboards, BILLBOARD_OFFSET_M),
+            ("building_site", 0.5, SITE_OFFSET_M),
         ):
             for _ in range(int(self.rng.poisson(per_km * frontage.line.length / 1000.0))):
                 self._place(name, frontage, float(self.rng.uniform(0.0, frontage.line.length)), aside)
@@ -139,16 +139,16 @@ class _Fitter:
             s += float(self.rng.uniform(*step))
 
     def _place(
-        self, name: str, frontage: Frontage, s: float, aside_m: float
+        self, name: str, frontage: Frontage, s: float, offset_m: float
     ) -> Float[np.ndarray, "3"] | None:
         """Place an object beside a frontage if there is room. Return its foot, or None."""
-        thing: Thing = self._things[name]
+        thing: FurnitureItem = self._things[name]
         reach = min(s + 0.5, frontage.line.length)
         ahead = frontage.at(reach) - frontage.at(reach - 0.5)
         ahead /= np.linalg.norm(ahead)
         left = np.array([-ahead[1], ahead[0]])
         half = thing.room_m
-        xy = frontage.at(s) - (aside_m + max(half[1] - SETBACK_M + 0.25, 0.0)) * left
+        xy = frontage.at(s) - (offset_m + max(half[1] - SETBACK_M + 0.25, 0.0)) * left
         corners = xy + np.array(
             [
                 a * half[0] * ahead + b * half[1] * left
@@ -165,7 +165,7 @@ class _Fitter:
         moved = thing.mesh.transformed(T)
         self.parts.append(Mesh(moved.xyz, thing.mesh.uvw, moved.look))
         for surface, points in thing.thin:
-            self.thin.append(thin_things([points @ T[:3, :3].T + T[:3, 3]], surface))
+            self.thin.append(thin_points([points @ T[:3, :3].T + T[:3, 3]], surface))
         return T[:3, 3].copy()
 
 

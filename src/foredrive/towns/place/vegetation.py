@@ -11,13 +11,13 @@ from jaxtyping import Float
 from foredrive.towns.place.assets import Assets
 from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, frustum, join, triangles
-from foredrive.towns.place.props import ThinThings, along_pole, thin_things
+from foredrive.towns.place.props import ThinPoints, pole_points, thin_points
 from foredrive.towns.place.site import Site, frontages
 
 TREE_SETBACK_M = 1.5
 TREE_SPACING_M = (7.0, 15.0)
 STREET_TREES, OPEN_TREES_PER_M2 = 0.6, 1 / 260.0
-FIRST_TREE_M, LAST_TREE_M = 5.0, 80.0
+MIN_TREE_M, MAX_TREE_M = 5.0, 80.0
 NEAR_M = 22.0
 """Maximum distance from the roads at which trees have leaves that stick out, m."""
 TRUNK_M = 2.0
@@ -43,9 +43,9 @@ _SPHERE, _COARSE = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.
 
 def build_vegetation(
     site: Site, assets: Assets, table: LookTable, rng: np.random.Generator
-) -> tuple[Mesh, ThinThings]:
+) -> tuple[Mesh, ThinPoints]:
     """Place plants on the land that is still free and take their places from the site."""
-    nursery = _Nursery(assets, table, rng)
+    maker = _PlantMaker(assets, table, rng)
     parts, trunks = [], []
     spots = np.array(_street_tree_spots(site, rng) + _open_tree_spots(site, rng)).reshape(-1, 2)
     near = site.distance_to_road(spots) < NEAR_M
@@ -56,9 +56,9 @@ def build_vegetation(
             continue
         site.take(shapely.Point(xy).buffer(0.6))
         foot = np.array([*xy, float(site.height(xy[None])[0])])
-        parts.append(nursery.plant(kind, foot, radius, bool(detail)))
-        trunks.append(along_pole(xy, foot[2], TRUNK_M if kind not in _LOW else 0.5))
-    return join(parts), thin_things(trunks, Surface.VEGETATION)
+        parts.append(maker.plant(kind, foot, radius, bool(detail)))
+        trunks.append(pole_points(xy, foot[2], TRUNK_M if kind not in _LOW else 0.5))
+    return join(parts), thin_points(trunks, Surface.VEGETATION)
 
 
 def _street_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
@@ -80,7 +80,7 @@ def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndar
     xy = terrain.origin_xy + rng.random((count, 2)) * extent
     away = site.distance_to_road(xy)
     clump = np.sin(xy[:, 0] / 17.0 + 1.3 * np.sin(xy[:, 1] / 23.0)) + np.sin(xy[:, 1] / 19.0)
-    wanted = (away > FIRST_TREE_M) & (away < LAST_TREE_M) & (clump > rng.uniform(-0.6, 1.6, count))
+    wanted = (away > MIN_TREE_M) & (away < MAX_TREE_M) & (clump > rng.uniform(-0.6, 1.6, count))
     return list(xy[wanted])
 
 
@@ -97,7 +97,7 @@ def _has_room(site: Site, xy: Float[np.ndarray, "2"], kind: str, radius: float) 
 
 
 @dataclass
-class _Nursery:
+class _PlantMaker:
     """A few plants of each kind. Each placed plant is a rotated and scaled copy of one of them."""
 
     assets: Assets

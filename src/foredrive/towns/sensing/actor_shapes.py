@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.place.actor_looks import MeshLooks
-from foredrive.towns.place.actor_meshes import DRESSES, PEOPLE, SHAPES_OF_KIND, THINGS, VEHICLES
+from foredrive.towns.place.actor_meshes import DRESSES, OBJECTS, PEOPLE, SHAPES_OF_KIND, VEHICLES
 from foredrive.towns.place.assets import Assets, Palette
 from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join
@@ -58,7 +58,7 @@ class ShapeLibrary:
     """All shapes of road users."""
 
     shapes: dict[str, Shape]
-    soup: Mesh
+    triangles: Mesh
     paints: dict[str, Int32[np.ndarray, "_"]]
     """Looks for painting, by palette."""
 
@@ -80,13 +80,13 @@ class ShapeLibrary:
             palettes = ("bus", "bus", "bus")
         else:
             palettes = ("car", "cargo", "car")
-        mixed = zip(palettes, _mixed(actor.style), strict=True)
+        mixed = zip(palettes, _paint_numbers(actor.style), strict=True)
         chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in mixed]
         return np.array([*chosen, rear_light], dtype=np.int32)
 
 
 @lru_cache(maxsize=4096)
-def _mixed(style: int) -> tuple[float, ...]:
+def _paint_numbers(style: int) -> tuple[float, ...]:
     """Return uniform random numbers, one for each paint slot."""
     return tuple(np.random.default_rng(style).random(PAINTS).tolist())
 
@@ -96,7 +96,7 @@ def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:
     looks = MeshLooks(table)
     vehicles = {name: VEHICLES[name] for name in assets.vehicles}
     shapes, first = {}, 0
-    for name, build in {**vehicles, **PEOPLE, **THINGS}.items():
+    for name, build in {**vehicles, **PEOPLE, **OBJECTS}.items():
         mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name in PEOPLE else None)
         scene = TriangleScene(mesh)
         shapes[name] = Shape(scene, mesh, first, _solid(scene, _USUAL_SIZE_M.get(name, (5.0, 2.0))))
@@ -111,7 +111,7 @@ def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:
 
     return ShapeLibrary(
         shapes=shapes,
-        soup=join([shape.mesh for shape in shapes.values()]),
+        triangles=join([shape.mesh for shape in shapes.values()]),
         paints={
             "car": paints(assets.car_paints, 0.07),
             "cargo": paints(assets.cargo_paints, 0.02),

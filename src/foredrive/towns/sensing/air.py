@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 
 CONTRAST_LOST = 3.912
 """-ln 0.02: the product of visibility and extinction (Koschmieder)."""
@@ -26,7 +26,7 @@ class AirArrays(NamedTuple):
     """Extinction of a lidar's near-infrared light, one way, 1/m."""
     backscatter_per_m_sr: float
     """Share of a lidar pulse that the air scatters straight back, per metre and steradian."""
-    drops: float
+    rain_mmph: float
     """Rain rate, mm/h. Raindrops give single echoes, fog gives a continuous one."""
     wetness: float
     """Wetness of the ground, 0 to 1."""
@@ -56,6 +56,6 @@ def make_air(conditions: Conditions) -> AirArrays:
         extinction_per_m=extinction,
         lidar_extinction_per_m=rain + droplets * (1.0 if foggy else HAZE_AT_905_NM),
         backscatter_per_m_sr=BACKSCATTER_RATIO * (rain + (droplets if foggy else 0.0)),
-        drops=conditions.rain_mmph,
+        rain_mmph=conditions.rain_mmph,
         wetness=max(conditions.wetness, 0.5 if conditions.rain_mmph > 0.0 else 0.0),
     )

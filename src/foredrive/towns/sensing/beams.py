@@ -6,12 +6,12 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from foredrive.towns.sensing.lamps import DIPPED_RAD, HEAD, beam
+from foredrive.towns.sensing.lamps import DIPPED_RAD, HEAD, relative_intensity
 
 ASYMMETRY = 0.54
 """Asymmetry of the phase function (Henyey & Greenstein, Astrophysical Journal 93, 1941). With this value the
 fog's backscatter agrees with that for lidars, `air.BACKSCATTER_RATIO`."""
-ASIDE_M = np.array([16.0, 25.0, 3.0], dtype=np.float32)
+MAX_LATERAL_M = np.array([16.0, 25.0, 3.0], dtype=np.float32)
 """Distance from a lamp beyond which a ray shows nothing of its beam, by kind of lamp, m. Fog reduces it."""
 SPREAD_M = np.array([0.25, 0.8, 0.8], dtype=np.float32)
 """Half the width of a lamp, by kind of lamp, m. The lamps of a vehicle represent a pair."""
@@ -20,7 +20,7 @@ STEPS = np.array([5, 8, 3])
 STRAY_STEPS = 3
 EDGE_SLOPE = 0.7 * DIPPED_RAD
 """Slope of the cut-off of headlights."""
-DEPTHS = 3.0
+MAX_OPTICAL_DEPTH = 3.0
 """Optical depth beyond which nothing is visible."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -37,13 +37,13 @@ def phase(cosine):
 
 @_kernel
 @no_type_check
-def _within_sight(lamps, extinction_per_m, origin):
+def _visible_lamps(lamps, extinction_per_m, origin):
     """Return the indices of the lamps whose light can be visible for rays from about there."""
     index = np.empty(len(lamps.xyz), np.int64)
     count = 0
     for k in range(len(lamps.xyz) if len(origin) > 0 else 0):
         x, y = lamps.xyz[k, 0] - origin[0, 0], lamps.xyz[k, 1] - origin[0, 1]
-        if math.hypot(x, y) < DEPTHS / extinction_per_m + ASIDE_M[lamps.kind[k]]:
+        if math.hypot(x, y) < MAX_OPTICAL_DEPTH / extinction_per_m + MAX_LATERAL_M[lamps.kind[k]]:
             index[count] = k
             count += 1
     return index[:count]
@@ -62,24 +62,24 @@ def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
         direction: [N 3] unit directions of the rays.
         known: [N 3] not negative for rays that do not change; or [0 3].
     """
-    seen = _within_sight(lamps, extinction_per_m, origin)
+    seen = _visible_lamps(lamps, extinction_per_m, origin)
     for i in range(len(t)):
         if len(known) > 0 and known[i, 0] >= 0.0:
             continue
-        end = min(t[i], DEPTHS / extinction_per_m)
+        end = min(t[i], MAX_OPTICAL_DEPTH / extinction_per_m)
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         for k in seen:
             px, py, pz = lamps.xyz[k, 0], lamps.xyz[k, 1], lamps.xyz[k, 2]
             px, py, pz = px - origin[i, 0], py - origin[i, 1], pz - origin[i, 2]
-            along, aside_m = px * dx + py * dy + pz * dz, ASIDE_M[lamps.kind[k]]
+            along, lateral_m = px * dx + py * dy + pz * dz, MAX_LATERAL_M[lamps.kind[k]]
             near = px * px + py * py + pz * pz - along * along
-            if near > aside_m * aside_m or along > end + aside_m or along < -aside_m:
+            if near > lateral_m * lateral_m or along > end + lateral_m or along < -lateral_m:
                 continue
-            aside_m *= math.exp(-extinction_per_m * max(along, 0.0))
-            if near > aside_m * aside_m:
+            lateral_m *= math.exp(-extinction_per_m * max(along, 0.0))
+            if near > lateral_m * lateral_m:
                 continue
             sent = _scattered(lamps, k, extinction_per_m, px, py, pz, dx, dy, dz, along, near, end)
-            sent *= 1.0 - near / (aside_m * aside_m)
+            sent *= 1.0 - near / (lateral_m * lateral_m)
             for c in range(3):
                 radiance[i, c] += lamps.rgb[k, c] * sent
 
@@ -119,7 +119,7 @@ def _scattered(lamps, k, extinction_per_m, px, py, pz, dx, dy, dz, along, near, 
             lx, ly, lz = s * dx - px, s * dy - py, s * dz - pz
             r = math.sqrt(lx * lx + ly * ly + lz * lz) + 1e-3
             lx, ly, lz = lx / r, ly / r, lz / r
-            sent = beam(kind, hx, hy, lx, ly, lz)
+            sent = relative_intensity(kind, hx, hy, lx, ly, lz)
             if sent > 0.0:
                 towards_eye = -(lx * dx + ly * dy + lz * dz)
                 sent *= phase(towards_eye) * math.exp(-extinction_per_m * (s + r))

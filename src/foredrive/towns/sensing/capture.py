@@ -13,14 +13,15 @@ from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.threads import in_parallel
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import CameraOptics, SpinningLidar, camera_rays
+from foredrive.sensors.vehicle import VehicleSensors
 from foredrive.towns.sensing import echoes, shading
 from foredrive.towns.sensing import wet as wet_ground
 from foredrive.towns.sensing.beams import add_beams
+from foredrive.towns.sensing.hit_buffer import HitBuffer, empty_hit_buffer, record_hits
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import LightArrays
-from foredrive.towns.sensing.outlines import Looked, outlines, same_as_centre
-from foredrive.towns.sensing.raycast import Surroundings
-from foredrive.towns.sensing.seen import Seen, note, nothing_seen
+from foredrive.towns.sensing.outlines import ShadedPixels, outlines, same_as_centre
+from foredrive.towns.sensing.raycast import RaycastScene
 
 PIXEL_GRAIN, BEAM_GRAIN = 4096, 4096
 
@@ -40,12 +41,9 @@ class EgoRays(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SensorSuite:
-    """The sensors of the recording vehicle."""
+class SensorSuite(VehicleSensors):
+    """The sensors of the recording vehicle, with the way in which a town's renderer samples them."""
 
-    rig: CameraRig
-    """Cameras, without leading dimensions."""
-    lidar: SpinningLidar
     samples_per_outline_pixel: int = 4
     """Number of rays of an outline pixel, a square number. Other pixels have one ray, because textures are
     filtered. Pixels with an outline or a shadow edge have this many."""
@@ -91,16 +89,16 @@ class EgoMotion:
     twist_ego: Float[np.ndarray, "6"]
     """Velocity (m/s), then turn rate (rad/s), of the ego frame in its own axes."""
 
-    def now(self, rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
+    def to_world(self, rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
         """Transform the rays `rows` from the ego frame of the frame's time to the world, all at that time."""
         T = np.ascontiguousarray(self.T_world_ego[:3], dtype=np.float32)
-        origin, direction = shading.move_rays(T, rays.origin, rays.direction, rows)
+        origin, direction = shading.transform_rays(T, rays.origin, rays.direction, rows)
         return WorldRays(origin, direction, None)
 
-    def then(self, rays: EgoRays) -> WorldRays:
+    def to_world_at_ray_times(self, rays: EgoRays) -> WorldRays:
         """Transform rays from the ego frame of the time at which each of them is measured to the world."""
         if not self.twist_ego.any():
-            return self.now(rays, np.arange(len(rays.dt_s)))._replace(dt_s=rays.dt_s)
+            return self.to_world(rays, np.arange(len(rays.dt_s)))._replace(dt_s=rays.dt_s)
         dt_s, row = np.unique(rays.dt_s, return_inverse=True)
         T_now_then = exp_se3(torch.from_numpy(dt_s[:, None].astype(np.float64) * self.twist_ego)).numpy()
         T = (self.T_world_ego @ T_now_then)[:, :3].astype(np.float32)[row]
@@ -109,18 +107,18 @@ class EgoMotion:
 
 
 @dataclass(frozen=True)
-class DriveSnapshot:
+class RayTracer:
     """A town with its road users at their positions at one time, and their motion around that time."""
 
-    scene: shading.Scene
-    surroundings: Surroundings
+    scene: shading.SceneArrays
+    surroundings: RaycastScene
     light: LightArrays
 
     def cast(self, rays: WorldRays) -> shading.Hits:
         """Return the nearest hits."""
         return self.surroundings.cast(*rays)
 
-    def look(
+    def trace(
         self, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
     ) -> tuple[shading.Hits, shading.Surfaces, Bool[np.ndarray, "N"]]:
         """Return the hits of rays, the surfaces there, and whether the sun shines there.
@@ -147,7 +145,7 @@ class DriveSnapshot:
         mirrored = self.mirrored(found, hits, rays, ray_rad)
         looks, light = self.scene.looks, self.light
         out = shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
-        if light.air.foggy and len(light.lamps.near) > 0:
+        if light.air.foggy and len(light.lamps.lamp_index) > 0:
             t = np.where(found.look == shading.MISS, np.float32(np.inf), hits.t)
             add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, known, out)
         return out
@@ -178,9 +176,11 @@ class DriveSnapshot:
         wetness, looks = self.light.air.wetness, self.scene.looks
         wet = wet_ground.mirror_rays(looks, found, hits.t, rays.direction, wetness, origin, direction)
         dt_s = None if rays.dt_s is None else rays.dt_s[wet]
-        onward = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
-        met, there, lit = self.look(onward, ray_rad[wet])
-        out[wet] = shading.shade(looks, there, met.t, onward.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN)
+        mirrored_rays = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
+        met, there, lit = self.trace(mirrored_rays, ray_rad[wet])
+        out[wet] = shading.shade(
+            looks, there, met.t, mirrored_rays.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN
+        )
         return out
 
 
@@ -201,7 +201,7 @@ class Film:
             self._linear[pixels] = self._exposure * radiance.reshape(-1, samples, 3).mean(1)
 
     @property
-    def shown(self) -> UInt8[np.ndarray, "P 3"]:
+    def noise_free(self) -> UInt8[np.ndarray, "P 3"]:
         """Return the present colours of the pixels, without sensor noise."""
         return self._rgb if self._linear is None else shading.develop(self._linear, 1.0, 1)
 
@@ -212,9 +212,9 @@ class Film:
         return shading.develop(self._optics.with_noise(self._linear, rng), 1.0, 1)
 
 
-def see(
-    moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
-) -> tuple[UInt8[np.ndarray, "C H W 3"], Seen]:
+def render_images(
+    tracer: RayTracer, sensors: SensorSuite, ego: EgoMotion, rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "C H W 3"], HitBuffer]:
     """Render images of all cameras.
 
     Also return the hits of the pixels' central rays [C·H·W] in the middle of their exposure. Each row is
@@ -223,76 +223,86 @@ def see(
     """
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     count = int(np.prod(shape))
-    seen, film = nothing_seen(count), Film(sensors.optics, moment.light.exposure, count)
+    buffer, film = empty_hit_buffer(count), Film(sensors.optics, tracer.light.exposure, count)
     if sensors.optics.shutter_s > 0:
-        _see_blurred(moment, sensors, ego, film, seen)
+        _render_blurred(tracer, sensors, ego, film, buffer)
     else:
-        _see_sharp(moment, sensors, ego, film, seen)
-    return film.develop(rng).reshape(*shape, 3), seen
+        _render_sharp(tracer, sensors, ego, film, buffer)
+    return film.develop(rng).reshape(*shape, 3), buffer
 
 
-def _see_sharp(moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+def _render_sharp(
+    tracer: RayTracer, sensors: SensorSuite, ego: EgoMotion, film: Film, buffer: HitBuffer
+) -> None:
     """Render one ray per pixel, then several rays for pixels on outlines."""
-    count, samples = len(seen.look), sensors.samples_per_outline_pixel
+    count, samples = len(buffer.look), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
     rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    known = Looked(rgb, normal, np.empty(count, np.bool_))
+    known = ShadedPixels(rgb, normal, np.empty(count, np.bool_))
 
     def to_world(rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
-        return ego.then(EgoRays(*(column[rows] for column in rays))) if rolling else ego.now(rays, rows)
+        return (
+            ego.to_world_at_ray_times(EgoRays(*(column[rows] for column in rays)))
+            if rolling
+            else ego.to_world(rays, rows)
+        )
 
-    def first_look(start: int, stop: int) -> None:
+    def trace_centres(start: int, stop: int) -> None:
         part = slice(start, stop)
         rays = to_world(sensors.pixel_rays, np.arange(start, stop))
-        hits, found, lit = moment.look(rays, sensors.pixel_rad[part])
-        radiance = moment.radiance(hits, found, lit, rays, sensors.pixel_rad[part])
+        hits, found, lit = tracer.trace(rays, sensors.pixel_rad[part])
+        radiance = tracer.radiance(hits, found, lit, rays, sensors.pixel_rad[part])
         film.expose(part, radiance, 1)
-        note(seen, part, hits, found.look)
+        record_hits(buffer, part, hits, found.look)
         known.radiance[part], known.normal[part], known.lit[part] = radiance, found.normal, lit
 
-    in_parallel(first_look, count, PIXEL_GRAIN)
+    in_parallel(trace_centres, count, PIXEL_GRAIN)
     if samples == 1:
         return
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
-    pixels = np.flatnonzero(outlines(seen, known, film.shown, shape))
+    pixels = np.flatnonzero(outlines(buffer, known, film.noise_free, shape))
 
-    def closer_look(start: int, stop: int) -> None:
+    def trace_outlines(start: int, stop: int) -> None:
         some = pixels[start:stop]
         rows = (some[:, None] * samples + np.arange(samples)).ravel()
         rays = to_world(sensors.outline_rays, rows)
         ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
-        hits, found, lit = moment.look(rays, ray_rad)
-        same = same_as_centre(some, samples, found, hits.actor, lit, seen, known)
-        film.expose(some, moment.radiance(hits, found, lit, rays, ray_rad, same), samples)
+        hits, found, lit = tracer.trace(rays, ray_rad)
+        same = same_as_centre(some, samples, found, hits.actor, lit, buffer, known)
+        film.expose(some, tracer.radiance(hits, found, lit, rays, ray_rad, same), samples)
 
-    in_parallel(closer_look, len(pixels), PIXEL_GRAIN // samples)
+    in_parallel(trace_outlines, len(pixels), PIXEL_GRAIN // samples)
 
 
-def _see_blurred(moment: DriveSnapshot, sensors: SensorSuite, ego: EgoMotion, film: Film, seen: Seen) -> None:
+def _render_blurred(
+    tracer: RayTracer, sensors: SensorSuite, ego: EgoMotion, film: Film, buffer: HitBuffer
+) -> None:
     """Render the mean of the light at several instants, each through a different part of the pixel."""
     optics, samples = sensors.optics, sensors.samples_per_outline_pixel
 
     def job(start: int, stop: int) -> None:
         part = slice(start, stop)
-        rays = ego.then(EgoRays(*(column[part] for column in sensors.pixel_rays)))
-        hits = moment.cast(rays)
+        rays = ego.to_world_at_ray_times(EgoRays(*(column[part] for column in sensors.pixel_rays)))
+        hits = tracer.cast(rays)
         ray_rad = sensors.pixel_rad[part]
-        found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
-        note(seen, part, hits, found.look)
+        found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
+        record_hits(buffer, part, hits, found.look)
         total = np.zeros((stop - start, 3), np.float32)
         for k, dt_s in enumerate(optics.sub_exposure_dt_s):
             origin, direction, row_dt_s = sensors.outline_rays
             rows = slice(start * samples + k % samples, stop * samples, samples)
-            rays = ego.then(EgoRays(origin[rows], direction[rows], row_dt_s[rows] + np.float32(dt_s)))
-            total += moment.radiance(*moment.look(rays, ray_rad), rays, ray_rad)
+            rays = ego.to_world_at_ray_times(
+                EgoRays(origin[rows], direction[rows], row_dt_s[rows] + np.float32(dt_s))
+            )
+            total += tracer.radiance(*tracer.trace(rays, ray_rad), rays, ray_rad)
         film.expose(part, total / np.float32(optics.sub_exposures), 1)
 
-    in_parallel(job, len(seen.look), PIXEL_GRAIN)
+    in_parallel(job, len(buffer.look), PIXEL_GRAIN)
 
 
-def sweep(
-    moment: DriveSnapshot, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
-) -> tuple[LidarSweep, Seen]:
+def simulate_sweep(
+    tracer: RayTracer, lidar: SpinningLidar, ego: EgoMotion, rng: np.random.Generator
+) -> tuple[LidarSweep, HitBuffer]:
     """Simulate one revolution of the lidar, and return the sweep and the hits of its beams.
 
     Road users move straight ahead during the revolution. A beam without a return is free up to the surface
@@ -306,31 +316,31 @@ def sweep(
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
-    seen, air, far_m = nothing_seen(count), moment.light.air, np.float32(lidar.max_range_m)
+    buffer, air, far_m = empty_hit_buffer(count), tracer.light.air, np.float32(lidar.max_range_m)
     clutter = rng.random((count if air.backscatter_per_m_sr > 0 else 0, 4), dtype=np.float32)
     beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps if n == 1 else lidar.divergence_rad / n**0.5)
 
     def job(start: int, stop: int) -> None:
         part, rows = slice(start, stop), np.arange(start * n, stop * n)
-        rays = ego.now(ego_rays, rows)._replace(dt_s=ego_rays.dt_s[rows])
-        hits = moment.cast(rays)
+        rays = ego.to_world(ego_rays, rows)._replace(dt_s=ego_rays.dt_s[rows])
+        hits = tracer.cast(rays)
         ray_rad = np.full(len(hits.t), beam_rad)
-        found = shading.surfaces(moment.scene, hits, rays.origin, rays.direction, ray_rad)
+        found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
         odds = chance[part]
         if n > 1:
             t = np.where(found.look == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
-            odds = echoes.chance_of_shares(odds, share)
-        look, echo = found.look, lidar_returns(moment.scene.looks, found, hits.t, far_m, odds, air)
+            odds = echoes.footprint_chance(odds, share)
+        look, echo = found.look, lidar_returns(tracer.scene.looks, found, hits.t, far_m, odds, air)
         if n > 1:
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
             hits, look = shading.Hits(*(column[picked] for column in hits)), look[picked]
         range_m[part], returned[part], intensity[part] = echo
-        note(seen, part, hits, look)
+        record_hits(buffer, part, hits, look)
         if len(clutter):
             surfaces = range_m[part], returned[part], intensity[part]
             of_air = air_returns(air, clutter[part], lidar.pulse_m, far_m, *surfaces)
-            seen.triangle[part][of_air], seen.look[part][of_air] = shading.MISS, shading.MISS
+            buffer.triangle[part][of_air], buffer.look[part][of_air] = shading.MISS, shading.MISS
 
     in_parallel(job, count, BEAM_GRAIN // n)
     returned &= range_m >= lidar.min_range_m
@@ -344,4 +354,4 @@ def sweep(
         dt_s=beams.dt_s,
         beam=lidar.channel,
         valid=torch.ones(count, dtype=torch.bool),
-    ), seen
+    ), buffer

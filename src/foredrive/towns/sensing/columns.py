@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from foredrive.towns.place.looks import Surface
 from foredrive.towns.place.mesh import Mesh
-from foredrive.towns.place.props import ThinThings
+from foredrive.towns.place.props import ThinPoints
 from foredrive.towns.sensing.raycast import TriangleScene
 from foredrive.towns.sensing.shading import MISS
 
@@ -21,13 +21,13 @@ EDGE_M = 0.4
 WALL_SPACING_M = 0.2
 UPRIGHT = 0.3
 """Maximum vertical component of a wall's unit normal."""
-MOST_LAYERS = 40
+MAX_LAYERS = 40
 STEP_M = 2e-3
 DECK_DEPTH_M = 1.5
 """Maximum depth below a road, m, at which an underside belongs to the road's deck."""
 
 _GROUND = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN)
-_PASSED = (Surface.HIDDEN, Surface.VEHICLE, Surface.PEDESTRIAN)
+_IGNORED = (Surface.HIDDEN, Surface.VEHICLE, Surface.PEDESTRIAN)
 """Surfaces that rays pass. Parked cars are handled like road users."""
 
 
@@ -49,18 +49,18 @@ class TownColumns:
     faces: "Faces"
     top_m: float
     """Height above everything, m."""
-    unmet: Intervals
+    extra: Intervals
     """Intervals of matter that rays from above miss: upright faces, and objects thinner than a column."""
     _tiles: dict[tuple[int, int], Intervals] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        key = np.floor(np.stack([self.unmet.x, self.unmet.y], axis=1) / TILE_M).astype(int)
+        key = np.floor(np.stack([self.extra.x, self.extra.y], axis=1) / TILE_M).astype(int)
         order = np.lexsort(key.T)
         starts = np.flatnonzero(np.diff(key[order], axis=0, prepend=key[order][:1] - 1).any(axis=1))
         rows = np.split(order, starts[1:])
-        self._unmet = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
+        self._extra = {(int(key[r[0], 0]), int(key[r[0], 1])): r for r in rows if len(r)}
 
-    def below(self, xy: Float[np.ndarray, "P 2"], yaw: float) -> list[Intervals]:
+    def tiles_around(self, xy: Float[np.ndarray, "P 2"], yaw: float) -> list[Intervals]:
         """Return all tiles that overlap the rectangle around some points, whose sides have the angle `yaw` to
         world x."""
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -81,7 +81,7 @@ class TownColumns:
         count = round(TILE_M / COLUMN_M)
         offsets = (np.arange(count) + 0.5) * COLUMN_M
         y, x = (a.ravel() for a in np.meshgrid(j * TILE_M + offsets, i * TILE_M + offsets, indexing="ij"))
-        coarse, ray = columns(self.scene, self.faces, x, y, self.top_m)
+        coarse, ray = cast_columns(self.scene, self.faces, x, y, self.top_m)
         solid = coarse.high > coarse.low
         height = np.zeros(len(x))
         np.maximum.at(height, ray[solid], (coarse.high - coarse.low)[solid])
@@ -89,13 +89,13 @@ class TownColumns:
         fine = (np.arange(EDGE_SPLIT) + 0.5) / EDGE_SPLIT * COLUMN_M - 0.5 * COLUMN_M
         dy, dx = (a.ravel() for a in np.meshgrid(fine, fine, indexing="ij"))
         fine_x, fine_y = (x[edge][:, None] + dx).ravel(), (y[edge][:, None] + dy).ravel()
-        refined, _ = columns(self.scene, self.faces, fine_x, fine_y, self.top_m)
-        rows = self._unmet.get((i, j), np.zeros(0, dtype=int))
-        return _join([coarse, refined, Intervals(*(column[rows] for column in self.unmet))])
+        refined, _ = cast_columns(self.scene, self.faces, fine_x, fine_y, self.top_m)
+        rows = self._extra.get((i, j), np.zeros(0, dtype=int))
+        return _join([coarse, refined, Intervals(*(column[rows] for column in self.extra))])
 
 
 def make_columns(
-    mesh: Mesh, scene: TriangleScene, surface_of_look: Int[np.ndarray, "L"], thin: ThinThings
+    mesh: Mesh, scene: TriangleScene, look_surface: Int[np.ndarray, "L"], thin: ThinPoints
 ) -> TownColumns:
     """Prepare the columns of all static objects of a town.
 
@@ -105,10 +105,10 @@ def make_columns(
         surface_of_look: the `Surface` of each look.
         thin: points on objects that the columns would miss.
     """
-    faces = faces_of(mesh, surface_of_look)
+    faces = faces_of(mesh, look_surface)
     x, y, z = thin.xyz.T.astype(np.float32)
-    unmet = _join([wall_intervals(mesh, faces), Intervals(x, y, z, z, thin.surface)])
-    return TownColumns(scene, faces, float(mesh.xyz[..., 2].max()) + 1.0, unmet)
+    extra = _join([wall_intervals(mesh, faces), Intervals(x, y, z, z, thin.surface)])
+    return TownColumns(scene, faces, float(mesh.xyz[..., 2].max()) + 1.0, extra)
 
 
 def _join(parts: Sequence[Intervals]) -> Intervals:
@@ -124,14 +124,14 @@ class Faces:
     surface: Int[np.ndarray, "F"]
 
 
-def faces_of(mesh: Mesh, surface_of_look: Int[np.ndarray, "L"]) -> Faces:
+def faces_of(mesh: Mesh, look_surface: Int[np.ndarray, "L"]) -> Faces:
     """Return the orientation and the surface of each triangle."""
     a, b = mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]
     upward = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    return Faces(upward, surface_of_look[mesh.look])
+    return Faces(upward, look_surface[mesh.look])
 
 
-def columns(
+def cast_columns(
     scene: TriangleScene,
     faces: Faces,
     x: Float[np.ndarray, "C"],
@@ -153,7 +153,7 @@ def columns(
     def emit(rays: np.ndarray, low: np.ndarray, high: np.ndarray, surface: np.ndarray) -> None:
         found.append((rays, low, high, surface))
 
-    for _ in range(MOST_LAYERS):
+    for _ in range(MAX_LAYERS):
         down = np.broadcast_to(np.array([0, 0, -1], np.float32), (len(ray), 3))
         hits = scene.cast(origin[ray], np.ascontiguousarray(down))
         on = hits.triangle != MISS
@@ -164,7 +164,7 @@ def columns(
             break
         surface, upward = faces.surface[triangle], faces.upward[triangle]
         ground = np.isin(surface, _GROUND)
-        solid = ~ground & ~np.isin(surface, _PASSED)
+        solid = ~ground & ~np.isin(surface, _IGNORED)
         enters, leaves = solid & upward, solid & ~upward
         closing = (ground & (depth[ray] > 0)) | (leaves & (depth[ray] == 1))
         # A ray that grazed the rim of a crown has a wrong count: leaves do not reach the ground.

@@ -41,7 +41,7 @@ def group_echoes(t, pulse_m):
     return group, share
 
 
-def chance_of_shares(
+def footprint_chance(
     chance: Float32[np.ndarray, "B K"], share: Float32[np.ndarray, "B n"]
 ) -> Float32[np.ndarray, "R K"]:
     """Convert the random numbers of whole beams to those of the R = B · n rays of their footprints.

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Float64, Int32
 
 from foredrive.data.log_writer import EGO_VEHICLE
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 
 UNIT_LUX = 65_000.0
 """Illuminance under which a white diffuse surface has radiance 1, lx."""
@@ -42,8 +42,8 @@ class LampArrays(NamedTuple):
     kind: Int32[np.ndarray, "K"]
     origin_xy: Float64[np.ndarray, "2"]
     first: Int32[np.ndarray, "cells+1"]
-    """Index in `near` at which the lamps of each cell start."""
-    near: Int32[np.ndarray, "n"]
+    """Index in `lamp_index` at which the lamps of each cell start."""
+    lamp_index: Int32[np.ndarray, "n"]
 
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -131,7 +131,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
 
 @_kernel
 @no_type_check
-def beam(kind, hx, hy, lx, ly, lz):
+def relative_intensity(kind, hx, hy, lx, ly, lz):
     """Return the share of a lamp's intensity that it emits along the unit vector (lx, ly, lz)."""
     if kind == STREET:  # cut off at 78° from straight down
         return min(max(5.0 * (-lz - 0.2), 0.0), 1.0)
@@ -168,7 +168,7 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
         return
     cell = int(row) * CELLS + int(column)
     for item in range(lamps.first[cell], lamps.first[cell + 1]):
-        k = lamps.near[item]
+        k = lamps.lamp_index[item]
         lx, ly, lz = x - lamps.xyz[k, 0], y - lamps.xyz[k, 1], z - lamps.xyz[k, 2]
         square = max(lx * lx + ly * ly + lz * lz, 0.05)
         scale = 1.0 / math.sqrt(square)
@@ -176,7 +176,9 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
         facing = -(nx * lx + ny * ly + nz * lz)
         if facing <= 0.0:
             continue
-        sent = beam(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
+        sent = (
+            relative_intensity(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
+        )
         if shine > 0.0:
             hx, hy, hz = -lx - dx, -ly - dy, -lz - dz
             length = math.sqrt(hx * hx + hy * hy + hz * hz)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 
 FALL_MPS = 7.0
 """Speed of falling drops of 2 mm, m/s (Gunn & Kinzer, J. Meteorology 6, 1949)."""
@@ -15,7 +15,7 @@ EXPOSURE_S = 1 / 60
 DROP_M = 2e-3
 STREAKS_PER_PIXEL = 1.1e-3
 """Streaks per pixel at 10 mm/h, from drops that are close enough to be visible one by one."""
-NEAREST_M, FURTHEST_M = 0.8, 7.0
+MIN_STREAK_M, MAX_STREAK_M = 0.8, 7.0
 LENS_DROPS = 9
 DROP_RADIUS = (0.006, 0.024)
 """Minimum and maximum radius of drops on the lens, as a fraction of the image width."""
@@ -61,7 +61,7 @@ def _streaks(
     """Return the share of each pixel that falling drops hide. The number of drops grows with R^0.63."""
     height, width = size_hw
     count = round(STREAKS_PER_PIXEL * height * width * (rain_mmph / 10.0) ** 0.63)
-    distance_m = rng.uniform(NEAREST_M, FURTHEST_M, count)
+    distance_m = rng.uniform(MIN_STREAK_M, MAX_STREAK_M, count)
     start = rng.random((count, 2)) * (width, 1.3 * height) - (0.0, 0.3 * height)
     slant = rng.normal(0.05, 0.03, count)
     length_px = focal_px * FALL_MPS * EXPOSURE_S / distance_m

@@ -23,7 +23,7 @@ RETROREFLECTED = 0.3
 FOLIAGE_DEPTH_M = 0.25
 WET_LIDAR_LOSS, FILM_LIDAR_LOSS = 0.35, 0.75
 """Share of the dry surface's echo that is lost: on a soaked surface, and below a film of water."""
-NEAREST_CLUTTER_M, CLUTTER_DEPTH_M = 1.2, 9.0
+MIN_CLUTTER_M, CLUTTER_DEPTH_M = 1.2, 9.0
 """Range of clutter, m. Closer, the laser does not overlap with the detector's field of view. Further away,
 clutter is too weak."""
 DROP_MMPH = 150.0
@@ -112,12 +112,12 @@ def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity)
     from_air = np.zeros(count, np.bool_)
     if air.backscatter_per_m_sr <= 0.0:
         return from_air
-    share = 1.0 - math.exp(-air.drops / DROP_MMPH) if air.drops > 0.0 else 1.0
+    share = 1.0 - math.exp(-air.rain_mmph / DROP_MMPH) if air.rain_mmph > 0.0 else 1.0
     reflectivity = math.pi * air.backscatter_per_m_sr * pulse_m / share
     for i in range(count):
         if chance[i, 0] > share:
             continue
-        r = NEAREST_CLUTTER_M + CLUTTER_DEPTH_M * chance[i, 1] ** 2
+        r = MIN_CLUTTER_M + CLUTTER_DEPTH_M * chance[i, 1] ** 2
         if r >= min(range_m[i], max_range_m):
             continue
         there = reflectivity * math.exp(-2.0 * air.lidar_extinction_per_m * r)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from foredrive.towns.conditions import Conditions
+from foredrive.scene.conditions import Conditions
 from foredrive.towns.sensing.air import CONTRAST_LOST, AirArrays, make_air
 from foredrive.towns.sensing.lamps import NO_LAMPS, UNIT_LUX, LampArrays
 from foredrive.towns.sensing.sky import FOG_TOP_M
@@ -48,7 +48,7 @@ class LightArrays(NamedTuple):
     sun: Rgb
     """Unit direction towards the sun; zeros where it casts no shadows."""
     sun_rgb: Rgb
-    sunward: Rgb
+    glow_direction: Rgb
     """Unit direction towards the brightest part of the sky."""
     glow_rgb: Rgb
     """Glow of the sky around the sun."""
@@ -150,7 +150,7 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
     return LightArrays(
         sun=toward * np.float32(through > 0.0),
         sun_rgb=beam * np.float32(through),
-        sunward=toward,
+        glow_direction=toward,
         glow_rgb=colours.glow * np.float32(behind / NOON_SKY) + np.float32(0.12) * beam * np.float32(through),
         zenith=colours.zenith * np.float32(behind / NOON_SKY)
         + np.float32(0.5) * glow_lux * _rgb(0.8, 0.9, 1.25),
@@ -169,12 +169,12 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
     )
 
 
-def is_dark(conditions: Conditions) -> bool:
+def street_lamps_on(conditions: Conditions) -> bool:
     """Return whether street lamps are on."""
     return daylight_lux(conditions) < LAMPS_BELOW_LUX
 
 
-def drive_lit(conditions: Conditions) -> bool:
+def headlights_on(conditions: Conditions) -> bool:
     """Return whether drivers have their lights on."""
     hidden = conditions.rain_mmph > 0.0 or conditions.visibility_m < HEADLIGHTS_BELOW_M
     return hidden or daylight_lux(conditions) < HEADLIGHTS_BELOW_LUX

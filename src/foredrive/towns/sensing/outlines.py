@@ -15,7 +15,7 @@ CONTRAST = 12
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-class Looked(NamedTuple):
+class ShadedPixels(NamedTuple):
     """The results of the central rays of P pixels."""
 
     radiance: Float32[np.ndarray, "P 3"]
@@ -26,13 +26,13 @@ class Looked(NamedTuple):
 
 @_kernel
 @no_type_check
-def outlines(seen, centre, rgb, shape):
+def outlines(buffer, centre, rgb, shape):
     """Return which pixels [C·H·W] lie on a visible edge: of an object, of a shadow, or at a bend of a
     surface.
 
     Args:
-        seen: look and actor of each pixel.
-        centre: `Looked`.
+        buffer: look and actor of each pixel.
+        centre: `ShadedPixels`.
         rgb: [C·H·W 3] 8-bit colours.
         shape: C, H, W.
     """
@@ -44,8 +44,8 @@ def outlines(seen, centre, rgb, shape):
             inside = (i % width) + 1 < width if step == 1 else (i // width) % height + 1 < height
             if not inside:
                 continue
-            edge = seen.look[i] != seen.look[j] or seen.actor[i] != seen.actor[j]
-            if not edge and seen.look[i] != MISS:
+            edge = buffer.look[i] != buffer.look[j] or buffer.actor[i] != buffer.actor[j]
+            if not edge and buffer.look[i] != MISS:
                 edge = centre.lit[i] != centre.lit[j] or _bends(centre.normal, i, centre.normal, j)
             if edge:
                 for c in range(3):
@@ -56,7 +56,7 @@ def outlines(seen, centre, rgb, shape):
 
 @_kernel
 @no_type_check
-def same_as_centre(pixels, samples, found, actor, lit, seen, centre):
+def same_as_centre(pixels, samples, found, actor, lit, buffer, centre):
     """Return the radiance [n·samples 3] of rays that find the same as their pixel's central ray, -1 for
     others.
 
@@ -69,7 +69,7 @@ def same_as_centre(pixels, samples, found, actor, lit, seen, centre):
     out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
     for i in range(len(out)):
         pixel = pixels[i // samples]
-        same = found.look[i] == seen.look[pixel] and actor[i] == seen.actor[pixel]
+        same = found.look[i] == buffer.look[pixel] and actor[i] == buffer.actor[pixel]
         if same and found.look[i] != MISS:
             same = lit[i] == centre.lit[pixel] and not _bends(found.normal, i, centre.normal, pixel)
         if same:

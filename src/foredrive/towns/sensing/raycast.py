@@ -41,7 +41,7 @@ class TriangleScene:
         return embree.occluded(_scenes([self.handle]), origin, direction, _ALWAYS)
 
 
-class PlacedShapes:
+class ShapeInstances:
     """A actors in the world, ready for ray casting.
 
     Args:
@@ -65,11 +65,11 @@ class PlacedShapes:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class RaycastScene:
     """The static world and the actors in it."""
 
     static: TriangleScene
-    placed: PlacedShapes
+    placed: ShapeInstances
 
     def cast(self, origin: Rays, direction: Rays, dt_s: Times | None = None) -> Hits:
         """Return the nearest hits of unit rays.

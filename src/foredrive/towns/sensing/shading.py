@@ -35,7 +35,7 @@ _ENCODED = (np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) * 255 + 0.5).astype(np.uint
 """8-bit values of display brightness by 12-bit linear value."""
 
 
-class Soup(NamedTuple):
+class Triangles(NamedTuple):
     """Triangles, as in `Mesh`."""
 
     xyz: Float32[np.ndarray, "F 3 3"]
@@ -68,11 +68,11 @@ class Hits(NamedTuple):
     """Barycentric coordinates of the second and third corner."""
 
 
-class Scene(NamedTuple):
+class SceneArrays(NamedTuple):
     """Everything that rays can hit."""
 
-    static: Soup
-    shapes: Soup
+    static: Triangles
+    shapes: Triangles
     actors: ActorArrays
     looks: LookArrays
 
@@ -98,7 +98,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 @_kernel
 @no_type_check
-def move_rays(T, origin, direction, rows):
+def transform_rays(T, origin, direction, rows):
     """Transform the origins and directions [n 3] of the rays `rows` by T [3 4]."""
     origins, directions = np.empty((len(rows), 3), np.float32), np.empty((len(rows), 3), np.float32)
     for i in range(len(rows)):
@@ -112,7 +112,7 @@ def move_rays(T, origin, direction, rows):
 
 
 def surfaces(
-    scene: Scene,
+    scene: SceneArrays,
     hits: Hits,
     origin: Float32[np.ndarray, "N 3"],
     direction: Float32[np.ndarray, "N 3"],
@@ -262,7 +262,7 @@ def shade(looks, found, t, direction, lit, light, mirrored, known):
     out = np.empty((len(t), 3), np.float32)
     colour, lamp = np.empty(TEXTURE_WORDS, np.float32), np.zeros(6, np.float32)
     mirror = np.empty(3, np.float32)
-    by_lamps, wetness = len(light.lamps.near) > 0, light.air.wetness
+    by_lamps, wetness = len(light.lamps.lamp_index) > 0, light.air.wetness
     for i in range(len(t)):
         if len(known) > 0 and known[i, 0] >= 0.0:
             out[i, 0], out[i, 1], out[i, 2] = known[i, 0], known[i, 1], known[i, 2]

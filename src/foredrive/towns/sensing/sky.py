@@ -40,7 +40,9 @@ def blurred_sky(light, dx, dy, dz, out):
 def _air_and_sun(light, dx, dy, dz, cloud, out):
     up = max(dz, 0.0)
     blend = 1.0 - (1.0 - up) ** 5
-    near = max(dx * light.sunward[0] + dy * light.sunward[1] + dz * light.sunward[2], 0.0)
+    near = max(
+        dx * light.glow_direction[0] + dy * light.glow_direction[1] + dz * light.glow_direction[2], 0.0
+    )
     halo = 0.25 * near**6 + 0.6 * near**64
     disc = 8.0 if near > 0.9999 else 0.0
     veil = 1.0 - math.exp(-light.air.extinction_per_m * FOG_TOP_M / max(dz, 0.02))

@@ -23,7 +23,7 @@ _DRY_DEPTH = 1.12
 """Minimum depth of a hollow that holds water on almost dry ground. The deepest hollow has 1.4."""
 THIN_FILM = 0.28
 RIPPLES = 0.008
-FAINTEST_MIRROR = 0.015
+MIN_MIRROR = 0.015
 _ROAD, _SIDEWALK = int(Surface.ROAD), int(Surface.SIDEWALK)
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -75,7 +75,7 @@ def mirror_rays(looks, found, t, direction, wetness, out_origin, out_direction):
         if look < 0 or nz < LEVEL_COS or not is_paved(looks.surface[look]):
             continue
         film = water_film(wetness, looks.surface[look], found.xyz, found.extent, i)
-        if film * water_mirror(found.cosine[i]) < FAINTEST_MIRROR:
+        if film * water_mirror(found.cosine[i]) < MIN_MIRROR:
             continue
         x, y, size = found.xyz[i, 0], found.xyz[i, 1], found.extent[i, 3]
         rx = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 94)

@@ -4,27 +4,27 @@ import numpy as np
 from jaxtyping import Bool
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.traffic.pedestrians import Pedestrians
 from foredrive.towns.traffic.scripted_actors import ScriptedActor
 from foredrive.towns.traffic.vehicles import MOTION_S, Poses, Vehicles
 
-BRAKE_LIGHTS_MPS2, STANDS_MPS = 0.7, 0.1
+BRAKE_LIGHTS_MPS2, STANDSTILL_MPS = 0.7, 0.1
 """Deceleration above which brake lights are on, m/s², because the engine alone slows less; and the speed
 below which a standing vehicle has them on, m/s."""
 
 
 def vehicle_actors(
-    v: Vehicles, poses: Poses, around: tuple[Poses, Poses], kept: Bool[np.ndarray, "N"]
+    v: Vehicles, poses: Poses, motion: tuple[Poses, Poses], kept: Bool[np.ndarray, "N"]
 ) -> list[ActorState]:
     """Return the actors of the vehicles in `kept`.
 
     Args:
         around: the result of `motion`.
     """
-    before, after = around
+    before, after = motion
     velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
-    slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDS_MPS)
+    slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDSTILL_MPS)
     braking = slows & (v.category != Category.BICYCLE)
     return [
         ActorState(

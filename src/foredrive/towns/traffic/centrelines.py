@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import savgol_filter
 
 from foredrive.towns.map.town_map import Lane
 
@@ -48,6 +47,8 @@ def _bent_to(
 
 def resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
     """Sample a line evenly, at most `SAMPLE_M` apart, and smooth it. Its ends do not move."""
+    from scipy.signal import savgol_filter  # takes 0.3 s
+
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
     s = np.linspace(0.0, along[-1], count)

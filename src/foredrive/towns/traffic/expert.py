@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
 from foredrive.scene import Command
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
 from foredrive.towns.traffic.fleet import StartPoints, ego_vehicle
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.recovery import PathDeviation, step_deviation
@@ -56,7 +56,7 @@ class DriveSnapshot:
     actors: list[ActorState]
     """All road users that move or could move, without the ego vehicle."""
     lights: Int[np.ndarray, "Z"]
-    """`Light` of each of the town's stop zones."""
+    """`LightState` of each of the town's stop zones."""
 
 
 class ExpertDrive:

@@ -31,11 +31,11 @@ MIN_CHANGE_M = 16.0
 STOPPING_MPS2 = 2.5
 """Deceleration of a gentle stop, m/s². A vehicle that need not change lanes does so only where there is room
 for such a stop afterwards."""
-NEAREST_M = 2.0
+MIN_GAP_M = 2.0
 COURTEOUS_MPS2, COURTEOUS_TO_STANDING_MPS2 = 1.5, 3.0
 """Maximum deceleration, m/s², to let in a vehicle that has to change lanes: if that vehicle moves, and if it
 stands. A standing vehicle would otherwise have to wait for ever."""
-STANDS_MPS = 0.5
+STANDSTILL_MPS = 0.5
 COURTEOUS_GAP_M = 1.0
 """Additional gap to the vehicle that is let in, m, compared with the gap to a leader in the driver's own
 lane."""
@@ -134,7 +134,7 @@ def lane_change_allowed(
     onward = (ahead >= 0) & (change_ranges.target[:, ahead] >= 0)
     onward[:, :, 1:] &= change_ranges.continues[:, ahead[:, 1:]]
     room_m = np.sum(np.logical_and.accumulate(onward, axis=2) * graph.length_m[ahead], axis=2)
-    goes_on = room_m > v.s_m + need + np.where(mandatory, NEAREST_M, stops)
+    goes_on = room_m > v.s_m + need + np.where(mandatory, MIN_GAP_M, stops)
     fitting = (target >= 0) & fits[np.arange(len(lane)), target]
     return v.active & begun & goes_on & fitting & ((v.shift_m == 0) | settled)
 
@@ -236,7 +236,7 @@ def incentive(
     gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - desired[n], 0.0)
     gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - desired[o], 0.0)
     gain = np.minimum(own, halt) - desired + POLITENESS * (gain_n + gain_o)
-    near = (gaps.leader_gap_m < NEAREST_M) | (gaps.follower_gap_m < NEAREST_M)
+    near = (gaps.leader_gap_m < MIN_GAP_M) | (gaps.follower_gap_m < MIN_GAP_M)
     unsafe = (own < -SAFE_BRAKING_MPS2) | ((n >= 0) & (new < -SAFE_BRAKING_MPS2))
     return np.where(near | unsafe, -np.inf, gain)
 
@@ -264,7 +264,7 @@ def room_to_change_m(
         while beside >= 0 and beside != lane:
             beside = int(graph.sides.lane[side, beside])
         if beside == lane and beside != here:
-            need = MIN_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + NEAREST_M
+            need = MIN_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + MIN_GAP_M
             return side, float(change_ranges.room_m[side, here] - vehicles.s_m[0] - need)
     return None
 
@@ -327,12 +327,14 @@ def courtesy_limits(
     """
     limit = np.full(len(target), np.inf)
     gaps = find_gaps(graph, vehicles, starts_m, target, side)
-    who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= NEAREST_M))
+    who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= MIN_GAP_M))
     n = gaps.follower[who]
     desired = following_acceleration(
         vehicles, n, context.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M
     )
-    max_braking = np.where(vehicles.speed_mps[who] < STANDS_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2)
+    max_braking = np.where(
+        vehicles.speed_mps[who] < STANDSTILL_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2
+    )
     np.minimum.at(limit, n, np.maximum(desired, -max_braking))
     return limit
 

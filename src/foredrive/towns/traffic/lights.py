@@ -1,11 +1,11 @@
 """Traffic lights with fixed cycles. Their state is a function of time alone."""
 
-import enum
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.traffic.lane_graph import Control, LaneGraph
 
 GREEN_S = 8.0
@@ -17,15 +17,6 @@ SAME_AXIS_COS = 0.7
 either end."""
 
 
-class Light(enum.IntEnum):
-    """The state of a light."""
-
-    NONE = 0
-    RED = 1
-    YELLOW = 2
-    GREEN = 3
-
-
 @dataclass(frozen=True)
 class SignalPlan:
     """For each lane that a light guards, the green time in the cycle of its junction."""
@@ -35,12 +26,14 @@ class SignalPlan:
     cycle_s: Float64[np.ndarray, "L"]
 
     def light_states(self, time_s: float) -> Int[np.ndarray, "L"]:
-        """Return the `Light` at the start of each lane."""
+        """Return the `LightState` at the start of each lane."""
         into_s = (time_s - self.green_from_s) % self.cycle_s
         light = np.where(
-            into_s < GREEN_S, Light.GREEN, np.where(into_s < GREEN_S + YELLOW_S, Light.YELLOW, Light.RED)
+            into_s < GREEN_S,
+            LightState.GREEN,
+            np.where(into_s < GREEN_S + YELLOW_S, LightState.YELLOW, LightState.RED),
         )
-        return np.where(self.guarded, light, Light.NONE)
+        return np.where(self.guarded, light, LightState.NONE)
 
 
 def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:

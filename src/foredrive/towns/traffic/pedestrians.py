@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.traffic.leaders import LOOKAHEAD_M, motion_arrays
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 from foredrive.towns.traffic.walkways import WalkGraph
 
@@ -266,7 +266,7 @@ def _may_cross(
     """Return whether no light is green or yellow for the crossed lanes, and every vehicle can stop or has
     passed."""
     may = np.ones(len(walk), dtype=np.bool_)
-    moving = light[graph.lane] > Light.RED
+    moving = light[graph.lane] > LightState.RED
     released = np.unique(graph.crossing[moving & (graph.lane_span_m[:, 0] < BEYOND_LIGHT_M)])
     for i in np.flatnonzero(asked):
         may[i] = walk[i] not in released

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene import Category
-from foredrive.towns.actors import ActorState
+from foredrive.scene.actors import ActorState
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.appearance import people_actors, scripted_actor_state, vehicle_actors
 from foredrive.towns.traffic.drivers import Decision, DrivingContext, driving_context, move_vehicles
@@ -34,7 +35,7 @@ from foredrive.towns.traffic.lane_changes import (
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.lane_index import LaneIndex, build_lane_index
 from foredrive.towns.traffic.leaders import find_leaders
-from foredrive.towns.traffic.lights import Light, SignalPlan, plan_signals
+from foredrive.towns.traffic.lights import SignalPlan, plan_signals
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.paths import extend_paths
 from foredrive.towns.traffic.pedestrians import crossing_gap, empty_pedestrians, step_pedestrians
@@ -206,7 +207,7 @@ class Traffic:
         v, ahead = state.vehicles, state.route[state.route_passed :]
         on_it = np.flatnonzero(self.lanes.contested[ahead])
         shows = self.signals.light_states(state.time_s + in_s)
-        closed = len(on_it) > 0 and shows[ahead[on_it[0]]] not in (Light.NONE, Light.GREEN)
+        closed = len(on_it) > 0 and shows[ahead[on_it[0]]] not in (LightState.NONE, LightState.GREEN)
         if not closed or self.lanes.contested[v.lane[0]]:
             return np.inf
         return float(path_starts(self.lanes, v.path[:1])[0, BEHIND + 1] - v.front_m[0])
@@ -222,7 +223,7 @@ class Traffic:
         """Decide the acceleration and the right of way of all vehicles."""
         v = state.vehicles
         leaders = find_leaders(self.lanes, v, starts_m)
-        green = (light == Light.NONE) | (light == Light.GREEN)
+        green = (light == LightState.NONE) | (light == LightState.GREEN)
         way = claim_junctions(self.lanes, v, starts_m, leaders, green, state.time_s, may_request, runs)
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
@@ -246,9 +247,9 @@ class Traffic:
         return perceive_ego(self.lanes, self.lane_index, state.vehicles, ego, *known)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
-        """Return the `Light` of each of the town's stop zones."""
+        """Return the `LightState` of each of the town's stop zones."""
         guarded = np.flatnonzero(self.signals.guarded)
-        lights = np.full(self._zone_count, int(Light.NONE))
+        lights = np.full(self._zone_count, int(LightState.NONE))
         lights[self.lanes.zone[guarded]] = self.signals.light_states(time_s)[guarded]
         return lights
 

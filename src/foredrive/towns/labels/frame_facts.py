@@ -7,23 +7,23 @@ import shapely
 from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 
-from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting
+from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
 from foredrive.scene import Category, Command
-from foredrive.towns.actors import ActorState
-from foredrive.towns.conditions import Conditions
-from foredrive.towns.labels.captions import SEEN, Situation, Thing
+from foredrive.scene.actors import ActorState
+from foredrive.scene.conditions import Conditions
+from foredrive.scene.traffic_light import LightState
+from foredrive.towns.labels.captions import MIN_VISIBILITY, CaptionActor, FrameFacts
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
 from foredrive.towns.traffic.expert import DriveSnapshot
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
-from foredrive.towns.traffic.lights import Light
 from foredrive.towns.traffic.routes import Route
 
 STANDING_MPS = 0.3
 TURNING_RADPS = 0.05
 CHANGING_MPS = 0.5
 GENTLE_MPS2 = 1.0
-LEADER_M, LEADER_ASIDE_M = 30.0, 1.6
+LEADER_M, LEADER_LATERAL_M = 30.0, 1.6
 FOLLOWED_M = 25.0
 MIDDLE_M = 0.8
 """Height of a vehicle's middle above the road, m, because routes lie on the road."""
@@ -41,12 +41,12 @@ RING_TURN_RAD = 1.5 * np.pi
 """Minimum turn of a roundabout, rad. It is less than a full circle because turn is lost where lanes meet."""
 
 
-class Places:
+class PlaceClassifier:
     """A classifier of the kind of place at points of a town."""
 
     def __init__(self, town: TownMap, lanes: LaneGraph) -> None:
         self._lanes = lanes
-        self._of_lane = [_place_of(lanes, lane) for lane in range(len(lanes.ids))]
+        self._of_lane = [_lane_place(lanes, lane) for lane in range(len(lanes.ids))]
         for lane in _ring_lanes(lanes):
             self._of_lane[lane] = Place.ROUNDABOUT
         self._samples = cKDTree(lanes.xyz)
@@ -54,7 +54,7 @@ class Places:
         self._over, self._under = _crossed_levels(lanes.xyz)
         self._roads = shapely.STRtree([strip.polygon for strip in town.strips_of(StripKind.DRIVING)])
 
-    def place(self, xyz: Float64[np.ndarray, "3"]) -> Place:
+    def classify(self, xyz: Float64[np.ndarray, "3"]) -> Place:
         """Return the kind of place at a point on the road."""
         sample = int(self._samples.query(xyz)[1])
         if self._over[sample]:
@@ -70,7 +70,7 @@ class Places:
         return out
 
 
-class Narrator:
+class FactCollector:
     """A collector of the facts of the moments of one drive."""
 
     def __init__(
@@ -82,7 +82,7 @@ class Narrator:
         signal_xyz: dict[int, Float64[np.ndarray, "_ 3"]],
     ) -> None:
         self._places, self._lanes, self._route, self._conditions = (
-            Places(town, lanes),
+            PlaceClassifier(town, lanes),
             lanes,
             route,
             conditions,
@@ -93,15 +93,15 @@ class Narrator:
         length = lanes.length_m[route.lanes]
         self._begins_m = np.cumsum(length) - length - route.start_m
         self._passed = 0
-        self._aside: tuple[float, float] | None = None
+        self._last_lateral: tuple[float, float] | None = None
 
-    def situation(
+    def facts(
         self,
-        moment: DriveSnapshot,
+        snapshot: DriveSnapshot,
         actors: Sequence[ActorState],
         visibility: Float[np.ndarray, "M"],
-        sees: Callable[[Float64[np.ndarray, "3"]], bool],
-    ) -> Situation:
+        is_visible: Callable[[Float64[np.ndarray, "3"]], bool],
+    ) -> FrameFacts:
         """Collect the facts of a moment. Calls must be in the order of time.
 
         Args:
@@ -110,34 +110,34 @@ class Narrator:
             visibility: the visible share of each of them.
             sees: a function that returns whether the cameras see a point (ego frame).
         """
-        T_ego_world = np.linalg.inv(moment.T_world_ego)
-        R, at = T_ego_world[:3, :3], moment.T_world_ego[:3, 3]
+        T_ego_world = np.linalg.inv(snapshot.T_world_ego)
+        R, at = T_ego_world[:3, :3], snapshot.T_world_ego[:3, 3]
         centre = np.array([actor.centre_m for actor in actors]).reshape(-1, 3)
         in_ego = centre @ R.T + T_ego_world[:3, 3]
         on_road = self._places.on_road(centre[:, :2])
         seen = zip(actors, in_ego, visibility.tolist(), on_road.tolist(), strict=True)
-        things = [_thing(*each, R) for each in seen]
+        things = [_caption_actor(*each, R) for each in seen]
         window = slice(self._passed, self._passed + 200)
         self._passed += int(np.linalg.norm(self._line[window] - at, axis=1).argmin())
-        aside_mps = self._aside_speed(moment)
+        lateral_mps = self._lateral_speed(snapshot)
         beside = at - self._line[self._passed]  # the lane beside the route's, while overtaking
         leader, gap_m = self._leader(actors, centre - beside, visibility)
         now = self._conditions
         setting = Setting(
-            time_of_day=now.time_of_day,
-            weather=now.weather,
-            place=self._places.place(at),
-            doing=self._doing(moment, leader, gap_m, aside_mps),
-            speed_mps=float(moment.twist_ego[0]),
-            leader=None if leader is None else kind_of(leader),
-            light=self._light(moment, T_ego_world, sees),
+            time_of_day=TimeOfDay.at_hour(now.hour),
+            weather=Weather.under(now),
+            place=self._places.classify(at),
+            doing=self._doing(snapshot, leader, gap_m, lateral_mps),
+            speed_mps=float(snapshot.twist_ego[0]),
+            leader=None if leader is None else object_kind(leader),
+            light=self._light(snapshot, T_ego_world, is_visible),
             hour=now.hour,
             clouds=now.clouds,
             rain_mmph=now.rain_mmph,
             wetness=now.wetness,
             visibility_m=now.visibility_m,
         )
-        return Situation(setting, things)
+        return FrameFacts(setting, things)
 
     def _leader(
         self,
@@ -153,35 +153,37 @@ class Narrator:
         away_m, index = (np.asarray(found) for found in cKDTree(way).query(centre - [0.0, 0.0, MIDDLE_M]))
         ahead_m = arc_m[index] - arc_m[0]
         vehicle = [not (a.parked or a.category is Category.PEDESTRIAN) for a in actors]
-        candidate = vehicle & (away_m < LEADER_ASIDE_M) & (ahead_m > BUMPER_M) & (visibility >= SEEN)
+        candidate = (
+            vehicle & (away_m < LEADER_LATERAL_M) & (ahead_m > BUMPER_M) & (visibility >= MIN_VISIBILITY)
+        )
         if not candidate.any():
             return None, np.inf
         best = int(np.where(candidate, ahead_m, np.inf).argmin())
         return actors[best], float(ahead_m[best])
 
-    def _aside_speed(self, moment: DriveSnapshot) -> float:
+    def _lateral_speed(self, snapshot: DriveSnapshot) -> float:
         """Return the speed of the vehicle to the left of its route, m/s; 0 at the first moment."""
-        before, self._aside = self._aside, (moment.t_s, self._aside_m(moment))
-        return 0.0 if before is None else (self._aside[1] - before[1]) / (moment.t_s - before[0])
+        before, self._last_lateral = self._last_lateral, (snapshot.t_s, self._lateral_offset_m(snapshot))
+        return 0.0 if before is None else (self._last_lateral[1] - before[1]) / (snapshot.t_s - before[0])
 
-    def _aside_m(self, moment: DriveSnapshot) -> float:
+    def _lateral_offset_m(self, snapshot: DriveSnapshot) -> float:
         k = min(self._passed, len(self._line) - 2)
-        ahead, offset = self._line[k + 1] - self._line[k], moment.T_world_ego[:3, 3] - self._line[k]
+        ahead, offset = self._line[k + 1] - self._line[k], snapshot.T_world_ego[:3, 3] - self._line[k]
         return float(ahead[0] * offset[1] - ahead[1] * offset[0]) / float(np.hypot(*ahead[:2]))
 
     def _doing(
-        self, moment: DriveSnapshot, leader: ActorState | None, gap_m: float, aside_mps: float
+        self, snapshot: DriveSnapshot, leader: ActorState | None, gap_m: float, lateral_mps: float
     ) -> Doing:
-        speed, turn_rate = float(moment.twist_ego[0]), float(moment.twist_ego[5])
+        speed, turn_rate = float(snapshot.twist_ego[0]), float(snapshot.twist_ego[5])
         if speed < STANDING_MPS:
             return Doing.WAITS
         row = int(np.searchsorted(self._begins_m, self._arc_m[self._passed], side="right")) - 1
         command = self._lanes.command(int(self._route.lanes[max(row, 0)]))
         if command is not Command.STRAIGHT and abs(turn_rate) > TURNING_RADPS:
             return Doing.TURNS_LEFT if command is Command.LEFT else Doing.TURNS_RIGHT
-        if abs(aside_mps) > CHANGING_MPS:
-            return Doing.CHANGES_LEFT if aside_mps > 0 else Doing.CHANGES_RIGHT
-        acceleration = float(moment.acceleration_ego_mps2[0])
+        if abs(lateral_mps) > CHANGING_MPS:
+            return Doing.CHANGES_LEFT if lateral_mps > 0 else Doing.CHANGES_RIGHT
+        acceleration = float(snapshot.acceleration_ego_mps2[0])
         if acceleration < -GENTLE_MPS2:
             return Doing.SLOWS
         if leader is not None and gap_m < FOLLOWED_M and np.linalg.norm(leader.velocity_mps) > STANDING_MPS:
@@ -190,9 +192,9 @@ class Narrator:
 
     def _light(
         self,
-        moment: DriveSnapshot,
+        snapshot: DriveSnapshot,
         T_ego_world: Float64[np.ndarray, "4 4"],
-        sees: Callable[[Float64[np.ndarray, "3"]], bool],
+        is_visible: Callable[[Float64[np.ndarray, "3"]], bool],
     ) -> LightColour | None:
         """Return the colour of the next light on the route if its lamps are in view."""
         axle_m = float(self._arc_m[self._passed])
@@ -202,19 +204,19 @@ class Narrator:
             zone = int(self._lanes.zone[lane])
             if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
                 lamps = self._signal_xyz[zone] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
-                in_view = any(np.linalg.norm(lamp) < LAMPS_M and sees(lamp) for lamp in lamps)
-                return _COLOUR_OF_LIGHT.get(Light(int(moment.lights[zone]))) if in_view else None
+                in_view = any(np.linalg.norm(lamp) < LAMPS_M and is_visible(lamp) for lamp in lamps)
+                return _COLOUR_OF_LIGHT.get(LightState(int(snapshot.lights[zone]))) if in_view else None
         return None
 
 
 _COLOUR_OF_LIGHT = {
-    Light.RED: LightColour.RED,
-    Light.YELLOW: LightColour.YELLOW,
-    Light.GREEN: LightColour.GREEN,
+    LightState.RED: LightColour.RED,
+    LightState.YELLOW: LightColour.YELLOW,
+    LightState.GREEN: LightColour.GREEN,
 }
 
 
-def kind_of(actor: ActorState) -> ObjectKind:
+def object_kind(actor: ActorState) -> ObjectKind:
     """Return the name of a road user by its appearance, which distinguishes vans from cars."""
     if actor.category is Category.CAR:
         length_m, _, height_m = actor.size_lwh
@@ -237,16 +239,16 @@ _KIND_OF_CATEGORY = {
 }
 
 
-def _thing(
+def _caption_actor(
     actor: ActorState,
     xyz: Float64[np.ndarray, "3"],
     seen: float,
     on_road: bool,
     R: Float64[np.ndarray, "3 3"],
-) -> Thing:
+) -> CaptionActor:
     heading = R @ [np.cos(actor.yaw), np.sin(actor.yaw), 0.0]
-    return Thing(
-        kind=kind_of(actor),
+    return CaptionActor(
+        kind=object_kind(actor),
         xy_m=xyz[:2],
         velocity_mps=(R @ actor.velocity_mps)[:2],
         yaw=float(np.arctan2(heading[1], heading[0])),
@@ -256,7 +258,7 @@ def _thing(
     )
 
 
-def _place_of(lanes: LaneGraph, lane: int) -> Place:
+def _lane_place(lanes: LaneGraph, lane: int) -> Place:
     if lanes.limit_mps[lane] > MOTORWAY_LIMIT_MPS:
         return Place.HIGHWAY
     return Place.JUNCTION if lanes.junction[lane] >= 0 else Place.STREET

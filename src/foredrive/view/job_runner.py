@@ -9,7 +9,7 @@ from foredrive.errors import InputError
 _log = logging.getLogger(__name__)
 
 
-class Background:
+class JobRunner:
     """One thread that runs named jobs. A waiting job is replaced by a newer job with the same name.
 
     The name that has waited longest runs first, so that no name starves when jobs arrive faster than they
@@ -28,7 +28,7 @@ class Background:
         self._thread = threading.Thread(target=self._work, name="foredrive-page", daemon=True)
         self._thread.start()
 
-    def ask(self, name: str, job: Callable[[], None]) -> None:
+    def submit(self, name: str, job: Callable[[], None]) -> None:
         """Queue a job in place of an older one of this name that has not begun."""
         with self._changed:
             self._wanted[name] = job

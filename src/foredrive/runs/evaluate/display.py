@@ -18,7 +18,7 @@ RAYS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
-class Vision(Record):
+class DisplayPrediction(Record):
     """The predictions of a model: now first, then K imagined key frames, F = K + 1 in all."""
 
     occupancy_logit: Float[Tensor, "F Z Y X"]
@@ -49,7 +49,7 @@ class Vision(Record):
         return start.unflatten(0, spec.shape_zyx), end.unflatten(0, spec.shape_zyx)
 
 
-class Observer:
+class DisplayPredictor:
     """Runs an agent on clips and renders its predictions.
 
     Args:
@@ -67,12 +67,12 @@ class Observer:
         return self._renderer is not None
 
     @torch.no_grad()
-    def look(self, observed: Clip) -> Vision:
+    def predict(self, observed: Clip) -> DisplayPrediction:
         """Return all predictions for an observed clip, a batch of one."""
         output = self.agent(observed, self.steps)
         beliefs = output.beliefs
         eye = torch.eye(4)
-        return Vision(
+        return DisplayPrediction(
             occupancy_logit=torch.stack([frame.occupancy_logit[0] for frame in output.decoded]),
             volume=torch.stack([belief.volume[0] for belief in beliefs]),
             T_now_ego=torch.stack([eye if b.T_now_ego is None else b.T_now_ego[0] for b in beliefs]),
@@ -85,17 +85,17 @@ class Observer:
         return -self.agent.world_model.dt_s * torch.stack(flow) if flow else None
 
     @torch.no_grad()
-    def render(self, vision: Vision, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:
+    def render(self, prediction: DisplayPrediction, k: int, rig: CameraRig) -> Float[Tensor, "C H W 3"]:
         """Render frame k for any cameras, real or virtual: RGB, 0 to 1.
 
         Args:
-            vision: from `look`.
+            prediction: from `predict`.
             k: index of the frame; 0 is now.
             rig: C cameras without leading dimensions; `T_ego_cam` leads to the ego frame of frame k.
         """
         renderer = self._renderer
         assert renderer is not None
-        volume, logit = vision.volume[k : k + 1], vision.occupancy_logit[k : k + 1]
+        volume, logit = prediction.volume[k : k + 1], prediction.occupancy_logit[k : k + 1]
         rays = camera_rays(rig)
         origin, direction = rays.origin_ego.flatten(0, 1), rays.dir_ego.flatten(0, 1)
         parts = [

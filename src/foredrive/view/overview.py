@@ -9,12 +9,13 @@ from PIL import Image, ImageDraw
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.runs import ExamplePrediction
 from foredrive.scene import Trajectory
 from foredrive.view import palette
 from foredrive.view.bev import path_points
-from foredrive.view.example_panel import ExamplePanel
+from foredrive.view.example_panel import example_title
 from foredrive.view.log_sheet import camera_picture, camera_rows
-from foredrive.view.voxel_drawing import Eye, draw_voxels
+from foredrive.view.voxel_drawing import Viewpoint, draw_voxels
 
 DPI = 100
 CAMERA_WIDTH_PX, VOXELS_WIDTH_PX = 384, 760
@@ -22,19 +23,19 @@ GAP_PX, CAPTION_PX = 8, 46
 SUPERSAMPLING = 2
 EGO_LOWER_M, EGO_UPPER_M = (-1.0, -0.92, 0.1), (3.1, 0.92, 1.55)
 PATH_WIDTH_PX, DOT_PX = 4, 5
-CAPTION_OUT = "What the model makes of the cameras: occupancy and a plan (red; driven: green)"
+OUTPUT_CAPTION = "Output: predicted occupancy and plan (red; driven path: green)"
 
 
-def write_hero(path: Path, panel: ExamplePanel) -> None:
+def write_overview(path: Path, shown: ExamplePrediction) -> None:
     """Write the picture as a PNG, about 1,900 px wide.
 
     Raises:
         InputError: the example has no camera images.
     """
-    clip = panel.example.clip
+    clip = shown.example.clip
     rows = camera_rows(clip.rig[clip.now])
     if not rows or not bool(clip.image_valid[clip.now].any()):
-        raise InputError(f"{panel.title}: no camera images to make a picture of")
+        raise InputError(f"{example_title(shown.example)}: no camera images to make a picture of")
     cell_h = round(CAMERA_WIDTH_PX * clip.rig.size_hw[0] / clip.rig.size_hw[1])
     columns = max(len(row) for row in rows)
     cameras_w = columns * (CAMERA_WIDTH_PX + GAP_PX) - GAP_PX
@@ -49,39 +50,38 @@ def write_hero(path: Path, panel: ExamplePanel) -> None:
             picture = camera_picture(clip, camera, (cell_h, CAMERA_WIDTH_PX), with_boxes=False)
             at = (GAP_PX + column * (CAMERA_WIDTH_PX + GAP_PX), CAPTION_PX + row * (cell_h + GAP_PX))
             canvas.paste(Image.fromarray(picture), at)
-    voxels = occupancy_with_paths(panel, (body_h, VOXELS_WIDTH_PX))
+    voxels = occupancy_with_paths(shown, (body_h, VOXELS_WIDTH_PX))
     canvas.paste(Image.fromarray(voxels), (2 * GAP_PX + cameras_w, CAPTION_PX))
-    seen = "cameras and lidar" if bool(clip.sweep_valid[clip.now]) else "the cameras"
-    captions = {GAP_PX: f"What {seen} see", 2 * GAP_PX + cameras_w: CAPTION_OUT}
+    seen = "camera images, with lidar returns" if bool(clip.sweep_valid[clip.now]) else "camera images"
+    captions = {GAP_PX: f"Input: {seen}", 2 * GAP_PX + cameras_w: OUTPUT_CAPTION}
     with atomic_path(path) as scratch:
         _captioned(np.asarray(canvas), captions).savefig(scratch, dpi=DPI, format="png")
 
 
-def occupancy_with_paths(panel: ExamplePanel, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+def occupancy_with_paths(shown: ExamplePrediction, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Draw predicted occupancy now in perspective, with the vehicle, the driven future and the plan."""
-    eye = Eye.behind(panel.spec, size_hw)
-    picture = draw_voxels(panel.occupied[0], panel.spec, size_hw, eye)
+    viewpoint = Viewpoint.behind(shown.example.occupancy.spec, size_hw)
+    picture = draw_voxels(shown.occupied[0], shown.example.occupancy.spec, size_hw, viewpoint)
     large_hw = (size_hw[0] * SUPERSAMPLING, size_hw[1] * SUPERSAMPLING)
     canvas = Image.fromarray(picture).resize(large_hw[::-1], Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(canvas)
-    _draw_path(draw, eye, large_hw, panel.example.clip.future, palette.EXPERT)
-    if panel.plan is not None:
-        _draw_path(draw, eye, large_hw, panel.plan, palette.PLAN)
-    _draw_ego(draw, eye, large_hw)
+    _draw_path(draw, viewpoint, large_hw, shown.example.clip.future, palette.EXPERT)
+    _draw_path(draw, viewpoint, large_hw, shown.plan, palette.PLAN)
+    _draw_ego(draw, viewpoint, large_hw)
     return np.asarray(canvas.resize(size_hw[::-1], Image.Resampling.BOX))
 
 
 def _draw_path(
-    draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int], path: Trajectory, colour: str
+    draw: ImageDraw.ImageDraw, viewpoint: Viewpoint, size_hw: tuple[int, int], path: Trajectory, colour: str
 ) -> None:
-    points = [tuple(p) for p in eye.project(path_points(path).numpy(), size_hw).tolist()]
+    points = [tuple(p) for p in viewpoint.project(path_points(path).numpy(), size_hw).tolist()]
     draw.line(points, fill=colour, width=PATH_WIDTH_PX * SUPERSAMPLING, joint="curve")
     for x, y in points[1:]:
         draw.circle((x, y), DOT_PX * SUPERSAMPLING, fill=colour, outline=palette.GROUND, width=2)
 
 
-def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> None:
-    """Draw the vehicle as a box: the rear, right side and top that the eye sees."""
+def _draw_ego(draw: ImageDraw.ImageDraw, viewpoint: Viewpoint, size_hw: tuple[int, int]) -> None:
+    """Draw the vehicle as a box: the rear, right side and top that the viewpoint sees."""
     (x0, y0, z0), (x1, y1, z1) = EGO_LOWER_M, EGO_UPPER_M
     faces = (
         (0.62, [(x0, y0, z0), (x0, y1, z0), (x0, y1, z1), (x0, y0, z1)]),
@@ -89,7 +89,7 @@ def _draw_ego(draw: ImageDraw.ImageDraw, eye: Eye, size_hw: tuple[int, int]) -> 
         (1.0, [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)]),
     )
     for light, face in faces:
-        corners = eye.project(np.array(face), size_hw)
+        corners = viewpoint.project(np.array(face), size_hw)
         fill = tuple(round(light * c) for c in palette.rgb255(palette.EGO))
         draw.polygon([tuple(p) for p in corners.tolist()], fill=fill, outline=palette.GROUND)
 

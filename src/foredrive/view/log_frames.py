@@ -12,14 +12,15 @@ from foredrive.scene import Clip, VoxelSpec
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
-    from foredrive.runs.evaluate.vision import Observer, Vision
+    from foredrive.runs.evaluate.display import DisplayPrediction, DisplayPredictor
 
 NO_LABELS = VoxelSpec((-1.0, -1.0, -1.0), 1.0, (2, 2, 2))
 """Voxel grid of the labels, which every clip has and this module does not use."""
 KEPT = 16
+CAMERA_WIDTH_PX = 640
 
 
-class LogTimes:
+class LogFrames:
     """The frames of a log in the order of time.
 
     Args:
@@ -32,7 +33,7 @@ class LogTimes:
             model, or is too short for it.
     """
 
-    observer: "Observer | None"
+    predictor: "DisplayPredictor | None"
     """Predicts with the run; None without a run."""
 
     def __init__(self, path: LogPath, image_width_px: int, run: "Run | None" = None) -> None:
@@ -55,13 +56,13 @@ class LogTimes:
         """Time of every frame on the log's clock, µs."""
         self.t_s = [(t_us - int(log.t_us[0])) * 1e-6 for t_us in self.now_us]
         """Time of every frame since the start of the log, s."""
-        self.observer = None
+        self.predictor = None
         if run is not None:
-            from foredrive.runs.evaluate.vision import Observer
+            from foredrive.runs.evaluate.display import DisplayPredictor
             from foredrive.runs.train.run import load_agent  # without a run, models are not imported
 
             size = run.recipe.clips
-            self.observer = Observer(load_agent(run), size.future_frames)
+            self.predictor = DisplayPredictor(load_agent(run), size.future_frames)
             seen = dataclasses.replace(
                 size,
                 future_frames=0,
@@ -73,7 +74,7 @@ class LogTimes:
             index_at = {self._observed.now_us(index): index for index in range(len(self._observed))}
             self._observed_index = [index_at.get(t_us) for t_us in self.now_us]
         self.clip = functools.lru_cache(KEPT)(self._clip)
-        self.vision = functools.lru_cache(KEPT)(self._vision)
+        self.prediction = functools.lru_cache(KEPT)(self._prediction)
 
     def __len__(self) -> int:
         return len(self._clips)
@@ -93,8 +94,8 @@ class LogTimes:
         """Read a frame as a clip of one key frame, without batch dimension."""
         return self._clips[index].clip
 
-    def _vision(self, index: int) -> "Vision | None":
+    def _prediction(self, index: int) -> "DisplayPrediction | None":
         """Predict with the run; None without a run, and at frames without enough past."""
-        if self.observer is None or (seen := self._observed_index[index]) is None:
+        if self.predictor is None or (seen := self._observed_index[index]) is None:
             return None
-        return self.observer.look(collate([self._observed[seen]]).clip.observed())
+        return self.predictor.predict(collate([self._observed[seen]]).clip.observed())

@@ -1,4 +1,4 @@
-"""The numba path of `sample_volume` and `attend_volume` as an autograd function."""
+"""The numba path of `attend_volume` as an autograd function."""
 
 from typing import Any
 
@@ -8,31 +8,31 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from foredrive.ops.threads import in_parallel
-from foredrive.ops.volume_kernels import Gradients, Inputs, Reader, read_back, read_queries
+from foredrive.ops.volume_kernels import ChannelSlice, VolumeGradients, VolumeInputs, read_back, read_queries
 
 MIN_QUERIES = 256
 """Minimum number of queries per thread."""
 CHANNELS_AT_ONCE = 16
-"""Channels of a reader: one cache line. The backward pass runs in parallel over readers."""
+"""Channels of a slice: one cache line. The backward pass runs in parallel over slices."""
 
 
-def readers_of(heads: int, channels: int) -> tuple[Reader, ...]:
-    """Return the readers of the backward pass: each head's channels in slices of `CHANNELS_AT_ONCE`."""
+def channel_slices(heads: int, channels: int) -> tuple[ChannelSlice, ...]:
+    """Return the slices of the backward pass: each head's channels in slices of `CHANNELS_AT_ONCE`."""
     width = channels // heads
-    slices = [
+    parts = [
         (head, start, min(start + CHANNELS_AT_ONCE, (head + 1) * width))
         for head in range(heads)
         for start in range(head * width, (head + 1) * width, CHANNELS_AT_ONCE)
     ]
-    return tuple(Reader(*part, slot) for slot, part in enumerate(slices))
+    return tuple(ChannelSlice(*part, slot) for slot, part in enumerate(parts))
 
 
-class ReadVolume(torch.autograd.Function):
+class AttendVolume(torch.autograd.Function):
     """Weighted sums of trilinear samples, for float32 on the CPU. See `attend_volume`.
 
-    The backward pass runs reader by reader. A head may have several readers, each with some of its channels.
-    Each reader has its own slot for the gradients of the points. The slots of a head are summed at the end,
-    so the result does not depend on the number of threads.
+    The backward pass runs slice by slice. A head may have several slices, each with some of its channels.
+    Each slice has its own slot for the gradients of the points. The slots of a head are summed at the end, so
+    the result does not depend on the number of threads.
     """
 
     @staticmethod
@@ -41,13 +41,13 @@ class ReadVolume(torch.autograd.Function):
         values: Float[Tensor, "b Z Y X D"],
         points: Float[Tensor, "b Q H P 3"],
         weights: Float[Tensor, "b Q H P"],
-        readers: tuple[Reader, ...],
+        slices: tuple[ChannelSlice, ...],
     ) -> Float[Tensor, "b Q D"]:
-        """Compute the sums. `readers` gives the channel slices of the backward pass."""
+        """Compute the sums. `slices` gives the channel slices of the backward pass."""
         values, points, weights = values.contiguous(), points.contiguous(), weights.contiguous()
         ctx.save_for_backward(values, points, weights)
-        ctx.readers = readers
-        inputs = Inputs(*(tensor.detach().numpy() for tensor in (values, points, weights)))
+        ctx.slices = slices
+        inputs = VolumeInputs(*(tensor.detach().numpy() for tensor in (values, points, weights)))
         b, queries = weights.shape[:2]
         out = values.new_empty(b, queries, values.shape[-1])
         rows = out.numpy()
@@ -66,21 +66,21 @@ class ReadVolume(torch.autograd.Function):
         """Return the gradients of values, points and weights, where they are wanted."""
         values, points, weights = ctx.saved_tensors
         wants_values, wants_points, wants_weights, _ = ctx.needs_input_grad
-        readers: tuple[Reader, ...] = ctx.readers
+        slices: tuple[ChannelSlice, ...] = ctx.slices
         b, queries, heads, per_head = weights.shape
         grad_values = torch.zeros_like(values) if wants_values else values[:0]
-        slots = len(readers)
+        slots = len(slices)
         grad_points = points.new_empty(b, queries, slots if wants_points else 0, per_head, 3)
         grad_weights = weights.new_empty(b, queries, slots if wants_weights else 0, per_head)
-        inputs = Inputs(*(tensor.numpy() for tensor in (values, points, weights)))
+        inputs = VolumeInputs(*(tensor.numpy() for tensor in (values, points, weights)))
         found = (grad_out.contiguous(), grad_values, grad_points, grad_weights)
-        grads = Gradients(*(tensor.numpy() for tensor in found))
+        grads = VolumeGradients(*(tensor.numpy() for tensor in found))
 
         def job(start: int, stop: int) -> None:
-            for item, reader in (divmod(i, len(readers)) for i in range(start, stop)):
-                read_back(inputs, item, readers[reader], grads)
+            for item, index in (divmod(i, len(slices)) for i in range(start, stop)):
+                read_back(inputs, item, slices[index], grads)
 
-        in_parallel(job, b * len(readers))
+        in_parallel(job, b * len(slices))
         if slots > heads:
             grad_points, grad_weights = (
                 grad.unflatten(2, (heads, -1)).sum(3) if grad.numel() else grad

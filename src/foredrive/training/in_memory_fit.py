@@ -1,4 +1,4 @@
-"""Fitting of small modules to rows in memory: no checkpoints, no workers, a few seconds."""
+"""Fits of small modules to data in memory: no checkpoints, no workers, a few seconds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
-class RowFit:
+class FitSchedule:
     """Schedule of a fit: AdamW, with a cosine learning rate down to 0."""
 
     steps: int
@@ -18,11 +18,11 @@ class RowFit:
     weight_decay: float
 
 
-def fit_rows(
+def fit_in_memory(
     module: nn.Module,
     rows: int,
     loss: Callable[[Int[Tensor, "n"]], Float[Tensor, ""]],
-    fit: RowFit,
+    fit: FitSchedule,
     seed: int,
 ) -> None:
     """Minimise `loss` on random rows, drawn with replacement. `module` ends in evaluation mode.

@@ -1,10 +1,9 @@
-"""Time of day and weather of a drive: the light on a town and the content of its air."""
+"""Conditions of a simulated drive: time of day, weather and the amount of traffic."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from foredrive.data.setting import TimeOfDay, Weather
 from foredrive.errors import InputError
 
 CLEAR_VISIBILITY_M = 20_000.0
@@ -44,29 +43,14 @@ class Conditions:
             if not low <= value <= high:
                 raise InputError(f"{name} lies between {low:g} and {high:g}, got {value:g}")
 
-    @property
-    def time_of_day(self) -> TimeOfDay:
-        """Return the time of day, by the height of the sun and, during the day, by the hour."""
-        if self.hour < 5.3 or self.hour >= 18.7:
-            return TimeOfDay.NIGHT
-        if self.hour < 6.7:
-            return TimeOfDay.DAWN
-        if self.hour >= 17.3:
-            return TimeOfDay.DUSK
-        if self.hour < 11.0:
-            return TimeOfDay.MORNING
-        return TimeOfDay.MIDDAY if self.hour < 13.0 else TimeOfDay.AFTERNOON
 
-    @property
-    def weather(self) -> Weather:
-        """Return the weather in one word."""
-        if self.rain_mmph > 0:
-            return Weather.RAIN
-        if self.visibility_m < FOG_M:
-            return Weather.FOG
-        if self.clouds >= 0.9:
-            return Weather.OVERCAST
-        return Weather.CLOUDY if self.clouds >= 0.5 else Weather.CLEAR
+@dataclass(frozen=True)
+class BackgroundTraffic:
+    """The numbers of other road users within about 140 m of the ego vehicle."""
+
+    vehicles: int = 30
+    pedestrians: int = 20
+    """Number of pedestrians, where the town has walkways."""
 
 
 CONDITIONS = {

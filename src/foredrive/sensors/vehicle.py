@@ -3,6 +3,7 @@ roof."""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import CameraRig
-from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
+from foredrive.sensors.lidar import SpinningLidar
+from foredrive.sensors.lidar_models import hdl32e, pandar64, vlp16
 
 _MOUNTS = {
     "PCAM_F0": ((1.70, 0.00, 1.60), 0.0, 70.0),
@@ -29,6 +31,15 @@ LIDARS: dict[str, Callable[[Float[Tensor, "4 4"], float], SpinningLidar]] = {
     "vlp16": vlp16,
 }
 """Real lidars by name, as functions of the mounting pose and the rate of revolution, Hz."""
+
+
+@dataclass(frozen=True)
+class VehicleSensors:
+    """The cameras and the lidar of a vehicle."""
+
+    rig: CameraRig
+    """Cameras, without leading dimensions."""
+    lidar: SpinningLidar
 
 
 def camera_rig(size_hw: tuple[int, int], readout_s: float = 0.0) -> CameraRig:

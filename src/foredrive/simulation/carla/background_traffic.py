@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.carla.frames import CarlaPose, xyz_of
 from foredrive.simulation.carla.session import Session
-from foredrive.towns.recorder import Crowd
 
 NEAR_ROUTE_M = 140.0
 """Maximum distance from the route at which vehicles start, m."""
@@ -20,13 +20,16 @@ TRIES = 5
 """Maximum number of attempts per pedestrian, as a place may be taken."""
 
 
-def add_crowd(
-    session: Session, crowd: Crowd, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
+def add_background_traffic(
+    session: Session,
+    background: BackgroundTraffic,
+    route_xyz: Float64[np.ndarray, "M 3"],
+    rng: np.random.Generator,
 ) -> None:
-    """Add vehicles and pedestrians, at most as many as `crowd` asks for. Places without room are skipped."""
-    _add_vehicles(session, crowd.vehicles, route_xyz, rng)
-    if crowd.people:
-        _add_people(session, crowd.people, rng)
+    """Add vehicles and pedestrians, at most the numbers in `background`. Places without room are skipped."""
+    _add_vehicles(session, background.vehicles, route_xyz, rng)
+    if background.pedestrians:
+        _add_people(session, background.pedestrians, rng)
 
 
 def _add_vehicles(

@@ -1,0 +1,40 @@
+"""The rows of DriveWorld's Table 1, and 3-D occupancy pre-training, the baseline of its other tables."""
+
+from dataclasses import replace
+
+from foredrive.recipes.config import named_after
+from foredrive.recipes.driveworld import DriveWorldRecipe
+
+
+def driveworld_ablations(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
+    """Return all rows by name: the full DriveWorld first, under its own name, the others as FULL_ROW.
+
+    The full DriveWorld is `mln` with task prompts. All rows are fine-tuned in the same way.
+
+    Args:
+        full: a recipe with pre-training.
+    """
+    size, stage = full.model, full.pretrain
+    assert stage is not None
+    mln = replace(size, prompt=None)
+    dmb = replace(mln, states=replace(mln.states, motion_norm=False))
+    ssp = replace(dmb, states=replace(dmb.states, memory_bank=False))
+    rows = {
+        "scratch": (replace(full, pretrain=None), "without pre-training (Table 1)"),
+        "occupancy": (
+            replace(full, pretrain=replace(stage, temporal=False)),
+            "pre-trained by the occupancy of single frames, as OccNet and UniScene are",
+        ),
+        "rssm": (
+            replace(full, model=replace(ssp, statics=None)),
+            "plain latent dynamics in one vector (Table 1)",
+        ),
+        "ssp": (replace(full, model=ssp), "rssm with Static Scene Propagation (Table 1)"),
+        "dmb": (replace(full, model=dmb), "ssp with the Dynamic Memory Bank (Table 1)"),
+        "mln": (replace(full, model=mln), "dmb with motion-aware layer normalisation (Table 1)"),
+        "carried": (
+            replace(full, model=replace(size, warp_statics=True)),
+            "latent statics warped by the ego motion; not in the paper",
+        ),
+    }
+    return named_after(full, rows)

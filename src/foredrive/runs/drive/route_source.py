@@ -1,0 +1,76 @@
+"""Drives over routes through towns: what every simulator with towns has in common."""
+
+import dataclasses
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from foredrive.errors import InputError
+from foredrive.runs.drive.agents import needs_of
+from foredrive.runs.drive.suite import DriveJob
+from foredrive.scene.conditions import (
+    ANY_CONDITIONS,
+    CONDITIONS,
+    BackgroundTraffic,
+    Conditions,
+    find_conditions,
+)
+from foredrive.simulation.route_sets import load_route_set
+from foredrive.simulation.routes import DriveRoute, snap_route
+
+
+@dataclass(frozen=True)
+class RouteSource:
+    """Routes through towns, with the conditions and the traffic of their drives."""
+
+    routes: str
+    """Name of a route set of the package, or path of a CARLA route file."""
+    repetitions: int = 1
+    seed: int = 0
+    """Seed of the town and its traffic in the first repetition; each repetition adds one."""
+    conditions: str | None = None
+    """Name of the conditions. `ANY_CONDITIONS` draws a name for each drive; None draws bright daylight from
+    the seed.
+    """
+    image_hw: tuple[int, int] = (144, 256)
+    vehicles: int = BackgroundTraffic.vehicles
+    people: int = BackgroundTraffic.pedestrians
+
+    def __post_init__(self) -> None:
+        if self.repetitions < 1:
+            raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
+        if self.conditions not in (None, ANY_CONDITIONS, *CONDITIONS):
+            there_are = ", ".join((ANY_CONDITIONS, *CONDITIONS))
+            raise InputError(f"no conditions are named {self.conditions}; there are {there_are}")
+
+    def noted(self) -> Mapping[str, object]:
+        """Return the fields."""
+        return dataclasses.asdict(self)
+
+    def jobs(self, driver: str) -> Sequence[DriveJob]:
+        """Return one drive for each route and repetition."""
+        needs_of(driver)
+        routes = load_route_set(self.routes)
+        return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
+
+    def route_of(self, job: DriveJob) -> DriveRoute:
+        """Return the route of a drive, snapped to the lanes."""
+        return snap_route(next(route for route in load_route_set(self.routes) if route.id == job.route))
+
+    def conditions_of(self, route: str, seed: int) -> Conditions | None:
+        """Return the conditions of the drive of a route with a seed."""
+        if self.conditions is None:
+            return None
+        if self.conditions != ANY_CONDITIONS:
+            return find_conditions(self.conditions)
+        return list(CONDITIONS.values())[drive_hash(seed, route) % len(CONDITIONS)]
+
+
+def job_of(route: str, repetition: int) -> DriveJob:
+    """Return the job of driving a route in one repetition."""
+    return DriveJob(f"route{route}_rep{repetition}", route, repetition)
+
+
+def drive_hash(seed: int, route: str) -> int:
+    """Return a pseudo-random number for a drive; the same arguments give the same number."""
+    return zlib.crc32(f"{seed} {route}".encode())
