@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import compose_se3, exp_se3, inverse_se3, transform_points
-from foredrive.models.driveworld.planes import carried_plane
+from foredrive.models.driveworld.planes import warp_plane
 from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
 from foredrive.models.lifting import project_to_cameras
 from foredrive.scene import Clip, Example, VoxelSpec
@@ -54,7 +54,7 @@ def test_depths_fall_into_the_same_cells(clip: Clip) -> None:
     """Under autocast 1.9 % of them changed their cell."""
     rig = clip.rig.map_tensors(lambda tensor: tensor[:, 0])
     depths = LiftSplatConfig(near_m=1.0, far_m=30.0, step_m=0.5)
-    encoder = LiftSplatEncoder(depths, SPEC, channels=4, width=4, levels=1)
+    encoder = LiftSplatEncoder(depths, SPEC, channels=4, plane_channels=4, levels=1)
     exact = encoder.cells(rig, (8, 16))
     with BF16:
         told = encoder.cells(rig, (8, 16))
@@ -70,7 +70,7 @@ def test_poses_and_what_they_move_are_exact() -> None:
         assert torch.equal(T, T_too)
         assert torch.equal(compose_se3(inverse_se3(T), T), compose_se3(inverse_se3(T_too), T_too))
         moved = transform_points(T, points)
-        carried = carried_plane(plane, T[None], SPEC)
+        carried = warp_plane(plane, T[None], SPEC)
     assert torch.equal(moved, transform_points(T, points))
-    assert torch.equal(carried, carried_plane(plane, T[None], SPEC))
+    assert torch.equal(carried, warp_plane(plane, T[None], SPEC))
     assert (compose_se3(inverse_se3(T), T) - torch.eye(4)).abs().max() < 1e-5
