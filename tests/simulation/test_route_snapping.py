@@ -61,6 +61,7 @@ def test_carla_s_left_handed_waypoints_are_mirrored(tmp_path: Path) -> None:
             "",
             "route 7 of .* has 1 waypoints",
         ),
+        ("</routes>", XML[XML.index("<route ") :], "more than one route '7'"),
     ],
 )
 def test_mistakes_in_a_route_file_are_one_line_that_names_it(

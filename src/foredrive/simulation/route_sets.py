@@ -4,6 +4,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -89,6 +90,9 @@ def read_carla_routes(path: Path) -> list[RouteWaypoints]:
     routes = [_route(path, number, element) for number, element in enumerate(root.iter("route"))]
     if not routes:
         raise InputError(f"there is no route in {path}")
+    twice = [name for name, count in Counter(route.id for route in routes).items() if count > 1]
+    if twice:
+        raise InputError(f"{path} has more than one route {twice[0]!r}; results are stored by id")
     return routes
 
 
