@@ -110,7 +110,7 @@ def test_evaluation_counts_corrupt_images_as_failed(
     assert (summary["items"], summary["failed"]) == (4, 2)
     assert summary["planning.uniad.frames_counted"] == 2
     report = (out / "report.html").read_text()
-    assert "Failed items of this model: 2" in report
+    assert "Failed clips of this model: 2." in report
     assert f"{CAMERA}.arrow: cannot read the image at frame 20" in report
 
 
