@@ -17,7 +17,7 @@ START_S = 120.0
 SERVER = """
 import json, os, sys, warnings
 import foredrive.runs.drive.recording, foredrive.runs.evaluate.run, foredrive.runs.train.run
-import foredrive.view.hero, foredrive.view.run_report, foredrive.view.summary_tables
+import foredrive.view.overview, foredrive.view.run_report, foredrive.view.summary_tables
 from miniature import miniature
 from foredrive.cli.main import main
 from foredrive.recipes import RECIPES
