@@ -119,7 +119,7 @@ def nemo_base() -> NemoRecipe:
     """Return the paper's size: ResNet-50, 200×200×16 voxels of 0.5 m, six cameras, two stages of 10 epochs.
 
     Constants are from §4.1. Values not given there: D = 64, three rounds of lifting with 8 heads and 8
-    points, four pyramid levels, T_f = 3 at 0.5 s, images of 450×800, λ_perc = 0.1 (Video Autoencoder).
+    points, four pyramid levels, T_f = 3 at 0.5 s, images of 448×800, λ_perc = 0.1 (Video Autoencoder).
     """
     schedule = Schedule(
         batch_size=1,
