@@ -43,7 +43,7 @@ def test_what_training_leaves_on_disk(trained: Run) -> None:
         f"checkpoints/step_{STEPS:07d}/{name}"
         for name in ("model.safetensors", "optimizer.safetensors", "progress.json")
     }
-    of_a_stage = {"metrics.jsonl", "model.safetensors"} | checkpoint
+    of_a_stage = {"metrics.jsonl", "conditions.json", "model.safetensors"} | checkpoint
     expected = {"config.yaml", "logs.json", "made_by.json", ".lock"}
     expected |= {f"{stage}/{name}" for stage in STAGES for name in of_a_stage}
     assert set(files(trained.folder)) == expected
