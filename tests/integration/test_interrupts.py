@@ -26,7 +26,7 @@ Sign = Callable[[], bool]
 
 
 class Programs:
-    """What the tests do with a program."""
+    """Starts, interrupts and kills programs."""
 
     def __init__(self, server: ProgramServer) -> None:
         self._server = server

@@ -36,7 +36,7 @@ class ActorState:
     parked: bool
     """True for a vehicle that is parked for the whole drive. It belongs to the place, not to the traffic."""
     braking: bool = False
-    """Whether its brake lights are on."""
+    """The brake lights are on."""
 
 
 def in_box_range(actors: Sequence[ActorState], T_world_ego: Float64[np.ndarray, "4 4"]) -> list[ActorState]:

@@ -4,7 +4,7 @@ import enum
 
 
 class LightState(enum.IntEnum):
-    """What a traffic light shows; NONE where there is no light."""
+    """Colour that a traffic light shows; NONE means that there is no light."""
 
     NONE = 0
     RED = 1

@@ -76,7 +76,10 @@ class NemoObjective(nn.Module):
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
         set_planner_trainable(agent.planner, plans)
-        world.motion.requires_grad_(self.steps > 0 or (plans and agent.planner.imagined_frames > 0))
+        imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
+        world.motion.requires_grad_(imagines)
+        if world.unseen is not None:
+            world.unseen.requires_grad_(imagines)
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)
 
