@@ -26,7 +26,7 @@ from foredrive.towns.campaign import Campaign, plan_drives
 
 WORK = work_folder(Path("runs/drive_nemo"))
 RECIPE = "nemo_drive"
-LESSONS = ("training-short", "training-long")
+DEMONSTRATIONS = ("training-short", "training-long")
 JUDGED = {"short": "town05-short", "long": "town05-long"}
 OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
 IMAGE_HW = (144, 256)
@@ -41,9 +41,9 @@ def _driven(suite: DriveSuite, out: Path) -> Driven:
     return driven
 
 
-def _lessons() -> tuple[LogPath, ...]:
-    folders = [WORK / "lessons" / name for name in LESSONS]
-    for name, folder in zip(LESSONS, folders, strict=True):
+def _demonstrations() -> tuple[LogPath, ...]:
+    folders = [WORK / "demonstrations" / name for name in DEMONSTRATIONS]
+    for name, folder in zip(DEMONSTRATIONS, folders, strict=True):
         _driven(DriveSuite("disturbed", TownRoutes(name)), folder)
     return find_all_logs(folders)
 
@@ -75,7 +75,7 @@ def learned(pretrained: bool) -> Callable[[int], Mapping[str, float]]:
         if not pretrained:
             recipe = dataclasses.replace(recipe, pretrain=None)
         folder = WORK / "runs" / f"{name}_seed{seed}"
-        run = train_run(recipe, _lessons(), folder, WORK / "cache")
+        run = train_run(recipe, _demonstrations(), folder, WORK / "cache")
         if not (folder / SUMMARY).is_file():
             recorded = record_drives(plan_drives(OPEN_LOOP), WORK / "towns", IMAGE_HW, CORES)
             logs = tuple(recorded.logs.values())
@@ -107,5 +107,9 @@ BENCHMARK = Benchmark(
         "scratch": learned(pretrained=False),
         "ego_mlp": ego_mlp,
     },
-    config={"recipe": dataclasses.asdict(find_recipe(RECIPE)), "lessons": LESSONS, "routes": JUDGED},
+    config={
+        "recipe": dataclasses.asdict(find_recipe(RECIPE)),
+        "demonstrations": DEMONSTRATIONS,
+        "routes": JUDGED,
+    },
 )

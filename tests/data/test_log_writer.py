@@ -16,8 +16,9 @@ from foredrive.data.log_paths import find_logs
 from foredrive.data.log_writer import Frame, FullOccupancy, LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.modalities import occupancy_metadata, pack_occupancy, unpack_beams, unpack_occupancy
+from foredrive.data.recorded import read_expert_plan
 from foredrive.errors import InputError
-from foredrive.scene import VoxelSpec
+from foredrive.scene import Trajectory, VoxelSpec
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -105,6 +106,23 @@ def test_a_provided_route_is_kept_and_none_is_made_up(tmp_path: Path) -> None:
     assert arc_m[-1] == pytest.approx(40)
     np.testing.assert_allclose(xyz[-1], route[-1], atol=1e-9)
     assert ArrowSceneAPI(world.write(tmp_path, frames=3, name="without")).get_route() is None
+
+
+@pytest.mark.parametrize("name", ["expert_plan", "taught_plan"])
+def test_the_experts_plan_comes_back_from_logs_of_this_and_earlier_versions(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("foredrive.data.log_writer.EXPERT_PLAN", name)
+    xy = torch.tensor([[[1.0, 0.25], [2.5, 0.5]]])
+    plan = Trajectory(
+        xy, torch.tensor([[0.25, 0.5]]), torch.ones(1, 2, dtype=torch.bool), torch.zeros(1), 0.5
+    )
+    with LogWriter(tmp_path, "flat_train", "log", [], None, None, None) as writer:
+        writer.write(dataclasses.replace(world.frame(0, []), expert_plan=plan))
+    read = read_expert_plan(Log(find_logs(tmp_path)[0]), 0)
+    assert read is not None
+    assert torch.equal(read.xy, plan.xy)
+    assert torch.equal(read.yaw, plan.yaw)
 
 
 def test_full_occupancy_survives_packing() -> None:

@@ -16,7 +16,7 @@ from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
-from foredrive.runs.drive.agents import needs_of
+from foredrive.runs.drive.agents import _run_folder, needs_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive
 from foredrive.runs.drive.route_source import job_of
@@ -72,23 +72,23 @@ def driven(suite: DriveSuite, out: Path) -> Driven:
     return drive_suite(suite, out, workers=1)
 
 
-def test_a_lesson_tells_what_the_expert_would_do(routes: Path, tmp_path: Path) -> None:
+def test_a_demonstration_has_the_plans_of_the_expert(routes: Path, tmp_path: Path) -> None:
     source = TownRoutes(str(routes), seed=5, conditions="any", vehicles=4, people=2)
     suite = DriveSuite("disturbed", source, sensors=False)
     driven = drive_suite(suite, tmp_path, workers=1)
     logs = find_logs(tmp_path)
-    taught, was_driven = (
+    planned, was_driven = (
         ClipDataset(logs, ClipConfig(1, 0, (18, 32), VOXELS, future_source=source), None)
-        for source in ("taught", "driven")
+        for source in ("expert", "driven")
     )
     assert driven.broken == {}
-    for index in range(len(taught)):
-        said, done = taught.clip(index).future, was_driven.clip(index).future
-        assert said.valid.all()  # three seconds, whenever the drive is over
-        assert said.dt_s == done.dt_s == 0.5
-        assert torch.diff(said.xy[0, :, 0]).ge(-0.01).all()
-        assert float(said.xy[0, -1].norm()) < 40
-        apart_m = (said.xy - done.xy)[done.valid].norm(dim=-1)  # he does what he says, more or less
+    for index in range(len(planned)):
+        plan, done = planned.clip(index).future, was_driven.clip(index).future
+        assert plan.valid.all()  # three seconds, whenever the drive is over
+        assert plan.dt_s == done.dt_s == 0.5
+        assert torch.diff(plan.xy[0, :, 0]).ge(-0.01).all()
+        assert float(plan.xy[0, -1].norm()) < 40
+        apart_m = (plan.xy - done.xy)[done.valid].norm(dim=-1)  # followed, but for disturbances
         assert apart_m.numel() == 0 or 0 < float(apart_m.max()) < 6
 
 
@@ -241,3 +241,7 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
     (tmp_path / "drives" / f"{HOSTILE}.json").write_text(json.dumps(drive))
     shutil.copy(tmp_path / "videos" / "routea_rep0.webp", tmp_path / "videos" / f"{HOSTILE}.webp")
     assert "<svg onload" not in write_drive_report(tmp_path).read_text()
+
+
+def test_the_driver_of_demonstrations_has_two_spellings(tmp_path: Path) -> None:
+    assert _run_folder(f"student:{tmp_path}") == _run_folder(f"pupil:{tmp_path}") == tmp_path

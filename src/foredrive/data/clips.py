@@ -19,7 +19,7 @@ from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
-from foredrive.data.recorded import read_taught_plan
+from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
 from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
@@ -52,9 +52,9 @@ class ClipConfig:
     occupancy_source: Literal["lidar", "recorded"] = "lidar"
     """Source of the voxel labels: "lidar" for beams of the sweep, or "recorded" for the exact occupancy and
     flow in recordings of towns, which includes voxels that no sensor has observed."""
-    future_source: Literal["driven", "taught"] = "driven"
-    """Source of the future trajectory: "driven" for the recorded path, or "taught" for the expert's plan in
-    DAgger demonstrations (`foredrive drive --taught`). Clips without such a plan use the driven path."""
+    future_source: Literal["driven", "expert"] = "driven"
+    """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
+    DAgger demonstrations. Clips without such a plan use the driven path."""
     part_s: tuple[float, float] | None = None
     """Part of each log, (start, end) in s since its start, end exclusive. Only clips with now and all later
     frames inside it are used. None is the whole log."""
@@ -152,10 +152,10 @@ class ClipDataset(Dataset[Example]):
 
     def _future(self, log: Log, now: int) -> Trajectory:
         steps, dt_s = self.config.horizon_steps, self.config.horizon_dt_s
-        taught = read_taught_plan(log, now) if self.config.future_source == "taught" else None
-        if taught is None:
+        plan = read_expert_plan(log, now) if self.config.future_source == "expert" else None
+        if plan is None:
             return log.driven_future(now, steps, dt_s)
-        return _at_times(taught, dt_s * np.arange(1, steps + 1))
+        return _at_times(plan, dt_s * np.arange(1, steps + 1))
 
     def clip(self, index: int) -> Clip:
         """Read one clip without its labels.

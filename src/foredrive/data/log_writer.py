@@ -62,9 +62,9 @@ from foredrive.data.camera_streams import (
 from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
+    EXPERT_PLAN,
     LIDAR_BEAMS,
     SETTING,
-    TAUGHT_PLAN,
     FullOccupancy,
     occupancy_metadata,
     pack_beams,
@@ -131,7 +131,7 @@ class Frame:
     """For each of `boxes`, the visible area relative to the area without occlusion, 0 to 1."""
     setting: Setting | None = None
     caption: str | None = None
-    taught: Trajectory | None = None
+    expert_plan: Trajectory | None = None
     """Plan of the expert from here, unbatched, in the ego frame at `t_us`."""
     traffic_lights: dict[int, TrafficLightStatus] | None = None
     """States of the traffic lights, by the map ids of the lanes behind their stop lines."""
@@ -234,8 +234,8 @@ class LogWriter:
             modalities.append(_custom(frame, SETTING, pack_setting(frame.setting)))
         if frame.caption is not None:
             modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
-        if frame.taught is not None:
-            modalities.append(_custom(frame, TAUGHT_PLAN, pack_plan(frame.taught)))
+        if frame.expert_plan is not None:
+            modalities.append(_custom(frame, EXPERT_PLAN, pack_plan(frame.expert_plan)))
         if frame.traffic_lights is not None:
             lights = [TrafficLightDetection(*shown) for shown in sorted(frame.traffic_lights.items())]
             modalities.append(TrafficLightDetections(lights, Timestamp.from_us(frame.t_us)))

@@ -1,6 +1,6 @@
 """Foredrive's additions to 123D's modalities.
 
-They are beams that did not return, exact occupancy, visibility, settings, captions and the plans of an
+They are beams that did not return, exact occupancy, visibility, settings, captions and the plans of the
 expert. All are stored as 123D custom modalities with one row per frame. Each array is compressed separately
 with zstd, so that a row can be read without its neighbours.
 """
@@ -24,8 +24,10 @@ SETTING = "setting"
 """The facts of `data.setting.Setting`: words and numbers by field name."""
 CAPTION = "caption"
 """One text per frame."""
-TAUGHT_PLAN = "taught_plan"
+EXPERT_PLAN = "expert_plan"
 """The plan of the expert from the frame on."""
+OLD_NAMES = {EXPERT_PLAN: "taught_plan"}
+"""Names of modalities in logs of earlier versions. They are read where the present name is absent."""
 
 _ORIGIN_STEP_M = 1e-4
 _DIRECTION_STEP = 1 / 32767

@@ -1,5 +1,8 @@
 """Exact labels of recordings beyond 123D's own modalities, and states of traffic lights."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from jaxtyping import Float
 from py123d.datatypes import ModalityType, TrafficLightStatus
 from py123d.datatypes.custom.custom_modality import CustomModality
@@ -10,9 +13,10 @@ from foredrive.data.logs import Log
 from foredrive.data.modalities import (
     BOX_VISIBILITY,
     CAPTION,
+    EXPERT_PLAN,
     FULL_OCCUPANCY,
+    OLD_NAMES,
     SETTING,
-    TAUGHT_PLAN,
     FullOccupancy,
     unpack_occupancy,
     unpack_plan,
@@ -21,6 +25,8 @@ from foredrive.data.modalities import (
 from foredrive.data.setting import Setting, unpack_setting
 from foredrive.scene import Trajectory
 
+T = TypeVar("T")
+
 
 def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
     """Read the visible share of each box of `read_boxes`, 0 to 1. Return None if it was not recorded.
@@ -28,9 +34,7 @@ def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
     Raises:
         InputError: the row cannot be read.
     """
-    with reading(log.file(f"custom.{BOX_VISIBILITY}"), f"the visibility at frame {frame}"):
-        row = _row(log, frame, BOX_VISIBILITY)
-        return None if row is None else from_numpy(unpack_visibility(row.data))
+    return _read(log, frame, BOX_VISIBILITY, lambda row: from_numpy(unpack_visibility(row.data)))
 
 
 def read_setting(log: Log, frame: int) -> Setting | None:
@@ -39,9 +43,7 @@ def read_setting(log: Log, frame: int) -> Setting | None:
     Raises:
         InputError: the row cannot be read.
     """
-    with reading(log.file(f"custom.{SETTING}"), f"the setting at frame {frame}"):
-        row = _row(log, frame, SETTING)
-        return None if row is None else unpack_setting(row.data)
+    return _read(log, frame, SETTING, lambda row: unpack_setting(row.data))
 
 
 def read_caption(log: Log, frame: int) -> str | None:
@@ -50,9 +52,7 @@ def read_caption(log: Log, frame: int) -> str | None:
     Raises:
         InputError: the row cannot be read.
     """
-    with reading(log.file(f"custom.{CAPTION}"), f"the caption at frame {frame}"):
-        row = _row(log, frame, CAPTION)
-        return None if row is None else str(row.data["text"])
+    return _read(log, frame, CAPTION, lambda row: str(row.data["text"]))
 
 
 def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
@@ -61,20 +61,16 @@ def read_occupancy(log: Log, frame: int) -> FullOccupancy | None:
     Raises:
         InputError: the row cannot be read.
     """
-    with reading(log.file(f"custom.{FULL_OCCUPANCY}"), f"the occupancy at frame {frame}"):
-        row = _row(log, frame, FULL_OCCUPANCY)
-        return None if row is None else unpack_occupancy(row.data, row.metadata)
+    return _read(log, frame, FULL_OCCUPANCY, lambda row: unpack_occupancy(row.data, row.metadata))
 
 
-def read_taught_plan(log: Log, frame: int) -> Trajectory | None:
+def read_expert_plan(log: Log, frame: int) -> Trajectory | None:
     """Read the expert's plan from a frame on, unbatched, in its ego frame. Return None if there is none.
 
     Raises:
         InputError: the row cannot be read.
     """
-    with reading(log.file(f"custom.{TAUGHT_PLAN}"), f"the taught plan at frame {frame}"):
-        row = _row(log, frame, TAUGHT_PLAN)
-        return None if row is None else unpack_plan(row.data)
+    return _read(log, frame, EXPERT_PLAN, lambda row: unpack_plan(row.data))
 
 
 def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] | None:
@@ -89,6 +85,11 @@ def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] |
         return None if shown is None else {int(light.lane_id): light.status for light in shown}
 
 
-def _row(log: Log, frame: int, kind: str) -> CustomModality | None:
-    row = log.scene.get_custom_modality_at_iteration(log.iteration(frame), kind)
-    return row if isinstance(row, CustomModality) else None
+def _read(log: Log, frame: int, name: str, unpack: Callable[[CustomModality], T]) -> T | None:
+    """Unpack a frame's row of a custom modality. Return None if it was not recorded."""
+    old = OLD_NAMES.get(name)
+    if old is not None and not log.file(f"custom.{name}").exists():
+        name = old
+    with reading(log.file(f"custom.{name}"), f"the {name.replace('_', ' ')} at frame {frame}"):
+        row = log.scene.get_custom_modality_at_iteration(log.iteration(frame), name)
+        return unpack(row) if isinstance(row, CustomModality) else None

@@ -110,7 +110,7 @@ def nemo_drive() -> NemoRecipe:
         town,
         name="nemo_drive",
         about="nemo_town to drive in closed loop, trained on DAgger demonstrations",
-        clips=dataclasses.replace(town.clips, future_source="taught"),
+        clips=dataclasses.replace(town.clips, future_source="expert"),
         planner=dataclasses.replace(town.planner, history=0, target=True),
     )
 

@@ -36,7 +36,10 @@ def _with_module_configs(written: Mapping[str, Any]) -> Any:
             model["prompt"] = {"expand": {"widths": prompt["widths"]}, **rest}
     written = _renamed({**written, "model": model}, "model", carry_statics="warp_statics")
     planner = _renamed(written.get("planner"), "path", aside_m="lateral_m")
-    return {**written, "planner": planner} if "planner" in written else written
+    written = {**written, "planner": planner} if "planner" in written else written
+    if isinstance(clips := written.get("clips"), Mapping) and clips.get("future_source") == "taught":
+        return {**written, "clips": {**clips, "future_source": "expert"}}
+    return written
 
 
 def _renamed(written: Any, part: str, **names: str) -> Any:

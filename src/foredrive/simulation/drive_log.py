@@ -41,17 +41,17 @@ def drive_log(
     return LogWriter(out, split, name, [] if rig is None else camera_specs(rig), maps, town, route_xyz)
 
 
-def town_log_frame(simulator: TownSimulator, taught: Trajectory | None = None) -> Frame:
+def town_log_frame(simulator: TownSimulator, expert_plan: Trajectory | None = None) -> Frame:
     """Return the log frame of a town's latest key frame, which must be the current one, with its lights.
 
     Args:
-        taught: trajectory that the expert would drive from here, a batch of one.
+        expert_plan: plan of the expert from here, a batch of one.
     """
     state, sensors = simulator.state, simulator.scenario.sensors
     lights = simulator.traffic.zone_lights(state.decided.time_s)
     return dataclasses.replace(
         log_frame(state.frames[-1], state.ego, None if sensors is None else sensors.rig),
-        taught=None if taught is None else taught[0],
+        expert_plan=None if expert_plan is None else expert_plan[0],
         traffic_lights=traffic_light_states(load_town_map(simulator.scenario.town), lights),
     )
 

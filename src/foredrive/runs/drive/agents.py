@@ -15,7 +15,7 @@ from foredrive.models.ego_mlp import EgoMLP
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.simulation.lessons import Alternating, Disturbed
+from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.restarts import Restarting
 from foredrive.simulation.simple_agents import Straight
@@ -24,7 +24,9 @@ from foredrive.simulation.town_expert import TownExpert
 
 CRUISE_MPS = 5.0
 EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
-DISTURBED, PUPIL = "disturbed", "pupil:"
+DISTURBED, STUDENT = "disturbed", "student:"
+OLD_STUDENT = "pupil:"
+"""The prefix of `STUDENT` in earlier versions, still accepted."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def needs_of(driver: str) -> Needs:
     Args:
         driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
             the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
-            the expert under disturbances, or "pupil:RUN", in which a run and the expert drive by turns.
+            the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
 
     Raises:
         InputError: there is no such driver, or it was trained on another frame interval.
@@ -91,12 +93,12 @@ def make_driver(
     if driver == EXPERT:
         return _expert(town)
     if driver == DISTURBED:
-        return Disturbed(_expert(town), clock, seed)
+        return DisturbedExpert(_expert(town), clock, seed)
     if driver in (STOP, CONSTANT_VELOCITY):
         return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
     folder = _run_folder(driver)
-    if driver.startswith(PUPIL):
-        return Alternating(_seeing(folder), _expert(town), clock, seed)
+    if driver.startswith((STUDENT, OLD_STUDENT)):
+        return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
     return Restarting(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
 
 
@@ -107,10 +109,11 @@ def _expert(town: TownSimulator | None) -> TownExpert:
 
 
 def _run_folder(driver: str) -> Path:
-    folder = Path(driver.removeprefix(EGO_MLP).removeprefix(PUPIL))
+    prefix = next((known for known in (EGO_MLP, STUDENT, OLD_STUDENT) if driver.startswith(known)), "")
+    folder = Path(driver.removeprefix(prefix))
     if not folder.is_dir():
         known = (
-            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {PUPIL}RUN"
+            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {STUDENT}RUN"
         )
         raise InputError(f"{driver}: no such driver; there are {known}")
     return folder

@@ -11,8 +11,8 @@ from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
 from foredrive.scene import Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.drive_log import drive_log, town_log_frame
-from foredrive.simulation.lessons import Alternating, Disturbed
 from foredrive.simulation.routes import DriveRoute
 from foredrive.simulation.scenarios.places import scenarios_on
 from foredrive.simulation.scores import timeout_s
@@ -39,8 +39,10 @@ class TownRoutes(RouteSource):
         disturbance_seed = drive_hash(scenario.seed, job.route)
         agent = make_driver(suite.driver, lambda: simulator.state.t_s, simulator, disturbance_seed)
 
-        def taught() -> Trajectory | None:
-            return agent.teacher.plan() if isinstance(agent, Disturbed | Alternating) else None
+        def expert_plan() -> Trajectory | None:
+            if isinstance(agent, DisturbedExpert | AlternatingStudent):
+                return agent.expert.plan()
+            return None
 
         rig = None if scenario.sensors is None else scenario.sensors.rig
         with drive_log(out, job.name, route.xyz, rig, route.town) as log:
@@ -51,7 +53,7 @@ class TownRoutes(RouteSource):
                 route.xyz,
                 route.length_m,
                 log,
-                lambda: town_log_frame(simulator, taught()),
+                lambda: town_log_frame(simulator, expert_plan()),
                 route.town,
             )
 

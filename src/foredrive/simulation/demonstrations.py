@@ -1,4 +1,4 @@
-"""Drives that teach a student to recover from lateral offsets and from too low or too high speed.
+"""Agents that record DAgger demonstrations: states off the expert's path, with the expert's plan for each.
 
 A student that learns from faultless drives only has never seen the states that its own mistakes lead to.
 There are two remedies. Either the expert is disturbed while it drives (Laskey et al. 2017, "DART"; Codevilla
@@ -31,8 +31,8 @@ TURN_S = 6.0
 
 
 @runtime_checkable
-class Teacher(Protocol):
-    """The expert: it knows what to do, as `TownExpert` does."""
+class Expert(Protocol):
+    """An agent that plans from the true state of the simulator, such as `TownExpert`."""
 
     def plan(self) -> Trajectory:
         """Return the plan of the expert from now on, in the ego frame.
@@ -49,24 +49,24 @@ class _Disturbance:
     pace: float = 1.0
 
 
-class Disturbed:
+class DisturbedExpert:
     """An `Agent` that drives as the expert but is now and then steered aside, slowed down or sped up.
 
     Args:
-        teacher: expert whose plans are disturbed.
+        expert: its plans are disturbed.
         clock: returns the time of the drive, s.
         seed: seed of the disturbances.
     """
 
-    def __init__(self, teacher: Teacher, clock: Callable[[], float], seed: int) -> None:
-        self.teacher, self._clock = teacher, clock
+    def __init__(self, expert: Expert, clock: Callable[[], float], seed: int) -> None:
+        self.expert, self._clock = expert, clock
         self._rng = np.random.default_rng([seed, 0])
         self._begins_s = self._rng.exponential(CALM_S)
         self._now: _Disturbance | None = None
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the expert's plan with the current disturbance, if there is one."""
-        plan, t_s, rng = self.teacher.plan(), self._clock(), self._rng
+        plan, t_s, rng = self.expert.plan(), self._clock(), self._rng
         if self._now is not None and t_s >= self._now.until_s:
             self._now, self._begins_s = None, t_s + rng.exponential(CALM_S)
         if self._now is None and t_s >= self._begins_s:
@@ -83,14 +83,14 @@ class Disturbed:
         return dataclasses.replace(plan, xy=plan.xy @ turned.to(plan.xy), yaw=plan.yaw + self._now.bears_rad)
 
 
-class Alternating:
+class AlternatingStudent:
     """An `Agent` that alternates between the student and the expert.
 
     The student drives most of the time. The expert drives in between and so leads it out of dead ends.
 
     Args:
-        pupil: student that drives.
-        teacher: expert that drives in between.
+        student: drives most of the time.
+        expert: drives in between.
         clock: returns the time of the drive, s.
         seed: seed of the turns.
         share: share of the turns that the student gets.
@@ -98,19 +98,19 @@ class Alternating:
 
     def __init__(
         self,
-        pupil: Agent,
-        teacher: Teacher,
+        student: Agent,
+        expert: Expert,
         clock: Callable[[], float],
         seed: int,
         share: float = 0.7,
     ) -> None:
-        self._pupil, self.teacher, self._clock = pupil, teacher, clock
+        self._student, self.expert, self._clock = student, expert, clock
         self._share, self._rng = share, np.random.default_rng([seed, 1])
-        self._until_s, self._is_pupils = -math.inf, True
+        self._until_s, self._student_drives = -math.inf, True
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan of the agent that has the current turn."""
         if self._clock() >= self._until_s:
             self._until_s = self._clock() + TURN_S
-            self._is_pupils = bool(self._rng.random() < self._share)
-        return self._pupil.act(observation) if self._is_pupils else self.teacher.plan()
+            self._student_drives = bool(self._rng.random() < self._share)
+        return self._student.act(observation) if self._student_drives else self.expert.plan()

@@ -1,4 +1,4 @@
-"""Lessons: what happens to a teacher, whose turn it is, and what he says meanwhile."""
+"""The disturbances of an expert, and the turns of student and expert."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,12 @@ import torch
 from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.scene.actors import boxes_in_ego_frame
-from foredrive.simulation.lessons import STEERED_SHARE, STEERS_RAD, Alternating, Disturbed
+from foredrive.simulation.demonstrations import (
+    STEERED_SHARE,
+    STEERS_RAD,
+    AlternatingStudent,
+    DisturbedExpert,
+)
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.simple_agents import Straight
 
@@ -18,16 +23,16 @@ STEP_S, HOURS_S = 0.5, 3600.0
 
 @dataclass(frozen=True)
 class Steady:
-    """A teacher who always says the same."""
+    """An expert whose plan never changes."""
 
-    said: Trajectory
+    fixed: Trajectory
 
     def plan(self) -> Trajectory:
-        return self.said
+        return self.fixed
 
 
 @pytest.fixture(scope="module")
-def teacher(clip: Clip) -> Steady:
+def expert(clip: Clip) -> Steady:
     return Steady(Straight(8.0).act(clip))
 
 
@@ -48,8 +53,8 @@ def plans(agent_type: type, clip: Clip, seed: int, *agents: object) -> torch.Ten
     return torch.stack(out)
 
 
-def test_a_teacher_is_steered_aside_or_held_up_but_mostly_left_alone(clip: Clip, teacher: Steady) -> None:
-    xy = plans(Disturbed, clip, 3, teacher)
+def test_the_expert_is_steered_aside_or_slowed_but_mostly_undisturbed(clip: Clip, expert: Steady) -> None:
+    xy = plans(DisturbedExpert, clip, 3, expert)
     gets_m, bears_rad = xy[:, -1].norm(dim=-1), torch.atan2(xy[:, 0, 1], xy[:, 0, 0])
     steered, paced = bears_rad != 0, ~torch.isclose(gets_m, torch.tensor(24.0))
     assert not (steered & paced).any()  # one thing at a time
@@ -65,23 +70,23 @@ def test_a_teacher_is_steered_aside_or_held_up_but_mostly_left_alone(clip: Clip,
     torch.testing.assert_close(straight[steered, 2] * 6, straight[steered, 5] * 3, rtol=1e-5, atol=1e-5)
 
 
-def test_the_same_seed_brings_the_same_lesson(clip: Clip, teacher: Steady) -> None:
-    first, again, other = (plans(Disturbed, clip, seed, teacher) for seed in (1, 1, 2))
+def test_the_same_seed_brings_the_same_disturbances(clip: Clip, expert: Steady) -> None:
+    first, again, other = (plans(DisturbedExpert, clip, seed, expert) for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_pupil_and_teacher_take_turns(clip: Clip, teacher: Steady) -> None:
-    speed = plans(Alternating, clip, 0, Straight(2.0), teacher)[:, -1, 0] / 3
-    is_pupils = speed == 2.0
-    assert ((speed == 8.0) | is_pupils).all()
-    assert 0.6 < is_pupils.float().mean() < 0.8
-    changes = torch.nonzero(torch.diff(is_pupils.int()))[:, 0] + 1
+def test_student_and_expert_take_turns(clip: Clip, expert: Steady) -> None:
+    speed = plans(AlternatingStudent, clip, 0, Straight(2.0), expert)[:, -1, 0] / 3
+    is_students = speed == 2.0
+    assert ((speed == 8.0) | is_students).all()
+    assert 0.6 < is_students.float().mean() < 0.8
+    changes = torch.nonzero(torch.diff(is_students.int()))[:, 0] + 1
     assert (changes % 12 == 0).all()  # turns of six seconds
 
 
-def test_at_the_pupils_share_of_one_the_teacher_never_drives(clip: Clip, teacher: Steady) -> None:
+def test_at_a_share_of_one_the_expert_never_drives(clip: Clip, expert: Steady) -> None:
     now = [0.0]
-    agent = Alternating(Straight(2.0), teacher, lambda: now[0], 0, share=1.0)
+    agent = AlternatingStudent(Straight(2.0), expert, lambda: now[0], 0, share=1.0)
     for now[0] in range(0, 100, 3):
         assert float(agent.act(clip).xy[0, 0, -1, 0]) == 6.0
