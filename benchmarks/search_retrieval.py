@@ -38,7 +38,7 @@ def judged(seed: int) -> dict[str, dict[str, float]]:
     """Return the metrics by modality."""
     towers = find_towers(TOWERS[seed])
     logs = drives()
-    views = gather_views(logs, 1 / RATE_HZ, towers.image_side_px, WORK)
+    views = gather_views(logs, 1 / RATE_HZ, towers.image_side_px, towers.crop, WORK)
     seen = Judged.of_logs(logs, views, towers)
     figures = judge_retrieval(seen, towers)
     for modality, named in judge_naming(seen, towers).items():

@@ -33,6 +33,7 @@ from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.indexing import IndexWriter
+from foredrive.search.crops import Crop
 from foredrive.search.embedding import read_views
 from foredrive.search.find import find
 from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, Making, Part
@@ -218,7 +219,7 @@ def lidar_tower(seed: int) -> dict[str, float]:
         plan = DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0)
         log = Log(record_drives([plan], Path(folder), (144, 256), workers=1).logs[plan])
         frames = range(len(log.t_us))
-        read = [read_views(log, frame, 128, with_lidar=True) for frame in frames]
+        read = [read_views(log, frame, 128, Crop.WHOLE, with_lidar=True) for frame in frames]
     sectors = [[views[name].sweep for views in read] for name in read[0]]
     clouds = [PointCloud.from_sweeps(stack_records(those)) for those in sectors]
     cores = os.cpu_count() or 1

@@ -8,6 +8,7 @@ from torch import Tensor
 from transformers import BertTokenizerFast, CLIPConfig, CLIPModel, SiglipConfig, SiglipModel
 
 from foredrive.scene import LidarSweep
+from foredrive.search.crops import Crop
 
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "a", "photo", "of", "car", "night", "rain", "crossing", "the"]
 SMALL = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
@@ -17,7 +18,8 @@ VISION = {**SMALL, "image_size": 16, "patch_size": 8}
 class PlainTowers:
     """Mean colour of an image, mean place of a sweep and which words a text has, all in four numbers."""
 
-    name, fingerprint, dim, image_side_px, has_lidar = "plain", "plain-1", 4, 12, True
+    name, fingerprint, dim, image_side_px = "plain", "plain-1", 4, 12
+    crop, has_lidar = Crop.WHOLE, True
 
     def embed_images(self, images: Tensor) -> Tensor:
         return torch.cat([images.float().mean((-2, -1)) / 255, torch.full((len(images), 1), 0.1)], dim=-1)

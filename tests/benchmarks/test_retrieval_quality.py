@@ -17,6 +17,7 @@ from benchmarks.common.retrieval_quality import (
     weather_of,
 )
 from foredrive.runs.search.sector_views import Row
+from foredrive.search.crops import Crop
 from foredrive.search.facts import Thing, ViewFacts
 from foredrive.search.phrases import SETTINGS
 from foredrive.search.towers import unit
@@ -28,7 +29,8 @@ FACTS = sorted({fact for question in ASKED for fact in question.facts})
 class AllKnowing:
     """Texts are what they say, one number for each fact; so are views."""
 
-    name, fingerprint, dim, image_side_px, has_lidar = "all-knowing", "1", len(FACTS), 8, True
+    name, fingerprint, dim, image_side_px = "all-knowing", "1", len(FACTS), 8
+    crop, has_lidar = Crop.WHOLE, True
 
     def embed_images(self, images: Tensor) -> Tensor:
         raise AssertionError

@@ -17,7 +17,9 @@ from foredrive.errors import InputError
 from foredrive.runs.search import indexing
 from foredrive.runs.search.indexing import Job, index_logs
 from foredrive.runs.search.searching import ask, listed_clips
-from foredrive.search.index import FrameIndex
+from foredrive.runs.search.towers import find_towers
+from foredrive.search.crops import Crop
+from foredrive.search.index import FrameIndex, Making
 from foredrive.search.query import Query
 
 FRAMES = 21
@@ -128,6 +130,17 @@ def test_other_towers_are_refused(logs: list[LogPath], towers: str, tmp_path: Pa
         index_logs(logs[:1], uri, str(others), 1.0, 1)
     with pytest.raises(InputError, match="cannot be compared"):
         ask(FrameIndex(uri), Query(text="rain"), str(others))
+
+
+def test_an_index_of_sweeps_that_were_not_cut_is_refused(
+    logs: list[LogPath], towers: str, tmp_path: Path
+) -> None:
+    uri = str(tmp_path / "index")
+    clip = find_towers(towers)
+    assert clip.crop is Crop.MIDDLE_SQUARE
+    FrameIndex.make(uri, Making(clip.name, clip.fingerprint.replace("-middle-square", ""), clip.dim, 1.0))
+    with pytest.raises(InputError, match="index the logs again in another place"):
+        index_logs(logs[:1], uri, towers, 1.0, 1)
 
 
 def _t_us(log: LogPath, frame: int) -> int:

@@ -15,6 +15,7 @@ from foredrive.runs.search.captioning import CAPTIONS, caption_views, load_capti
 from foredrive.runs.search.searching import ask
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.towers import EMBEDDED, SHIPPED, find_towers
+from foredrive.search.crops import Crop
 from foredrive.search.embedding import read_views
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
@@ -41,9 +42,19 @@ def test_they_are_small_enough_to_come_along() -> None:
     assert sum(files.values()) < MOST_BYTES
 
 
+def test_they_look_at_the_whole_image() -> None:
+    towers = find_towers(EMBEDDED)
+    assert towers.crop is Crop.WHOLE
+    images = torch.randint(0, 256, (1, 3, 128, 228), dtype=torch.uint8)
+    for columns in (slice(0, 8), slice(-8, None)):
+        changed = images.clone()
+        changed[..., columns] = 255 - changed[..., columns]
+        assert float((towers.embed_images(changed) - towers.embed_images(images)).norm()) > 0.01
+
+
 def test_they_tell_night_from_day(drives: dict[str, LogPath], tmp_path: Path) -> None:
     towers = find_towers(EMBEDDED)
-    views = gather_views(list(drives.values()), 0.5, towers.image_side_px, tmp_path)
+    views = gather_views(list(drives.values()), 0.5, towers.image_side_px, towers.crop, tmp_path)
     named = classify(torch.from_numpy(embed_all(views, towers)["image"]), class_vectors(towers, LIGHTS))
     true = np.repeat(range(len(LIGHTS)), 6)
     assert (named.numpy() == true).mean() >= 0.9
@@ -66,7 +77,9 @@ def test_they_say_whether_it_is_night(drives: dict[str, LogPath]) -> None:
     towers = find_towers(EMBEDDED)
     decoder = load_captions(SHIPPED / CAPTIONS, towers)
     for light, log in drives.items():
-        said = caption_views(read_views(Log(log), 0, towers.image_side_px, with_lidar=True), towers, decoder)
+        said = caption_views(
+            read_views(Log(log), 0, towers.image_side_px, towers.crop, with_lidar=True), towers, decoder
+        )
         assert len(said) == 6
         at_night = ["at night" in str(each.by_image) for each in said.values()]
         assert sum(at_night) >= 5 if light == "night" else sum(at_night) <= 1

@@ -27,6 +27,7 @@ from foredrive.runs.search.tower_data import (
 )
 from foredrive.runs.search.tower_training import TowerRecipe, train_towers
 from foredrive.runs.search.towers import find_towers
+from foredrive.search.crops import Crop
 from foredrive.search.embedded import SentenceTowers, load_towers
 from foredrive.training import Schedule, read_metrics
 
@@ -87,12 +88,13 @@ def test_a_run_trains_both_towers_and_is_not_begun_again(
 def test_a_lidar_tower_beside_clip_needs_nothing_that_could_be_said(
     recipe: TowerRecipe, log: LogPath, tmp_path: Path
 ) -> None:
-    views = gather_views([log], recipe.stride_s, 16, tmp_path)
+    views = gather_views([log], recipe.stride_s, 16, Crop.WHOLE, tmp_path)
 
     class Wordless:
         """The image tower of a CLIP, and nothing else."""
 
-        name, fingerprint, dim, image_side_px, has_lidar = "wordless", "0", 4, 16, False
+        name, fingerprint, dim, image_side_px = "wordless", "0", 4, 16
+        crop, has_lidar = Crop.WHOLE, False
 
         def embed_images(self, images: torch.Tensor) -> torch.Tensor:
             return images.float().flatten(1)[:, :4]
@@ -120,7 +122,7 @@ def test_a_lidar_tower_beside_clip_needs_nothing_that_could_be_said(
 def test_views_are_read_once_and_hold_what_their_sector_does(
     recipe: TowerRecipe, log: LogPath, tmp_path: Path
 ) -> None:
-    (views,) = gather_views([log], 0.5, 24, tmp_path)
+    (views,) = gather_views([log], 0.5, 24, Crop.WHOLE, tmp_path)
     assert len(views) == 5 * 2  # five moments, two cameras
     assert {row.view for row in views.rows} == {row.view for row in views.rows[:2]}
     for row in range(2):
@@ -129,12 +131,12 @@ def test_views_are_read_once_and_hold_what_their_sector_does(
         ahead = torch.atan2(points[:, 1], points[:, 0]).abs()  # x points along the sector's middle
         assert float(ahead.max()) < 1.0
         assert views.image(row).shape[0] == 3
-    (again,) = gather_views([log], 0.5, 24, tmp_path)
+    (again,) = gather_views([log], 0.5, 24, Crop.WHOLE, tmp_path)
     assert again.rows == views.rows
     (rows_file,) = tmp_path.glob("views/*/rows.json")
     rows_file.write_text("{")
     with pytest.raises(InputError, match="cannot be read"):
-        gather_views([log], 0.5, 24, tmp_path)
+        gather_views([log], 0.5, 24, Crop.WHOLE, tmp_path)
 
 
 def test_texts_are_embedded_once(recipe: TowerRecipe, tmp_path: Path) -> None:
@@ -149,7 +151,7 @@ def test_texts_are_embedded_once(recipe: TowerRecipe, tmp_path: Path) -> None:
 
 
 def test_every_text_of_a_view_is_true_of_it(recipe: TowerRecipe, log: LogPath, tmp_path: Path) -> None:
-    views = gather_views([log], 0.5, 24, tmp_path)
+    views = gather_views([log], 0.5, 24, Crop.WHOLE, tmp_path)
     dataset = CaptionedViews(views, TextEncoder(recipe.text), 3)
     batch = collate_captioned([dataset[n] for n in range(len(dataset))])
     assert batch.texts.shape == (len(dataset), 3, 16)
@@ -159,7 +161,7 @@ def test_every_text_of_a_view_is_true_of_it(recipe: TowerRecipe, log: LogPath, t
 
 
 def test_sweeps_of_a_batch_stay_apart(log: LogPath, tmp_path: Path) -> None:
-    views = gather_views([log], 0.5, 24, tmp_path)
+    views = gather_views([log], 0.5, 24, Crop.WHOLE, tmp_path)
     dataset = ImagedViews(views, torch.zeros(len(views[0]), 2, 4))
     batch = collate_imaged([dataset[n] for n in (0, 3)])
     for item, row in enumerate((0, 3)):

@@ -9,8 +9,12 @@ import torch
 from synthetic_log import EGO_SPEED_MPS
 
 from foredrive.data import LogPath
+from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.search.crops import Crop
 from foredrive.search.embedding import embed_frames, mean_direction, read_views
 from foredrive.search.rows import FACTS, WHOLE, row_schema
 from foredrive.search.sectors import Sector, blind_sectors
@@ -73,7 +77,7 @@ def test_parts_of_a_log_are_embedded_as_the_whole_is(rows: pa.Table, log: LogPat
 
 def test_a_sector_holds_the_returns_its_camera_can_see_and_looks_along_x(log: LogPath) -> None:
     opened = Log(log)
-    views = read_views(opened, 0, 48, with_lidar=True)
+    views = read_views(opened, 0, 48, Crop.WHOLE, with_lidar=True)
     for view in views.values():
         assert view.sweep is not None
         points = view.sweep.points_ego
@@ -81,6 +85,33 @@ def test_a_sector_holds_the_returns_its_camera_can_see_and_looks_along_x(log: Lo
         assert view.sweep.returned.all()
         azimuth = torch.atan2(points[:, 1], points[:, 0])
         assert azimuth.abs().quantile(0.9) < math.radians(50)  # 90° wide, seen from the axle
+
+
+def test_a_return_beside_the_crop_of_the_image_is_left_out(log: LogPath) -> None:
+    opened = Log(log)
+    found = read_sweep(opened, 0)
+    assert found is not None
+    points = found[0].points_ego[found[0].valid & found[0].returned]
+    whole, square = (read_views(opened, 0, 24, crop, with_lidar=True) for crop in Crop)
+    for name, metadata in pinhole_cameras(opened).items():
+        view = square[name]
+        assert view.image is not None
+        assert view.sweep is not None
+        assert view.image.shape[-2:] == (24, 24)
+        full = read_camera(opened, 0, metadata, (24, 48), with_image=True)
+        assert full.image is not None
+        assert torch.equal(view.image, full.image[..., 12:36])
+        uv, _, inside = project(
+            transform_points(inverse_se3(full.T_ego_cam), points), full.K, full.dist, (24, 48)
+        )
+        expected = points[inside & (uv[:, 0] >= 12) & (uv[:, 0] < 36)]
+        assert len(view.sweep.valid) == len(expected) < int(inside.sum())
+        across = whole[name].sweep
+        assert across is not None
+        assert len(across.valid) == int(inside.sum())
+        torch.testing.assert_close(
+            view.sweep.points_ego.norm(dim=-1), expected.norm(dim=-1), atol=1e-4, rtol=1e-5
+        )
 
 
 def test_sectors_without_cameras_share_every_return(log: LogPath) -> None:

@@ -14,6 +14,7 @@ from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.setting import Doing, Place, Setting, TimeOfDay, Weather
 from foredrive.scene import Boxes, Category
+from foredrive.search.crops import Crop
 from foredrive.search.embedding import read_views
 from foredrive.search.facts import NOUNS, Thing, ViewFacts, _things, view_facts
 from foredrive.search.phrases import phrases, whole_caption
@@ -129,7 +130,9 @@ def test_a_setting_is_said_by_itself_too() -> None:
 
 def test_views_of_a_log_have_the_facts_of_what_lies_in_their_sector(log: LogPath) -> None:
     opened = Log(log)
-    sectors = {name: view.sector for name, view in read_views(opened, 10, 32, with_lidar=False).items()}
+    sectors = {
+        name: view.sector for name, view in read_views(opened, 10, 32, Crop.WHOLE, with_lidar=False).items()
+    }
     found = view_facts(opened, 10, sectors)
     assert set(found) == set(sectors)
     for facts in found.values():
@@ -151,7 +154,10 @@ def test_time_weather_and_place_are_recorded_facts_not_a_caption_read_again(tmp_
         with LogWriter(tmp_path, "flat_train", f"log{told[0]}", specs, None, None, None) as writer:
             writer.write(dataclasses.replace(plain, setting=setting))
         opened = Log(LogPath(writer.folder, tmp_path))
-        sectors = {name: view.sector for name, view in read_views(opened, 0, 24, with_lidar=False).items()}
+        sectors = {
+            name: view.sector
+            for name, view in read_views(opened, 0, 24, Crop.WHOLE, with_lidar=False).items()
+        }
         for facts in view_facts(opened, 0, sectors).values():
             assert facts[:3] == told
 

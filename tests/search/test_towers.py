@@ -18,21 +18,22 @@ from foredrive.search.towers import embed_prompt, unit
 def test_clip_sees_the_middle_square_as_its_model_does(clip_folder: Path) -> None:
     towers = PretrainedTowers(str(clip_folder))
     images = torch.randint(0, 256, (2, 3, 16, 28), dtype=torch.uint8)
+    left, top, right, bottom = towers.crop.box_px((16, 28))
+    assert (left, top, right, bottom) == (6, 0, 22, 16)
     middle = (images[..., 6:22].float() / 255 - torch.tensor(CLIP_MEAN).view(3, 1, 1)) / torch.tensor(
         CLIP_STD
     ).view(3, 1, 1)
     with torch.no_grad():
         expected = CLIPModel.from_pretrained(clip_folder).eval().get_image_features(pixel_values=middle)
     expected = expected if isinstance(expected, torch.Tensor) else expected.pooler_output
-    torch.testing.assert_close(towers.embed_images(images), expected, atol=1e-5, rtol=1e-4)
+    seen = towers.embed_images(images[..., top:bottom, left:right])
+    torch.testing.assert_close(seen, expected, atol=1e-5, rtol=1e-4)
     assert (towers.dim, towers.image_side_px) == (12, 16)
-    aside = images.clone()
-    aside[..., :6] = 0
-    torch.testing.assert_close(towers.embed_images(aside), towers.embed_images(images))
 
 
 def test_siglip_sees_all_of_an_image(siglip_folder: Path) -> None:
     towers = PretrainedTowers(str(siglip_folder))
+    assert towers.crop.box_px((16, 28)) == (0, 0, 28, 16)
     images = torch.randint(0, 256, (1, 3, 16, 28), dtype=torch.uint8)
     squeezed = F.interpolate(images.float() / 255, size=(16, 16), mode="bicubic", antialias=True).clamp(0, 1)
     with torch.no_grad():
@@ -55,8 +56,9 @@ def test_there_is_no_lidar_tower(clip_folder: Path) -> None:
     assert not PretrainedTowers(str(clip_folder)).has_lidar
 
 
-def test_the_fingerprint_is_that_of_the_weights(clip_folder: Path, tmp_path: Path) -> None:
+def test_the_fingerprint_is_that_of_the_weights_and_the_crop(clip_folder: Path, tmp_path: Path) -> None:
     towers = PretrainedTowers(str(clip_folder))
+    assert towers.fingerprint.startswith("clip-middle-square-")  # without a crop, it was clip-DIGEST
     moved = tmp_path / "moved"
     shutil.copytree(clip_folder, moved)
     assert PretrainedTowers(str(moved)).fingerprint == towers.fingerprint

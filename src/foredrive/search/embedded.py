@@ -19,6 +19,7 @@ from foredrive.models.image_tower import ImageTower, ImageTowerConfig
 from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.models.text_encoder import TextEncoder
 from foredrive.scene import LidarSweep
+from foredrive.search.crops import Crop
 from foredrive.search.pretrained import PretrainedTowers
 from foredrive.search.towers import Towers, weights_digest
 
@@ -51,7 +52,7 @@ class SentenceTowers:
     texts better.
     """
 
-    has_lidar = False
+    has_lidar, crop = False, Crop.WHOLE
 
     def __init__(
         self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], size: ImageTowerConfig, text: str
@@ -89,7 +90,7 @@ class LidarTowers:
 
     def __init__(self, name: str, base: Towers, encoder: LidarEncoder) -> None:
         self.name, self.base, self.encoder = name, base, encoder.eval()
-        self.dim, self.image_side_px = base.dim, base.image_side_px
+        self.dim, self.image_side_px, self.crop = base.dim, base.image_side_px, base.crop
         self.fingerprint = f"{base.fingerprint}-lidar-{weights_digest(encoder.state_dict())}"
 
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
@@ -133,8 +134,8 @@ def load_towers(folder: Path) -> Towers:
     """Load towers from a folder of `save_towers`.
 
     Raises:
-        InputError: there are no towers, they are damaged, or the base model has other weights than in
-            training.
+        InputError: there are no towers, they are damaged, or the base model has other weights or looks at
+            another crop than in training.
     """
     try:
         card = TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
@@ -146,7 +147,10 @@ def load_towers(folder: Path) -> Towers:
     if card.lidar is None:
         return base
     if base.fingerprint != card.base_fingerprint:
-        raise InputError(f"{folder}: the lidar tower was trained beside other weights of {card.text}")
+        raise InputError(
+            f"{folder}: the lidar tower was trained beside {card.text} with other weights or another crop of "
+            f"its images; train it again: foredrive search train --beside {card.text}"
+        )
     encoder = LidarEncoder(card.lidar, dim=card.dim)
     _load_weights(encoder, folder / LIDAR)
     return LidarTowers(str(folder), base, encoder)

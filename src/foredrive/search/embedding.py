@@ -12,13 +12,14 @@ from torch import Tensor
 
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import read_boxes
-from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.cameras import CameraFrame, pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_caption, read_setting
 from foredrive.scene import Category, LidarSweep
+from foredrive.search.crops import Crop
 from foredrive.search.rows import COUNTS, FACTS, SCORES, WHOLE, row_schema
-from foredrive.search.sectors import Sector, blind_sectors
+from foredrive.search.sectors import Sector, blind_sectors, cut_camera
 from foredrive.search.towers import Towers, unit
 
 FRAMES_AT_ONCE = 8
@@ -33,6 +34,14 @@ class View:
     sector: Sector
     image: Tensor | None
     sweep: LidarSweep | None
+
+    @classmethod
+    def of_camera(cls, camera: CameraFrame, sweep: LidarSweep | None) -> "View":
+        """Return a camera's image, and the returns of an unbatched sweep that lie in it."""
+        assert camera.image is not None
+        height, width = camera.image.shape[-2:]
+        sector = Sector.of_camera(camera, (height, width))
+        return cls(sector, camera.image, None if sweep is None else sector.sweep(sweep))
 
 
 def embed_frames(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
@@ -49,7 +58,10 @@ def embed_frames(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
 
 
 def _embed_few(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
-    seen = [read_views(log, frame, towers.image_side_px, with_lidar=towers.has_lidar) for frame in frames]
+    seen = [
+        read_views(log, frame, towers.image_side_px, towers.crop, with_lidar=towers.has_lidar)
+        for frame in frames
+    ]
     vectors = _embed_by_name(towers, seen)
     rows: list[dict[str, object]] = []
     by_image, by_lidar = [], []
@@ -84,10 +96,14 @@ def _embed_by_name(
     return vectors
 
 
-def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[str, View]:
+def read_views(log: Log, frame: int, side_px: int, crop: Crop, *, with_lidar: bool) -> dict[str, View]:
     """Read all sectors of a moment by name.
 
-    They are the sectors of cameras with an image, or four sectors around the vehicle if there is none.
+    They are the sectors of cameras with an image, or four sectors around the vehicle if there is none. Image,
+    sweep and sector of a camera are cut to one crop.
+
+    Args:
+        side_px: length of the shorter side of a whole image.
     """
     found = read_sweep(log, frame) if with_lidar else None
     sweep = None if found is None else found[0][found[0].valid & found[0].returned]
@@ -97,8 +113,7 @@ def read_views(log: Log, frame: int, side_px: int, *, with_lidar: bool) -> dict[
         size_hw = (round(metadata.height * scale), round(metadata.width * scale))
         camera = read_camera(log, frame, metadata, size_hw, with_image=True)
         if camera.image is not None:
-            sector = Sector.of_camera(camera, size_hw)
-            views[name] = View(sector, camera.image, None if sweep is None else sector.sweep(sweep))
+            views[name] = View.of_camera(cut_camera(camera, crop.box_px(size_hw)), sweep)
     if not views and sweep is not None:
         views = {name: View(sector, None, sector.sweep(sweep)) for name, sector in blind_sectors().items()}
     return views

@@ -107,7 +107,7 @@ class FrameIndex:
         if ours.fingerprint != fingerprint:
             raise InputError(
                 f"{self.uri}: made by the towers {ours.towers} ({ours.fingerprint}), not by {name} "
-                f"({fingerprint}): their embeddings cannot be compared"
+                f"({fingerprint}): their embeddings cannot be compared; index the logs again in another place"
             )
 
     def parts(self) -> set[Part]:

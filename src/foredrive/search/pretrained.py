@@ -12,6 +12,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep
+from foredrive.search.crops import Crop
 from foredrive.search.towers import weights_digest
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -26,7 +27,7 @@ KINDS = ("clip", "siglip", "siglip2")
 class PretrainedTowers:
     """The towers of a CLIP or SigLIP model. There is no lidar tower.
 
-    CLIP uses the central square of an image. SigLIP squeezes the whole image into a square. Both are as in
+    CLIP looks at the middle square of an image. SigLIP squeezes the whole image into a square. Both are as in
     training.
 
     Args:
@@ -46,7 +47,9 @@ class PretrainedTowers:
         self.is_clip = config.model_type == "clip"
         self.image_side_px = int(config.vision_config.image_size)
         self.dim = int(config.projection_dim if self.is_clip else config.vision_config.hidden_size)
-        self.fingerprint = f"{config.model_type}-{weights_digest(self.model.state_dict())}"
+        self.crop = Crop.MIDDLE_SQUARE if self.is_clip else Crop.WHOLE
+        kind = f"clip-{self.crop}" if self.is_clip else config.model_type
+        self.fingerprint = f"{kind}-{weights_digest(self.model.state_dict())}"
         mean, std = (CLIP_MEAN, CLIP_STD) if self.is_clip else (SIGLIP_MEAN, SIGLIP_STD)
         self._mean, self._std = (torch.tensor(values).view(3, 1, 1) for values in (mean, std))
 
@@ -54,8 +57,6 @@ class PretrainedTowers:
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
         """Embed images, see `Towers`."""
         side = self.image_side_px
-        if self.is_clip:
-            images = _middle_square(images)
         pixels = images.float() / 255
         if images.shape[-2:] != (side, side):
             pixels = F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
@@ -82,13 +83,6 @@ class PretrainedTowers:
 
 def _features(found: Any) -> Float[Tensor, "n D"]:
     return (found if isinstance(found, Tensor) else found.pooler_output).float()
-
-
-def _middle_square(images: UInt8[Tensor, "n 3 H W"]) -> UInt8[Tensor, "n 3 S S"]:
-    height, width = images.shape[-2:]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    return images[..., top : top + side, left : left + side]
 
 
 def _not_loaded(model: str, error: Exception) -> InputError:

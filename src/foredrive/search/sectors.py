@@ -30,7 +30,7 @@ class Sector(NamedTuple):
 
     @classmethod
     def of_camera(cls, camera: CameraFrame, size_hw: tuple[int, int]) -> "Sector":
-        """Return the sector of a camera."""
+        """Return the sector of a camera whose images have this size."""
         forward = camera.T_ego_cam[:2, 2]
         return cls(float(torch.atan2(forward[1], forward[0])), camera, size_hw)
 
@@ -51,6 +51,14 @@ class Sector(NamedTuple):
             origin_ego=rotate_vectors(T_sector_ego, inside.origin_ego),
             dir_ego=rotate_vectors(T_sector_ego, inside.dir_ego),
         )
+
+
+def cut_camera(camera: CameraFrame, box_px: tuple[int, int, int, int]) -> CameraFrame:
+    """Return a camera with a part of its image (left, top, right, bottom) and its principal point moved."""
+    left, top, right, bottom = box_px
+    shift = torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    image = None if camera.image is None else camera.image[:, top:bottom, left:right]
+    return dataclasses.replace(camera, image=image, K=camera.K - shift)
 
 
 def blind_sectors() -> dict[str, Sector]:

@@ -1,14 +1,12 @@
 """Target vectors of a query, from its texts or its example."""
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from foredrive.data.cameras import CameraFrame, find_camera, pinhole_cameras, read_camera, told_cameras
+from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera, told_cameras
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
@@ -17,7 +15,7 @@ from foredrive.search.embedding import View, embed_views, mean_direction, read_v
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Like, Query
 from foredrive.search.rows import WHOLE
-from foredrive.search.sectors import Sector
+from foredrive.search.sectors import cut_camera
 from foredrive.search.tables import quoted
 from foredrive.search.towers import PROMPTS, Towers, embed_prompt
 
@@ -90,9 +88,9 @@ def example_views(index: FrameIndex | None, like: Like, towers: Towers) -> Examp
         raise InputError(f"{log.path.name}: has nothing at {like.t_s:g} s; it lasts {_length_s(log):.1f} s")
     moment = (log.path.name, int(log.t_us[frame[0]]))
     if like.crop_px is not None:
-        views = {like.view: _cropped(log, int(frame[0]), like, with_lidar=towers.has_lidar)}
+        views = {like.view: _cropped(log, int(frame[0]), like, towers)}
     else:
-        views = read_views(log, int(frame[0]), towers.image_side_px, with_lidar=towers.has_lidar)
+        views = read_views(log, int(frame[0]), towers.image_side_px, towers.crop, with_lidar=towers.has_lidar)
         if like.view != WHOLE:
             camera = find_camera(pinhole_cameras(log), like.view)  # by its own name or 123D's
             name = like.view if camera is None else camera.camera_name
@@ -123,8 +121,8 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
     return next(iter(logs.values()))
 
 
-def _cropped(log: Log, frame: int, like: Like, *, with_lidar: bool) -> View:
-    """Return a crop of an image as a view: a camera with a shifted principal point."""
+def _cropped(log: Log, frame: int, like: Like, towers: Towers) -> View:
+    """Return a part of an image as a view. The towers' own crop applies to this part."""
     metadata = find_camera(pinhole_cameras(log), like.view)
     if metadata is None:
         there = told_cameras(pinhole_cameras(log).values())
@@ -138,12 +136,10 @@ def _cropped(log: Log, frame: int, like: Like, *, with_lidar: bool) -> View:
             if camera.image is not None
             else f"{log.path.name}: no image of {like.view} at {like.t_s:g} s"
         )
-    shift = torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
-    image = camera.image[:, top:bottom, left:right]
-    cut: CameraFrame = dataclasses.replace(camera, image=image, K=camera.K - shift)
-    sector = Sector.of_camera(cut, (bottom - top, right - left))
-    found = read_sweep(log, frame) if with_lidar else None
-    return View(sector, image, None if found is None else sector.sweep(found[0]))
+    part = cut_camera(camera, like.crop_px)
+    found = read_sweep(log, frame) if towers.has_lidar else None
+    seen = cut_camera(part, towers.crop.box_px((bottom - top, right - left)))
+    return View.of_camera(seen, None if found is None else found[0])
 
 
 def _length_s(log: Log) -> float:

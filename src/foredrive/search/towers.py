@@ -11,6 +11,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep
+from foredrive.search.crops import Crop
 
 PROMPTS = (
     "{}",
@@ -37,18 +38,20 @@ class Towers(Protocol):
     dim: int
     """D, the length of an embedding."""
     image_side_px: int
-    """Length of the shorter side of the input images, with the aspect ratio kept."""
+    """Length of the shorter side of whole images, with the aspect ratio kept."""
+    crop: Crop
+    """The part of an image that the image tower looks at."""
     has_lidar: bool
 
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
-        """Embed RGB images of one camera sector each."""
+        """Embed RGB images of one camera sector each, cut to `crop`."""
         ...
 
     def embed_sweeps(self, sweeps: LidarSweep) -> Float[Tensor, "n D"] | None:
         """Embed sweeps [n N] of one sector each. Return None if there is no lidar tower.
 
-        Each sweep has the returns in its sector. Its frame is the ego frame turned about z, so that x points
-        along the middle of the sector. Padding has `valid` False.
+        Each sweep has the returns in its sector, cut to `crop` as the image is. Its frame is the ego frame
+        turned about z, so that x points along the middle of the sector. Padding has `valid` False.
         """
         ...
 

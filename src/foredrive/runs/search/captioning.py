@@ -61,7 +61,7 @@ def train_captions(
     from foredrive.training import make_fabric  # the import takes seconds
 
     towers = find_towers(str(towers_folder))
-    views = gather_views(logs, stride_s, towers.image_side_px, folder / "cache")
+    views = gather_views(logs, stride_s, towers.image_side_px, towers.crop, folder / "cache")
     targets = unit(image_targets(views, towers, folder))
     rows = [row for log in views for row in log.rows]
     told = [whole_caption(row.facts) for row in rows]

@@ -19,6 +19,7 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.lidar_clip import PointCloud
 from foredrive.runs.search.indexing import log_digest, moments
+from foredrive.search.crops import Crop
 from foredrive.search.embedding import View, read_views
 from foredrive.search.facts import Thing, ViewFacts, view_facts
 
@@ -79,7 +80,9 @@ class LogViews:
             yield torch.tensor(rows), images[[self._place[row][1] for row in rows]]
 
 
-def gather_views(logs: Sequence[LogPath], stride_s: float, side_px: int, cache_dir: Path) -> list[LogViews]:
+def gather_views(
+    logs: Sequence[LogPath], stride_s: float, side_px: int, crop: Crop, cache_dir: Path
+) -> list[LogViews]:
     """Return the views of each log; read them from the log only if they are not in the cache.
 
     Raises:
@@ -87,20 +90,20 @@ def gather_views(logs: Sequence[LogPath], stride_s: float, side_px: int, cache_d
     """
     found = []
     for path in logs:
-        asked = f"{VIEWS_VERSION} {path} {log_digest(path)} {stride_s} {side_px}"
+        asked = f"{VIEWS_VERSION} {path} {log_digest(path)} {stride_s} {side_px} {crop}"
         folder = cache_dir / "views" / hashlib.sha256(asked.encode()).hexdigest()[:24]
         if not folder.is_dir():
-            _write_views(Log(path), stride_s, side_px, folder)
+            _write_views(Log(path), stride_s, side_px, crop, folder)
         found.append(LogViews(folder))
     return found
 
 
-def _write_views(log: Log, stride_s: float, side_px: int, folder: Path) -> None:
+def _write_views(log: Log, stride_s: float, side_px: int, crop: Crop, folder: Path) -> None:
     rows: list[dict[str, object]] = []
     images: dict[str, list[Tensor]] = {}
     points, count = [torch.zeros(0, 4)], 0
     for frame in moments(log, stride_s):
-        views = read_views(log, frame, side_px, with_lidar=True)
+        views = read_views(log, frame, side_px, crop, with_lidar=True)
         facts = view_facts(log, frame, {name: view.sector for name, view in views.items()})
         for name, view in views.items():
             if view.image is None:

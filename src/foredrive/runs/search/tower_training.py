@@ -112,12 +112,12 @@ def train_towers(
     with _folder_of(folder, recipe, logs, beside).claimed():
         cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")
         if beside is None:
-            views = gather_views(logs, recipe.stride_s, recipe.image.side_px, cache_dir)
+            views = gather_views(logs, recipe.stride_s, recipe.image.side_px, SentenceTowers.crop, cache_dir)
             base: Towers = _train_image(recipe, views, folder, fabric)
         else:
             base = find_towers(beside)
             base = base.base if isinstance(base, LidarTowers) else base
-            views = gather_views(logs, recipe.stride_s, base.image_side_px, cache_dir)
+            views = gather_views(logs, recipe.stride_s, base.image_side_px, base.crop, cache_dir)
         return _train_lidar(recipe, views, folder, fabric, base)
 
 
