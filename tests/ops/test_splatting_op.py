@@ -68,6 +68,36 @@ def test_two_behind_each_other(dtype: torch.dtype) -> None:
 
 
 @BOTH
+def test_opacities_before_the_hit_ignore_what_hides_a_splat(dtype: torch.dtype) -> None:
+    """Three on one ray, opacities .25, .5, .8 at 10, 20, 40 m; the first slopes by 9 m a pixel.
+
+    At the pixel beside the centre, exp(-1/2) = 0.607 of each opacity is left and the first lies at 19 m. With
+    a hit at 15 m its weight does not count, and its opacity does, because its centre is at 10 m.
+    """
+    three = splats(
+        [[7.5, 8.5]] * 3,
+        opacity=[0.25, 0.5, 0.8],
+        range_m=[10.0, 20.0, 40.0],
+        slope=[9.0, 0.0],
+        dtype=dtype,
+    )
+    left, opacity = math.exp(-0.5), three.opacity.requires_grad_()
+    for hit_m, weight, alphas in ((15.0, 0.0, 0.25), (30.0, 0.25 + 0.5 * (1 - 0.25 * left), 0.75)):
+        hit, at = torch.full((256,), hit_m, dtype=dtype), 8 * 16 + 8
+        weights = composite_splats(three, pixel_points((16, 16)), hit).alpha_before_hit
+        opacities = composite_splats(
+            three, pixel_points((16, 16)), hit, before_hit="opacities"
+        ).alpha_before_hit
+        assert weights is not None
+        assert opacities is not None
+        assert weights[at].item() == pytest.approx(left * weight, rel=1e-5)
+        assert opacities[at].item() == pytest.approx(left * alphas, rel=1e-5)
+        (grad,) = torch.autograd.grad(opacities[at], opacity)
+        expected = [left if range_m < hit_m else 0.0 for range_m in (10.0, 20.0, 40.0)]
+        torch.testing.assert_close(grad, torch.tensor(expected, dtype=dtype))
+
+
+@BOTH
 def test_order_is_that_of_ranges_and_then_of_the_list(dtype: torch.dtype) -> None:
     ranges = [3.0, -2.0, 3.0, 0.5, -7.0]
     all_here = splats([[0.5, 0.5]] * 5, opacity=[0.5] * 5, range_m=ranges, dtype=dtype)

@@ -97,8 +97,10 @@ SCENES = pytest.mark.parametrize("scene", [image, sweep])
 
 
 @SCENES
-@pytest.mark.parametrize("seed", [0, 1])
-def test_values_and_gradients_are_those_of_the_reference(scene, seed: int) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize(("seed", "before_hit"), [(0, "weights"), (1, "weights"), (0, "opacities")])
+def test_values_and_gradients_are_those_of_the_reference(  # type: ignore[no-untyped-def]
+    scene, seed: int, before_hit: splatting.BeforeHit
+) -> None:
     splats, points = scene(seed)
     rng = torch.Generator().manual_seed(seed + 10)
     hits = 50 * torch.rand(points.count, generator=rng)
@@ -106,7 +108,9 @@ def test_values_and_gradients_are_those_of_the_reference(scene, seed: int) -> No
     assert clear.float().mean() > 0.6
     fast = Splats(*(field.clone().requires_grad_() for field in splats))
     exact = Splats(*(field.double().requires_grad_() for field in splats))
-    seen, truth = composite_splats(fast, points, hits), composite_splats(exact, points, hits.double())
+    seen, truth = (
+        composite_splats(some, points, hits.to(some.mean), before_hit=before_hit) for some in (fast, exact)
+    )
     assert truth.alpha.dtype == torch.float64
     loss, true_loss = torch.zeros(()), torch.zeros((), dtype=torch.float64)
     for name in ("feature", "expected_range_m", "alpha", "alpha_before_hit", "median_range_m"):

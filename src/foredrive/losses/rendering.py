@@ -64,3 +64,34 @@ def line_of_sight_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean share of light that is stopped before the beam's hit; 0 if none returned."""
     return masked_mean(alpha_before_hit, returned)
+
+
+def published_lidar_losses(
+    weighted_range_m: Float[Tensor, "P"],
+    intensity: Float[Tensor, "P"],
+    opacity_before_hit: Float[Tensor, "P"],
+    real_range_m: Float[Tensor, "P"],
+    real_intensity: Float[Tensor, "P"],
+    returned: Bool[Tensor, "P"],
+    quantile: float,
+) -> dict[str, Float[Tensor, ""]]:
+    """Return the losses "depth", "intensity" and "line_of_sight" of SplatAD's reference implementation.
+
+    A beam whose error of depth reaches the quantile adds 0 to each of them; means are over all returned
+    beams. With our losses (`range_loss`, `intensity_loss`, `line_of_sight_loss`) the quantile bounds depth
+    alone.
+
+    Args:
+        weighted_range_m: Σ weight · range. It is not divided by alpha, so the loss raises opacities too.
+        opacity_before_hit: `alpha_before_hit` with `BeforeHit` "opacities".
+    """
+    error = (weighted_range_m - real_range_m).abs()[returned]
+    if not len(error):
+        nothing = weighted_range_m.new_zeros(())
+        return {"depth": nothing, "intensity": nothing, "line_of_sight": nothing}
+    counts = error < torch.quantile(error.detach(), quantile)
+    return {
+        "depth": (error * counts).mean(),
+        "intensity": (counts * (intensity - real_intensity)[returned] ** 2).mean(),
+        "line_of_sight": (counts * opacity_before_hit[returned]).mean(),
+    }

@@ -12,7 +12,7 @@ and is not counted.
 """
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +26,11 @@ from foredrive.ops.splat_points import TiledPoints
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
+BeforeHit = Literal["weights", "opacities"]
+"""The sum over the splats nearer than a hit: "weights" adds their weights, and compares their ranges at the
+point. "opacities" adds their opacities at the point, without the transmittance, and compares the ranges of
+their centres at time 0 (SplatAD's reference implementation).
+"""
 REFERENCE_SIZE = 2**21
 """Maximum number of (point, splat) pairs that plain PyTorch processes at once."""
 
@@ -62,7 +67,7 @@ class Composited(NamedTuple):
     alpha: Float[Tensor, "P"]
     """Σ weight, the probability that the ray ends."""
     alpha_before_hit: Float[Tensor, "P"] | None
-    """Σ weight over the splats nearer than the hit. None if no hits are given."""
+    """Σ over the splats nearer than the hit, see `BeforeHit`. None if no hits are given."""
 
 
 class SplatLists(NamedTuple):
@@ -80,6 +85,7 @@ def composite_splats(
     hit_range_m: Float[Tensor, "P"] | None = None,
     *,
     median: bool = True,
+    before_hit: BeforeHit = "weights",
 ) -> Composited:
     """Composite the splats at all points.
 
@@ -91,6 +97,7 @@ def composite_splats(
         hit_range_m: range of the lidar return minus a margin; infinite if there is no return. It is needed
             for `alpha_before_hit`.
         median: whether to compute `median_range_m`; without it the field is NaN.
+        before_hit: what `alpha_before_hit` adds up.
 
     Raises:
         ValueError: values are not finite, or the number of hits is not that of the points.
@@ -99,7 +106,7 @@ def composite_splats(
     _check(splats, points, hit_range_m)
     if splats.mean.is_cuda and points.single_instant and hit_range_m is None and not median:
         return _composite_image(splats, points)
-    result = _composite(splats, points, hit_range_m)
+    result = _composite(splats, points, hit_range_m, before_hit)
     return result if median else result._replace(median_range_m=torch.full_like(result.alpha, math.nan))
 
 
@@ -120,14 +127,17 @@ def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
     return Composited(feature, expected_m, torch.full_like(alpha.detach(), math.nan), alpha, None)
 
 
-def _composite(splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None) -> Composited:
+def _composite(
+    splats: Splats, points: TiledPoints, hit_range_m: Float[Tensor, "P"] | None, before_hit: BeforeHit
+) -> Composited:
     if not numba_supports(*splats):
-        return composite_splats_reference(splats, points, hit_range_m)
+        return composite_splats_reference(splats, points, hit_range_m, before_hit=before_hit)
     from foredrive.ops.splatting_numba import CompositeSplats  # numba is slow to import
 
     hits = torch.zeros(points.count) if hit_range_m is None else hit_range_m.detach().float()
     fields = (field.float() for field in splats)
-    out = CompositeSplats.apply(points.to("cpu", torch.float32), hits, *fields)
+    by_centre = before_hit == "opacities"
+    out = CompositeSplats.apply(points.to("cpu", torch.float32), hits, by_centre, *fields)
     return _composited(out, hit_range_m is not None)
 
 
@@ -136,6 +146,7 @@ def composite_splats_reference(
     points: TiledPoints,
     hit_range_m: Float[Tensor, "P"] | None = None,
     lists: SplatLists | None = None,
+    before_hit: BeforeHit = "weights",
 ) -> Composited:
     """Compute `composite_splats` in plain PyTorch, on the lists of `list_splats` if no others are given."""
     lists = lists or list_splats(splats, points)
@@ -149,7 +160,7 @@ def composite_splats_reference(
         max_length = int(lengths[tiles[0]])
         chunk, tiles = tiles.split([n := min(_chunk(points, max_length), len(tiles)), len(tiles) - n])
         index = points.index[chunk].flatten()
-        values = _composite_tiles(splats, points, hits, lists, chunk, max_length).flatten(0, 1)
+        values = _composite_tiles(splats, points, hits, lists, chunk, max_length, before_hit).flatten(0, 1)
         out = out.index_copy(0, index[index >= 0], values[index >= 0])
     return _composited(out, hit_range_m is not None)
 
@@ -171,6 +182,7 @@ def _composite_tiles(
     lists: SplatLists,
     tiles: Int[Tensor, "C"],
     max_length: int,
+    before_hit: BeforeHit,
 ) -> Float[Tensor, "C S D4"]:
     """Return, per slot: feature, expected range, median range, alpha, alpha before the hit."""
     place = lists.first[tiles, None] + torch.arange(max_length, device=tiles.device)  # [C L]
@@ -192,7 +204,12 @@ def _composite_tiles(
     half = (weight > 0) & (before > 0.5) & (passed <= 0.5)
     median = F.pad(torch.where(half, range_m.detach(), math.inf), (0, 1), value=math.inf).amin(-1)
     hit = hit_range_m[points.index[tiles].clamp(min=0)][..., None]
-    sums = (weight * range_m).sum(-1), median, weight.sum(-1), (weight * (range_m < hit)).sum(-1)
+    if before_hit == "opacities":
+        alpha = torch.where(passed > MIN_TRANSMITTANCE, alpha, 0.0)
+        nearer = (alpha * (splats.range_m[chosen][:, None] < hit)).sum(-1)
+    else:
+        nearer = (weight * (range_m < hit)).sum(-1)
+    sums = (weight * range_m).sum(-1), median, weight.sum(-1), nearer
     return torch.cat([weight @ splats.feature[chosen], torch.stack(sums, -1)], -1)
 
 

@@ -8,11 +8,10 @@ from typing import no_type_check
 
 import numpy as np
 
-from foredrive.ops.splat_listing_kernels import MEAN_X, nearest_turn
+from foredrive.ops.splat_listing_kernels import MEAN_X, RANGE, nearest_turn
 from foredrive.ops.splatting_kernels import (
     ALL,
     BATCH,
-    EXTRA_COLUMNS,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     POINTS,
@@ -61,8 +60,9 @@ def _load_gradients(points, tile, out, grad_out, state, columns):
         if p >= 0:
             state[base] = 1
             left = out[p, depth] * grad_out[p, depth]
-            for k in range(2, EXTRA_COLUMNS):
-                left += out[p, depth + k] * grad_out[p, depth + k]
+            left += out[p, depth + 2] * grad_out[p, depth + 2]
+            if not points.by_centre:  # else nothing in front of a splat changes what it adds before the hit
+                left += out[p, depth + 3] * grad_out[p, depth + 3]
             state[base + 2 * ROW] = grad_out[p, depth]
             state[base + 3 * ROW] = grad_out[p, depth + 2]
             state[base + 4 * ROW] = grad_out[p, depth + 3]
@@ -74,7 +74,7 @@ def _load_gradients(points, tile, out, grad_out, state, columns):
 
 @inlined_part
 @no_type_check
-def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, sums):
+def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, by_centre, sums):
     """Subtract a splat from the remaining result of a block, and add the gradient of its feature to `sums`.
 
     Return whether any ray continues, and e and h of `composite_tiles_backward`.
@@ -88,7 +88,9 @@ def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, sums):
     to_range = load_row(state, base + 2 * ROW)
     range_m = range_at(splat, dx, dy, t)
     grad_weight = load_row(state, base + 3 * ROW) + to_range * range_m
-    grad_weight = grad_weight + select_greater(hit, range_m, load_row(state, base + 4 * ROW), ZERO)
+    to_before = load_row(state, base + 4 * ROW)
+    if not by_centre:
+        grad_weight = grad_weight + select_greater(hit, range_m, to_before, ZERO)
     at = base + 5 * ROW
     for d in range(feature.size):
         grad = load_row(state, at)
@@ -101,6 +103,8 @@ def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, sums):
     store(state, base + ROW, behind)
     # d/d log α: the own contribution of the splat, minus what it hides behind it.
     slope = weight * grad_weight - alpha * behind / (broadcast(ONE) - alpha)
+    if by_centre:
+        slope = slope + alpha * select_greater(hit, splat[RANGE], to_before, ZERO)
     slope = select_greater(opacity, MAX_ALPHA, ZERO, slope)
     return greater_mask(passed, MIN_TRANSMITTANCE) != 0, slope, weight * to_range
 
@@ -154,8 +158,8 @@ def _composite_splat_backward(lists, points, tile, at, blocks, active, hits, sta
         block = lowest_set_bit(blocks)
         blocks &= blocks - np.uint32(1)
         dx, dy, t = offsets(splat, rows, block * ROW, x)
-        hit = load_row(hits, block * ROW)
-        on, e, h = _accumulate_backward(splat, feature, block * columns * ROW, state, dx, dy, t, hit, sums)
+        hit, base = load_row(hits, block * ROW), block * columns * ROW
+        on, e, h = _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, points.by_centre, sums)
         if not on:
             active &= ~(np.uint32(1) << np.uint32(block))
         ex, ey = e * dx, e * dy

@@ -153,7 +153,7 @@ def _reset_state(state, columns):
 
 @inlined_part
 @no_type_check
-def _accumulate(splat, feature, base, state, dx, dy, t, hit):
+def _accumulate(splat, feature, base, state, dx, dy, t, hit, by_centre):
     """Add a splat behind the splats that a block already has. Return whether any of its rays continues."""
     transmittance = load_row(state, base)
     alpha = minimum(opacity_at(splat, dx, dy), MAX_ALPHA)
@@ -170,7 +170,11 @@ def _accumulate(splat, feature, base, state, dx, dy, t, hit):
     median = load_row(state, base + 2 * ROW)
     store(state, base + 2 * ROW, select_greater(crossed, ZERO, range_m, median))
     store(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
-    nearer = select_greater(hit, range_m, weight, ZERO)
+    if by_centre:
+        alpha = select_greater(passed, MIN_TRANSMITTANCE, alpha, ZERO)
+        nearer = select_greater(hit, splat[RANGE], alpha, ZERO)
+    else:
+        nearer = select_greater(hit, range_m, weight, ZERO)
     store(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
     at = base + (EXTRA_COLUMNS + 1) * ROW
     for d in range(feature.size):
@@ -228,8 +232,8 @@ def _composite_splat(lists, points, tile, at, touched, active, hits, state):
         block = lowest_set_bit(blocks)
         blocks &= blocks - np.uint32(1)
         dx, dy, t = offsets(splat, rows, block * ROW, x)
-        hit = load_row(hits, block * ROW)
-        if not _accumulate(splat, feature, block * columns * ROW, state, dx, dy, t, hit):
+        hit, base = load_row(hits, block * ROW), block * columns * ROW
+        if not _accumulate(splat, feature, base, state, dx, dy, t, hit, points.by_centre):
             active &= ~(np.uint32(1) << np.uint32(block))
     return active
 

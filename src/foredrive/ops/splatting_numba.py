@@ -40,11 +40,12 @@ class CompositeSplats(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], *fields: Tensor
+        ctx: Any, tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], by_centre: bool, *fields: Tensor
     ) -> Float[Tensor, "P D4"]:
         """Composite the splats. `fields` are those of `Splats`."""
         fields = tuple(tensor.detach().contiguous() for tensor in fields)
-        splats, points = SplatArrays(*(tensor.numpy() for tensor in fields)), _arrays(tiled, hit_range_m)
+        splats = SplatArrays(*(tensor.numpy() for tensor in fields))
+        points = _arrays(tiled, hit_range_m, by_centre)
         lists, first_slot = _list(splats, points)
         # numpy requests huge pages
         composited = np.empty((tiled.count, splats.feature.shape[1] + EXTRA_COLUMNS), np.float32)
@@ -79,10 +80,10 @@ class CompositeSplats(torch.autograd.Function):
             gather_gradients(start, stop, pairs, first_slot, splats, to_splats)
 
         in_parallel(gather, len(splats.feature), grain=MIN_SPLATS)
-        return None, None, *grads
+        return None, None, None, *grads
 
 
-def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"]) -> PointArrays:
+def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], by_centre: bool) -> PointArrays:
     times = tiled.rows[:, 2]
     return PointArrays(
         rows=tiled.rows.numpy(),
@@ -90,6 +91,7 @@ def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"]) -> PointArrays:
         tile_bounds=tiled.tile_bounds.numpy(),
         point=tiled.index.int().numpy(),
         hit=hit_range_m.numpy(),
+        by_centre=by_centre,
         left_edge=tiled.left_edge.numpy(),
         lower_edge=tiled.lower_edge.numpy(),
         first_tile=tiled.first_tile.numpy(),

@@ -15,7 +15,7 @@ from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors, sensor_twist
 from foredrive.ops.splat_points import TiledPoints, pixel_points
-from foredrive.ops.splatting import composite_splats
+from foredrive.ops.splatting import BeforeHit, composite_splats
 from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
 from foredrive.rendering.gaussians import (
     Gaussians,
@@ -60,6 +60,12 @@ class RenderedSweep:
     """Logit of the probability that the beam does not return."""
     alpha: Float[Tensor, "P"]
     alpha_before_hit: Float[Tensor, "P"] | None
+    """See `Composited`."""
+
+    @property
+    def weighted_range_m(self) -> Float[Tensor, "P"]:
+        """Return Σ weight · range: the expected range, not divided by alpha."""
+        return self.range_m * self.alpha
 
     @property
     def hit_range_m(self) -> Float[Tensor, "P"]:
@@ -258,6 +264,7 @@ class RebuiltScene(nn.Module):
         t_s: float,
         hit_range_m: Float[Tensor, "P"] | None = None,
         mirror: Bool[Tensor, "A"] | None = None,
+        before_hit: BeforeHit = "weights",
     ) -> RenderedSweep:
         """Render a sweep.
 
@@ -265,7 +272,7 @@ class RebuiltScene(nn.Module):
             graph: this scene, or an edited version of it.
             points: from `prepare_sweep`.
             t_s: time of the sweep.
-            hit_range_m: see `composite_splats`.
+            hit_range_m, before_hit: see `composite_splats`.
             mirror: see `place_gaussians`.
         """
         placed = place_gaussians(graph, t_s + points.middle_s, mirror)
@@ -277,7 +284,7 @@ class RebuiltScene(nn.Module):
             reach_m=self.reach_m,
             scan_s=None if points.scan_s is None else points.scan_s.to(placed.velocity_mps),
         )
-        seen = composite_splats(splats, points.tiles, hit_range_m)
+        seen = composite_splats(splats, points.tiles, hit_range_m, before_hit=before_hit)
         intensity, drop_logit = self.lidar_decoder(
             seen.feature, seen.alpha, points.dir_scene.to(seen.feature)
         )

@@ -18,11 +18,13 @@ from foredrive.losses.rendering import (
     intensity_loss,
     line_of_sight_loss,
     photometric_loss,
+    published_lidar_losses,
     range_loss,
 )
-from foredrive.rendering.rebuilt import PreparedSweep, RebuiltScene
+from foredrive.rendering.rebuilt import PreparedSweep, RebuiltScene, RenderedSweep
 from foredrive.rendering.relocation import random_walk_m
 from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene import LidarSweep
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint
 from foredrive.training.gaussian_steps import grow, relocate
 from foredrive.training.loop import CHECKPOINTS, check_finite, step_counter
@@ -91,6 +93,8 @@ class RebuildSchedule:
     """Probability that a left-right symmetric actor is mirrored in a step."""
     before_hit_m: float = 0.8
     """Light that is stopped more than this distance before a lidar return is penalised, m."""
+    lidar_losses: Literal["ours", "published"] = "ours"
+    """"published": those of SplatAD's reference implementation, see `published_lidar_losses`."""
     checkpoint_every: int = 500
     seed: int = 0
 
@@ -218,19 +222,36 @@ class _Trainer:
         view, points = self.sweeps[number]
         beams = view.beams.to(self.scene.actor.device)
         hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
-        rendered = self.scene.sweep(self.scene.graph, points, view.t_s, hit_m, mirror)
-        assert rendered.alpha_before_hit is not None
-        losses = {
-            "depth": range_loss(
-                rendered.range_m, beams.range_m, beams.returned, self.schedule.weights.depth_quantile
-            ),
-            "intensity": intensity_loss(rendered.intensity, beams.intensity, beams.returned),
-            "line_of_sight": line_of_sight_loss(rendered.alpha_before_hit, beams.returned),
-        }
+        published = self.schedule.lidar_losses == "published"
+        rendered = self.scene.sweep(
+            self.scene.graph, points, view.t_s, hit_m, mirror, "opacities" if published else "weights"
+        )
+        losses = self._published_losses(rendered, beams) if published else self._our_losses(rendered, beams)
         if view.misses_known:
             losses["drop"] = drop_loss(rendered.drop_logit, beams.returned)
         loss = torch.stack([getattr(self.schedule.weights, name) * value for name, value in losses.items()])
         return {"loss": loss.sum(), **losses}
+
+    def _our_losses(self, rendered: RenderedSweep, beams: LidarSweep) -> dict[str, Tensor]:
+        assert rendered.alpha_before_hit is not None
+        quantile = self.schedule.weights.depth_quantile
+        return {
+            "depth": range_loss(rendered.range_m, beams.range_m, beams.returned, quantile),
+            "intensity": intensity_loss(rendered.intensity, beams.intensity, beams.returned),
+            "line_of_sight": line_of_sight_loss(rendered.alpha_before_hit, beams.returned),
+        }
+
+    def _published_losses(self, rendered: RenderedSweep, beams: LidarSweep) -> dict[str, Tensor]:
+        assert rendered.alpha_before_hit is not None
+        return published_lidar_losses(
+            rendered.weighted_range_m,
+            rendered.intensity,
+            rendered.alpha_before_hit,
+            beams.range_m,
+            beams.intensity,
+            beams.returned,
+            self.schedule.weights.depth_quantile,
+        )
 
     def _regularisers(self) -> Tensor:
         weights = self.schedule.weights
