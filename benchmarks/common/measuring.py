@@ -15,13 +15,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+CHECKOUT = Path(__file__).parents[2]
+"""Folder of the package `benchmarks`."""
+
 
 def in_a_process(program: str, *arguments: str) -> dict[str, float]:
     """Run `program`, a Python file that prints metrics as JSON; return them. Numba compiles again there."""
+    path = os.pathsep.join(filter(None, (str(CHECKOUT), os.environ.get("PYTHONPATH"))))
     with tempfile.TemporaryDirectory() as empty_cache:
         done = subprocess.run(
             [sys.executable, program, *arguments],
-            env=os.environ | {"NUMBA_CACHE_DIR": empty_cache},
+            env=os.environ | {"NUMBA_CACHE_DIR": empty_cache, "PYTHONPATH": path},
             stdout=subprocess.PIPE,
             check=True,
             text=True,
