@@ -1,8 +1,7 @@
-"""Effect of the set likelihood on a detector: trained by matching, then by the likelihood, then calibrated.
+"""Effect of the loss on a detector: matching, energy score or set likelihood, Gaussian or Laplace, calibrated.
 
 A detection head on a volume of lidar hits is trained on drives in towns and evaluated in Town05, which it has
-not seen. Both trained arms start from the same head and train for equally many steps: `foredrive bench
-sets-training`.
+not seen. All arms start from the same head and train for equally many steps: `foredrive bench sets-training`.
 """
 
 import functools
@@ -20,7 +19,7 @@ SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.0), voxel_m=1.0, shape_zyx=(4, 64, 64
 TRAIN, CALIBRATE, TEST = ("Town01", "Town02", "Town03", "Town04", "Town10HD"), ("Town07",), ("Town05",)
 TRAIN_SEEDS, CALIBRATE_SEEDS, TEST_SEEDS = (0, 1), (0, 1), (0, 1, 2, 3)
 SECONDS, RATE_HZ = 30.0, 2.0
-STEPS = {"first_steps": 500, "more_steps": 250}
+STEPS = {"first_steps": 300, "more_steps": 150}
 IMAGE_HW = (16, 28)
 """Size of the images, which are not used."""
 

@@ -3,6 +3,7 @@
 `training.detection.fit_head` trains a head (`models.detection`) on samples; docs/sets.md shows how.
 """
 
+import copy
 import dataclasses
 import functools
 import math
@@ -20,8 +21,9 @@ from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.models.detection import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
-from foredrive.sets import LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
-from foredrive.training.detection import Loss, fit_head, matching_loss, said_of, set_loss
+from foredrive.sets import Family, LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
+from foredrive.training.detection import Sample, fit_head, predict_sets
+from foredrive.training.detection_losses import Loss, MatchingLossConfig, matching_loss, set_loss
 
 CLASSES = ("vehicle", "cycle", "pedestrian")
 _CLASS_OF = {
@@ -29,7 +31,7 @@ _CLASS_OF = {
     **dict.fromkeys((Category.BICYCLE, Category.MOTORCYCLE), 1),
     Category.PEDESTRIAN: 2,
 }
-LEAST_HITS = 3
+MIN_HITS = 3
 """Minimum number of lidar hits of an object; objects with fewer are left out."""
 _IMAGE_HW = (16, 28)
 """Size of the images, which are not used."""
@@ -111,12 +113,12 @@ def objects_of(clip: Clip, spec: VoxelSpec) -> LabelledBoxes:
     lower, upper = _ground(spec)
     inside = ((boxes.centre[:, :2] > lower) & (boxes.centre[:, :2] < upper)).all(-1)
     label = torch.tensor([_CLASS_OF.get(Category(int(c)), -1) for c in boxes.category])
-    keep = boxes.valid & inside & (hits >= LEAST_HITS) & (label >= 0)
+    keep = boxes.valid & inside & (hits >= MIN_HITS) & (label >= 0)
     kept = boxes[keep]
     return LabelledBoxes(label[keep], torch.cat([kept.centre, kept.size_lwh.log()], dim=-1), kept.yaw)
 
 
-def unexplained(spec: VoxelSpec) -> UniformPoisson:
+def uniform_background(spec: VoxelSpec) -> UniformPoisson:
     """Return a prior of one undetected object per frame, uniform over classes and the ground area."""
     lower, upper = _ground(spec)
     rest = torch.tensor([HALF_HEIGHT_M, *[LARGEST_LOG_SIZE] * 3])
@@ -125,11 +127,11 @@ def unexplained(spec: VoxelSpec) -> UniformPoisson:
     return UniformPoisson(rate, *region, has_yaw=True)
 
 
-def judge(
+def evaluate(
     detected: Sequence[MultiBernoulli], samples: Sequence[DetectionSample], spec: VoxelSpec
 ) -> dict[str, float]:
     """Return the metrics of `foredrive score`: likelihood, its parts, mAP, calibration; NaN for none."""
-    region = unexplained(spec)
+    region = uniform_background(spec)
     frames = [
         DetectionFrame(f"{n}", sample.log, found, sample.objects, region.lower.numpy(), region.upper.numpy())
         for n, (found, sample) in enumerate(zip(detected, samples, strict=True))
@@ -148,38 +150,63 @@ def judge(
     return {short: math.nan if value is None else float(value) for short, value in found.items()}
 
 
+class _Arm(NamedTuple):
+    loss: Loss
+    family: Family = "gaussian"
+
+
+ARMS = {
+    "matching": _Arm(matching_loss),
+    "matching_laplace": _Arm(matching_loss, "laplace"),
+    "energy": _Arm(functools.partial(matching_loss, config=MatchingLossConfig(box_score="energy"))),
+    "mb_nll": _Arm(set_loss),
+    "mb_nll_laplace": _Arm(set_loss, "laplace"),
+}
+"""Loss of the last steps of training, and family of the box densities that it trains."""
+
+
 def compare_losses(
     split: Callable[[], DetectionSplit], spec: VoxelSpec, *, first_steps: int, more_steps: int
 ) -> dict[str, Callable[[int], dict[str, float]]]:
-    """Return the arms of a benchmark as functions from seed to metrics.
+    """Return the arms of a benchmark as functions from seed to metrics: `ARMS`, and each calibrated.
 
-    The arms train by matching or by set likelihood, each with and without calibration. All heads of a seed
-    start from the same head and train for equally many steps; `split` is called whenever samples are needed.
+    All heads of a seed start from the same head, trained by Gaussian matching, and train for equally many
+    steps. `split` is called whenever samples are needed.
     """
 
+    def samples() -> list[Sample]:
+        return [sample[:2] for sample in split().train]
+
     @functools.cache
-    def trained(loss: Loss | None, seed: int) -> DetectionHead:
-        data = [sample[:2] for sample in split().train]
-        if loss is not None:
-            return fit_head(trained(None, seed), data, loss, steps=more_steps, seed=seed + 100)
+    def first(seed: int) -> DetectionHead:
         torch.manual_seed(seed)
+        data = samples()
         head = DetectionHead(spec, channels=len(data[0][0]), classes=len(CLASSES))
         return fit_head(head, data, matching_loss, steps=first_steps, seed=seed)
 
-    def measure(loss: Loss, calibrated: bool, seed: int) -> dict[str, float]:
+    @functools.cache
+    def trained(name: str, seed: int) -> DetectionHead:
+        loss, family = ARMS[name]
+        head = copy.deepcopy(first(seed))
+        head.family = family
+        return fit_head(head, samples(), loss, steps=more_steps, seed=seed + 100)
+
+    def measure(name: str, calibrated: bool, seed: int) -> dict[str, float]:
         torch.set_num_threads(1)
-        head, (_, apart, test) = trained(loss, seed), split()
-        said = said_of(head, [sample.volume for sample in test])
+        head, (_, apart, test) = trained(name, seed), split()
+        predicted = predict_sets(head, [sample.volume for sample in test])
         if calibrated:
-            before = said_of(head, [sample.volume for sample in apart])
-            mend = fit_set_calibration(before, [sample.objects for sample in apart], unexplained(spec))
-            said = [mend(found) for found in said]
-        return {**judge(said, test, spec), "frames": float(len(test))}
+            before = predict_sets(head, [sample.volume for sample in apart])
+            calibrate = fit_set_calibration(
+                before, [sample.objects for sample in apart], uniform_background(spec)
+            )
+            predicted = [calibrate(found) for found in predicted]
+        return {**evaluate(predicted, test, spec), "frames": float(len(test))}
 
     return {
-        name + ("_calibrated" if calibrated else ""): functools.partial(measure, loss, calibrated)
+        name + ("_calibrated" if calibrated else ""): functools.partial(measure, name, calibrated)
         for calibrated in (False, True)
-        for name, loss in {"matching": matching_loss, "mb_nll": set_loss}.items()
+        for name in ARMS
     }
 
 

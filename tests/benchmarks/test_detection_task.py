@@ -9,15 +9,16 @@ import torch
 from miniature import miniature
 
 from benchmarks.common.detection import (
+    ARMS,
     CLASSES,
     DetectionSplit,
     compare_losses,
     detection_samples,
+    evaluate,
     hits_volume,
-    judge,
     objects_of,
     observed_samples,
-    unexplained,
+    uniform_background,
 )
 from foredrive.data import LogPath
 from foredrive.errors import InputError
@@ -25,7 +26,8 @@ from foredrive.models.detection import DetectionHead
 from foredrive.runs.build import build_agent
 from foredrive.scene import Category, Example, LidarSweep, VoxelSpec
 from foredrive.sets import LabelledBoxes
-from foredrive.training.detection import fit_head, matching_loss, said_of, set_loss
+from foredrive.training.detection import fit_head, predict_sets
+from foredrive.training.detection_losses import matching_loss, set_loss
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
 
@@ -94,7 +96,7 @@ def test_a_log_from_samples_to_figures(log: LogPath) -> None:
     torch.manual_seed(0)
     head = DetectionHead(spec, channels=1, classes=len(CLASSES), width=16, shrink=1, layers=1, heads=2)
     head = fit_head(head, [sample[:2] for sample in samples], matching_loss, steps=2, batch=2)
-    figures = judge(said_of(head, [sample.volume for sample in samples]), samples, spec)
+    figures = evaluate(predict_sets(head, [sample.volume for sample in samples]), samples, spec)
     assert math.isfinite(figures["pmb_nll"])
     assert figures["objects"] == sum(len(sample.objects.label) for sample in samples)
     with pytest.raises(InputError, match="fewer than a batch"):
@@ -120,7 +122,7 @@ def test_arms_of_a_comparison_go_on_from_one_head(log: LogPath) -> None:
     samples = detection_samples(log, spec, stride_s=1.0)
     split = DetectionSplit((samples * 8)[:8], samples, samples)
     arms = compare_losses(lambda: split, spec, first_steps=2, more_steps=1)
-    assert list(arms) == ["matching", "mb_nll", "matching_calibrated", "mb_nll_calibrated"]
+    assert list(arms) == [name + end for end in ("", "_calibrated") for name in ARMS]
     found = {name: measure(3) for name, measure in arms.items()}
     assert found["mb_nll"]["pmb_nll"] == pytest.approx(found["matching"]["pmb_nll"], rel=0.2)
     assert found["mb_nll"]["pmb_nll"] != found["matching"]["pmb_nll"]
@@ -128,8 +130,8 @@ def test_arms_of_a_comparison_go_on_from_one_head(log: LogPath) -> None:
     assert {figures["frames"] for figures in found.values()} == {len(samples)}
 
 
-def test_what_is_unexplained_is_over_the_volume() -> None:
-    process = unexplained(SPEC)
+def test_the_background_is_one_object_over_the_volume() -> None:
+    process = uniform_background(SPEC)
     assert process.lower[:2].tolist() == [-8.0, -8.0]
     assert process.upper[:2].tolist() == [8.0, 8.0]
     assert process.expected_count.item() == pytest.approx(1.0)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from foredrive.scene import Detections, VoxelSpec
 from foredrive.scene.record import Record
+from foredrive.sets import BoxDensity, Family, MultiBernoulli
 
 LOG_STD_RANGE = (-4.0, 2.0)
 """Bounds of the log standard deviations: 2 cm to 7 m for positions; log sizes and headings use the same
@@ -17,7 +18,7 @@ TYPICAL_LOG_LWH = (1.2, 0.4, 0.4)
 
 @dataclass(frozen=True)
 class BoxSet(Record):
-    """The raw output of the head for each query. `detections` returns it as probabilities."""
+    """The raw output of the head for each query; `detections` and `as_multi_bernoulli` return densities."""
 
     logits: Float[Tensor, "*b Q K_1"]
     """Logits of the classes and, last, of "no object"."""
@@ -27,9 +28,28 @@ class BoxSet(Record):
     heading: Float[Tensor, "*b Q 2"]
     """Sine and cosine of the yaw, normalised to length 1."""
     log_std_yaw: Float[Tensor, "*b Q"]
+    family: Family = "gaussian"
+    """Family of the density of `mean` with `log_std`; the heading has a von Mises density."""
+
+    def as_multi_bernoulli(self) -> MultiBernoulli:
+        """Return the boxes as a random finite set.
+
+        It is built from logits, so no precision is lost where r is close to 1.
+        """
+        boxes = BoxDensity(
+            mean=self.mean,
+            chol=torch.diag_embed(self.log_std.exp()),
+            yaw=torch.atan2(self.heading[..., 0], self.heading[..., 1]),
+            concentration=(-2 * self.log_std_yaw).exp(),
+            family=self.family,
+        )
+        return MultiBernoulli.from_softmax(self.logits, boxes)
 
     def detections(self) -> Detections:
-        """Return the boxes as `Detections`. Sine and cosine get the variance of the angle."""
+        """Return the boxes as `Detections`, which hold mean and covariance but no family.
+
+        Sine and cosine get the variance of the angle.
+        """
         log_prob = self.logits.double().log_softmax(-1)
         log_existence = log_prob[..., :-1].logsumexp(-1)
         std_yaw = self.log_std_yaw[..., None].expand(*self.log_std_yaw.shape, 2)
@@ -57,6 +77,7 @@ class DetectionHead(nn.Module):
         width: channels of the queries.
         shrink: how many times the plane is halved.
         layers, heads: sizes of the attention among queries.
+        family: family of the box densities, which the likelihoods of training and evaluation use.
     """
 
     middle_m: Tensor
@@ -71,8 +92,10 @@ class DetectionHead(nn.Module):
         shrink: int = 2,
         layers: int = 2,
         heads: int = 4,
+        family: Family = "gaussian",
     ) -> None:
         super().__init__()
+        self.family = family
         depth, height, breadth = spec.shape_zyx
         self.classes = classes
         convolutions: list[nn.Module] = [nn.Conv2d(depth * channels, width, 3, padding=1), nn.ReLU()]
@@ -118,4 +141,5 @@ class DetectionHead(nn.Module):
             log_std=log_std[..., :6],
             heading=nn.functional.normalize(heading, dim=-1, eps=1e-3),
             log_std_yaw=log_std[..., 6],
+            family=self.family,
         )

@@ -1,7 +1,7 @@
 """Random finite sets: densities over sets of objects, their likelihood and their calibration."""
 
 from foredrive.sets.associations import AssociationSum, sum_associations
-from foredrive.sets.boxes import BoxDensity, LabelledBoxes
+from foredrive.sets.boxes import BoxDensity, Family, LabelledBoxes
 from foredrive.sets.calibration import (
     ExistenceMap,
     SetCalibration,
@@ -27,6 +27,7 @@ __all__ = [
     "AssociationSum",
     "BoxDensity",
     "ExistenceMap",
+    "Family",
     "LabelledBoxes",
     "MixturePoisson",
     "MultiBernoulli",

@@ -18,6 +18,8 @@ from foredrive.errors import InputError
 from foredrive.scene.record import Record
 from foredrive.sets.box_kernel import add_heading, box_log_prob
 
+Family = Literal["gaussian", "laplace"]
+
 _LOG_2PI = math.log(2 * math.pi)
 
 
@@ -49,7 +51,7 @@ class BoxDensity(Record):
     yaw: Float[Tensor, "*b M"] | None = None
     concentration: Float[Tensor, "*b M"] | None = None
     """Concentration κ of the heading. 0 is uniform; a large κ is about 1/σ²."""
-    family: Literal["gaussian", "laplace"] = "gaussian"
+    family: Family = "gaussian"
 
     def __post_init__(self) -> None:
         if (self.yaw is None) != (self.concentration is None):

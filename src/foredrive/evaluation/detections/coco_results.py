@@ -20,7 +20,6 @@ from foredrive.evaluation.detections.frames import (
     STD_PX,
     DetectionFrame,
     DetectionSet,
-    Family,
     enclosing_region,
     make_detections,
     make_objects,
@@ -30,6 +29,7 @@ from foredrive.evaluation.detections.frames import (
     read_numbers,
     read_relevance,
 )
+from foredrive.sets import Family
 
 Record = Mapping[str, Any]
 

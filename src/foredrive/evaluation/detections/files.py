@@ -8,11 +8,12 @@ from typing import Any
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.coco_results import read_coco
-from foredrive.evaluation.detections.frames import DetectionSet, Family
+from foredrive.evaluation.detections.frames import DetectionSet
 from foredrive.evaluation.detections.kitti_labels import read_kitti
 from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
 from foredrive.evaluation.detections.score import FrameScore
 from foredrive.files import atomic_path
+from foredrive.sets import Family
 
 
 def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:

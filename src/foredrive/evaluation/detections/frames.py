@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +10,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli
-
-Family = Literal["gaussian", "laplace"]
+from foredrive.sets import BoxDensity, Family, LabelledBoxes, MultiBernoulli
 
 MIN_PROBABILITY = 1e-6
 """Probabilities in files are kept this far from 0 and 1, which are mostly rounded from such."""

@@ -17,13 +17,13 @@ from foredrive.evaluation.detections.frames import (
     STD_YAW_RAD,
     DetectionFrame,
     DetectionSet,
-    Family,
     enclosing_region,
     make_detections,
     make_objects,
     order_classes,
 )
 from foredrive.evaluation.detections.nuscenes_results import DEFAULT_COVARIANCE
+from foredrive.sets import Family
 
 LOWER = np.array([0.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([120.0, 60.0, 10.0, 4.0, 4.0, 4.0])

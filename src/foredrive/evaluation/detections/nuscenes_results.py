@@ -21,7 +21,6 @@ from foredrive.evaluation.detections.frames import (
     STD_YAW_RAD,
     DetectionFrame,
     DetectionSet,
-    Family,
     enclosing_region,
     make_detections,
     make_objects,
@@ -32,6 +31,7 @@ from foredrive.evaluation.detections.frames import (
     read_numbers,
     read_relevance,
 )
+from foredrive.sets import Family
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])

@@ -7,11 +7,12 @@ from pathlib import Path
 from rich.progress import Progress
 
 from foredrive.evaluation.detections.files import read_detections, write_frame_scores
-from foredrive.evaluation.detections.frames import DetectionSet, Family
+from foredrive.evaluation.detections.frames import DetectionSet
 from foredrive.evaluation.detections.score import FrameScore, score_frames
 from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
+from foredrive.sets import Family
 
 SUMMARY, FRAMES = "summary.json", "frames.jsonl"
 
