@@ -1,4 +1,4 @@
-"""Effect of the loss on a detector: matching, energy score or set likelihood, Gaussian or Laplace, calibrated.
+"""Effect of a detector's loss: matching, energy score or set likelihood; Gaussian or Laplace; calibrated.
 
 A detection head on a volume of lidar hits is trained on drives in towns and evaluated in Town05, which it has
 not seen. All arms start from the same head and train for equally many steps: `foredrive bench sets-training`.
