@@ -116,7 +116,8 @@ def recipe_at(voxel_m: float) -> Recipe:
     clips = dataclasses.replace(
         recipe.clips, voxels=VoxelSpec(lower_m=spec.lower_m, voxel_m=voxel_m, shape_zyx=shape_zyx)
     )
-    return dataclasses.replace(recipe, clips=clips, finetune=dataclasses.replace(recipe.finetune, vgg16=None))
+    finetune = dataclasses.replace(recipe.finetune, perceptual=None)
+    return dataclasses.replace(recipe, clips=clips, finetune=finetune)
 
 
 @contextmanager

@@ -99,7 +99,17 @@ FLAT, NESTED = WRITTEN_BEFORE.glob("*.yaml"), (WRITTEN_BEFORE / "nested").glob("
 
 @pytest.mark.parametrize("file", sorted([*FLAT, *NESTED]), ids=lambda file: f"{file.parent.name}-{file.stem}")
 def test_a_recipe_in_an_earlier_format_opens_as_the_same_recipe(file: Path) -> None:
-    assert load_recipe(file) == find_recipe(file.stem)
+    assert load_recipe(file) == as_it_was(find_recipe(file.stem))
+
+
+def as_it_was(recipe: Any) -> Any:
+    """The recipe without the changes since those files were written: their runs go on as they began."""
+    stages = {}
+    for name in ("pretrain", "finetune"):
+        stage = getattr(recipe, name)
+        if hasattr(stage, "pixels"):
+            stages[name] = dataclasses.replace(stage, pixels="thinned")
+    return dataclasses.replace(recipe, **stages)
 
 
 def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> None:

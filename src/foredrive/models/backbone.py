@@ -18,9 +18,14 @@ IMAGE_STRIDE = {"stage1": 4, "stage2": 8, "stage3": 16, "stage4": 32}
 
 def normalise_images(images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
     """Normalise 8-bit RGB images to zero mean and unit variance by the statistics of ImageNet."""
-    mean = torch.tensor(IMAGENET_MEAN, device=images.device).view(3, 1, 1)
-    std = torch.tensor(IMAGENET_STD, device=images.device).view(3, 1, 1)
-    return (images.float() / 255 - mean) / std
+    return normalise_rgb(images.float() / 255)
+
+
+def normalise_rgb(rgb: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
+    """Normalise RGB images in [0, 1] by the statistics of ImageNet."""
+    mean = torch.tensor(IMAGENET_MEAN, device=rgb.device).view(3, 1, 1)
+    std = torch.tensor(IMAGENET_STD, device=rgb.device).view(3, 1, 1)
+    return (rgb - mean) / std
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from foredrive.models.attention_pool import AttentionPool
-from foredrive.models.backbone import normalise_images
+from foredrive.models.backbone import normalise_images, normalise_rgb
 
 
 @dataclass(frozen=True)
@@ -53,3 +54,37 @@ class ImageTower(nn.Module):
         pixels = normalise_images(images).contiguous(memory_format=torch.channels_last)
         (features,) = self.resnet(pixels).feature_maps
         return self.pool(features.flatten(2).mT)
+
+
+class ImageTowerFeatures(nn.Module):
+    """Activations of the first stages of a trained `ImageTower`, frozen, for a perceptual loss.
+
+    Images are enlarged first, because the tower was trained on whole ones and its first stage has stride 4.
+
+    Args:
+        tower: a trained tower.
+        stages: number of stages that are read.
+        enlarge: factor of enlargement.
+    """
+
+    def __init__(self, tower: ImageTower, *, stages: int = 3, enlarge: int = 4) -> None:
+        super().__init__()
+        self.enlarge = enlarge
+        self.embedder = tower.resnet.embedder
+        self.stages = nn.ModuleList(list(tower.resnet.encoder.stages)[:stages])
+        self.requires_grad_(False)
+        self.eval()
+
+    def train(self, mode: bool = True) -> "ImageTowerFeatures":
+        """Stay in evaluation mode, because the features are fixed."""
+        return super().train(False)
+
+    def forward(self, rgb: Float[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _c _h _w"], ...]:
+        """Return features of RGB images in [0, 1]."""
+        enlarged = F.interpolate(rgb, scale_factor=float(self.enlarge), mode="bilinear", align_corners=False)
+        x = self.embedder(normalise_rgb(enlarged))
+        found = []
+        for stage in self.stages:
+            x = stage(x)
+            found.append(x)
+        return tuple(found)

@@ -1,14 +1,16 @@
 """VGG-16 features for the perceptual loss."""
 
 from pathlib import Path
+from pickle import UnpicklingError
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.backbone import IMAGENET_MEAN, IMAGENET_STD
+from foredrive.models.backbone import normalise_rgb
 
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512))
 TORCHVISION_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
@@ -24,9 +26,6 @@ class Vgg16Features(nn.Module):
             server into the torch hub cache.
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self, weights: str | Path) -> None:
         super().__init__()
         layers: list[nn.Module] = []
@@ -39,8 +38,6 @@ class Vgg16Features(nn.Module):
             self.taps.append(len(layers) - 1)
             layers.append(nn.MaxPool2d(2))
         self.features = nn.Sequential(*layers[:-1])
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
         state = _read_weights(weights)
         wanted = {key: state[key] for key in self.state_dict() if key in state}
         missing = set(self.state_dict()) - set(wanted)
@@ -55,10 +52,12 @@ class Vgg16Features(nn.Module):
         return super().train(False)
 
     def forward(self, rgb: Float[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _c _h _w"], ...]:
-        """Return features of RGB images in [0, 1]."""
-        x = (rgb - self.mean) / self.std
+        """Return features of RGB images in [0, 1]; of small images, only as deep as they can be pooled."""
+        x = normalise_rgb(rgb)
         taps = []
         for index, layer in enumerate(self.features):
+            if isinstance(layer, nn.MaxPool2d) and min(x.shape[-2:]) < 2:
+                break
             x = layer(x)
             if index in self.taps:
                 taps.append(x)
@@ -71,4 +70,7 @@ def _read_weights(weights: str | Path) -> dict[str, Tensor]:
     path = Path(weights)
     if not path.is_file():
         raise InputError(f"{path}: no such file of VGG-16 weights")
-    return load_file(path) if path.suffix == ".safetensors" else torch.load(path, weights_only=True)
+    try:
+        return load_file(path) if path.suffix == ".safetensors" else torch.load(path, weights_only=True)
+    except (OSError, RuntimeError, SafetensorError, UnpicklingError) as error:
+        raise InputError(f"{path}: not VGG-16 weights: {str(error).splitlines()[0]}") from error

@@ -159,13 +159,15 @@ def nemo_base() -> NemoRecipe:
             schedule=schedule,
             weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0),
             ray_stride=8,
-            vgg16="download",
+            pixels="averaged",
+            perceptual="vgg16",
         ),
         finetune=NemoStage(
             schedule=schedule,
             weights=NemoWeights(wpts=1.0, recon=0.5, occ=0.5),
             ray_stride=8,
-            vgg16="download",
+            pixels="averaged",
+            perceptual="vgg16",
         ),
         precision="bf16-mixed",
     )

@@ -10,7 +10,17 @@ def upgraded(written: Any) -> Any:
     if not isinstance(model, Mapping):
         return written
     nested = _nested(written) if "planner_width" in model else written
-    return _with_module_configs(nested)
+    stages = {name: _stage(nested[name]) for name in ("pretrain", "finetune") if name in nested}
+    return _with_module_configs({**nested, **stages})
+
+
+def _stage(written: Any) -> Any:
+    """Convert a stage from when the only network of the perceptual loss was VGG-16."""
+    if not isinstance(written, Mapping) or "vgg16" not in written:
+        return written
+    rest = {key: value for key, value in written.items() if key != "vgg16"}
+    vgg16 = written["vgg16"]
+    return {**rest, "perceptual": "vgg16" if vgg16 == "download" else vgg16}
 
 
 def upgraded_reconstruction(written: Any) -> Any:

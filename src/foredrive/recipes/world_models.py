@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 from torch import nn
 
 from foredrive.data import ClipConfig
-from foredrive.errors import InputError
+from foredrive.losses.reconstruction import ImageFeatures
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, DriveWorldConfig
+from foredrive.models.image_tower import ImageTowerFeatures
 from foredrive.models.nemo import Nemo, NemoConfig
 from foredrive.models.vgg import Vgg16Features
 from foredrive.scene import WorldModel
@@ -43,13 +44,19 @@ def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
 
 
 def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConfig) -> NemoObjective:
-    """Build NeMo's objective. Without real VGG-16 weights the perceptual loss has weight 0."""
-    features = None
-    if stage.vgg16 is not None:
+    """Build NeMo's objective. Where VGG-16 cannot be downloaded, the perceptual loss has weight 0."""
+    features: ImageFeatures | None = None
+    if stage.perceptual == "tower":
+        from foredrive.search.embedded import SHIPPED, load_image_tower  # few stages need it
+
+        features = ImageTowerFeatures(load_image_tower(SHIPPED))
+    elif stage.perceptual == "vgg16":
         try:
-            features = Vgg16Features(stage.vgg16)
-        except (OSError, InputError) as error:
+            features = Vgg16Features("download")
+        except OSError as error:
             warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
+    elif stage.perceptual is not None:
+        features = Vgg16Features(stage.perceptual)
     return NemoObjective(agent, stage, steps=clips.future_frames, image_features=features)
 
 

@@ -25,6 +25,8 @@ from foredrive.search.towers import Towers, weights_digest
 
 CARD, IMAGE, LIDAR = "towers.json", "image.safetensors", "lidar.safetensors"
 TEXT_MEAN = "text_mean"
+SHIPPED = Path(__file__).parent / "shipped"
+"""Folder of the towers that come with the package."""
 AT_ONCE = 8
 """Number of sectors embedded together. More do not fit into the cache of a core."""
 
@@ -137,12 +139,7 @@ def load_towers(folder: Path) -> Towers:
         InputError: there are no towers, they are damaged, or the base model has other weights or looks at
             another crop than in training.
     """
-    try:
-        card = TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
-    except (OSError, ValidationError) as error:
-        raise InputError(
-            f"{folder / CARD}: does not describe towers: {str(error).splitlines()[0]}"
-        ) from error
+    card = _read_card(folder)
     base = _load_base(folder, card)
     if card.lidar is None:
         return base
@@ -156,14 +153,43 @@ def load_towers(folder: Path) -> Towers:
     return LidarTowers(str(folder), base, encoder)
 
 
+def load_image_tower(folder: Path) -> ImageTower:
+    """Load the image tower alone from a folder of `save_towers`.
+
+    Raises:
+        InputError: there are no towers, they are damaged, or the image tower is that of another model.
+    """
+    card = _read_card(folder)
+    if card.image is None:
+        raise InputError(f"{folder}: the image tower is that of {card.text}")
+    return _load_image_tower(folder, card.image, card.dim)[0]
+
+
+def _read_card(folder: Path) -> TowerCard:
+    try:
+        return TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
+    except (OSError, ValidationError) as error:
+        raise InputError(
+            f"{folder / CARD}: does not describe towers: {str(error).splitlines()[0]}"
+        ) from error
+
+
 def _load_base(folder: Path, card: TowerCard) -> Towers:
     if card.image is None:
         return PretrainedTowers(card.text)
-    tower = ImageTower(card.image, dim=card.dim)
+    tower, text_mean = _load_image_tower(folder, card.image, card.dim)
+    return SentenceTowers(str(folder), tower, text_mean, card.image, card.text)
+
+
+def _load_image_tower(
+    folder: Path, size: ImageTowerConfig, dim: int
+) -> tuple[ImageTower, Float[Tensor, "D"]]:
+    """Return the image tower and the mean of the texts."""
+    tower = ImageTower(size, dim=dim)
     text_mean = _load_weights(tower, folder / IMAGE).get(TEXT_MEAN)
     if text_mean is None:
         raise InputError(f"{folder / IMAGE}: no {TEXT_MEAN} in it")
-    return SentenceTowers(str(folder), tower, text_mean, card.image, card.text)
+    return tower, text_mean
 
 
 def _halved(model: nn.Module) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Example, Trajectory
 from foredrive.training.loop import Schedule
-from foredrive.training.rays import thinned_rays
+from foredrive.training.rays import averaged_rays, thinned_rays
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,12 @@ class NemoStage:
     schedule: Schedule
     weights: NemoWeights
     ray_stride: int
-    """One pixel in `ray_stride` along rows and columns is rendered."""
-    vgg16: str | None = None
-    """File of VGG-16 weights for the perceptual loss, or "download". None disables that loss (weight 0)."""
+    """One ray in `ray_stride` pixels along rows and columns is rendered."""
+    pixels: Literal["thinned", "averaged"] = "thinned"
+    """Truth of a ray: its own pixel, or the mean of the `ray_stride`² pixels around it."""
+    perceptual: str | None = None
+    """Network of the perceptual loss: "vgg16" (its weights are downloaded), a file of VGG-16 weights, or
+    "tower", the image tower that comes with the package. None disables that loss (weight 0)."""
     imagine: bool = True
     """Imagine the future key frames and supervise them. If False, only the present is trained."""
     kind: Literal["nemo"] = "nemo"
@@ -58,7 +61,7 @@ class NemoObjective(nn.Module):
         agent: world model and planner.
         stage: λ, and what is trained.
         steps: T_f, number of future key frames that are imagined and supervised, if the stage imagines.
-        image_features: VGG-16 features with real weights for the perceptual loss, or None to disable it.
+        image_features: trained features for the perceptual loss, or None to disable it.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class NemoObjective(nn.Module):
     ) -> None:
         super().__init__()
         self.agent, self.weights, self.ray_stride = agent, stage.weights, stage.ray_stride
+        self.rays = averaged_rays if stage.pixels == "averaged" else thinned_rays
         self.steps = steps if stage.imagine else 0
         self.image_features = image_features
         world, weights = agent.world_model, stage.weights
@@ -109,7 +113,7 @@ class NemoObjective(nn.Module):
                     occupied_weight=weights.occupied,
                 )
             if weights.recon > 0:
-                rays = thinned_rays(clip, frame, self.ray_stride, generator)
+                rays = self.rays(clip, frame, self.ray_stride, generator)
                 rendered = world.renderer(
                     belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
                 )

@@ -3,14 +3,12 @@
 import functools
 from pathlib import Path
 
-import foredrive.search
-from foredrive.search.embedded import CARD, load_towers
+from foredrive.search.embedded import CARD, SHIPPED, load_towers
 from foredrive.search.pretrained import PretrainedTowers
 from foredrive.search.towers import Towers
 
 EMBEDDED = "embedded"
 """Name of the towers that come with the package."""
-SHIPPED = Path(foredrive.search.__file__).parent / "shipped"
 
 
 @functools.lru_cache(maxsize=1)

@@ -1,0 +1,108 @@
+"""NeMo's objective: rays, perceptual networks, weights."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from miniature import miniature
+from safetensors.torch import save_file
+
+from foredrive.errors import InputError
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.models.vgg import Vgg16Features
+from foredrive.recipes import find_recipe
+from foredrive.runs.build import build_agent, build_objective
+from foredrive.scene import Example
+from foredrive.training.rays import averaged_rays
+
+RECIPE = miniature()
+SPEC = RECIPE.clips.voxels
+
+
+@pytest.fixture
+def example(make_example: Callable[..., Example]) -> Example:
+    return make_example(spec=SPEC)
+
+
+def vgg_file(path: Path) -> Path:
+    """Small random weights of VGG-16 in a file."""
+    widths = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512]
+    rng, state = torch.Generator().manual_seed(0), {}
+    for layer, source, target in zip((0, 2, 5, 7, 10, 12, 14, 17, 19, 21), widths, widths[1:], strict=False):
+        state[f"features.{layer}.weight"] = torch.randn(target, source, 3, 3, generator=rng) * 0.05
+        state[f"features.{layer}.bias"] = torch.zeros(target)
+    save_file(state, path)
+    return path
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_averaged_ray_goes_through_the_middle_of_the_pixels_that_it_shows(
+    seed: int, example: Example
+) -> None:
+    clip, stride = example.clip, 8
+    height, width = clip.rig.size_hw
+    row, column = torch.randint(stride, (2,), generator=torch.Generator().manual_seed(seed)).tolist()
+    rays = averaged_rays(clip, 1, stride, torch.Generator().manual_seed(seed))
+    b, c, _, h, w = rays.rgb.shape
+    assert (h, w) == ((height - row) // stride, (width - column) // stride)
+    block = clip.images[1, 1, 1, :, row + 8 : row + 16, column + 16 : column + 24].double()
+    torch.testing.assert_close(rays.rgb[1, 1, :, 1, 2].double(), block.mean(dim=(1, 2)) / 255)
+    ahead = (rays.origin + 7.0 * rays.direction).view(b, c, h * w, 3)
+    rig = clip.rig
+    in_camera = transform_points(inverse_se3(rig.T_ego_cam[:, 1]), ahead)
+    uv, _, _ = project(in_camera, rig.K[:, 1], rig.dist[:, 1], rig.size_hw)
+    middle = torch.tensor([column + 16 + 4.0, row + 8 + 4.0])
+    torch.testing.assert_close(uv[1, 1].view(h, w, 2)[1, 2], middle, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["tower", "vgg"])
+@pytest.mark.parametrize("pixels", ["thinned", "averaged"])
+def test_both_networks_teach_the_renderer(name: str, pixels: str, example: Example, tmp_path: Path) -> None:
+    perceptual = "tower" if name == "tower" else str(vgg_file(tmp_path / "vgg.safetensors"))
+    stage = dataclasses.replace(RECIPE.pretrain, pixels=pixels, perceptual=perceptual)
+    stage = dataclasses.replace(stage, weights=dataclasses.replace(stage.weights, occ=0.0))
+    torch.manual_seed(0)
+    objective = build_objective(RECIPE, stage, build_agent(RECIPE)).train()
+    losses = objective(example, torch.Generator().manual_seed(0))
+    expected = stage.weights.recon * (losses["l1"] + stage.weights.perc * losses["perc"])
+    torch.testing.assert_close(losses["loss"], expected)
+    losses["perc"].backward()
+    assert all(p.grad is not None and p.grad.any() for p in objective.agent.world_model.renderer.parameters())
+    fixed = dict(objective.image_features.named_parameters())
+    assert fixed
+    assert not any(p.requires_grad for p in fixed.values())
+
+
+def test_a_network_finds_equal_images_equal_and_blurred_ones_not(tmp_path: Path) -> None:
+    stage = dataclasses.replace(RECIPE.pretrain, perceptual="tower")
+    features = build_objective(RECIPE, stage, build_agent(RECIPE)).image_features
+    image = torch.rand(1, 3, 12, 20, generator=torch.Generator().manual_seed(0))
+    blurred = torch.nn.functional.avg_pool2d(image, 3, 1, 1)
+    levels = features(image)
+    assert [level.shape[-2:] for level in levels] == [(12, 20), (6, 10), (3, 5)]
+    assert all(torch.equal(a, b) for a, b in zip(levels, features(image), strict=True))
+    assert all((a - b).abs().mean() > 0.01 for a, b in zip(levels, features(blurred), strict=True))
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_a_file_of_vgg_weights_fits_the_recipes_of_towns(stage: str, tmp_path: Path) -> None:
+    """Fine-tuning renders 6 × 10 pixels: too few to be pooled three times."""
+    file = vgg_file(tmp_path / "vgg.safetensors")
+    recipe = find_recipe("nemo_town", (f"{stage}.perceptual={file}",))
+    chosen = getattr(recipe, stage)
+    height, width = recipe.clips.image_hw
+    features = Vgg16Features(chosen.perceptual)
+    taps = features(torch.rand(1, 3, height // chosen.ray_stride, width // chosen.ray_stride))
+    assert [tap.shape[1] for tap in taps] == [64, 128, 256, 512][: 4 if stage == "pretrain" else 3]
+
+
+def test_a_file_that_is_named_and_wrong_is_one_line(tmp_path: Path) -> None:
+    agent = build_agent(RECIPE)
+    (tmp_path / "vgg.pth").write_bytes(b"no weights")
+    for file, said in ((tmp_path / "none.pth", "no such file"), (tmp_path / "vgg.pth", "not VGG-16 weights")):
+        with pytest.raises(InputError, match=said) as caught:
+            build_objective(RECIPE, dataclasses.replace(RECIPE.pretrain, perceptual=str(file)), agent)
+        assert "\n" not in str(caught.value)
