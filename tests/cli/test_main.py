@@ -1,6 +1,7 @@
 """What a user sees when a verb cannot go on: one line and an exit code."""
 
 import dataclasses
+import os
 import signal
 import subprocess
 import sys
@@ -39,6 +40,14 @@ def run(
 
 def test_a_verb_that_ends_well_is_silent(run: Callable) -> None:
     assert run(lambda: None) == (0, "")
+
+
+def test_a_reader_that_has_stopped_ends_the_verb(run: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w", buffering=1) as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert run(lambda: print("a line")) == (141, "")
 
 
 def test_bad_input_is_one_line_and_2(run: Callable) -> None:

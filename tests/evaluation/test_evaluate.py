@@ -150,6 +150,34 @@ def test_a_batch_that_cannot_be_loaded_is_counted_and_the_rest_goes_on(make_exam
     assert result.failures[0].reason == "drive 1: corrupt JPEG"
 
 
+def test_every_item_of_a_batch_that_cannot_be_loaded_failed(make_example: MakeExample) -> None:
+    def collate(indices: list[int]) -> Example:
+        if 1 in indices:
+            raise InputError("drive 1: corrupt JPEG")
+        return make_example(*indices)
+
+    told: list[int] = []
+    loader = DataLoader(range(4), batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
+    oracle = Oracle(make_example(2), make_example(3))
+    summary = evaluate(oracle, loader, on_items=told.append, **ABOUT).summary
+    assert (summary["items"], summary["failed"]) == (4, 2)
+    assert told == [2, 2]
+
+
+def test_a_plan_that_lacks_a_step_failed(make_example: MakeExample) -> None:
+    class Short(Oracle):
+        def predict(self, observed: Clip, asked: object) -> Prediction:
+            answer = super().predict(observed, asked)
+            assert answer.plan is not None
+            answer.plan.valid[1, 0, 3] = False
+            return answer
+
+    ones = [make_example(i) for i in range(3)]
+    result = evaluate(Short(*ones), [make_example(0, 1, 2)], **ABOUT)
+    assert [failure.key for failure in result.failures] == ["drive@1"]
+    assert result.summary["planning.uniad.frames_counted"] == 2
+
+
 def test_when_nothing_succeeds_there_is_no_result(make_example: MakeExample) -> None:
     oracle = Oracle()
     oracle.breaks_on = {float(make_example(0).clip.ego_speed_mps[0, 0])}

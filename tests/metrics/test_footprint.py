@@ -74,7 +74,7 @@ def test_the_half_metre_grid_by_hand(protocol: PlanningProtocol) -> None:
     assert not hits(protocol, (0.0, 0.0), some_boxes([(0.0, -2.0, 1.0, 1.0, 0.0)]))[0]
     # A path 0.4 m ahead keeps the rows when rounded down and moves by one, into the box, when rounded up.
     moved = hits(protocol, (0.4, 0.0), some_boxes([(3.0, 0.0, 1.0, 1.0, 0.0)]))[0]
-    assert moved == (protocol.grid is not None and protocol.grid.row_step == "up")
+    assert moved == (protocol.title == "VAD")
 
 
 def test_cells_beyond_the_grid_move_to_its_border() -> None:
@@ -99,6 +99,14 @@ def test_the_fine_grid_turns_the_vehicle() -> None:
     assert not hits(bev, (0.0, 0.0), ahead, heading=0.5 * math.pi)[0]
     assert hits(bev, (0.0, 0.0), ahead)[0]
     assert not hits(bev, (0.0, 0.0), left)[0]
+
+
+def test_corners_on_the_fine_grid_move_towards_the_vehicle() -> None:
+    # It reaches 3.528 m forward; its last cell has its centre at 3.45 m. Corners at 3.46 m move down to that
+    # cell, not on to the next grid line; corners at 3.56 m move to the cell after it.
+    bev = PROTOCOLS["bevplanner"]
+    assert hits(bev, (0.0, 0.0), some_boxes([(3.96, 0.0, 1.0, 1.0, 0.0)]))[0]
+    assert not hits(bev, (0.0, 0.0), some_boxes([(4.06, 0.0, 1.0, 1.0, 0.0)]))[0]
 
 
 def test_headings_by_each_rule() -> None:

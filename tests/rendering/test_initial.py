@@ -1,5 +1,6 @@
 """A scene before learning, from a log whose geometry is known."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,15 @@ def test_a_drive_has_every_frame(drive: Clip) -> None:
     assert drive.images.shape == (11, 2, 3, 48, 96)
     assert drive.rig.exposed_dt_s is not None
     assert float(drive.rig.exposed_dt_s.abs().max()) < 1e-5
+
+
+def test_a_view_is_at_the_time_of_its_exposure(drive: Clip) -> None:
+    late_s = torch.tensor([[0.02, -0.03]]).expand(11, 2)
+    rig = dataclasses.replace(drive.rig, exposed_dt_s=late_s)
+    views = camera_views(dataclasses.replace(drive, rig=rig), drive.T_world_ego[0])
+    for camera, shift_s in enumerate((0.02, -0.03)):
+        times = torch.tensor([view.t_s for view in views[camera]])
+        torch.testing.assert_close(times, drive.t_s + shift_s)
 
 
 def test_a_camera_the_log_lacks_is_told(drive: Clip, tmp_path: Path) -> None:

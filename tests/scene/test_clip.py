@@ -14,12 +14,14 @@ SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
 
 def test_observed_ends_at_now_and_hides_the_driven_future(make_example: Callable[..., Example]) -> None:
     clip = make_example(spec=SPEC, past=2, future=3).clip
+    clip.future.yaw[:] = 0.3
     seen = clip.observed()
     assert clip.now == 2
     assert seen.t_s[0].tolist() == [-1.0, -0.5, 0.0]
     assert seen.images.shape[1] == seen.rig.K.shape[1] == seen.boxes.centre.shape[1] == 3
     assert not seen.future.valid.any()
     assert not seen.future.xy.any()
+    assert not seen.future.yaw.any()
     assert clip.future.valid.all()  # the original is as it was
 
 

@@ -117,6 +117,12 @@ def test_joint_rules_are_the_papers(index: FrameIndex, target: Target) -> None:
     for hit in by_rule["logits"]:
         assert hit.score == pytest.approx(hit.scores["image"] + hit.scores.get("lidar", hit.scores["image"]))
         assert hit.scores.get("joint", hit.score / 2) == pytest.approx(hit.score / 2)
+    blind = find(
+        index, Query(text="x", modality="joint", rule="logits", where=f"log LIKE '{LOGS[2][:5]}%'"), target
+    )
+    assert blind.hits
+    for hit in blind.hits:
+        assert hit.score == pytest.approx(2 * hit.scores["image"])
     for hit in by_rule["rerank"]:
         assert hit.score == pytest.approx(hit.scores["lidar"])
         assert "joint" not in hit.scores

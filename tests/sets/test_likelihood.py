@@ -124,6 +124,20 @@ def test_gradients_are_those_of_the_definition() -> None:
         torch.testing.assert_close(got, expected, atol=1e-8, rtol=1e-8)
 
 
+def test_a_sum_that_is_not_exact_is_an_interval_around_the_value() -> None:
+    rng = np.random.default_rng(3)
+    boxes = BoxDensity(torch.as_tensor(rng.normal(size=(6, 2))), torch.eye(2).double().expand(6, 2, 2))
+    pmb = PoissonMultiBernoulli(
+        MultiBernoulli.from_softmax(torch.as_tensor(rng.normal(size=(6, 3))), boxes),
+        UniformPoisson(torch.tensor([0.5, 0.5]), torch.full((2,), -9.0), torch.full((2,), 9.0)),
+    )
+    truth = LabelledBoxes(torch.as_tensor(rng.integers(0, 2, 5)), torch.as_tensor(rng.normal(size=(5, 2))))
+    value = set_nll(pmb, truth).nll.item()
+    bounded = set_nll(pmb, truth, k=2, max_states=1)
+    assert bounded.lower < value - 1e-3
+    assert value + 1e-3 < bounded.nll.item()
+
+
 def test_parts_by_hand() -> None:
     """One detection at 0 and one object at 1, which may belong together or not."""
     r, rate, volume = 0.8, 0.5, 10.0

@@ -34,6 +34,13 @@ def test_held_steering_draws_a_circle_exactly(dt_s: float) -> None:
     assert yaw_rate_radps(state, vehicle) == pytest.approx(0.5)
 
 
+def test_while_the_wheel_turns_the_mean_of_its_angles_counts() -> None:
+    # From 0 to 0.2 rad within the step: 0.5 m on a circle of curvature tan(0.1) / wheelbase.
+    state = step(BicycleState(0.0, 0.0, 0.0, 10.0), Control(0.0, 0.2), 0.05, AT_ONCE)
+    assert state.steering_rad == 0.2
+    assert state.yaw_rad == pytest.approx(0.5 * math.tan(0.1) / EGO.wheelbase_m)
+
+
 def test_the_step_s_size_does_not_matter_on_an_accelerated_arc() -> None:
     start = BicycleState(3.0, -2.0, 1.0, 4.0, steering_rad=-0.2)
     coarse, fine, control = start, start, Control(1.0, -0.2)

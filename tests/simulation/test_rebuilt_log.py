@@ -188,6 +188,8 @@ def test_a_threat_hits_who_goes_on_as_the_log_did(threat: Threat) -> None:
     graph = scene_with(actor(-50.0, 0.0))
     drive = LoggedDrive(vehicle(), torch.eye(4))
     sent = send_threat(threat, graph, drive, 1.0)
+    velocity = {Threat.STATIONARY: (0, 0, 0), Threat.FRONTAL: (-5, 0, 0), Threat.SIDE: (0, 5, 0)}[threat]
+    assert sent.velocity_mps == pytest.approx(velocity, abs=1e-5)  # from the right to the left
     simulator = begun(graph, (sent,))
     went_on = driven(simulator, replay(simulator))
     first = went_on.score.infractions[0]

@@ -186,7 +186,7 @@ def test_who_is_run_into_is_told_once_with_the_speed_between_both(
     assert [(e.kind, e.what, e.t_s) for e in events] == [("collision_vehicle", "bus", 1.0)]
     assert events[0].severity == pytest.approx(5.0)
     assert stopped
-    for t_s, count in ((1.05, 0), (5.9, 0), (11.0, 1)):  # in contact still; then not for 5.1 s
+    for t_s, count in ((1.05, 0), (5.9, 0), (6.5, 0), (11.6, 1)):  # in contact still; then not for 5.1 s
         events, contacts, _ = sense.check(T, ego, ahead, contacts, t_s)
         assert len(events) == count
     beside = others(Category.CAR, 0.0, 1.75, 8.0 * forward)  # scraping along

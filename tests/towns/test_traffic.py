@@ -11,7 +11,8 @@ from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.car_following import MAX_BRAKING_MPS2
-from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S
+from foredrive.towns.traffic.lane_graph import Control
+from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, plan_signals
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
 
@@ -202,3 +203,21 @@ def test_lights_show_green_to_one_axis_at_a_time(town02: TownMap) -> None:
     assert seen[signals.guarded][:, [LightState.RED, LightState.YELLOW, LightState.GREEN]].all()
     assert not seen[~signals.guarded][:, 1:].any()
     assert GREEN_S + YELLOW_S < PHASE_S
+
+
+def test_a_junction_of_three_axes_has_three_phases(town02: TownMap) -> None:
+    """The lanes of one junction of the town, turned to 0°, 60° and 120°."""
+    graph = Traffic(town02, 0, vehicle_count=1, people_count=0).lanes
+    guarded = graph.control == Control.LIGHT
+    lanes = np.flatnonzero(guarded & (graph.junction == graph.junction[guarded][0]))
+    angle = np.pi / 3 * (np.arange(len(lanes)) % 3)
+    xyz = graph.xyz.copy()
+    way = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(lanes))], axis=1)
+    xyz[graph.first[lanes] + 1] = xyz[graph.first[lanes]] + way
+    signals = plan_signals(dataclasses.replace(graph, xyz=xyz), np.random.default_rng(0))
+    green = [
+        frozenset(angle[signals.light_states(time_s)[lanes] == LightState.GREEN])
+        for time_s in np.arange(0.0, 3 * PHASE_S, 0.5)
+    ]
+    assert {len(axes) for axes in green} == {0, 1}
+    assert frozenset().union(*green) == set(angle)

@@ -64,6 +64,16 @@ def returned_share(conditions: Conditions, range_m: float, looks: LookArrays = W
     return float(returned.mean())
 
 
+def test_a_matt_wall_at_60_degrees_looks_half_as_bright() -> None:
+    chance, t, air = np.zeros((1, 2), np.float32), np.full(1, 5.0, np.float32), make_air(Conditions())
+    normal, far_m = np.array([1.0, 0.0, 0.0]), np.float32(200.0)
+    ahead, aside = (
+        lidar_returns(WALL, met(1, normal, cosine), t, far_m, chance, air)[2].item() for cosine in (1.0, 0.5)
+    )
+    assert ahead == pytest.approx(0.4 * 100 / 255, rel=5e-3)  # the air dims it a little
+    assert aside == pytest.approx(0.5 * ahead, rel=1e-6)
+
+
 def seen_through(conditions: Conditions, range_m: float) -> np.ndarray:
     """Radiance of a wall in the shade."""
     light = make_light(conditions, 0.0)

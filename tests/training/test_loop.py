@@ -159,6 +159,8 @@ def test_every_item_once_an_epoch_in_an_order_of_its_own() -> None:
         assert sorted(itertools.chain(*epoch)) == list(range(7))
     assert [len(batch) for batch in first] == [3, 3, 1]
     assert first != second
+    other = batch_order(7, 3, seed=2)
+    assert [next(other) for _ in range(3)] != first
 
 
 def test_learning_rate_by_hand() -> None:
