@@ -198,19 +198,13 @@ def test_the_command_comes_from_the_driven_future_without_a_route(tmp_path: Path
 
 
 def test_a_route_derived_from_the_driven_path_is_no_route(tmp_path: Path) -> None:
-    from py123d.api.scene.arrow.utils import route_utils
-    from py123d.datatypes import RouteMetadata
-    from py123d.datatypes.metadata import CacheSourceInfo
-
-    folder = world.write(tmp_path, frames=41)
-    xyz = np.stack([world.ego_pose(0.1 * i)[:3, 3] for i in range(41)])
-    derived = route_utils.compute_route_data(xyz, 1.0)
-    source = CacheSourceInfo("py123d:x@1", "2026-01-01T00:00:00Z", [])
-    metadata: RouteMetadata = derived.to_route_metadata(1.0, "ego_state_se3", source)
-    times = world.START_US + np.arange(41) * world.PERIOD_US
-    route_utils.write_route_position_arrow(folder, times, derived.progress_m, metadata)
+    folder = world.write(tmp_path, frames=41, route_xyz=left_turn(15))
+    rewrite_metadata(folder / "route_position.arrow", lambda metadata: metadata | {"source": "ego_state_se3"})
     clips = ClipDataset(find_logs(folder), config(past_frames=0, future_frames=0), None)
     assert clips.command_source["route"] == 0
+    assert clips.command_source["driven_future"] > 0
+    assert clips[0].clip.command == Command.STRAIGHT
+    assert not clips[0].clip.target_valid
 
 
 def batch_of(clips: ClipDataset, workers: int) -> Example:
