@@ -19,7 +19,7 @@ from foredrive.recipes import find_recipe
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.drive.records import summarise
-from foredrive.runs.drive.suite import Driven, DriveSuite, drive_suite
+from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
 from foredrive.towns.campaign import Campaign, plan_drives
@@ -33,7 +33,7 @@ IMAGE_HW = (144, 256)
 CORES = len(os.sched_getaffinity(0))
 
 
-def _driven(suite: DriveSuite, out: Path) -> Driven:
+def _driven(suite: DriveSuite, out: Path) -> SuiteResult:
     driven = drive_suite(suite, out, CORES)
     if driven.broken:
         job, why = next(iter(driven.broken.items()))

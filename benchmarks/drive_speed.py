@@ -22,7 +22,7 @@ from foredrive.runs.build import build_agent
 from foredrive.scene import Clip
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.plans import fixed_in_world
@@ -48,13 +48,18 @@ def _steps(seed: int, sensors: SensorSuite | None, seconds: float) -> Iterator[t
     for waypoints in cycle(load_route_set(ROUTES)):
         route = snap_route(waypoints)
         scenario = TownScenario(route.town, route.xyz, seed, TRAFFIC, lanes=route.lanes, sensors=sensors)
-        clip, following, expert, done = simulator.reset(scenario), Following(), TownExpert(simulator), False
+        clip, controller, expert, done = (
+            simulator.reset(scenario),
+            ControllerState(),
+            TownExpert(simulator),
+            False,
+        )
         while not done:
             t_s = simulator.state.t_s
             if simulator.state.step_index % round(FRAME_DT_S / STEP_S) == 0:
                 plan = fixed_in_world(expert.act(stack_records([clip])), simulator.ego(), t_s)
-                following = following.expecting(plan, t_s)
-            control, following = follow(following, simulator.ego(), t_s)
+                controller = controller.expecting(plan, t_s)
+            control, controller = follow(controller, simulator.ego(), t_s)
             began = time.perf_counter()
             step = simulator.step(control)
             yield time.perf_counter() - began, step.clip

@@ -16,11 +16,11 @@ from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
-from foredrive.runs.drive.agents import _run_folder, needs_of
+from foredrive.runs.drive.agents import _run_folder, inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive
 from foredrive.runs.drive.route_source import job_of
-from foredrive.runs.drive.suite import DriveJob, Driven, DriveSuite, drive_suite, folder_of
+from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route
@@ -68,7 +68,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def driven(suite: DriveSuite, out: Path) -> Driven:
+def driven(suite: DriveSuite, out: Path) -> SuiteResult:
     return drive_suite(suite, out, workers=1)
 
 
@@ -104,7 +104,7 @@ def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path,
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
-def test_every_drive_is_kept_scored_and_logged(driven: Driven, out: Path) -> None:
+def test_every_drive_is_kept_scored_and_logged(driven: SuiteResult, out: Path) -> None:
     assert list(driven.drives) == [job_of("a", 0), job_of("b", 0)]
     assert (driven.skipped, driven.broken) == (0, {})
     for job, kept in driven.drives.items():
@@ -140,7 +140,7 @@ def test_scenarios_are_those_of_the_drives_seed(suite: DriveSuite) -> None:
     assert without.source.scenario_of(route, 0, without).scenarios == ()
 
 
-def test_what_lies_there_is_not_driven_again(driven: Driven, suite: DriveSuite, out: Path) -> None:
+def test_what_lies_there_is_not_driven_again(driven: SuiteResult, suite: DriveSuite, out: Path) -> None:
     (out / "drives" / "routeb_rep0.json").unlink()
     told: list[DriveJob] = []
     again = drive_suite(suite, out, workers=1, tick=lambda job, drive: told.append(job))
@@ -151,7 +151,7 @@ def test_what_lies_there_is_not_driven_again(driven: Driven, suite: DriveSuite, 
         assert dataclasses.replace(again.drives[job], **taken) == kept
 
 
-def test_files_of_suites_and_drives_stay_what_they_were(driven: Driven, out: Path) -> None:
+def test_files_of_suites_and_drives_stay_what_they_were(driven: SuiteResult, out: Path) -> None:
     """Folders of before go on, and are read by who knows their keys."""
     suite = json.loads((out / "suite.json").read_text())
     fields = "driver routes repetitions seed conditions sensors image_hw vehicles people scenarios"
@@ -181,7 +181,7 @@ def test_a_carla_server_is_reached_by_the_verb(
         assert "a CARLA server is named HOST:PORT" in capsys.readouterr().err
 
 
-def test_a_folder_holds_one_suite(driven: Driven, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
+def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another suite"):
         drive_suite(changed(suite, seed=1), out, workers=1)
     (tmp_path / "drives").mkdir()
@@ -224,7 +224,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize("driver", ["nobody", "ego-mlp:nowhere"])
 def test_an_unknown_driver_is_named(driver: str) -> None:
     with pytest.raises(InputError, match=f"{driver}: no such driver; there are expert"):
-        needs_of(driver)
+        inputs_of(driver)
 
 
 def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from foredrive.runs.drive.recording import Recorded, is_recorded, record_drives, record_plan
+from foredrive.runs.drive.recording import RecordingResult, is_recorded, record_drives, record_plan
 from foredrive.runs.fan_out import fan_out
 from foredrive.towns.campaign import DrivePlan
 
@@ -32,12 +32,12 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recorded(root: Path) -> Recorded:
+def recorded(root: Path) -> RecordingResult:
     return record_drives([LOST, *PLANS], root, IMAGE_HW, workers=2)
 
 
 def test_side_by_side_gives_the_bytes_of_one_after_another(
-    recorded: Recorded, root: Path, tmp_path: Path
+    recorded: RecordingResult, root: Path, tmp_path: Path
 ) -> None:
     assert list(recorded.logs) == PLANS
     for plan in PLANS[1:]:
@@ -47,12 +47,12 @@ def test_side_by_side_gives_the_bytes_of_one_after_another(
     assert one_by_one.items() <= digests(root).items()
 
 
-def test_a_drive_that_fails_is_named_and_the_others_go_on(recorded: Recorded) -> None:
+def test_a_drive_that_fails_is_named_and_the_others_go_on(recorded: RecordingResult) -> None:
     assert list(recorded.failed) == [LOST]
     assert "unknown town 'Town99'" in recorded.failed[LOST]
 
 
-def test_whole_logs_are_skipped(recorded: Recorded, root: Path) -> None:
+def test_whole_logs_are_skipped(recorded: RecordingResult, root: Path) -> None:
     before, ticks = {file: file.stat().st_mtime_ns for file in root.rglob("*.arrow")}, []
     again = record_drives(PLANS, root, IMAGE_HW, workers=2, tick=lambda: ticks.append(None))
     assert (again.skipped, again.logs, again.failed) == (len(PLANS), recorded.logs, {})
@@ -60,7 +60,7 @@ def test_whole_logs_are_skipped(recorded: Recorded, root: Path) -> None:
     assert {file: file.stat().st_mtime_ns for file in root.rglob("*.arrow")} == before
 
 
-def test_a_log_of_another_length_rate_or_size_does_not_count(recorded: Recorded, root: Path) -> None:
+def test_a_log_of_another_length_rate_or_size_does_not_count(recorded: RecordingResult, root: Path) -> None:
     plan = PLANS[0]
     assert is_recorded(plan, root, IMAGE_HW)
     assert not is_recorded(plan, root, (72, 128))
@@ -88,7 +88,7 @@ def test_a_process_that_dies_takes_its_own_drive_along() -> None:
     "FOREDRIVE_TEST_RAY" not in os.environ, reason="Ray takes long to start on a busy machine"
 )
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves its own processes to the system
-def test_on_ray(tmp_path: Path, recorded: Recorded, root: Path) -> None:
+def test_on_ray(tmp_path: Path, recorded: RecordingResult, root: Path) -> None:
     on_ray = record_drives([LOST, PLANS[0]], tmp_path, IMAGE_HW, workers=1, on_ray=True)
     assert list(on_ray.logs) == [PLANS[0]]
     assert "unknown town 'Town99'" in on_ray.failed[LOST]

@@ -9,8 +9,8 @@ from foredrive.scene import Control, Event
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.routes import DriveRoute
-from foredrive.simulation.scenarios.kinds import Scenario
 from foredrive.simulation.scenarios.kinematics import BRAKING_MPS2, REACTION_S
+from foredrive.simulation.scenarios.scenario import Scenario
 from foredrive.simulation.town import TownScenario, TownSimulator, TownState
 
 SEED = 3
@@ -40,7 +40,7 @@ class Driver:
 
     def _acceleration(self, state: TownState, done_m: float) -> float:
         speed = state.ego.speed_mps
-        begun_s = state.play.begun[-1][1] if state.play.begun else -math.inf
+        begun_s = state.scenarios.begun[-1][1] if state.scenarios.begun else -math.inf
         if self.attentive and REACTION_S <= state.t_s - begun_s < self.waits_s:
             return -BRAKING_MPS2
         return min(max((self._wanted_mps(done_m, speed) - speed) / 0.3, -SLOWS_MPS2 - 1.0), GAINS_MPS2)
@@ -69,7 +69,7 @@ def drive(
     events: list[Event] = []
     states = [simulator.state]
     while simulator.state.ended is None:
-        begun_s = min((s for _, s in simulator.state.play.begun), default=math.inf)
+        begun_s = min((s for _, s in simulator.state.scenarios.begun), default=math.inf)
         if simulator.state.t_s > min(begun_s + after_s, most_s):
             break
         events += simulator.step(driver.control(simulator.state)).events

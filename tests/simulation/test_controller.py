@@ -8,7 +8,7 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Trajectory
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import EGO, STEP_S, step
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.smooth_path import fit_path
@@ -34,10 +34,10 @@ def straight(ways_m: list[float]) -> np.ndarray:
 def drive(
     waypoints: np.ndarray, start: BicycleState, seconds: float, latency_s: float = 0.0
 ) -> list[BicycleState]:
-    following = Following().expecting(fixed_in_world(trajectory(waypoints), start, 0.0), latency_s)
+    controller = ControllerState().expecting(fixed_in_world(trajectory(waypoints), start, 0.0), latency_s)
     states = [start]
     for index in range(round(seconds / STEP_S)):
-        control, following = follow(following, states[-1], index * STEP_S)
+        control, controller = follow(controller, states[-1], index * STEP_S)
         states.append(step(states[-1], control))
     return states
 
@@ -70,9 +70,9 @@ def test_it_gets_back_to_its_path_and_its_time() -> None:
     plan = fixed_in_world(
         trajectory(straight([5.0 * k for k in range(1, 13)])), BicycleState(0.0, 0.0, 0.0, 10.0), 0.0
     )
-    state, following = BicycleState(-2.0, 0.8, 0.1, 9.0), Following(plan)
+    state, controller = BicycleState(-2.0, 0.8, 0.1, 9.0), ControllerState(plan)
     for index in range(100):
-        control, following = follow(following, state, index * STEP_S)
+        control, controller = follow(controller, state, index * STEP_S)
         state = step(state, control)
     assert state.y_m == pytest.approx(0.0, abs=0.02)
     assert state.yaw_rad == pytest.approx(0.0, abs=0.01)
@@ -111,9 +111,9 @@ def test_a_plan_backwards_is_waited_out() -> None:
 
 
 def test_without_a_plan_and_beyond_its_end_it_brakes_to_a_halt() -> None:
-    state, following = BicycleState(0.0, 0.0, 0.0, 6.0), Following()
+    state, controller = BicycleState(0.0, 0.0, 0.0, 6.0), ControllerState()
     for index in range(60):
-        control, following = follow(following, state, index * STEP_S)
+        control, controller = follow(controller, state, index * STEP_S)
         state = step(state, control)
     assert (state.speed_mps, state.y_m) == (0.0, 0.0)
     states = drive(straight([3.0, 6.0]), BicycleState(0.0, 0.0, 0.0, 6.0), 4.0)
@@ -135,7 +135,7 @@ def replanned(
 ) -> np.ndarray:
     """Offsets from a road, driven by plans made twice a second of waypoints on it."""
     road, rng = corner(radius_m), np.random.default_rng(0)
-    state, following, offsets = BicycleState(0.0, start_m, 0.0, speed_mps), Following(), []
+    state, controller, offsets = BicycleState(0.0, start_m, 0.0, speed_mps), ControllerState(), []
     way_m = 30 + 1.6 * radius_m + 40
     ahead = np.round(10 * speed_mps * DT_S * np.arange(1, 7)).astype(int)
     for index in range(round(way_m / speed_mps / STEP_S)):
@@ -146,8 +146,8 @@ def replanned(
             points = offset[near + ahead] @ np.array([[cos, -sin], [sin, cos]])
             points = points + noise_m * rng.standard_normal(points.shape)
             plan = fixed_in_world(trajectory(points), state, index * STEP_S)
-            following = following.expecting(plan, index * STEP_S + (latency_s if index else 0.0))
-        control, following = follow(following, state, index * STEP_S)
+            controller = controller.expecting(plan, index * STEP_S + (latency_s if index else 0.0))
+        control, controller = follow(controller, state, index * STEP_S)
         state = step(state, control)
         offsets.append(np.sin(road[near, 2]) * offset[near, 0] - np.cos(road[near, 2]) * offset[near, 1])
     return np.array(offsets)
@@ -175,12 +175,12 @@ def test_plans_that_want_back_at_once_do_not_overshoot() -> None:
 def test_a_plan_counts_once_it_is_there_and_a_newer_one_is_not_replaced_by_an_older() -> None:
     here = BicycleState(0.0, 0.0, 0.0, 5.0)
     first, second = (fixed_in_world(trajectory(straight([2.5, 5.0])), here, made_s) for made_s in (0.0, 0.5))
-    following = Following().expecting(second, 0.7).expecting(first, 0.9)
-    assert following.at(0.69).plan is None
-    assert following.at(0.7).plan is second
-    assert following.at(0.7).at(1.0).plan is second
-    assert following.at(2.0).plan is second
-    assert following.at(0.7).coming == ((0.9, first),)
+    controller = ControllerState().expecting(second, 0.7).expecting(first, 0.9)
+    assert controller.at(0.69).plan is None
+    assert controller.at(0.7).plan is second
+    assert controller.at(0.7).at(1.0).plan is second
+    assert controller.at(2.0).plan is second
+    assert controller.at(0.7).coming == ((0.9, first),)
 
 
 def test_the_most_probable_alternative_is_followed_as_far_as_it_is_valid() -> None:

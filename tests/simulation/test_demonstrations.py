@@ -16,7 +16,7 @@ from foredrive.simulation.demonstrations import (
     DisturbedExpert,
 )
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.simple_agents import StraightAgent
 
 STEP_S, HOURS_S = 0.5, 3600.0
 
@@ -33,7 +33,7 @@ class Steady:
 
 @pytest.fixture(scope="module")
 def expert(clip: Clip) -> Steady:
-    return Steady(Straight(8.0).act(clip))
+    return Steady(StraightAgent(8.0).act(clip))
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_the_same_seed_brings_the_same_disturbances(clip: Clip, expert: Steady) 
 
 
 def test_student_and_expert_take_turns(clip: Clip, expert: Steady) -> None:
-    speed = plans(AlternatingStudent, clip, 0, Straight(2.0), expert)[:, -1, 0] / 3
+    speed = plans(AlternatingStudent, clip, 0, StraightAgent(2.0), expert)[:, -1, 0] / 3
     is_students = speed == 2.0
     assert ((speed == 8.0) | is_students).all()
     assert 0.6 < is_students.float().mean() < 0.8
@@ -87,6 +87,6 @@ def test_student_and_expert_take_turns(clip: Clip, expert: Steady) -> None:
 
 def test_at_a_share_of_one_the_expert_never_drives(clip: Clip, expert: Steady) -> None:
     now = [0.0]
-    agent = AlternatingStudent(Straight(2.0), expert, lambda: now[0], 0, share=1.0)
+    agent = AlternatingStudent(StraightAgent(2.0), expert, lambda: now[0], 0, share=1.0)
     for now[0] in range(0, 100, 3):
         assert float(agent.act(clip).xy[0, 0, -1, 0]) == 6.0

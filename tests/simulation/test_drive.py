@@ -10,10 +10,10 @@ import torch
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.drive import Drive, Pace, drive_route
+from foredrive.simulation.drive import Drive, PlanningTiming, drive_route
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.simple_agents import StraightAgent
 from foredrive.simulation.town import TownScenario, TownSimulator
 from foredrive.simulation.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
@@ -46,7 +46,7 @@ class Failing:
 
     def act(self, observation: Clip) -> Trajectory:
         self._plans += 1
-        plan = Straight(4.0).act(observation)
+        plan = StraightAgent(4.0).act(observation)
         if self._plans < 5:
             return plan
         if self._nonsense:
@@ -73,7 +73,9 @@ def test_a_plan_takes_effect_after_its_latency(simulator: TownSimulator, scenari
     brief = dataclasses.replace(scenario, limit_s=1.4)
     moves = {}
     for latency_s in (0.0, 0.6):
-        drive = drive_route(simulator, brief, Straight(4.0), route="r", pace=Pace(latency_s=latency_s))
+        drive = drive_route(
+            simulator, brief, StraightAgent(4.0), route="r", pace=PlanningTiming(latency_s=latency_s)
+        )
         moves[latency_s] = next(k for k, state in enumerate(drive.states) if state.speed_mps > 0)
         assert drive.score.ending is Ending.TIMEOUT
         assert len(drive.act_s) == 3
@@ -87,14 +89,14 @@ def test_who_plans_less_often_is_asked_less_often(simulator: TownSimulator, scen
     def on_frame() -> None:
         frames.append(simulator.state.t_s)
 
-    pace = Pace(period_s=1.0)
-    drive = drive_route(simulator, brief, Straight(0.0), route="r", pace=pace, on_frame=on_frame)
+    pace = PlanningTiming(period_s=1.0)
+    drive = drive_route(simulator, brief, StraightAgent(0.0), route="r", pace=pace, on_frame=on_frame)
     assert len(drive.act_s) == 2
     assert frames == [0.0, 0.5, 1.0, 1.5]
     assert drive.score.completion == pytest.approx(0.0, abs=0.02)
     for wrong in ({"period_s": 0.3}, {"period_s": 0.0}, {"latency_s": -0.1}, {"latency_s": math.nan}):
         with pytest.raises(InputError):
-            Pace(**wrong)
+            PlanningTiming(**wrong)
 
 
 def test_the_expert_arrives_and_drives_the_same_again(

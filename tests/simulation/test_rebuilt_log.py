@@ -24,7 +24,7 @@ from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.rebuilt import STRUCK, RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import Replay, Straight
+from foredrive.simulation.simple_agents import ReplayAgent, StraightAgent
 from foredrive.simulation.threats import AFTER_S, Threat, reference_mps, send_threat, threat_score
 
 SPEED_MPS, PERIOD_S, END_S = 8.0, 0.1, 10.0
@@ -80,8 +80,8 @@ def driven(simulator: RebuiltSimulator, agent: Agent) -> Drive:
     return drive_route(simulator, simulator.scenario, agent, route="log")
 
 
-def replay(simulator: RebuiltSimulator) -> Replay:
-    return Replay(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
+def replay(simulator: RebuiltSimulator) -> ReplayAgent:
+    return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
 
 
 FAR = actor(200.0, SPEED_MPS)
@@ -132,7 +132,7 @@ def test_a_slower_vehicle_ahead_is_run_into_at_the_difference() -> None:
 
 def test_who_drives_into_the_vehicle_from_behind_is_not_its_fault() -> None:
     simulator = begun(scene_with(actor(-15.0, SPEED_MPS)))
-    drive = driven(simulator, Straight(0.0))
+    drive = driven(simulator, StraightAgent(0.0))
     assert drive.score.infractions == ()
     assert [event.kind for event in drive.events if "car" in event.detail] == [STRUCK]
     assert drive.score.ending is Ending.TIMEOUT  # the log was over
@@ -146,7 +146,7 @@ def test_leaving_what_the_log_has_seen_ends_the_drive() -> None:
     @dataclasses.dataclass
     class Veering:
         def act(self, observation):  # type: ignore[no-untyped-def]
-            plan = Straight(SPEED_MPS).act(observation)
+            plan = StraightAgent(SPEED_MPS).act(observation)
             return dataclasses.replace(
                 plan, xy=plan.xy + torch.tensor([0.0, 1.0]) * plan.xy[..., :1] ** 2 / 60
             )
@@ -169,7 +169,7 @@ def test_the_way_outside_of_lanes_is_counted() -> None:
     score = driven(simulator, replay(simulator)).score
     inside_m = 40.0 + 1.3 - EGO.axle_to_centre_m - SPEED_MPS  # it begins 8 m on
     assert score.outside_lanes == pytest.approx(1 - inside_m / score.driven_m, abs=0.02)
-    assert begun(scene_with(FAR)).standing().outside_lanes == 0.0
+    assert begun(scene_with(FAR)).progress().outside_lanes == 0.0
 
 
 @pytest.mark.parametrize("start_s", [0.2, END_S, 99.0])
@@ -204,7 +204,7 @@ def test_who_brakes_in_time_is_not_hit_by_what_stands() -> None:
     graph = scene_with(actor(-50.0, 0.0))
     drive = LoggedDrive(vehicle(), torch.eye(4))
     simulator = begun(graph, (send_threat(Threat.STATIONARY, graph, drive, 1.0),))
-    braked = driven(simulator, Straight(0.0))
+    braked = driven(simulator, StraightAgent(0.0))
     assert braked.score.infractions == ()
     assert threat_score(None, 8.0) == 5.0
 

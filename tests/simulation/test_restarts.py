@@ -10,8 +10,8 @@ from foredrive.data.batches import stack_records
 from foredrive.scene import Clip, Command, LidarSweep
 from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.restarts import Restarting, is_free_ahead
-from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.restarts import RestartingAgent, is_free_ahead
+from foredrive.simulation.simple_agents import StraightAgent
 
 
 def sweep(*points: tuple[float, float, float]) -> LidarSweep:
@@ -46,7 +46,7 @@ class Clock:
         return self.t_s
 
 
-def creeps(agent: Restarting, clock: Clock, t_s: float, speed_mps: float, lidar: LidarSweep) -> bool:
+def creeps(agent: RestartingAgent, clock: Clock, t_s: float, speed_mps: float, lidar: LidarSweep) -> bool:
     clock.t_s = t_s
     return float(agent.act(seen(speed_mps, lidar)).xy[0, 0, -1, 0]) > 5.0
 
@@ -76,7 +76,7 @@ def test_without_lidar_nobody_knows() -> None:
 
 def test_who_has_not_moved_yet_sets_off_soon_and_who_stopped_later_waits_long() -> None:
     clock = Clock()
-    agent, free = Restarting(Straight(0.0), clock), sweep()
+    agent, free = RestartingAgent(StraightAgent(0.0), clock), sweep()
     assert [creeps(agent, clock, t, 0.0, free) for t in (0.0, 0.5, 1.0, 1.5)] == [False, False, True, True]
     assert creeps(agent, clock, 2.0, 2.0, free)  # still
     assert not creeps(agent, clock, 3.5, 2.0, free)
@@ -86,7 +86,7 @@ def test_who_has_not_moved_yet_sets_off_soon_and_who_stopped_later_waits_long() 
 
 def test_it_waits_behind_somebody_and_sets_off_once_he_is_gone() -> None:
     clock = Clock()
-    agent = Restarting(Straight(0.0), clock)
+    agent = RestartingAgent(StraightAgent(0.0), clock)
     blocked, free = sweep((6.0, 0.0, 1.0)), sweep()
     assert not any(creeps(agent, clock, 0.5 * k, 0.0, blocked) for k in range(12))
     assert any(creeps(agent, clock, 6.0 + 0.5 * k, 0.0, free) for k in range(4))
@@ -94,7 +94,7 @@ def test_it_waits_behind_somebody_and_sets_off_once_he_is_gone() -> None:
 
 def test_who_drives_is_left_alone() -> None:
     clock = Clock()
-    agent = Restarting(Straight(5.0), clock)
+    agent = RestartingAgent(StraightAgent(5.0), clock)
     for k in range(60):
         clock.t_s = 0.5 * k
         plan = agent.act(seen(0.0, sweep()))

@@ -11,8 +11,8 @@ from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.lane_rules import RuleState
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
-from foredrive.simulation.route_progress import Progress, RouteLine
-from foredrive.simulation.town_lanes import LaneRules, stop_lines
+from foredrive.simulation.route_progress import RouteLine, RouteProgress
+from foredrive.simulation.town_lanes import TownLaneRules, stop_lines
 from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 
@@ -75,12 +75,12 @@ def town07() -> TownMap:
 
 
 @pytest.fixture(scope="module")
-def rules(town07: TownMap) -> LaneRules:
-    return LaneRules(town07, Traffic(town07, 1, 1, 0))
+def rules(town07: TownMap) -> TownLaneRules:
+    return TownLaneRules(town07, Traffic(town07, 1, 1, 0))
 
 
 def towards(
-    rules: LaneRules,
+    rules: TownLaneRules,
     town: TownMap,
     is_sign: bool,
     stations: list[tuple[float, float]],
@@ -121,7 +121,7 @@ def towards(
     ids=["through", "stops before", "stops on it", "green", "yellow", "back"],
 )
 def test_a_red_light_is_run_when_the_tail_crosses_the_line(
-    rules: LaneRules,
+    rules: TownLaneRules,
     town07: TownMap,
     light: LightState,
     stations: list[tuple[float, float]],
@@ -142,13 +142,13 @@ def test_a_red_light_is_run_when_the_tail_crosses_the_line(
     ids=["stops", "rolls", "stops far from it", "stops the first time only"],
 )
 def test_a_stop_sign_asks_for_a_stop_near_its_line(
-    rules: LaneRules, town07: TownMap, stations: list[tuple[float, float]], runs: bool
+    rules: TownLaneRules, town07: TownMap, stations: list[tuple[float, float]], runs: bool
 ) -> None:
     events = towards(rules, town07, True, stations, LightState.NONE)
     assert [event.kind for event in events] == (["stop_sign"] if runs else [])
 
 
-def test_the_way_outside_of_lanes_and_against_them_is_counted(town07: TownMap, rules: LaneRules) -> None:
+def test_the_way_outside_of_lanes_and_against_them_is_counted(town07: TownMap, rules: TownLaneRules) -> None:
     graph = Traffic(town07, 1, 1, 0).lanes
     lane = int(np.argmax(np.where(graph.junction < 0, graph.length_m, 0.0)))
     here, ahead = graph.position(np.array([lane, lane]), np.array([30.0, 30.5]))
@@ -180,13 +180,13 @@ def test_progress_counts_along_the_route_and_never_back() -> None:
     corner = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [100.0, 100.0, 0.0]])
     route = RouteLine(corner)
     assert route.length_m == pytest.approx(200.0)
-    progress = Progress()
+    progress = RouteProgress()
     for x in np.arange(0.0, 99.0, 3.0):
         progress = route.advance(progress, np.array([x, 2.0]), 10.0, 1.0)
     assert progress.done_m == pytest.approx(96.0, abs=0.6)
     assert progress.beside_m == pytest.approx(2.0, abs=0.3)
     assert route.command(progress) == Command.LEFT
-    assert route.command(Progress(done_m=20.0)) == Command.STRAIGHT
+    assert route.command(RouteProgress(done_m=20.0)) == Command.STRAIGHT
     back = route.advance(progress, np.array([93.0, 0.0]), 10.0, 2.0)
     assert back.done_m == progress.done_m
     assert route.end_of(progress, 2.0, np.inf) is None

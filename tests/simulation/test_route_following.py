@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from foredrive.scene import BicycleState, Trajectory
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S, step
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_sets import load_route_set
@@ -34,7 +34,7 @@ def test_a_route_is_driven_to_its_end_on_its_line(name: str, id: str) -> None:
     xy = route.xyz[:, :2]
     heading = math.atan2(*(xy[4] - xy[0])[::-1])
     state = BicycleState(float(xy[0, 0]), float(xy[0, 1]), heading, SPEED_MPS)
-    following, near, off_m = Following(), 0, [0.0]
+    controller, near, off_m = ControllerState(), 0, [0.0]
     for index in range(round(1.2 * route.length_m / SPEED_MPS / STEP_S)):
         if near >= len(xy) - 2:
             break
@@ -45,8 +45,8 @@ def test_a_route_is_driven_to_its_end_on_its_line(name: str, id: str) -> None:
         off_m.append(abs(along[0] * aside[1] - along[1] * aside[0]) / np.hypot(*along))
         if index % 10 == 0:
             plan = fixed_in_world(ahead(route, float(route.arc_m[near]), state), state, index * STEP_S)
-            following = following.expecting(plan, index * STEP_S + (LATENCY_S if index else 0.0))
-        control, following = follow(following, state, index * STEP_S)
+            controller = controller.expecting(plan, index * STEP_S + (LATENCY_S if index else 0.0))
+        control, controller = follow(controller, state, index * STEP_S)
         state = step(state, control)
     assert near >= len(xy) - 2
     assert max(off_m) < 0.25

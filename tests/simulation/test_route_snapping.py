@@ -18,7 +18,7 @@ from foredrive.simulation.route_sets import (
     write_shipped,
 )
 from foredrive.simulation.routes import DriveRoute, RouteOption, route_line, snap_route
-from foredrive.simulation.training_routes import KINDS
+from foredrive.simulation.training_routes import ROUTE_SETS
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
@@ -84,7 +84,7 @@ def test_a_file_that_is_not_there_and_a_set_that_is_unknown_are_named(tmp_path: 
 
 def test_the_sets_that_come_along_have_the_published_sizes() -> None:
     carlas = {"town05-short", "town05-short-10", "town05-long", "longest6"}
-    assert set(route_set_names()) == carlas | KINDS.keys()
+    assert set(route_set_names()) == carlas | ROUTE_SETS.keys()
     short, long, longest = (load_route_set(name) for name in ("town05-short", "town05-long", "longest6"))
     assert (len(short), len(long), len(longest)) == (32, 10, 36)
     assert {route.town for route in [*short, *long]} == {"Town05"}
@@ -96,14 +96,14 @@ def test_the_sets_that_come_along_have_the_published_sizes() -> None:
     assert (min(chords), max(chords)) == (pytest.approx(531, abs=1), pytest.approx(2101, abs=1))
 
 
-@pytest.mark.parametrize("name", list(KINDS))
+@pytest.mark.parametrize("name", list(ROUTE_SETS))
 def test_the_training_towns_have_routes_of_their_own(name: str) -> None:
-    kind, routes = KINDS[name], load_route_set(name)
+    spec, routes = ROUTE_SETS[name], load_route_set(name)
     towns = [town for town in TOWNS if town not in TEST_TOWNS]
-    assert Counter(route.town for route in routes) == dict.fromkeys(towns, kind.per_town)
+    assert Counter(route.town for route in routes) == dict.fromkeys(towns, spec.per_town)
     assert len({route.id for route in routes}) == len(routes)
     here = [snap_route(route) for route in routes if route.town == "Town02"]
-    assert all(kind.shortest_m <= route.length_m <= kind.longest_m for route in here)
+    assert all(spec.min_m <= route.length_m <= spec.max_m for route in here)
     assert max(route.aside_m for route in here) < 0.5
     met = set(np.concatenate([route.option for route in here]).tolist())
     assert {RouteOption.LEFT, RouteOption.RIGHT, RouteOption.STRAIGHT, RouteOption.FOLLOW} <= met

@@ -1,4 +1,4 @@
-"""What scenarios are made of: ways to a halt, meeting in time, who strays, who is given orders."""
+"""Parts of scenarios: stopping distances, timed arrivals, crossing actors, and orders to vehicles."""
 
 import dataclasses
 
@@ -7,11 +7,11 @@ import pytest
 
 from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.scenarios.acts import act
-from foredrive.simulation.scenarios.kinds import MEETINGS, Scenario, ScenarioKind, Way
+from foredrive.simulation.scenarios.context import ScenarioContext, ScenarioEgo, ScenarioProgress
+from foredrive.simulation.scenarios.crossing_actors import pace_among
 from foredrive.simulation.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
-from foredrive.simulation.scenarios.scene import Ego, Play, Scene
-from foredrive.simulation.scenarios.strays import pace_among
+from foredrive.simulation.scenarios.scenario import MEETINGS, Scenario, ScenarioKind, Way
+from foredrive.simulation.scenarios.vehicle_orders import give_orders
 from foredrive.simulation.time_to_collision import MovingBoxes
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.external_ego import EgoPose
@@ -81,7 +81,7 @@ def test_a_stray_waits_for_who_comes_and_steps_back_before_who_stands(
     others: MovingBoxes, pace: float
 ) -> None:
     """He is 1 m along his way, and with what he keeps free 0.65 m to each side along it."""
-    walker = stray([[0, 0, 0], [0, 8, 0]], s_m=1.0)
+    walker = crossing_actor([[0, 0, 0], [0, 8, 0]], s_m=1.0)
     assert pace_among(walker, 1.4, others) == pace
 
 
@@ -92,7 +92,7 @@ def scene_on(
     mps: float = 0.0,
     done_m: float = 0.0,
     ego_mps: float = 0.0,
-) -> Scene:
+) -> ScenarioContext:
     """Guests on the long lane, the first of which plays; they meet at 120 m of it, and 100 m of the route."""
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([12.0])))
@@ -100,9 +100,9 @@ def scene_on(
         state = add_vehicle(traffic, state, slot, (lane,), along_m, mps)
     scenario = Scenario(kind, 100.0, 13.9, ways=(Way((lane,), 120.0, 110.0),), ego_lane=lane)
     count = len(guests_m) if kind in MEETINGS else 1
-    play = Play(cast=tuple(traffic.scenario_slots[:count]))
-    ego = Ego(5.0, done_m, ego_mps, 0.0, traffic.poses(state).centre_m[0], 0.0)
-    return Scene(traffic, scenario, play, state, ego, Orders.none(len(state.vehicles.active)))
+    progress = ScenarioProgress(slots=tuple(traffic.scenario_slots[:count]))
+    ego = ScenarioEgo(5.0, done_m, ego_mps, 0.0, traffic.poses(state).centre_m[0], 0.0)
+    return ScenarioContext(traffic, scenario, progress, state, ego, Orders.none(len(state.vehicles.active)))
 
 
 @pytest.mark.parametrize("kind", [ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN])
@@ -111,12 +111,12 @@ def test_who_waits_for_the_ego_vehicle_does_not_hold_up_others_for_long(
     traffic: Traffic, kind: ScenarioKind, follower_m: float | None
 ) -> None:
     guests_m = (70.0,) if follower_m is None else (70.0, follower_m)
-    scene = scene_on(traffic, kind, guests_m)
+    context = scene_on(traffic, kind, guests_m)
     slot, goes = traffic.scenario_slots[0], []
     for _ in range(60):
-        scene.orders.max_mps2[:] = np.inf
-        scene = act(scene, DT_S)
-        goes.append(bool(scene.orders.max_mps2[slot] > 0.0))
+        context.orders.max_mps2[:] = np.inf
+        context = give_orders(context, DT_S)
+        goes.append(bool(context.orders.max_mps2[slot] > 0.0))
     if follower_m is None:
         assert not any(goes)
     else:
@@ -126,11 +126,11 @@ def test_who_waits_for_the_ego_vehicle_does_not_hold_up_others_for_long(
 
 def test_who_has_passed_is_not_waited_for(traffic: Traffic) -> None:
     kind, (first, second) = ScenarioKind.ONCOMING_TRAFFIC, traffic.scenario_slots
-    scene = act(scene_on(traffic, kind, (135.0, 100.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
-    assert scene.play.cast == (second,)
-    assert np.isinf(scene.orders.max_mps2[first])
-    scene = act(scene_on(traffic, kind, (136.0, 129.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
-    assert (scene.play.number, scene.play.begun) == (1, ())
+    context = give_orders(scene_on(traffic, kind, (135.0, 100.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
+    assert context.progress.slots == (second,)
+    assert np.isinf(context.orders.max_mps2[first])
+    context = give_orders(scene_on(traffic, kind, (136.0, 129.0), 8.0, done_m=70.0, ego_mps=8.0), DT_S)
+    assert (context.progress.number, context.progress.begun) == (1, ())
 
 
 @pytest.mark.parametrize(("along_m", "begins"), [(85.0, True), (100.0, False)])
@@ -140,26 +140,26 @@ def test_who_cuts_in_has_room_for_it_before_the_junction(
     """At 7 m/s a change takes 3.5 s and 24.5 m, and at 11 m/s somebody is so near as it takes."""
     on_route_m = along_m - 20.0
     done_m = on_route_m - 18.5
-    scene = scene_on(traffic, ScenarioKind.CUT_IN, (along_m,), 7.0, done_m, ego_mps=11.0)
-    scene = act(scene, DT_S)
-    assert bool(scene.play.begun) == begins
-    assert (scene.orders.change is not None) == begins
+    context = scene_on(traffic, ScenarioKind.CUT_IN, (along_m,), 7.0, done_m, ego_mps=11.0)
+    context = give_orders(context, DT_S)
+    assert bool(context.progress.begun) == begins
+    assert (context.orders.change is not None) == begins
 
 
 def test_who_is_over_the_line_does_not_brake_for_a_scenario(traffic: Traffic) -> None:
-    scene = scene_on(traffic, ScenarioKind.LEAD_BRAKES, (123.0,), 7.0, done_m=90.0, ego_mps=8.0)
-    scene = act(scene, DT_S)
-    assert (scene.play.number, scene.play.begun) == (1, ())
-    assert np.isinf(scene.orders.max_mps2).all()
+    context = scene_on(traffic, ScenarioKind.LEAD_BRAKES, (123.0,), 7.0, done_m=90.0, ego_mps=8.0)
+    context = give_orders(context, DT_S)
+    assert (context.progress.number, context.progress.begun) == (1, ())
+    assert np.isinf(context.orders.max_mps2).all()
 
 
-def stray(way: list[list[float]], **changes: float) -> ScriptedActor:
+def crossing_actor(way: list[list[float]], **changes: float) -> ScriptedActor:
     size = np.array([0.5, 0.6, 1.7])
     return ScriptedActor(40_000, Category.PEDESTRIAN, 0, size, np.array(way, dtype=float), **changes)
 
 
 def test_a_stray_follows_its_way_and_stands_at_its_end() -> None:
-    walker = stray([[0, 0, 1], [4, 0, 1], [4, 3, 1]])
+    walker = crossing_actor([[0, 0, 1], [4, 0, 1], [4, 3, 1]])
     assert walker.length_m == 7.0
     assert not walker.is_under_way
     walker = walker.moved(1.0, 0.1)  # 4 m/s²: .4 m/s after .1 s
@@ -270,14 +270,14 @@ def test_room_is_made_only_out_of_sight(traffic: Traffic) -> None:
     assert out_of_sight.vehicles.active[0]
 
 
-def test_drivers_stop_for_who_strays_into_their_lane(traffic: Traffic) -> None:
+def test_drivers_stop_for_actors_that_cross_their_lane(traffic: Traffic) -> None:
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
     slot = traffic.scenario_slots[0]
     state = add_vehicle(traffic, state, slot, (lane,), 40.0, 8.0)
     here, ahead = points_along(traffic.lanes, (lane,), np.array([75.0, 76.0]))
     left = np.array([-(ahead - here)[1], (ahead - here)[0], 0.0])
-    walker = stray([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
+    walker = crossing_actor([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
     state = dataclasses.replace(state, scripted_actors=(walker,))
     ego = ego_on(traffic, lane, 20.0)
     for _ in range(80):
@@ -285,16 +285,16 @@ def test_drivers_stop_for_who_strays_into_their_lane(traffic: Traffic) -> None:
     front_m = state.vehicles.s_m[slot] + 0.5 * state.vehicles.size_lwh[slot, 0]
     assert state.vehicles.speed_mps[slot] == pytest.approx(0.0, abs=0.1)
     assert 66.0 < front_m < 74.0
-    actor = next(actor for actor in traffic.actors(state) if actor.track_id == 40_000)
-    np.testing.assert_allclose(actor.centre_m, here + np.array([0.0, 0.0, 0.85]), atol=1e-6)
+    found = next(actor for actor in traffic.actors(state) if actor.track_id == 40_000)
+    np.testing.assert_allclose(found.centre_m, here + np.array([0.0, 0.0, 0.85]), atol=1e-6)
 
 
-def test_vehicle_0_stops_for_strays_as_well_while_it_drives_itself(traffic: Traffic) -> None:
+def test_vehicle_0_stops_for_crossing_actors_while_it_drives_itself(traffic: Traffic) -> None:
     lane = long_lane(traffic)
     state = traffic.start(ego_vehicle(traffic.lanes, np.array([lane]), np.array([20.0])))
     here, ahead = points_along(traffic.lanes, (lane,), np.array([75.0, 76.0]))
     left = np.array([-(ahead - here)[1], (ahead - here)[0], 0.0])
-    walker = stray([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
+    walker = crossing_actor([(here - 4.0 * left).tolist(), (here + 4.0 * left).tolist()], s_m=4.0)
     free = state
     state = dataclasses.replace(state, scripted_actors=(walker,))
     for _ in range(120):

@@ -10,9 +10,9 @@ from driver import SEED, Driver, drive, town_scenario
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.route_sets import RouteWaypoints, load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
-from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
 from foredrive.simulation.scenarios.kinematics import REACTION_S
 from foredrive.simulation.scenarios.places import possible_scenarios, scenarios_on
+from foredrive.simulation.scenarios.scenario import Scenario, ScenarioKind
 from foredrive.simulation.town import TownSimulator, grow
 from foredrive.simulation.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
@@ -65,9 +65,9 @@ def happens(simulator: TownSimulator, route: DriveRoute, scenario: Scenario, wha
     for attentive in (False, True):
         simulator.reset(town_scenario(route, (scenario,)))
         events, states = drive(simulator, Driver(route, scenario.limit_mps, attentive))
-        play = states[-1].play
-        assert [number for number, _ in play.begun] == [0]
-        actors = {str(stray.track_id) for stray in states[-1].decided.scripted_actors} or {"1", "2", "3"}
+        progress = states[-1].progress
+        assert [number for number, _ in progress.begun] == [0]
+        actors = {str(actor.track_id) for actor in states[-1].decided.scripted_actors} or {"1", "2", "3"}
         hits = [event for event in events if event.kind == f"collision_{what}"]
         assert len({hit.detail.split()[1] for hit in hits}) == len(hits)  # each is counted once
         if attentive:
@@ -77,7 +77,7 @@ def happens(simulator: TownSimulator, route: DriveRoute, scenario: Scenario, wha
             assert hits
             assert hits[0].detail.split()[1] in actors  # on an empty road there is nobody else
             assert hits[0].severity > 3.0
-            assert hits[0].t_s > play.begun[0][1] + REACTION_S
+            assert hits[0].t_s > progress.begun[0][1] + REACTION_S
 
 
 @pytest.mark.parametrize(
@@ -119,10 +119,10 @@ def test_a_scenario_is_over_and_the_vehicle_in_the_way_drives_on(
     route, scenario = places[ScenarioKind.OBSTACLE_BEHIND_CORNER]
     simulator.reset(town_scenario(route, (scenario,)))
     events, states = drive(simulator, Driver(route, scenario.limit_mps, attentive=True))
-    (slot,) = states[0].play.cast
+    (slot,) = states[0].progress.slots
     assert {float(state.decided.vehicles.speed_mps[slot]) for state in states[:100]} == {0.0}
     waited = [state.t_s for state in states if state.ego.speed_mps == 0.0 and state.t_s > 5.0]
-    over_s = next(state.t_s for state in states if state.play.number == 1)
+    over_s = next(state.t_s for state in states if state.progress.number == 1)
     assert over_s == pytest.approx(waited[0] + 3.0, abs=0.5)
     assert states[-1].decided.vehicles.speed_mps[slot] > 3.0
     assert [(event.kind, event.what) for event in events] == [("scenario", "obstacle_behind_corner")]
@@ -160,7 +160,7 @@ def test_a_drive_with_a_scenario_goes_on_bit_by_bit(
     _, again = drive(simulator, driver)
     assert len(again) == len(states) - states.index(middle)
     assert again[-1].ego == states[-1].ego
-    assert again[-1].play == states[-1].play
+    assert again[-1].progress == states[-1].progress
     for first, second in zip(
         states[-1].decided.scripted_actors, again[-1].decided.scripted_actors, strict=True
     ):
@@ -174,9 +174,9 @@ def test_an_actor_is_seen_as_everybody_is(
     route, scenario = places[ScenarioKind.CROSSING_PEDESTRIAN]
     clip = simulator.reset(town_scenario(route, (scenario,)))
     boxes = clip.boxes
-    (found,) = (boxes.track_id[-1] == scenario.stray.track_id).nonzero()[:, 0].tolist()
+    (found,) = (boxes.track_id[-1] == scenario.actor.track_id).nonzero()[:, 0].tolist()
     T = clip.T_world_ego[-1].numpy()
-    expected = np.linalg.inv(T) @ np.append(scenario.stray.xyz, 1.0)
+    expected = np.linalg.inv(T) @ np.append(scenario.actor.xyz, 1.0)
     np.testing.assert_allclose(boxes.centre[-1, found, :2], expected[:2], atol=1e-3)
     assert boxes.centre[-1, found, 2] == pytest.approx(expected[2] + 0.86, abs=0.01)
 
@@ -191,7 +191,7 @@ def test_equal_seeds_draw_equal_scenarios_with_room_between() -> None:
     assert len({scenario.kind for scenario in first}) >= 3
     assert np.diff(at_m).min() >= 80.0
     assert 28.0 <= at_m.min() < at_m.max() < route.length_m
-    numbers = [scenario.stray.track_id for scenario in first if scenario.stray is not None]
+    numbers = [scenario.actor.track_id for scenario in first if scenario.actor is not None]
     assert len(set(numbers)) == len(numbers)
 
 

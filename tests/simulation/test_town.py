@@ -12,7 +12,7 @@ from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.collisions import Contacts
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.road_users import RoadUsers
@@ -207,7 +207,7 @@ def test_the_plan_along_the_route_is_driven_to_its_end(
 ) -> None:
     """A controller follows waypoints on the route, 5 m/s, planned anew with every key frame."""
     clip = simulator.reset(dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:60], limit_s=60.0))
-    following, seen, events = Following(), None, []
+    controller, seen, events = ControllerState(), None, []
     for _ in range(1200):
         state = simulator.state
         if clip is not seen:
@@ -229,8 +229,8 @@ def test_the_plan_along_the_route_is_driven_to_its_end(
                 log_prob=torch.zeros(1),
                 dt_s=0.5,
             )
-            following = following.expecting(fixed_in_world(plan, state.ego, state.t_s), state.t_s)
-        control, following = follow(following, state.ego, state.t_s)
+            controller = controller.expecting(fixed_in_world(plan, state.ego, state.t_s), state.t_s)
+        control, controller = follow(controller, state.ego, state.t_s)
         step = simulator.step(control)
         clip, events = step.clip, [*events, *step.events]
         if step.done:

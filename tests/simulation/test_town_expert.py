@@ -16,7 +16,7 @@ from foredrive.simulation.town_expert import TownExpert, _is_free, _is_too_late,
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
-from foredrive.towns.traffic.lane_graph import Control
+from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle
 from foredrive.towns.traffic.traffic import Traffic
 
@@ -91,7 +91,7 @@ def test_nobody_sets_off_over_a_line_that_closes_before_he_is_over_it(
     late: bool,
 ) -> None:
     graph = traffic.lanes
-    lit = np.flatnonzero((graph.control == Control.LIGHT) & graph.contested)
+    lit = np.flatnonzero((graph.control == LaneControl.LIGHT) & graph.contested)
     befores = graph.predecessors[lit, 0]
     roomy = (befores >= 0) & ~graph.contested[befores] & (graph.length_m[befores] > 30.0)
     inside, before = int(lit[roomy][0]), int(befores[roomy][0])
@@ -122,7 +122,7 @@ def simulator() -> TownSimulator:
 def test_it_edges_along_the_route_until_somebody_is_near(
     simulator: TownSimulator, ahead_m: float | None, mps: float
 ) -> None:
-    traffic, now, (lane,) = simulator.traffic, simulator.foresight(), simulator.scenario.lanes
+    traffic, now, (lane,) = simulator.traffic, simulator.predict_now(), simulator.scenario.lanes
     slot = traffic.scenario_slots[0]
     if ahead_m is not None:
         there = add_vehicle(traffic, now.traffic, slot, (lane,), BEGIN_M + ahead_m, mps)

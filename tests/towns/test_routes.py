@@ -11,7 +11,7 @@ from foredrive.data.commands import LATERAL_M, route_offset_m
 from foredrive.scene import Command
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.fleet import find_start_points
-from foredrive.towns.traffic.lane_graph import Control, LaneGraph, build_lane_graph
+from foredrive.towns.traffic.lane_graph import LaneControl, LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import LIGHT_S, ROUTE_SPACING_M, Route, draw_route
 
 
@@ -86,7 +86,7 @@ def test_lights_and_curves_take_time(graph: LaneGraph) -> None:
     assert (np.diff(driven_m) >= 0).all()
     assert np.diff(driven_m).max() <= graph.limit_mps.max()
     to_light_m = graph.length_m[route.lanes[0]] - route.start_m
-    assert graph.control[route.lanes[1]] == Control.LIGHT
+    assert graph.control[route.lanes[1]] == LaneControl.LIGHT
     assert np.interp(to_light_m + 0.5, driven_m, np.arange(100)) > LIGHT_S + to_light_m / 14.0
 
 

@@ -10,7 +10,7 @@ import pytest
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.external_ego import EgoPose, find_lane, perceive_ego
 from foredrive.towns.traffic.fleet import ego_vehicle, place_vehicles
-from foredrive.towns.traffic.lane_graph import Control
+from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Vehicles, path_starts
@@ -127,7 +127,7 @@ def test_against_the_traffic_a_shadow_comes_towards_it(alone: Traffic) -> None:
 def before_a_light(traffic: Traffic) -> tuple[int, int]:
     """A lane that ends at a light, and the lane behind the line."""
     graph = traffic.lanes
-    for lane in np.flatnonzero((graph.control == Control.LIGHT) & (np.diff(graph.conflicts.first) > 0)):
+    for lane in np.flatnonzero((graph.control == LaneControl.LIGHT) & (np.diff(graph.conflicts.first) > 0)):
         before = int(graph.predecessors[lane, 0])
         if before >= 0 and not graph.contested[before] and graph.length_m[before] > 40:
             return before, int(lane)

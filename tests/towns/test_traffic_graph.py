@@ -5,7 +5,7 @@ import pytest
 
 from foredrive.scene import Command
 from foredrive.towns.map.town_map import Lane, MarkingKind, StopZone, StopZoneKind, TownMap
-from foredrive.towns.traffic.lane_graph import Control, LaneGraph, build_lane_graph, lanes_for
+from foredrive.towns.traffic.lane_graph import LaneControl, LaneGraph, build_lane_graph, lanes_for
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles, empty_slots, path_starts, vehicle_poses
 
@@ -84,8 +84,8 @@ def test_commands_and_guards(graph: LaneGraph) -> None:
     index = {name: i for i, name in enumerate(graph.ids)}
     assert graph.command(index["turn"]) is Command.LEFT
     assert graph.command(index["we_1"]) is Command.STRAIGHT
-    assert graph.control[index["sn_1"]] == Control.STOP
-    assert (np.delete(graph.control, index["sn_1"]) == Control.NONE).all()
+    assert graph.control[index["sn_1"]] == LaneControl.STOP
+    assert (np.delete(graph.control, index["sn_1"]) == LaneControl.NONE).all()
 
 
 def test_a_curve_is_driven_at_its_comfortable_speed(graph: LaneGraph) -> None:

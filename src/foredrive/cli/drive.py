@@ -12,7 +12,7 @@ from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
-    from foredrive.runs.drive.suite import DriveJob, Driven
+    from foredrive.runs.drive.suite import DriveJob, SuiteResult
     from foredrive.simulation.drive_record import DriveRecord
 
 FAILURES_SHOWN = 3
@@ -58,7 +58,7 @@ def drive(
     print(f"look: {write_drive_report(out)}")
 
 
-def _tell(driven: "Driven") -> None:
+def _tell(driven: "SuiteResult") -> None:
     """Print the scores.
 
     Raises:

@@ -17,7 +17,7 @@ from foredrive.towns.map.names import check_town
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from foredrive.runs.drive.recording import Recorded
+    from foredrive.runs.drive.recording import RecordingResult
     from foredrive.towns.campaign import DrivePlan
 
 SHEET = "contact_sheet.png"
@@ -98,7 +98,7 @@ def record(
     _tell(done, plans, out)
 
 
-def _tell(done: "Recorded", plans: "list[DrivePlan]", out: Path) -> None:
+def _tell(done: "RecordingResult", plans: "list[DrivePlan]", out: Path) -> None:
     """Print the recorded drives, write the contact sheet, and report the failed drives last.
 
     Raises:

@@ -208,16 +208,16 @@ class BicycleState:
     yaw_rad: float
     """In [-π, π]."""
     speed_mps: float
-    """Never negative: nobody reverses."""
+    """Never negative: vehicles do not reverse."""
     steering_rad: float = 0.0
     """Front-wheel angle, positive to the left."""
     acceleration_mps2: float = 0.0
-    """Of the speed, as engine and brakes have it now; 0 while the vehicle stands."""
+    """Derivative of the speed; 0 while the vehicle stands."""
 
 
 @dataclass(frozen=True)
-class Standing:
-    """How far a drive has come."""
+class DriveProgress:
+    """Progress of a drive."""
 
     completion: float
     """Share of the route, 0 to 1."""
@@ -235,15 +235,15 @@ class Simulator(Protocol):
         ...
 
     def step(self, control: Control) -> Step:
-        """Drive on for one simulation step; an event's kind tells why a drive is over."""
+        """Drive on for one simulation step. The `kind` of an event gives the reason why a drive ended."""
         ...
 
     def ego(self) -> BicycleState:
-        """The ego vehicle now."""
+        """Return the current state of the ego vehicle."""
         ...
 
-    def standing(self) -> Standing:
-        """How far the drive has come."""
+    def progress(self) -> DriveProgress:
+        """Return the progress of the drive."""
         ...
 
 

@@ -33,14 +33,14 @@ NO_PLAN_MPS2 = 3.0
 
 
 @dataclass(frozen=True)
-class Following:
+class ControllerState:
     """State of the controller: the plan it follows, and the plans that are still being computed."""
 
     plan: Plan | None = None
     coming: tuple[tuple[float, Plan], ...] = ()
     """Time at which each plan becomes available, s, and the plan. Sorted by time."""
 
-    def expecting(self, plan: Plan, ready_s: float) -> "Following":
+    def expecting(self, plan: Plan, ready_s: float) -> "ControllerState":
         """Return the state with one more plan.
 
         The plan becomes available at `ready_s` because of the agent's latency.
@@ -48,7 +48,7 @@ class Following:
         coming = sorted([*self.coming, (ready_s, plan)], key=lambda item: item[0])
         return dataclasses.replace(self, coming=tuple(coming))
 
-    def at(self, t_s: float) -> "Following":
+    def at(self, t_s: float) -> "ControllerState":
         """Return the state with the newest plan that is available at `t_s`."""
         ready = [plan for ready_s, plan in self.coming if ready_s <= t_s + 1e-9]
         if not ready:
@@ -56,17 +56,17 @@ class Following:
         newest = max(ready, key=lambda plan: plan.made_s)
         if self.plan is not None and self.plan.made_s > newest.made_s:
             newest = self.plan
-        return Following(newest, self.coming[len(ready) :])
+        return ControllerState(newest, self.coming[len(ready) :])
 
 
 def follow(
-    following: Following, state: BicycleState, t_s: float, vehicle: Vehicle = EGO
-) -> tuple[Control, Following]:
+    controller: ControllerState, state: BicycleState, t_s: float, vehicle: Vehicle = EGO
+) -> tuple[Control, ControllerState]:
     """Return the control for the step that begins now, and the updated state of the controller."""
-    following = following.at(t_s)
-    if following.plan is None:
-        return Control(-NO_PLAN_MPS2, state.steering_rad), following
-    return _track(following.plan, state, t_s - following.plan.made_s, vehicle), following
+    controller = controller.at(t_s)
+    if controller.plan is None:
+        return Control(-NO_PLAN_MPS2, state.steering_rad), controller
+    return _track(controller.plan, state, t_s - controller.plan.made_s, vehicle), controller
 
 
 def _track(plan: Plan, state: BicycleState, after_s: float, vehicle: Vehicle) -> Control:

@@ -11,7 +11,7 @@ from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator
 from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.plans import Plan, fixed_in_world
@@ -20,7 +20,7 @@ from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collisio
 
 
 @dataclass(frozen=True)
-class Pace:
+class PlanningTiming:
     """Planning period and latency of an agent, in simulation time (not the computer's time).
 
     Raises:
@@ -69,7 +69,7 @@ def drive_route(
     *,
     route: str,
     repetition: int = 0,
-    pace: Pace | None = None,
+    pace: PlanningTiming | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Drive:
     """Drive until the route ends.
@@ -85,11 +85,11 @@ def drive_route(
     Raises:
         InputError: the simulator cannot start the scenario.
     """
-    pace = pace or Pace()
+    pace = pace or PlanningTiming()
     clip = simulator.reset(scenario)
     on_frame()
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
-    following, ending, error = Following(), None, ""
+    controller, ending, error = ControllerState(), None, ""
     while ending is None:
         index = len(states) - 1
         if index % pace.steps == 0:
@@ -100,8 +100,8 @@ def drive_route(
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
             act_s.append(time.perf_counter() - began)
-            following = following.expecting(plan, index * STEP_S + pace.latency_s)
-        control, following = follow(following, states[-1], index * STEP_S)
+            controller = controller.expecting(plan, index * STEP_S + pace.latency_s)
+        control, controller = follow(controller, states[-1], index * STEP_S)
         step = simulator.step(control)
         states.append(simulator.ego())
         events += step.events
@@ -110,15 +110,15 @@ def drive_route(
             nearest.append(_nearest_s(clip))
             on_frame()
         ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
-    standing = simulator.standing()
+    progress = simulator.progress()
     score = RouteScore(
         route=route,
         repetition=repetition,
-        completion=standing.completion,
-        outside_lanes=standing.outside_lanes,
+        completion=progress.completion,
+        outside_lanes=progress.outside_lanes,
         ending=ending,
         infractions=tuple(found for event in events if (found := infraction_of(event)) is not None),
-        driven_m=standing.driven_m,
+        driven_m=progress.driven_m,
         duration_s=(len(states) - 1) * STEP_S,
     )
     comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None

@@ -19,7 +19,7 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Track:
+class DrivenTrack:
     """Track that was driven, sampled at S times."""
 
     t_s: tuple[float, ...]
@@ -29,7 +29,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class ThreatMet:
+class ThreatResult:
     """Result of a drive through a threat."""
 
     kind: Threat
@@ -61,11 +61,11 @@ class DriveRecord:
     act_s: tuple[float, ...]
     """Wall-clock time of each plan, s."""
     route_xy: tuple[Point, ...]
-    track: Track
+    track: DrivenTrack
     wall_s: float
     log: str
     """Path of the drive's log inside the suite's folder."""
-    threat: ThreatMet | None = None
+    threat: ThreatResult | None = None
     lanes_known: bool = True
     """False if departures from the lanes cannot be detected."""
 
@@ -83,7 +83,7 @@ def record_of(
     town: str | None,
     log: str,
     wall_s: float,
-    threat: ThreatMet | None = None,
+    threat: ThreatResult | None = None,
     lanes_known: bool = True,
 ) -> DriveRecord:
     """Build the record of a drive. The arguments are fields of `DriveRecord`."""
@@ -100,7 +100,7 @@ def record_of(
         nearest_s=tuple(seconds if np.isfinite(seconds) else None for seconds in drive.nearest_s),
         act_s=drive.act_s,
         route_xy=tuple((x, y) for x, y in route_xyz[:, :2].round(2).tolist()),
-        track=Track(
+        track=DrivenTrack(
             t_s=tuple(round(STEP_S * TRACK_EVERY * k, 2) for k in range(len(states))),
             xy=tuple((round(s.x_m, 2), round(s.y_m, 2)) for s in states),
             yaw_rad=tuple(round(s.yaw_rad, 4) for s in states),

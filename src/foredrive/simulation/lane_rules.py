@@ -34,7 +34,7 @@ LEAST_LEFT_M = 0.5
 """A shorter distance outside of the lanes, m, gives no event, but still counts in the score."""
 
 
-class Lines(NamedTuple):
+class StopLines(NamedTuple):
     """Stop lines of K lanes. A line lies where the lane behind it begins."""
 
     zone: Int[np.ndarray, "K"]
@@ -67,7 +67,7 @@ class RuleState:
 
 
 def lines_run(
-    lines: Lines,
+    lines: StopLines,
     before: BicycleState,
     after: BicycleState,
     z_m: float,
@@ -141,16 +141,16 @@ def body_middle(state: BicycleState) -> Float64[np.ndarray, "2"]:
     return _point(state, EGO.axle_to_centre_m)
 
 
-def _near_lines(lines: Lines, xyz: Float64[np.ndarray, "3"]) -> Lines | None:
+def _near_lines(lines: StopLines, xyz: Float64[np.ndarray, "3"]) -> StopLines | None:
     """Return the lines near a vehicle whose middle is at `xyz`. None if there are none."""
     offset = np.abs(lines.xyz - xyz)
     near = np.flatnonzero((offset[:, 0] < LINES_WITHIN_M) & (offset[:, 1] < LINES_WITHIN_M))
     near = near[offset[near, 2] < LEVEL_M]
-    return Lines(*(column[near] for column in lines)) if len(near) else None
+    return StopLines(*(column[near] for column in lines)) if len(near) else None
 
 
 def _beside(
-    lines: Lines, xy: Float64[np.ndarray, "2"]
+    lines: StopLines, xy: Float64[np.ndarray, "2"]
 ) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K"]]:
     """Return how far a point lies beyond each line, m, and how far beside the middle of its lane, m."""
     dx, dy = (xy - lines.xyz[:, :2]).T
@@ -159,7 +159,7 @@ def _beside(
 
 
 def _crossed(
-    lines: Lines, before: BicycleState, after: BicycleState, ahead_m: float
+    lines: StopLines, before: BicycleState, after: BicycleState, ahead_m: float
 ) -> Bool[np.ndarray, "K"]:
     """Return which lines a point of the vehicle has crossed in the direction of travel."""
     first, _ = _beside(lines, _point(before, ahead_m))

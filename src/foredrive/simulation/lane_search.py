@@ -30,7 +30,7 @@ LEAST_ROOM_M = 1.0
 """Lane changes need at least this much room, m."""
 
 
-class Place(NamedTuple):
+class LanePoint(NamedTuple):
     """A point on the lane graph."""
 
     lane: int
@@ -66,7 +66,7 @@ class _Part(enum.IntEnum):
 _Node = tuple[int, _Part]
 
 
-def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
+def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[LanePoint]:
     """Return the places on the graph that a waypoint may mean: on the nearest lane and others nearby."""
     distance = np.linalg.norm(graph.xyz - xyz, axis=1)
     nearest = np.minimum.reduceat(distance, graph.first)
@@ -80,7 +80,7 @@ def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[Place]:
         part = np.clip(part, 0.0, 1.0)
         off = np.linalg.norm(start + part[:, None] * along - xyz, axis=1)
         k = int(np.argmin(off))
-        places.append(Place(lane, float((k + part[k]) * graph.step_m[lane]), float(off[k])))
+        places.append(LanePoint(lane, float((k + part[k]) * graph.step_m[lane]), float(off[k])))
     least = min(place.aside_m for place in places)
     return [place for place in places if place.aside_m <= _also(least)]
 
@@ -90,7 +90,7 @@ def _also(nearest_m: float) -> float:
     return min(ALSO_NEAR * nearest_m, nearest_m + NO_FURTHER_M) + ALSO_NEAR_M
 
 
-def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[list[Leg], list[Place]]:
+def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[list[Leg], list[LanePoint]]:
     """Find the shortest way through all waypoints in order, and the place of each waypoint on it.
 
     Among the places that each waypoint may mean, the search takes those that make the whole way shortest, as
@@ -122,7 +122,7 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
 
 
 def _best_onto(
-    graph: LaneGraph, starts: Sequence[Place], costs: Sequence[float], end: Place, most: float
+    graph: LaneGraph, starts: Sequence[LanePoint], costs: Sequence[float], end: LanePoint, most: float
 ) -> tuple[float, int, list[Leg]]:
     """Find the cheapest way to `end` from one of several start places with known costs.
 
@@ -150,7 +150,7 @@ def joined(first: Sequence[Leg], second: Sequence[Leg]) -> list[Leg]:
     return [*first[:-1], middle, *second[1:]]
 
 
-def _shortest(graph: LaneGraph, start: Place, end: Place, most_m: float) -> tuple[float, list[Leg]]:
+def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, most_m: float) -> tuple[float, list[Leg]]:
     """Find the cheapest way from one place to another (Dijkstra 1959).
 
     Returns its cost and its legs. The cost is infinite if no way costs less than `most_m`. A node of the
@@ -187,7 +187,7 @@ def _shortest(graph: LaneGraph, start: Place, end: Place, most_m: float) -> tupl
     return (np.inf, []) if legs is None else (so_far + end.s_m, legs)
 
 
-def _steps(graph: LaneGraph, node: _Node, start: Place, end: Place) -> Iterator[tuple[_Node, float]]:
+def _steps(graph: LaneGraph, node: _Node, start: LanePoint, end: LanePoint) -> Iterator[tuple[_Node, float]]:
     """Yield the nodes that can be reached from a node, and the cost of each step."""
     lane, part = node
     length_m = float(graph.length_m[lane])
@@ -215,7 +215,7 @@ def _beside(graph: LaneGraph, first: int, last: int) -> list[int]:
     return [first]
 
 
-def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[Leg] | None:
+def _legs(graph: LaneGraph, start: LanePoint, end: LanePoint, lanes: list[int]) -> list[Leg] | None:
     """Return the legs along lanes that follow each other or lie side by side.
 
     Returns None if they do not lead to the end. Lane changes are spread evenly over the part of the road that
@@ -249,7 +249,7 @@ def _legs(graph: LaneGraph, start: Place, end: Place, lanes: list[int]) -> list[
     return legs
 
 
-def _opposite(graph: LaneGraph, end: Place, lanes: list[int]) -> float:
+def _opposite(graph: LaneGraph, end: LanePoint, lanes: list[int]) -> float:
     """Return the arc length on the first of several lanes side by side, next to the end on the last."""
     at_m = end.s_m
     for lane, before in itertools.pairwise(reversed(lanes)):

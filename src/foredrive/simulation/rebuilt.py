@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
 from foredrive.rendering.tracks import ActorTracks, boxes_at
-from foredrive.scene import BicycleState, Clip, Control, Event, Renderer, Standing, Step
+from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Event, Renderer, Step
 from foredrive.scene.actors import BOX_RANGE_M
 from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
 from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
@@ -18,7 +18,7 @@ from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, make_clip, no_images
 from foredrive.simulation.replayed import comes_from_behind, users_at
-from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.route_progress import RouteLine, RouteProgress
 
 REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
@@ -48,7 +48,7 @@ class RebuiltState:
     ego: BicycleState
     frames: tuple[KeyFrame, ...]
     contacts: Contacts = field(default_factory=Contacts)
-    progress: Progress = field(default_factory=Progress)
+    progress: RouteProgress = field(default_factory=RouteProgress)
     driven_m: float = 0.0
     outside_m: float = 0.0
     """Part of `driven_m` outside of all lanes, m."""
@@ -129,12 +129,12 @@ class RebuiltSimulator:
         """Return the current state of the ego vehicle."""
         return self.state.ego
 
-    def standing(self) -> Standing:
+    def progress(self) -> DriveProgress:
         """Return the progress of the drive. Without lanes the distance outside of them is 0."""
         state = self.state
         completion = min(1.0, state.progress.done_m / self._route.length_m)
         outside = state.outside_m / state.driven_m if state.driven_m > 0 else 0.0
-        return Standing(completion, outside, state.driven_m)
+        return DriveProgress(completion, outside, state.driven_m)
 
     @property
     def scenario(self) -> RebuiltScenario:
@@ -178,7 +178,7 @@ class RebuiltSimulator:
             ended=ended,
         ), events
 
-    def _end_of(self, progress: Progress, t_s: float) -> str | None:
+    def _end_of(self, progress: RouteProgress, t_s: float) -> str | None:
         """Return the reason why the drive is over, or None.
 
         A drive also ends when it leaves the part of space or time that the log covers.

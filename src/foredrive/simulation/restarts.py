@@ -24,7 +24,7 @@ FREE_M, FREE_HALF_WIDTH_M, FREE_HEIGHT_M = 6.0, 1.3, (0.3, 2.2)
 """Box ahead of the bumper that must contain no lidar return."""
 
 
-class Restarting:
+class RestartingAgent:
     """An `Agent` that wraps another agent and creeps forward if that has stood for long and the way is free.
 
     Args:

@@ -24,7 +24,7 @@ BLOCKED_S, BLOCKED_MPS = 180.0, 0.1
 
 
 @dataclass(frozen=True)
-class Progress:
+class RouteProgress:
     """Progress along one route."""
 
     done_m: float = 0.0
@@ -63,8 +63,8 @@ class RouteLine:
         self._xy = np.stack([np.interp(self._arc_m, arc_m, xyz[:, axis]) for axis in (0, 1)], axis=1)
 
     def advance(
-        self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
-    ) -> Progress:
+        self, progress: RouteProgress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
+    ) -> RouteProgress:
         """Return the progress of a vehicle that is now at `xy`. Progress never decreases."""
         first, last = np.searchsorted(self._arc_m, [progress.done_m - BACK_M, progress.done_m + AHEAD_M])
         part = slice(int(first), int(last) + 1)
@@ -79,7 +79,7 @@ class RouteLine:
             moved_s=t_s if speed_mps >= BLOCKED_MPS else progress.moved_s,
         )
 
-    def end_of(self, progress: Progress, t_s: float, limit_s: float) -> str | None:
+    def end_of(self, progress: RouteProgress, t_s: float, limit_s: float) -> str | None:
         """Return why a drive is over: "completed", "deviation", "blocked" or "timeout". None if it is not."""
         if progress.done_m >= self.length_m:
             return "completed"
@@ -89,12 +89,12 @@ class RouteLine:
             return "blocked"
         return "timeout" if t_s >= limit_s else None
 
-    def command(self, progress: Progress) -> Command:
+    def command(self, progress: RouteProgress) -> Command:
         """Return the next command of the route, computed as for recorded logs."""
         return command_of(route_offset_m(self._arc_m, self._xy, progress.done_m))
 
     def target_xy(
-        self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
+        self, progress: RouteProgress, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> Float64[np.ndarray, "2"]:
         """Return the target point on the route in the ego frame, m, computed as for recorded logs."""
         return route_target(self._arc_m, self._xy, progress.done_m, T_world_ego)

@@ -14,7 +14,7 @@ from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
 
 @dataclass(frozen=True)
-class Straight:
+class StraightAgent:
     """Agent that drives straight on at a constant speed. At speed 0 it stands still.
 
     Drives begin at rest, so the constant-velocity baseline of open-loop evaluation would never move.
@@ -30,7 +30,7 @@ class Straight:
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class ReplayAgent:
     """Agent that replays the logged drive from wherever it is. At the end of the log it stands still."""
 
     drive: LoggedDrive

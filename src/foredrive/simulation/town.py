@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.errors import InputError
-from foredrive.scene import BicycleState, Clip, Control, Event, Standing, Step
+from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Event, Step
 from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.collisions import CollisionSense, Contacts
@@ -17,12 +17,12 @@ from foredrive.simulation.dynamics import EGO, STEP_S, step, yaw_rate_radps
 from foredrive.simulation.lane_rules import RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users
-from foredrive.simulation.route_progress import Progress, RouteLine, first_step
+from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
 from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
-from foredrive.simulation.scenarios.kinds import Scenario
-from foredrive.simulation.scenarios.play import Director
-from foredrive.simulation.scenarios.scene import Ego, Play
-from foredrive.simulation.town_lanes import LaneRules
+from foredrive.simulation.scenarios.context import ScenarioEgo, ScenarioProgress
+from foredrive.simulation.scenarios.director import Director
+from foredrive.simulation.scenarios.scenario import Scenario
+from foredrive.simulation.town_lanes import TownLaneRules
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.external_ego import EgoPose, find_lane
@@ -35,7 +35,7 @@ TRAFFIC_STEPS = 2
 """The traffic decides at 10 Hz, as in recordings. Between decisions its road users move in a straight
 line."""
 DECISION_S = TRAFFIC_STEPS * STEP_S
-GUESTS = 6
+SCENARIO_SLOTS = 6
 """Maximum number of scenario vehicles on the road at one time."""
 
 
@@ -64,12 +64,12 @@ class TownState:
     """Traffic at its last decision."""
     decided: TrafficState
     """Traffic one decision later: the state towards which the road users move."""
-    play: Play
+    scenarios: ScenarioProgress
     """State of the scenarios at that decision."""
     frames: tuple[KeyFrame, ...]
     contacts: Contacts = field(default_factory=Contacts)
     rules: RuleState = field(default_factory=RuleState)
-    progress: Progress = field(default_factory=Progress)
+    progress: RouteProgress = field(default_factory=RouteProgress)
     ended: str | None = None
     """Reason why the drive is over. None while it goes on."""
 
@@ -80,13 +80,13 @@ class TownState:
 
 
 @dataclass(frozen=True, eq=False)
-class Foresight:
+class PredictedState:
     """Predicted state in which the traffic's own rules drive the ego vehicle, which is vehicle 0 here."""
 
     t_s: float
     traffic: TrafficState
-    play: Play
-    progress: Progress
+    scenarios: ScenarioProgress
+    progress: RouteProgress
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,18 +121,18 @@ class TownSimulator:
             raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
         row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))
         lanes = np.array(scenario.lanes, dtype=np.int64) if scenario.lanes else None
-        play, traffic = self._director.set_up(
-            self._traffic.start(row, lanes), self._seen(ego, Progress(), z_m, 0.0), DECISION_S
+        scenarios, traffic = self._director.set_up(
+            self._traffic.start(row, lanes), self._seen(ego, RouteProgress(), z_m, 0.0), DECISION_S
         )
         before = max(round(SETTLE_S / DECISION_S), scenario.past_frames * FRAME_STEPS // TRAFFIC_STEPS)
         frames: tuple[KeyFrame, ...] = ()
         for number in range(-before, 1):
-            state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, play, frames)
+            state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, scenarios, frames)
             if number * TRAFFIC_STEPS % FRAME_STEPS == 0:
                 frames = self._with_frame(state)
             if number < 0:
-                play, traffic = self._decide(state)
-        self._adopt(TownState(0, ego, z_m, traffic, traffic, play, frames))
+                scenarios, traffic = self._decide(state)
+        self._adopt(TownState(0, ego, z_m, traffic, traffic, scenarios, frames))
         return self._clip
 
     def step(self, control: Control) -> Step:
@@ -146,10 +146,10 @@ class TownSimulator:
             raise InputError(f"the drive is over ({state.ended}): reset the simulator")
         moved = step(state.ego, control)
         if state.step_index % TRAFFIC_STEPS == 0:
-            play, decided = self._decide(state)
-            state = dataclasses.replace(state, traffic=state.decided, decided=decided, play=play)
+            scenarios, decided = self._decide(state)
+            state = dataclasses.replace(state, traffic=state.decided, decided=decided, scenarios=scenarios)
             self._users = self._users[1], road_users(self._traffic, decided)
-        begun = state.play.begun[len(self.state.play.begun) :]
+        begun = state.scenarios.begun[len(self.state.scenarios.begun) :]
         state, events = self._drive(state, moved)
         events = [*(self._begin_of(number) for number, _ in begun), *events]
         if state.step_index % FRAME_STEPS == 0:
@@ -176,33 +176,33 @@ class TownSimulator:
         """Return the traffic, with the rules that its road users follow."""
         return self._traffic
 
-    def foresight(self) -> Foresight:
+    def predict_now(self) -> PredictedState:
         """Return the prediction for now if the traffic decides now, else for its next decision."""
         state = self.state
         traffic = self._traffic.with_own_driver(state.decided, self.driven)
-        return Foresight(state.t_s, traffic, state.play, state.progress)
+        return PredictedState(state.t_s, traffic, state.scenarios, state.progress)
 
-    def foreseen(self, now: Foresight) -> Foresight:
+    def predict_next(self, now: PredictedState) -> PredictedState:
         """Return the prediction `DECISION_S` later."""
         v, poses, route = now.traffic.vehicles, self._traffic.poses(now.traffic), self._route
         xyz, speed, t_s = poses.axle_xyz[0], float(v.speed_mps[0]), now.t_s
         progress = route.advance(now.progress, xyz[:2], speed, t_s)
         motion = speed, float(v.acceleration_mps2[0])
-        ego = Ego(t_s, progress.done_m, *motion, poses.centre_m[0], float(poses.yaw[0]))
-        play, traffic, orders = self._director.direct(now.play, now.traffic, ego, DECISION_S)
+        ego = ScenarioEgo(t_s, progress.done_m, *motion, poses.centre_m[0], float(poses.yaw[0]))
+        scenarios, traffic, orders = self._director.direct(now.scenarios, now.traffic, ego, DECISION_S)
         after = self._traffic.step(traffic, DECISION_S, orders=orders)
-        return Foresight(t_s + DECISION_S, after, play, progress)
+        return PredictedState(t_s + DECISION_S, after, scenarios, progress)
 
     @property
     def driven(self) -> EgoPose:
         """Return the current ego vehicle as the traffic sees it."""
         return self._driven(self.state.ego, self.state.z_m)
 
-    def standing(self) -> Standing:
+    def progress(self) -> DriveProgress:
         """Return the progress of the drive."""
         rules = self.state.rules
         completion = min(1.0, self.state.progress.done_m / self._route.length_m)
-        return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
+        return DriveProgress(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def save(self) -> SavedDrive:
         """Return the drive in its current state, as an immutable value that can be pickled."""
@@ -221,7 +221,7 @@ class TownSimulator:
         if scenario.conditions is not None:
             self._world = self._world.under(scenario.conditions)
         self._collisions = CollisionSense(self._world)
-        self._rules = LaneRules(load_town_map(scenario.town), self._traffic)
+        self._rules = TownLaneRules(load_town_map(scenario.town), self._traffic)
         self._route = RouteLine(scenario.route_xyz)
         self._director = Director(self._traffic, scenario.scenarios)
 
@@ -229,18 +229,18 @@ class TownSimulator:
         self.state, self._clip = state, self._make_clip(state)
         self._users = road_users(self._traffic, state.traffic), road_users(self._traffic, state.decided)
 
-    def _decide(self, state: TownState) -> tuple[Play, TrafficState]:
+    def _decide(self, state: TownState) -> tuple[ScenarioProgress, TrafficState]:
         """Compute the next decision of the scenarios and the traffic."""
         seen = self._seen(state.ego, state.progress, state.z_m, state.t_s)
-        play, traffic, orders = self._director.direct(state.play, state.decided, seen, DECISION_S)
+        scenarios, traffic, orders = self._director.direct(state.scenarios, state.decided, seen, DECISION_S)
         driven = self._driven(state.ego, state.z_m)
-        return play, self._traffic.step(traffic, DECISION_S, driven, orders)
+        return scenarios, self._traffic.step(traffic, DECISION_S, driven, orders)
 
-    def _seen(self, ego: BicycleState, progress: Progress, z_m: float, t_s: float) -> Ego:
+    def _seen(self, ego: BicycleState, progress: RouteProgress, z_m: float, t_s: float) -> ScenarioEgo:
         """Return the ego vehicle as scenarios see it."""
         driven = self._driven(ego, z_m)
         middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
-        return Ego(t_s, progress.done_m, ego.speed_mps, ego.acceleration_mps2, middle, ego.yaw_rad)
+        return ScenarioEgo(t_s, progress.done_m, ego.speed_mps, ego.acceleration_mps2, middle, ego.yaw_rad)
 
     def _drive(self, state: TownState, moved: BicycleState) -> tuple[TownState, list[Event]]:
         """Move the ego vehicle unless an obstacle stops it. Return the new state and the events."""
@@ -324,7 +324,7 @@ def grow(town: str, seed: int) -> World:
 
 @lru_cache(maxsize=1)
 def _rules_of(town: str, seed: int, background: BackgroundTraffic) -> Traffic:
-    return Traffic(load_town_map(town), seed, background.vehicles + 1, background.pedestrians, GUESTS)
+    return Traffic(load_town_map(town), seed, background.vehicles + 1, background.pedestrians, SCENARIO_SLOTS)
 
 
 def _start(route_xyz: Float64[np.ndarray, "M 3"]) -> BicycleState:

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from foredrive.scene import Clip, Trajectory
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
-from foredrive.simulation.town import DECISION_S, Foresight, TownSimulator, TownState
+from foredrive.simulation.town import DECISION_S, PredictedState, TownSimulator, TownState
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState
@@ -59,7 +59,7 @@ class TownExpert:
 
     def __init__(self, simulator: TownSimulator) -> None:
         self._simulator = simulator
-        self._imagined: list[Foresight] = []
+        self._imagined: list[PredictedState] = []
         self._planned: tuple[TownState, Trajectory] | None = None
 
     def act(self, observation: Clip) -> Trajectory:
@@ -77,13 +77,13 @@ class TownExpert:
 
     def _plan(self) -> Trajectory:
         simulator, traffic = self._simulator, self._simulator.traffic
-        here, now = simulator.driven, simulator.foresight()
+        here, now = simulator.driven, simulator.predict_now()
         now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
         self._imagined = [now]
         if traffic.waits_at_line(now.traffic) or _is_too_late(traffic, now.traffic):
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
-            self._imagined.append(simulator.foreseen(self._imagined[-1]))
+            self._imagined.append(simulator.predict_next(self._imagined[-1]))
         halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
         if halts and traffic.lacks_change_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)

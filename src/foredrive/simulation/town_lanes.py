@@ -10,8 +10,8 @@ from foredrive.simulation.lane_rules import (
     LINE_MARGIN_M,
     OUTSIDE_BY_M,
     WRONG_WAY_RAD,
-    Lines,
     RuleState,
+    StopLines,
     body_middle,
     lines_run,
     way_driven,
@@ -23,7 +23,7 @@ from foredrive.towns.traffic.traffic import Traffic
 LANES_WITHIN_M = 6.0
 
 
-def stop_lines(town: TownMap) -> Lines:
+def stop_lines(town: TownMap) -> StopLines:
     """Return the stop lines at lights and at stop signs."""
     lanes = {lane.lane_id: lane for lane in town.lanes}
     kinds = (StopZoneKind.TRAFFIC_LIGHT, StopZoneKind.STOP_SIGN)
@@ -35,7 +35,7 @@ def stop_lines(town: TownMap) -> Lines:
     ]
     starts = np.array([lane.centreline_xyz[:2] for *_, lane in rows]).reshape(-1, 2, 3)
     ahead = starts[:, 1, :2] - starts[:, 0, :2]
-    return Lines(
+    return StopLines(
         zone=np.array([zone for zone, *_ in rows], dtype=np.int64),
         is_sign=np.array([sign for _, sign, _ in rows], dtype=np.bool_),
         xyz=starts[:, 0],
@@ -44,7 +44,7 @@ def stop_lines(town: TownMap) -> Lines:
     )
 
 
-class LaneRules:
+class TownLaneRules:
     """Checks the rules for one drive in a town."""
 
     def __init__(self, town: TownMap, traffic: Traffic) -> None:

@@ -30,33 +30,33 @@ APART_M = 300.0
 """A start this far from all others, m, is worth as much as a manoeuvre that no other route has."""
 
 
-class Kind(NamedTuple):
+class RouteSetSpec(NamedTuple):
     """Number and lengths of the routes of a set."""
 
     per_town: int
-    shortest_m: float
-    longest_m: float
+    min_m: float
+    max_m: float
 
 
-KINDS = {"training-short": Kind(8, 80.0, 150.0), "training-long": Kind(3, 500.0, 1500.0)}
+ROUTE_SETS = {"training-short": RouteSetSpec(8, 80.0, 150.0), "training-long": RouteSetSpec(3, 500.0, 1500.0)}
 
 
-def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
+def draw_routes(town: str, spec: RouteSetSpec, seed: int = 0) -> list[RouteWaypoints]:
     """Draw routes that are spread over a town.
 
     Turns, straight crossings and lane changes are mixed as evenly as possible.
     """
     graph = build_lane_graph(load_town_map(town))
-    starts, rng = find_start_points(graph), np.random.default_rng((seed, *town.encode(), kind.per_town))
+    starts, rng = find_start_points(graph), np.random.default_rng((seed, *town.encode(), spec.per_town))
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
     met: Counter[int] = Counter()
-    while len(chosen) < kind.per_town:
+    while len(chosen) < spec.per_town:
         best, most = None, -math.inf
         while best is None:
             for _ in range(CANDIDATES):
-                length_m = float(rng.uniform(kind.shortest_m, kind.longest_m))
+                length_m = float(rng.uniform(spec.min_m, spec.max_m))
                 drawn = draw_route(graph, starts, rng, length_m, from_s=0.0, until_s=math.inf)
-                found = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, kind)
+                found = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, spec)
                 worth = -math.inf if found is None else _worth(found[1], [route for _, route in chosen], met)
                 if worth > most:
                     best, most = found, worth
@@ -66,7 +66,7 @@ def draw_routes(town: str, kind: Kind, seed: int = 0) -> list[RouteWaypoints]:
 
 
 def _checked(
-    name: str, town: str, graph: LaneGraph, drawn: Route, length_m: float, kind: Kind
+    name: str, town: str, graph: LaneGraph, drawn: Route, length_m: float, spec: RouteSetSpec
 ) -> tuple[RouteWaypoints, DriveRoute] | None:
     """Return a route as waypoints and as `snap_route` reads them.
 
@@ -86,7 +86,7 @@ def _checked(
         route = snap_route(waypoints)
     except InputError:
         return None
-    fits = kind.shortest_m <= route.length_m <= kind.longest_m
+    fits = spec.min_m <= route.length_m <= spec.max_m
     return (waypoints, route) if fits and set(lanes.tolist()) <= {leg.lane for leg in route.legs} else None
 
 
@@ -103,9 +103,9 @@ def _manoeuvres(route: DriveRoute) -> set[int]:
 def main() -> None:
     """Draw these sets anew and write the data file. All other sets stay as they are."""
     sets: dict[str, Sequence[RouteWaypoints]] = dict(shipped_sets())
-    for name, kind in KINDS.items():
+    for name, spec in ROUTE_SETS.items():
         towns = [town for town in TOWNS if town not in TEST_TOWNS]
-        sets[name] = [route for town in towns for route in draw_routes(town, kind)]
+        sets[name] = [route for town in towns for route in draw_routes(town, spec)]
     write_shipped(Path(str(resources.files("foredrive.simulation").joinpath(SHIPPED))), sets)
 
 

@@ -12,8 +12,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
-from foredrive.simulation.drive_record import DriveRecord, ThreatMet
-from foredrive.simulation.scenarios.kinds import ScenarioKind
+from foredrive.simulation.drive_record import DriveRecord, ThreatResult
+from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import LEAST_S
 from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
@@ -232,7 +232,7 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
     )
 
 
-def _threat(met: ThreatMet) -> DriveEvent:
+def _threat(met: ThreatResult) -> DriveEvent:
     """Return the outcome of a threat as one entry of the list."""
     hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
     text = f"{hit} ({met.reference_mps:.1f} m/s if driven as logged), score {met.score:.1f} of 5"

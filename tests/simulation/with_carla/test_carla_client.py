@@ -10,8 +10,8 @@ from foredrive.errors import InputError
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.simulation.carla.client import connect, import_carla, require_same_version
 from foredrive.simulation.carla.frames import CarlaPose, matrix_of
-from foredrive.simulation.carla.road import CarlaRoad
-from foredrive.simulation.carla.session import Session
+from foredrive.simulation.carla.road import CarlaLaneRules
+from foredrive.simulation.carla.session import CarlaSession
 from foredrive.simulation.carla.weather import weather_of
 from foredrive.towns.map.town_map import load_town_map
 
@@ -54,7 +54,7 @@ def test_carlas_lanes_are_ours(carla: Any, town02: Any) -> None:
 
 
 def test_lanes_are_left_and_driven_the_wrong_way(carla: Any, town02: Any) -> None:
-    road = CarlaRoad(World(carla, town02))
+    road = CarlaLaneRules(World(carla, town02))
     lane = next(
         wp for wp in town02.generate_waypoints(20.0) if not wp.is_junction and wp.get_right_lane() is not None
     )
@@ -83,7 +83,7 @@ def test_an_unknown_blueprint_or_attribute_is_named(carla: Any, town02: Any) -> 
     world = World(carla, town02)
     client = Client(world)
     pose = CarlaPose(0.0, 0.0, 0.0)
-    with Session(client, "Town02", 1) as session:
+    with CarlaSession(client, "Town02", 1) as session:
         with pytest.raises(InputError, match=r"no blueprint 'vehicle.none'"):
             session.spawn("vehicle.none", pose, {})
         with pytest.raises(InputError, match="no attribute 'colour'"):
@@ -99,7 +99,7 @@ def test_a_step_of_leaving_that_fails_does_not_keep_the_others_from_being_made(
             raise RuntimeError("time-out while destroying")
 
     client = Stubborn(World(carla, town02))
-    with Session(client, "Town02", 1):
+    with CarlaSession(client, "Town02", 1):
         assert client.traffic.synchronous
     assert not client.traffic.synchronous
     assert not client.world.settings.synchronous_mode

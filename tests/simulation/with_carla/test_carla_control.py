@@ -9,42 +9,42 @@ from carla_stand_in import lat_lon
 
 from foredrive.errors import InputError
 from foredrive.scene import Control
-from foredrive.simulation.carla.control import Asked, actuate, steer_of, steering_rad_of
-from foredrive.simulation.carla.localization import Whereabouts, fit_geo_frame, locate
+from foredrive.simulation.carla.control import CommandedSpeed, actuate, steer_of, steering_rad_of
+from foredrive.simulation.carla.localization import PoseEstimate, fit_geo_frame, locate
 from foredrive.simulation.dynamics import EGO, STEP_S
 
 
 def test_pedals_are_never_pressed_together() -> None:
     for wanted in (-9.0, -2.0, -0.2, 0.0, 1.0, 9.0):
-        pedals, _ = actuate(Control(wanted, 0.0), 10.0, Asked())
+        pedals, _ = actuate(Control(wanted, 0.0), 10.0, CommandedSpeed())
         assert pedals.throttle * pedals.brake == 0
         assert 0 <= pedals.throttle <= 1
         assert 0 <= pedals.brake <= 1
     # 1 m/s² at 10 m/s: 1 + .3 + .08 of the 4 m/s² of full throttle.
-    assert actuate(Control(1.0, 0.0), 10.0, Asked())[0].throttle == pytest.approx(1.38 / 4)
-    assert actuate(Control(-2.0, 0.0), 10.0, Asked())[0].brake == pytest.approx(1.62 / 8)
-    assert actuate(Control(-1.0, 0.0), 0.0, Asked())[0].brake == pytest.approx(1.0 / 8)  # holds
+    assert actuate(Control(1.0, 0.0), 10.0, CommandedSpeed())[0].throttle == pytest.approx(1.38 / 4)
+    assert actuate(Control(-2.0, 0.0), 10.0, CommandedSpeed())[0].brake == pytest.approx(1.62 / 8)
+    assert actuate(Control(-1.0, 0.0), 0.0, CommandedSpeed())[0].brake == pytest.approx(1.0 / 8)  # holds
 
 
 @pytest.mark.parametrize(("strength", "drag_mps2"), [(1.0, 0.0), (0.6, 0.5), (1.4, 0.0)])
 def test_the_speed_asked_for_comes_about_with_any_engine(strength: float, drag_mps2: float) -> None:
-    speed, asked = 0.0, Asked()
+    speed, commanded = 0.0, CommandedSpeed()
     for _ in range(80):
-        pedals, asked = actuate(Control(1.5, 0.0), speed, asked)
+        pedals, commanded = actuate(Control(1.5, 0.0), speed, commanded)
         force = strength * (4.0 * pedals.throttle - 8.0 * pedals.brake)
         speed = max(0.0, speed + (force - (drag_mps2 if speed > 0 else 0.0)) * STEP_S)
     assert speed == pytest.approx(6.0, abs=0.8)  # while it accelerates; then it catches up
     for _ in range(40):
-        pedals, asked = actuate(Control(0.0, 0.0), speed, asked)
+        pedals, commanded = actuate(Control(0.0, 0.0), speed, commanded)
         speed += (strength * (4.0 * pedals.throttle - 8.0 * pedals.brake) - drag_mps2) * STEP_S
     assert speed == pytest.approx(6.0, abs=0.4)
 
 
 def test_who_waits_with_the_brake_on_does_not_start_with_a_jerk() -> None:
-    asked = Asked()
+    commanded = CommandedSpeed()
     for _ in range(100):
-        _, asked = actuate(Control(-1.0, 0.0), 0.0, asked)
-    assert actuate(Control(1.0, 0.0), 0.0, asked)[0].throttle == pytest.approx(0.25)
+        _, commanded = actuate(Control(-1.0, 0.0), 0.0, commanded)
+    assert actuate(Control(1.0, 0.0), 0.0, commanded)[0].throttle == pytest.approx(0.25)
 
 
 def test_steering_is_mirrored_and_gives_the_curvature() -> None:
@@ -82,7 +82,7 @@ def test_carlas_satellites_are_read_although_its_north_is_the_routes_south(carla
 def test_whereabouts_are_steadier_than_satellites() -> None:
     """Half a minute along a circle of 50 m at 8 m/s, with satellites half a metre off."""
     rng = np.random.default_rng(3)
-    found: Whereabouts | None = None
+    found: PoseEstimate | None = None
     errors, jumps = [], []
     for k in range(600):
         turned = 8.0 / 50.0 * k * STEP_S

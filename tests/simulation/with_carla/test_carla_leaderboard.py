@@ -16,7 +16,7 @@ from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.global_plan import GlobalPlan
 from foredrive.simulation.carla.leaderboard import GPS, IMU, LIDAR, SPEED, LeaderboardDriver
 from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.route_progress import Progress
+from foredrive.simulation.route_progress import RouteProgress
 
 SIZE = (9, 16)
 
@@ -65,7 +65,7 @@ BY_SATELLITE = [
     ],
 )
 def test_commands_come_from_the_route(done_m: float, command: Command) -> None:
-    assert GlobalPlan(PLAN).command(Progress(done_m=done_m)) is command
+    assert GlobalPlan(PLAN).command(RouteProgress(done_m=done_m)) is command
 
 
 class Straight:

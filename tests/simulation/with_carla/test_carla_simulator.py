@@ -17,7 +17,7 @@ from foredrive.simulation.drive import drive_route
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.route_scenario import RouteScenario
 from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.simple_agents import StraightAgent
 
 SENSORS = VehicleSensors(camera_rig((9, 16)), roof_lidar(channels=2, azimuth_steps=60))
 
@@ -147,7 +147,7 @@ def test_a_stop_sign_wants_a_stop(
 def test_an_agent_drives_and_is_scored_as_in_a_town(world: World, scenario: RouteScenario) -> None:
     route = dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:40])
     with CarlaSimulator(Client(world)) as simulator:
-        drive = drive_route(simulator, route, Straight(5.0), route="0")
+        drive = drive_route(simulator, route, StraightAgent(5.0), route="0")
     assert drive.score.ending is Ending.COMPLETED
     assert drive.score.driving_score_1_0 == 100.0
     assert drive.score.infractions == ()

@@ -17,8 +17,8 @@ from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.restarts import Restarting
-from foredrive.simulation.simple_agents import Straight
+from foredrive.simulation.restarts import RestartingAgent
+from foredrive.simulation.simple_agents import StraightAgent
 from foredrive.simulation.town import TownSimulator
 from foredrive.simulation.town_expert import TownExpert
 
@@ -30,13 +30,13 @@ OLD_STUDENT = "pupil:"
 
 
 @dataclass(frozen=True)
-class Needs:
+class AgentInputs:
     """The inputs that an agent requires."""
 
     cameras: bool
     lidar: bool
     """Whether the agent requires lidar. A learned agent starts again after a halt only where lidar shows free
-    space (`Restarting`).
+    space (`RestartingAgent`).
     """
     past_frames: int
     camera_names: tuple[str, ...] | None = None
@@ -44,7 +44,7 @@ class Needs:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sees:
+class _ResizingAgent:
     """An agent that was trained on smaller images than the vehicle records."""
 
     agent: PlanningAgent[Any]
@@ -56,7 +56,7 @@ class _Sees:
         return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
 
 
-def needs_of(driver: str) -> Needs:
+def inputs_of(driver: str) -> AgentInputs:
     """Return the inputs that a driver requires.
 
     Args:
@@ -68,12 +68,12 @@ def needs_of(driver: str) -> Needs:
         InputError: there is no such driver, or it was trained on another frame interval.
     """
     if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
-        return Needs(cameras=False, lidar=False, past_frames=1)
+        return AgentInputs(cameras=False, lidar=False, past_frames=1)
     clips = open_run(_run_folder(driver)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
     seeing = not driver.startswith(EGO_MLP)
-    return Needs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
+    return AgentInputs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
 def make_driver(
@@ -82,7 +82,7 @@ def make_driver(
     """Create a driver for one drive.
 
     Args:
-        driver: as for `needs_of`.
+        driver: as for `inputs_of`.
         clock: returns the time of the drive, s.
         town: the town that the expert drives in; the other drivers do not need it.
         seed: seed of the random disturbances and turns in a demonstration.
@@ -95,11 +95,11 @@ def make_driver(
     if driver == DISTURBED:
         return DisturbedExpert(_expert(town), clock, seed)
     if driver in (STOP, CONSTANT_VELOCITY):
-        return Straight(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
+        return StraightAgent(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
     folder = _run_folder(driver)
     if driver.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
-    return Restarting(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
+    return RestartingAgent(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
 
 
 def _expert(town: TownSimulator | None) -> TownExpert:
@@ -120,9 +120,9 @@ def _run_folder(driver: str) -> Path:
 
 
 @lru_cache(maxsize=1)  # a worker drives many routes with the same agent
-def _seeing(folder: Path) -> _Sees:
+def _seeing(folder: Path) -> _ResizingAgent:
     run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
-    return _Sees(load_agent(run).to(device), run.recipe.clips.image_hw, device)
+    return _ResizingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
 
 
 @lru_cache(maxsize=1)

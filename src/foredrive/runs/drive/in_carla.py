@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import make_driver, needs_of
+from foredrive.runs.drive.agents import inputs_of, make_driver
 from foredrive.runs.drive.route_source import RouteSource
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
+from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import VehicleSensors, camera_rig, roof_lidar
 from foredrive.simulation.carla.client import connect
@@ -49,11 +49,11 @@ class CarlaRoutes(RouteSource):
         return {**fields, "scenarios": False, "carla": fields.pop("server")}
 
     @contextlib.contextmanager
-    def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
+    def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive on the server; restore the server's state afterwards."""
-        route, needs = self.route_of(job), needs_of(suite.driver)
+        route, inputs = self.route_of(job), inputs_of(suite.driver)
         seed = self.seed + job.repetition
-        rig = camera_rig(self.image_hw) if needs.lidar or suite.sensors else None
+        rig = camera_rig(self.image_hw) if inputs.lidar or suite.sensors else None
         scenario = RouteScenario(
             town=route.town,
             route_xyz=route.xyz,
@@ -61,13 +61,13 @@ class CarlaRoutes(RouteSource):
             background_traffic=BackgroundTraffic(self.vehicles, self.people),
             conditions=self.conditions_of(route.id, seed),
             sensors=None if rig is None else VehicleSensors(rig, roof_lidar()),
-            past_frames=needs.past_frames,
+            past_frames=inputs.past_frames,
             limit_s=timeout_s(route.length_m),
         )
         with CarlaSimulator(connect(*self.address())) as simulator:
             agent = make_driver(suite.driver, lambda: simulator.state.t_s)
             with drive_log(out, job.name, route.xyz, rig, route.town) as log:
-                yield Stage(
+                yield DriveSetup(
                     simulator,
                     scenario,
                     agent,

@@ -12,8 +12,8 @@ from foredrive.data.maps import read_lane_outlines
 from foredrive.errors import InputError
 from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import make_driver, needs_of
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
+from foredrive.runs.drive.agents import inputs_of, make_driver
+from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenedReconstruction,
     camera_indices,
@@ -24,13 +24,13 @@ from foredrive.runs.rebuild.rebuilt_run import (
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.drive import Drive
 from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.drive_record import ThreatMet
+from foredrive.simulation.drive_record import ThreatResult
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.route_progress import RouteLine
-from foredrive.simulation.simple_agents import Replay
+from foredrive.simulation.simple_agents import ReplayAgent
 from foredrive.simulation.threats import Threat, reference_mps, send_threat, threat_score
 
 REPLAY = "log"
@@ -73,7 +73,7 @@ class RebuiltRoutes:
         return plan
 
     @contextlib.contextmanager
-    def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
+    def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in the reconstructed scene."""
         opened, edits, past_frames = _opened(self.run), _edits_of(self.edits), _past_frames(suite.driver)
         _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
@@ -86,12 +86,12 @@ class RebuiltRoutes:
         renderer = RebuiltRenderer(opened.scene, graph, opened.vehicle)
         lanes = _lanes(opened.folder)
         simulator = RebuiltSimulator(renderer, graph.tracks, drive, lanes)
-        sensors = suite.sensors or (suite.driver != REPLAY and needs_of(suite.driver).lidar)
+        sensors = suite.sensors or (suite.driver != REPLAY and inputs_of(suite.driver).lidar)
         agent = _driver(suite.driver, simulator)
         route_xyz = drive.route_from(start_s)
         rig = renderer.rig if sensors else None
         with drive_log(out, job.name, route_xyz, rig) as log:
-            yield Stage(
+            yield DriveSetup(
                 simulator,
                 RebuiltScenario(start_s, sensors, past_frames),
                 agent,
@@ -118,7 +118,7 @@ def _edits_of(file: str | None) -> list[Edit]:
 
 
 def _past_frames(driver: str) -> int:
-    return 1 if driver == REPLAY else needs_of(driver).past_frames
+    return 1 if driver == REPLAY else inputs_of(driver).past_frames
 
 
 def _lanes(folder: Path) -> LoggedLanes | None:
@@ -131,7 +131,7 @@ def _lanes(folder: Path) -> LoggedLanes | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Through:
+class _SelectedCameras:
     """An agent that receives only some of the cameras."""
 
     agent: Agent
@@ -144,15 +144,15 @@ class _Through:
 
 def _driver(driver: str, simulator: RebuiltSimulator) -> Agent:
     if driver == REPLAY:
-        return Replay(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
+        return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
     agent = make_driver(driver, lambda: simulator.state.t_s)
     there = [name.lower() for name in simulator.renderer.rig.names]
-    wanted = [name.lower() for name in needs_of(driver).camera_names or there]
-    return _Through(agent, camera_indices(there, wanted)) if wanted != there else agent
+    wanted = [name.lower() for name in inputs_of(driver).camera_names or there]
+    return _SelectedCameras(agent, camera_indices(there, wanted)) if wanted != there else agent
 
 
-def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatMet:
+def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatResult:
     """Score a drive against a threat by the severity of its first collision."""
     hits = [event.severity for event in driven.events if event.kind.startswith("collision")]
     impact_mps = hits[0] if hits else None
-    return ThreatMet(threat, impact_mps, reference, threat_score(impact_mps, reference))
+    return ThreatResult(threat, impact_mps, reference, threat_score(impact_mps, reference))

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from foredrive.runs.drive.agents import make_driver, needs_of
+from foredrive.runs.drive.agents import inputs_of, make_driver
 from foredrive.runs.drive.route_source import RouteSource, drive_hash
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, Stage
+from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene import Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
@@ -32,7 +32,7 @@ class TownRoutes(RouteSource):
     grows = ("repetitions",)
 
     @contextlib.contextmanager
-    def stage(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[Stage]:
+    def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in its town."""
         route = self.route_of(job)
         simulator, scenario = TownSimulator(), self.scenario_of(route, job.repetition, suite)
@@ -46,7 +46,7 @@ class TownRoutes(RouteSource):
 
         rig = None if scenario.sensors is None else scenario.sensors.rig
         with drive_log(out, job.name, route.xyz, rig, route.town) as log:
-            yield Stage(
+            yield DriveSetup(
                 simulator,
                 scenario,
                 agent,
@@ -59,8 +59,8 @@ class TownRoutes(RouteSource):
 
     def scenario_of(self, route: DriveRoute, repetition: int, suite: DriveSuite) -> TownScenario:
         """Return the set-up of one drive."""
-        needs, seed = needs_of(suite.driver), self.seed + repetition
-        sensed = needs.lidar or suite.sensors
+        inputs, seed = inputs_of(suite.driver), self.seed + repetition
+        sensed = inputs.lidar or suite.sensors
         return TownScenario(
             town=route.town,
             route_xyz=route.xyz,
@@ -68,7 +68,7 @@ class TownRoutes(RouteSource):
             background_traffic=BackgroundTraffic(self.vehicles, self.people),
             conditions=self.conditions_of(route.id, seed),
             sensors=SensorSuite(camera_rig(self.image_hw), roof_lidar()) if sensed else None,
-            past_frames=needs.past_frames,
+            past_frames=inputs.past_frames,
             limit_s=timeout_s(route.length_m),
             lanes=route.lanes,
             scenarios=scenarios_on(route, grow(route.town, seed), seed) if self.scenarios else (),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import make_driver, needs_of
+from foredrive.runs.drive.agents import inputs_of, make_driver
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.client import import_carla
@@ -54,10 +54,12 @@ class ForedriveAgent(_AutonomousAgent):
             InputError: there is no such driver, or it drives only in towns.
         """
         driver, self._route_name = driver_of(path_to_conf_file)
-        needs, self._t_s = needs_of(driver), 0.0
+        inputs, self._t_s = inputs_of(driver), 0.0
         agent = make_driver(driver, lambda: self._t_s)
-        rig = camera_rig(RouteSource.image_hw) if needs.cameras else None
-        self._driver = LeaderboardDriver(agent, rig, roof_lidar() if needs.lidar else None, needs.past_frames)
+        rig = camera_rig(RouteSource.image_hw) if inputs.cameras else None
+        self._driver = LeaderboardDriver(
+            agent, rig, roof_lidar() if inputs.lidar else None, inputs.past_frames
+        )
         self._make_control = import_carla().VehicleControl
         self._has_route = False
         self._metrics: dict[str, Any] = {}

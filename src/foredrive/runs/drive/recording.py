@@ -25,7 +25,7 @@ from foredrive.towns.sensing.capture import SensorSuite
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingResult:
     """The result of recording several drives."""
 
     logs: dict[DrivePlan, LogPath]
@@ -44,7 +44,7 @@ def record_drives(
     *,
     on_ray: bool = False,
     tick: Callable[[], None] = lambda: None,
-) -> Recorded:
+) -> RecordingResult:
     """Record all drives that are not in the data root yet.
 
     The bytes are the same as from `record`.
@@ -75,7 +75,7 @@ def record_drives(
             else:
                 logs[plan] = result
             tick()
-    return Recorded({plan: logs[plan] for plan in plans if plan in logs}, skipped, failed)
+    return RecordingResult({plan: logs[plan] for plan in plans if plan in logs}, skipped, failed)
 
 
 def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: int | None = None) -> LogPath:

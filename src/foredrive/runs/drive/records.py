@@ -13,7 +13,7 @@ from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 from foredrive.runs.folder import SUITE
 from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.scenarios.kinds import ScenarioKind
+from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import score_suite
 from foredrive.simulation.threats import Threat
 from foredrive.simulation.time_to_collision import LEAST_S

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import needs_of
+from foredrive.runs.drive.agents import inputs_of
 from foredrive.runs.drive.suite import DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,
@@ -49,7 +49,7 @@ class RouteSource:
 
     def jobs(self, driver: str) -> Sequence[DriveJob]:
         """Return one drive for each route and repetition."""
-        needs_of(driver)
+        inputs_of(driver)
         routes = load_route_set(self.routes)
         return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
 

@@ -27,8 +27,8 @@ from foredrive.runs.drive.records import read_drive, summarise, write_drive
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
-from foredrive.simulation.drive import Drive, Pace, drive_route
-from foredrive.simulation.drive_record import DriveRecord, ThreatMet, record_of
+from foredrive.simulation.drive import Drive, PlanningTiming, drive_route
+from foredrive.simulation.drive_record import DriveRecord, ThreatResult, record_of
 from foredrive.training.interrupts import start_fork_server
 
 
@@ -43,7 +43,7 @@ class DriveJob:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class DriveSetup:
     """Everything that one drive needs, already set up."""
 
     simulator: Simulator
@@ -59,12 +59,12 @@ class Stage:
     town: str | None = None
     """The town whose map is used; None: there is no map."""
     lanes_known: bool = True
-    judge: Callable[[Drive], ThreatMet | None] = lambda drive: None
+    judge: Callable[[Drive], ThreatResult | None] = lambda drive: None
     """Scores the drive against a threat; None: there is no threat."""
 
 
 @runtime_checkable
-class Source(Protocol):
+class DriveSource(Protocol):
     """A kind of world to drive in: it lists drives and sets up each one."""
 
     @property
@@ -85,7 +85,7 @@ class Source(Protocol):
         """Return the drives. Raise InputError if there are none, or there is no such driver."""
         ...
 
-    def stage(self, job: DriveJob, suite: "DriveSuite", out: Path) -> AbstractContextManager[Stage]:
+    def set_up(self, job: DriveJob, suite: "DriveSuite", out: Path) -> AbstractContextManager[DriveSetup]:
         """Set up a drive; its log is complete when the context ends. Raise InputError if that fails."""
         ...
 
@@ -95,15 +95,15 @@ class DriveSuite:
     """A driver, the source of its drives, and its planning period and latency."""
 
     driver: str
-    """Name of the driver; see `agents.needs_of`."""
-    source: Source
+    """Name of the driver; see `agents.inputs_of`."""
+    source: DriveSource
     sensors: bool = True
     """Whether cameras and lidar are logged even if the driver does not need them."""
-    period_s: float = Pace.period_s
-    latency_s: float = Pace.latency_s
+    period_s: float = PlanningTiming.period_s
+    latency_s: float = PlanningTiming.latency_s
 
     def __post_init__(self) -> None:
-        Pace(self.period_s, self.latency_s)
+        PlanningTiming(self.period_s, self.latency_s)
 
     def jobs(self) -> Sequence[DriveJob]:
         """Return the drives.
@@ -122,7 +122,7 @@ class DriveSuite:
 
 
 @dataclass(frozen=True)
-class Driven:
+class SuiteResult:
     """The result of driving a suite."""
 
     drives: dict[DriveJob, DriveRecord]
@@ -140,7 +140,7 @@ def drive_suite(
     *,
     on_ray: bool = False,
     tick: Callable[[DriveJob, DriveRecord | None], None] = lambda job, drive: None,
-) -> Driven:
+) -> SuiteResult:
     """Drive all jobs that have no record in the folder yet; write the summary when every job has one.
 
     Args:
@@ -175,7 +175,7 @@ def drive_suite(
                 else:
                     drives[job] = result
                     tick(job, result)
-        driven = Driven({job: drives[job] for job in jobs if job in drives}, skipped, broken)
+        driven = SuiteResult({job: drives[job] for job in jobs if job in drives}, skipped, broken)
         if not broken:  # a mean over only some of the drives would mislead
             write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
     return driven
@@ -193,25 +193,25 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
     if threads is not None:
         torch.set_num_threads(threads)
     began = time.perf_counter()
-    with suite.source.stage(job, suite, out) as stage:
+    with suite.source.set_up(job, suite, out) as setup:
         drive = drive_route(
-            stage.simulator,
-            stage.scenario,
-            stage.agent,
+            setup.simulator,
+            setup.scenario,
+            setup.agent,
             route=job.route,
             repetition=job.repetition,
-            pace=Pace(suite.period_s, suite.latency_s),
-            on_frame=lambda: stage.log.write(stage.frame()),
+            pace=PlanningTiming(suite.period_s, suite.latency_s),
+            on_frame=lambda: setup.log.write(setup.frame()),
         )
     record = record_of(
         drive,
-        stage.route_xyz,
-        stage.length_m,
-        town=stage.town,
-        log=str(stage.log.folder.relative_to(out)),
+        setup.route_xyz,
+        setup.length_m,
+        town=setup.town,
+        log=str(setup.log.folder.relative_to(out)),
         wall_s=time.perf_counter() - began,
-        threat=stage.judge(drive),
-        lanes_known=stage.lanes_known,
+        threat=setup.judge(drive),
+        lanes_known=setup.lanes_known,
     )
     write_drive(_file(out, job), record)
     return read_drive(_file(out, job))

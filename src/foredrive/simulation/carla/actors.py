@@ -56,7 +56,7 @@ def actor_state(actor: Any) -> ActorState | None:
 
 
 @dataclass(frozen=True)
-class Contact:
+class LastCollision:
     """The last collision of the ego vehicle."""
 
     actor_id: int | None = None
@@ -70,8 +70,8 @@ def collision(
     ego_xy: Float64[np.ndarray, "2"],
     ego_velocity: Float64[np.ndarray, "2"],
     t_s: float,
-    last: Contact,
-) -> tuple[Event | None, Contact]:
+    last: LastCollision,
+) -> tuple[Event | None, LastCollision]:
     """Return the collision that a `carla.CollisionEvent` reports, and the updated contact.
 
     The collision is None if the event belongs to the last collision, if the ego vehicle stands, or if it
@@ -95,4 +95,4 @@ def collision(
         severity = float(np.hypot(*(ego_velocity - xyz_of(other.get_velocity())[:2])))
     where = (float(ego_xy[0]), float(ego_xy[1]))
     text = f"{other.type_id} {other.id} at {severity:.1f} m/s"
-    return Event(kind, t_s, where, text, what, severity), Contact(known, t_s, where)
+    return Event(kind, t_s, where, text, what, severity), LastCollision(known, t_s, where)

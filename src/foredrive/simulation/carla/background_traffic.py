@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.carla.frames import CarlaPose, xyz_of
-from foredrive.simulation.carla.session import Session
+from foredrive.simulation.carla.session import CarlaSession
 
 NEAR_ROUTE_M = 140.0
 """Maximum distance from the route at which vehicles start, m."""
@@ -21,7 +21,7 @@ TRIES = 5
 
 
 def add_background_traffic(
-    session: Session,
+    session: CarlaSession,
     background: BackgroundTraffic,
     route_xyz: Float64[np.ndarray, "M 3"],
     rng: np.random.Generator,
@@ -33,7 +33,7 @@ def add_background_traffic(
 
 
 def _add_vehicles(
-    session: Session, count: int, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
+    session: CarlaSession, count: int, route_xyz: Float64[np.ndarray, "M 3"], rng: np.random.Generator
 ) -> None:
     library = session.world.get_blueprint_library().filter("vehicle.*")
     kinds = sorted(thing.id for thing in library if thing.has_attribute("number_of_wheels"))
@@ -53,7 +53,7 @@ def _add_vehicles(
             count -= 1
 
 
-def _add_people(session: Session, count: int, rng: np.random.Generator) -> None:
+def _add_people(session: CarlaSession, count: int, rng: np.random.Generator) -> None:
     kinds = sorted(thing.id for thing in session.world.get_blueprint_library().filter("walker.pedestrian.*"))
     controllers = list[Any]()
     for _ in range(count * TRIES):
@@ -73,7 +73,7 @@ def _add_people(session: Session, count: int, rng: np.random.Generator) -> None:
         _let_walk(session, controller, rng)
 
 
-def _let_walk(session: Session, controller: Any, rng: np.random.Generator) -> None:
+def _let_walk(session: CarlaSession, controller: Any, rng: np.random.Generator) -> None:
     controller.start()
     controller.set_max_speed(float(rng.uniform(*WALKING_MPS)))
     goal = session.world.get_random_location_from_navigation()

@@ -41,17 +41,17 @@ class Pedals(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Asked:
+class CommandedSpeed:
     """Effect of all commands so far."""
 
     speed_mps: float | None = None
     """Speed that the vehicle would have now if it had followed its commands, m/s. None at the beginning."""
 
 
-def actuate(control: Control, speed_mps: float, asked: Asked) -> tuple[Pedals, Asked]:
+def actuate(control: Control, speed_mps: float, commanded: CommandedSpeed) -> tuple[Pedals, CommandedSpeed]:
     """Return pedals and steering for the step that begins now, and the state for the next step."""
     wanted = min(max(control.acceleration_mps2, -EGO.max_braking_mps2), EGO.max_acceleration_mps2)
-    behind = 0.0 if asked.speed_mps is None else asked.speed_mps - speed_mps
+    behind = 0.0 if commanded.speed_mps is None else commanded.speed_mps - speed_mps
     behind = min(max(behind, -MOST_BEHIND_MPS), MOST_BEHIND_MPS)
     stands = speed_mps < STANDING_MPS
     if stands and wanted <= 0:  # standing as commanded
@@ -61,7 +61,7 @@ def actuate(control: Control, speed_mps: float, asked: Asked) -> tuple[Pedals, A
     coasting = 0.0 if stands else COASTING_MPS2 + COASTING_PER_M * speed_mps**2
     force = wanted + CATCH_UP_PER_S * behind + coasting
     throttle, brake = max(force, 0.0) / FULL_THROTTLE_MPS2, max(-force, 0.0) / FULL_BRAKE_MPS2
-    return Pedals(min(throttle, 1.0), min(brake, 1.0), steer_of(control.steering_rad)), Asked(due)
+    return Pedals(min(throttle, 1.0), min(brake, 1.0), steer_of(control.steering_rad)), CommandedSpeed(due)
 
 
 def steer_of(steering_rad: float) -> float:

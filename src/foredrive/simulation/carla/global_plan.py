@@ -10,7 +10,7 @@ from foredrive.data.commands import LOOKAHEAD_M
 from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.simulation.carla.frames import xyz_of
-from foredrive.simulation.route_progress import Progress, RouteLine
+from foredrive.simulation.route_progress import RouteLine, RouteProgress
 
 COMMAND_OF_OPTION = {
     "LEFT": Command.LEFT,
@@ -43,12 +43,12 @@ class GlobalPlan:
         self._line = RouteLine(np.column_stack([self.xy, np.zeros(len(plan))]))
 
     def advance(
-        self, progress: Progress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
-    ) -> Progress:
+        self, progress: RouteProgress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
+    ) -> RouteProgress:
         """Return the progress of a vehicle that is now at `xy`."""
         return self._line.advance(progress, xy, speed_mps, t_s)
 
-    def command(self, progress: Progress) -> Command:
+    def command(self, progress: RouteProgress) -> Command:
         """Return the first turn or lane change that is under way or begins within `LOOKAHEAD_M`.
 
         In training (`data.commands`) commands change at about the same place. The difference is bends outside
@@ -60,7 +60,7 @@ class GlobalPlan:
         return next((command for command in soon if command is not Command.STRAIGHT), Command.STRAIGHT)
 
     def target_xy(
-        self, progress: Progress, T_world_ego: Float64[np.ndarray, "4 4"]
+        self, progress: RouteProgress, T_world_ego: Float64[np.ndarray, "4 4"]
     ) -> Float64[np.ndarray, "2"]:
         """Return the target point on the route in the ego frame, m.
 

@@ -19,22 +19,22 @@ from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, CameraRig, Clip
 from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.sensors import SpinningLidar
-from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
+from foredrive.simulation.carla.control import CommandedSpeed, Pedals, actuate, steering_rad_of
 from foredrive.simulation.carla.frames import ego_in_actor, pose_of, yaw_of_compass
 from foredrive.simulation.carla.global_plan import GlobalPlan
 from foredrive.simulation.carla.localization import (
     GeoFrame,
-    Whereabouts,
+    PoseEstimate,
     fit_geo_frame,
     lat_lon_of,
     locate,
 )
 from foredrive.simulation.carla.sensors import camera_specs, image_of, lidar_spec, mounting, sweep_of
-from foredrive.simulation.controller import Following, follow
+from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
 from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.route_progress import Progress
+from foredrive.simulation.route_progress import RouteProgress
 
 GPS, IMU, SPEED, LIDAR = "GPS", "IMU", "SPEED", "LIDAR"
 COMPASS_AT = 6
@@ -76,8 +76,8 @@ class LeaderboardDriver:
         self._plan: GlobalPlan | None = None
         self._frames: tuple[KeyFrame, ...] = ()
         self._points: tuple[Float32[np.ndarray, "_ 4"], ...] = ()
-        self._where: Whereabouts | None = None
-        self._following, self._asked, self._progress = Following(), Asked(), Progress()
+        self._where: PoseEstimate | None = None
+        self._following, self._asked, self._progress = ControllerState(), CommandedSpeed(), RouteProgress()
         self._steer = 0.0
         self._next_frame_s = 0.0
 
@@ -134,7 +134,7 @@ class LeaderboardDriver:
         self._steer = pedals.steer
         return pedals
 
-    def _see(self, input_data: Mapping[str, tuple[int, Any]], at: Whereabouts, speed_mps: float) -> None:
+    def _see(self, input_data: Mapping[str, tuple[int, Any]], at: PoseEstimate, speed_mps: float) -> None:
         images = no_images()
         if self._rig is not None:
             images = torch.stack([_image(self._rig, name, input_data[name][1]) for name in self._rig.names])

@@ -62,7 +62,7 @@ def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarra
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class PoseEstimate:
     """Estimated pose of the rear axle in our world."""
 
     x_m: float
@@ -83,12 +83,12 @@ class Whereabouts:
 
 
 def locate(
-    before: Whereabouts | None,
+    before: PoseEstimate | None,
     satellites_xy: Float64[np.ndarray, "2"],
     yaw_rad: float,
     speed_mps: float,
     t_s: float,
-) -> Whereabouts:
+) -> PoseEstimate:
     """Return the estimate one step later: dead reckoning, corrected towards the satellites.
 
     Args:
@@ -97,7 +97,7 @@ def locate(
     """
     if before is None:
         x, y = satellites_xy.tolist()
-        return Whereabouts(x, y, yaw_rad if math.isfinite(yaw_rad) else 0.0, t_s)
+        return PoseEstimate(x, y, yaw_rad if math.isfinite(yaw_rad) else 0.0, t_s)
     yaw_rad = yaw_rad if math.isfinite(yaw_rad) else before.yaw_rad
     way_m = speed_mps * (t_s - before.t_s)
     along = before.yaw_rad + 0.5 * math.remainder(yaw_rad - before.yaw_rad, 2 * math.pi)

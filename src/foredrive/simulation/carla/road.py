@@ -16,15 +16,15 @@ from foredrive.simulation.lane_rules import (
     LINE_MARGIN_M,
     OUTSIDE_BY_M,
     WRONG_WAY_RAD,
-    Lines,
     RuleState,
+    StopLines,
     body_middle,
     lines_run,
     way_driven,
 )
 
 
-class CarlaRoad:
+class CarlaLaneRules:
     """Checks the rules for one drive in a CARLA world.
 
     Only the client's data is used. A light's lines are its `get_stop_waypoints()`. A stop sign's line lies
@@ -84,7 +84,7 @@ class CarlaRoad:
         return bool(abs(turned) > WRONG_WAY_RAD)
 
 
-def lines_at(waypoints: Sequence[tuple[int, Any]], lights: int) -> Lines:
+def lines_at(waypoints: Sequence[tuple[int, Any]], lights: int) -> StopLines:
     """Return the stop lines across lanes.
 
     Args:
@@ -94,7 +94,7 @@ def lines_at(waypoints: Sequence[tuple[int, Any]], lights: int) -> Lines:
     T = np.array([matrix_of(waypoint.transform) for _, waypoint in waypoints]).reshape(-1, 4, 4)
     index = np.array([i for i, _ in waypoints], dtype=np.int64)
     ahead = T[:, :2, 0]
-    return Lines(
+    return StopLines(
         zone=index,
         is_sign=index >= lights,
         xyz=T[:, :3, 3],

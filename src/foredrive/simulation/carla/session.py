@@ -15,7 +15,7 @@ TRAFFIC_PORT = 8000
 _log = logging.getLogger(__name__)
 
 
-class Session:
+class CarlaSession:
     """One town in synchronous mode at 20 Hz, with all actors that were added to it.
 
     `close` destroys the actors and returns the server to asynchronous mode, even after errors. Each of these
@@ -108,14 +108,14 @@ class Session:
         except RuntimeError as error:
             _log.warning("CARLA's server is not left as it was found: %s", " ".join(str(error).split()))
 
-    def __enter__(self) -> "Session":
+    def __enter__(self) -> "CarlaSession":
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
 
-class Receiver:
+class SensorQueue:
     """Queue that passes the data of one sensor from the client's thread to ours.
 
     Args:

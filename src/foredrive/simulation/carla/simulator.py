@@ -12,23 +12,23 @@ from jaxtyping import Float64, UInt8
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.scene import BicycleState, Boxes, Clip, Control, Event, LidarSweep, Standing, Step
+from foredrive.scene import BicycleState, Boxes, Clip, Control, DriveProgress, Event, LidarSweep, Step
 from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import draw_daylight
 from foredrive.sensors import SpinningLidar
 from foredrive.simulation.carla import sensors as carla_sensors
-from foredrive.simulation.carla.actors import Contact, actor_state, collision
+from foredrive.simulation.carla.actors import LastCollision, actor_state, collision
 from foredrive.simulation.carla.background_traffic import ABOVE_M, add_background_traffic
 from foredrive.simulation.carla.client import answering, import_carla
-from foredrive.simulation.carla.control import Asked, Pedals, actuate, steering_rad_of
+from foredrive.simulation.carla.control import CommandedSpeed, Pedals, actuate, steering_rad_of
 from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of, pose_of, xyz_of
-from foredrive.simulation.carla.road import CarlaRoad
-from foredrive.simulation.carla.session import TRAFFIC_PORT, Receiver, Session
+from foredrive.simulation.carla.road import CarlaLaneRules
+from foredrive.simulation.carla.session import TRAFFIC_PORT, CarlaSession, SensorQueue
 from foredrive.simulation.carla.weather import weather_of
 from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.lane_rules import RuleState, left_lanes
 from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
-from foredrive.simulation.route_progress import Progress, RouteLine, first_step
+from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
 from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2020"
@@ -44,10 +44,10 @@ class CarlaState:
     ego: BicycleState
     T_world_ego: Float64[np.ndarray, "4 4"]
     frames: tuple[KeyFrame, ...] = ()
-    asked: Asked = field(default_factory=Asked)
-    contact: Contact = field(default_factory=Contact)
+    commanded: CommandedSpeed = field(default_factory=CommandedSpeed)
+    contact: LastCollision = field(default_factory=LastCollision)
     rules: RuleState = field(default_factory=RuleState)
-    progress: Progress = field(default_factory=Progress)
+    progress: RouteProgress = field(default_factory=RouteProgress)
     ended: str | None = None
     """Reason why the drive is over. None while it goes on."""
 
@@ -62,9 +62,9 @@ class _Ego(NamedTuple):
 
     vehicle: Any
     T_actor_ego: Float64[np.ndarray, "4 4"]
-    cameras: Sequence[Receiver]
-    lidar: Receiver | None
-    collisions: Receiver
+    cameras: Sequence[SensorQueue]
+    lidar: SensorQueue | None
+    collisions: SensorQueue
 
 
 class CarlaSimulator:
@@ -83,17 +83,17 @@ class CarlaSimulator:
 
     def __init__(self, client: Any, timeout_s: float = 20.0, traffic_port: int = TRAFFIC_PORT) -> None:
         self._client, self._timeout_s, self._traffic_port = client, timeout_s, traffic_port
-        self._session: Session | None = None
+        self._session: CarlaSession | None = None
 
     def ego(self) -> BicycleState:
         """Return the current state of the ego vehicle."""
         return self.state.ego
 
-    def standing(self) -> Standing:
+    def progress(self) -> DriveProgress:
         """Return the progress of the drive."""
         rules = self.state.rules
         completion = min(1.0, self.state.progress.done_m / self._route.length_m)
-        return Standing(completion, min(1.0, rules.outside_share), rules.driven_m)
+        return DriveProgress(completion, min(1.0, rules.outside_share), rules.driven_m)
 
     def reset(self, scenario: RouteScenario) -> Clip:
         """Load the town and start a drive. The vehicle stands until traffic has started to move.
@@ -105,7 +105,7 @@ class CarlaSimulator:
         self.close()
         self._scenario, self._route = scenario, RouteLine(scenario.route_xyz)
         start = _start(scenario.route_xyz)
-        self._session = Session(self._client, scenario.town, scenario.seed, self._traffic_port)
+        self._session = CarlaSession(self._client, scenario.town, scenario.seed, self._traffic_port)
         try:
             with answering("setting the scene"):
                 return self._set_scene(self._session, start)
@@ -142,7 +142,7 @@ class CarlaSimulator:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _set_scene(self, session: Session, start: CarlaPose) -> Clip:
+    def _set_scene(self, session: CarlaSession, start: CarlaPose) -> Clip:
         scenario, rng = self._scenario, np.random.default_rng(self._scenario.seed)
         self._make_control = import_carla().VehicleControl
         session.world.set_weather(weather_of(scenario.conditions or draw_daylight(rng)))
@@ -150,7 +150,7 @@ class CarlaSimulator:
         self._ego = self._spawn_ego(session, start)
         add_background_traffic(session, scenario.background_traffic, scenario.route_xyz, rng)
         session.tick()  # actors of a new world are listed from the next frame on
-        self._road = CarlaRoad(session.world)
+        self._road = CarlaLaneRules(session.world)
         before = max(round(SETTLE_S / STEP_S), scenario.past_frames * FRAME_STEPS)
         self.state = CarlaState(-before, BicycleState(0.0, 0.0, 0.0, 0.0), np.eye(4))
         for index in range(-before + 1, 1):
@@ -164,18 +164,18 @@ class CarlaSimulator:
         self._clip = self._make_clip(self.state)
         return self._clip
 
-    def _spawn_ego(self, session: Session, start: CarlaPose) -> _Ego:
+    def _spawn_ego(self, session: CarlaSession, start: CarlaPose) -> _Ego:
         vehicle = session.spawn(EGO_BLUEPRINT, start, {"role_name": "hero"})
         if vehicle is None:
             raise InputError(f"there is no room for the ego vehicle in {self._scenario.town} at {start}")
         T_actor_ego = ego_in_actor(vehicle.bounding_box.location.x)
-        suite, cameras, lidar = self._scenario.sensors, list[Receiver](), None
+        suite, cameras, lidar = self._scenario.sensors, list[SensorQueue](), None
 
-        def mount(kind: str, name: str, pose: CarlaPose, attributes: dict[str, str]) -> Receiver:
+        def mount(kind: str, name: str, pose: CarlaPose, attributes: dict[str, str]) -> SensorQueue:
             sensor = session.spawn(kind, pose, attributes, attach_to=vehicle)
             if sensor is None:
                 raise InputError(f"CARLA cannot mount {name} at {pose}")
-            return Receiver(sensor, name)
+            return SensorQueue(sensor, name)
 
         if suite is not None:
             for spec in carla_sensors.camera_specs(suite.rig, T_actor_ego):
@@ -189,7 +189,7 @@ class CarlaSimulator:
         return _Ego(vehicle, T_actor_ego, cameras, lidar, collisions)
 
     def _advance(
-        self, session: Session, pedals: Pedals
+        self, session: CarlaSession, pedals: Pedals
     ) -> tuple[int, Float64[np.ndarray, "4 4"], BicycleState]:
         """Run one step with some pedals. Return the frame number and the vehicle's new pose and state."""
         vehicle = self._ego.vehicle
@@ -202,9 +202,9 @@ class CarlaSimulator:
         steering = steering_rad_of(pedals.steer)
         return frame, T, BicycleState(float(T[0, 3]), float(T[1, 3]), heading, speed, steering, gained)
 
-    def _drive(self, session: Session, control: Control) -> Step:
+    def _drive(self, session: CarlaSession, control: Control) -> Step:
         state = self.state
-        pedals, asked = actuate(control, state.ego.speed_mps, state.asked)
+        pedals, commanded = actuate(control, state.ego.speed_mps, state.commanded)
         frame, T, ego = self._advance(session, pedals)
         index = state.step_index + 1
         t_s = index * STEP_S
@@ -218,7 +218,7 @@ class CarlaSimulator:
                 events.append(left_lanes(rules.left_at, rules.left_m, t_s))
             text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
             events.append(Event(ended, t_s, (ego.x_m, ego.y_m), text))
-        state = CarlaState(index, ego, T, state.frames, asked, contact, rules, progress, ended)
+        state = CarlaState(index, ego, T, state.frames, commanded, contact, rules, progress, ended)
         if index % FRAME_STEPS == 0:
             state = dataclasses.replace(state, frames=self._with_frame(session, state, frame))
             self._clip = self._make_clip(state)
@@ -227,7 +227,7 @@ class CarlaSimulator:
 
     def _collisions(
         self, before: CarlaState, T: Float64[np.ndarray, "4 4"], t_s: float
-    ) -> tuple[list[Event], Contact]:
+    ) -> tuple[list[Event], LastCollision]:
         middle = T[:2, 3] + EGO.axle_to_centre_m * T[:2, 0]
         velocity = before.ego.speed_mps * np.array([np.cos(before.ego.yaw_rad), np.sin(before.ego.yaw_rad)])
         events, contact = list[Event](), before.contact
@@ -237,7 +237,7 @@ class CarlaSimulator:
                 events.append(found)
         return events, contact
 
-    def _with_frame(self, session: Session, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
+    def _with_frame(self, session: CarlaSession, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
         """Append the current key frame and return the latest frames, as many as an observation has."""
         suite, images, sweep = self._scenario.sensors, no_images(), None
         if suite is not None and self._ego.lidar is not None:
@@ -251,7 +251,7 @@ class CarlaSimulator:
         sent = [camera.at(frame, self._timeout_s) for camera in self._ego.cameras]
         return torch.stack([carla_sensors.image_of(carla_sensors.bgra_of(image)) for image in sent])
 
-    def _boxes(self, session: Session, T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
+    def _boxes(self, session: CarlaSession, T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
         found = [actor_state(a) for a in session.world.get_actors() if a.id != self._ego.vehicle.id]
         near = in_box_range([actor for actor in found if actor is not None], T_world_ego)
         return boxes_in_ego_frame(near, T_world_ego)

@@ -9,12 +9,12 @@ import numpy as np
 
 from foredrive.scene import Category
 from foredrive.simulation.routes import DriveRoute
-from foredrive.simulation.scenarios.cast import can_drive_ahead, can_stand
-from foredrive.simulation.scenarios.ground import Ground, Stretch, onward, stretches_of
+from foredrive.simulation.scenarios.crossings import beside_parked, crossing
 from foredrive.simulation.scenarios.junctions import at_junctions
-from foredrive.simulation.scenarios.kerbs import beside_parked, crossing
-from foredrive.simulation.scenarios.kinds import ENDS_BEFORE, Scenario, ScenarioKind, Way
 from foredrive.simulation.scenarios.kinematics import SPARE_M, stopping_m
+from foredrive.simulation.scenarios.road_context import RoadContext, Stretch, onward, stretches_of
+from foredrive.simulation.scenarios.scenario import ENDS_BEFORE, Scenario, ScenarioKind, Way
+from foredrive.simulation.scenarios.vehicles import can_drive_ahead, can_stand
 from foredrive.towns.traffic.lane_graph import TURN_RAD, build_lane_graph
 from foredrive.towns.traffic.lane_index import build_lane_index
 from foredrive.towns.traffic.leaders import project_to_neighbour
@@ -29,14 +29,14 @@ sight."""
 CHOICE_M = 70.0
 """One scenario is drawn among those within this distance on the route, m, of the kind that is rarest so
 far."""
-STRAY_EVERY_M = 9.0
+CROSSING_EVERY_M = 9.0
 AFTER_TURN_M, SEEN_AFTER_TURN_M = 9.0, 8.0
 """Distance of a crossing behind a turn, m, and the distance before it from which it must be visible, m."""
 BEHIND_CORNER_M = 16.0
 """Distance of a standing vehicle behind a turn, m. It is longer because in a turn one drives slowly but is
 hardly through it."""
 BEFORE_LINE_M = 14.0
-LEAST_STRETCH_M = 45.0
+MIN_STRETCH_M = 45.0
 
 
 def scenarios_on(route: DriveRoute, world: World, seed: int) -> tuple[Scenario, ...]:
@@ -57,10 +57,10 @@ def possible_scenarios(route: DriveRoute, world: World, rng: np.random.Generator
     Places and kinds of crossings are drawn at random.
     """
     graph = build_lane_graph(world.town)
-    ground = Ground(route, graph, build_lane_index(graph), world)
-    stretches = stretches_of(ground)
-    possible = [*at_junctions(ground, stretches), *_on_stretches(ground, stretches, rng)]
-    possible += beside_parked(ground)
+    road = RoadContext(route, graph, build_lane_index(graph), world)
+    stretches = stretches_of(road)
+    possible = [*at_junctions(road, stretches), *_on_stretches(road, stretches, rng)]
+    possible += beside_parked(road)
     last_m = route.length_m - CLEAR_OF_END_M
     within = [s for s in possible if s.at_m >= FIRST_M and (s.at_m <= last_m or s.kind in ENDS_BEFORE)]
     return sorted(within, key=lambda scenario: scenario.at_m)
@@ -72,12 +72,12 @@ def _drawn(possible: Sequence[Scenario], rng: np.random.Generator) -> list[Scena
     while True:
         last_m = drawn[-1].at_m if drawn else FIRST_M - APART_M
         apart_m = STAGED_APART_M if drawn else APART_M
-        open_to = [s for s in possible if s.at_m >= last_m + (APART_M if s.stray else apart_m)]
+        open_to = [s for s in possible if s.at_m >= last_m + (APART_M if s.actor else apart_m)]
         if not open_to:
             return drawn
         near = [s for s in open_to if s.at_m <= open_to[0].at_m + CHOICE_M]
-        fewest = min(count[s.kind] for s in near)
-        kinds = sorted({s.kind for s in near if count[s.kind] == fewest})
+        min_count = min(count[s.kind] for s in near)
+        kinds = sorted({s.kind for s in near if count[s.kind] == min_count})
         kind = kinds[int(rng.integers(len(kinds)))]
         of_kind = [s for s in near if s.kind == kind]
         drawn.append(of_kind[int(rng.integers(len(of_kind)))])
@@ -86,16 +86,18 @@ def _drawn(possible: Sequence[Scenario], rng: np.random.Generator) -> list[Scena
 
 def _numbered(scenario: Scenario, number: int, rng: np.random.Generator) -> Scenario:
     """Give the crossing road user of a scenario its own track id and style."""
-    if scenario.stray is None:
+    if scenario.actor is None:
         return scenario
     style = int(rng.integers(2**31))
-    stray = dataclasses.replace(scenario.stray, track_id=FIRST_TRACK_ID + number, style=style)
-    return dataclasses.replace(scenario, stray=stray)
+    actor = dataclasses.replace(scenario.actor, track_id=FIRST_TRACK_ID + number, style=style)
+    return dataclasses.replace(scenario, actor=actor)
 
 
-def _on_stretches(ground: Ground, stretches: list[Stretch], rng: np.random.Generator) -> Iterator[Scenario]:
+def _on_stretches(
+    road: RoadContext, stretches: list[Stretch], rng: np.random.Generator
+) -> Iterator[Scenario]:
     """Yield the scenarios outside of junctions, on runs of lanes between them."""
-    graph = ground.graph
+    graph = road.graph
     for is_inside, group in itertools.groupby(stretches, key=lambda s: bool(graph.junction[s.leg.lane] >= 0)):
         run = list(group)
         if is_inside:
@@ -104,38 +106,38 @@ def _on_stretches(ground: Ground, stretches: list[Stretch], rng: np.random.Gener
         turned = first > 0 and abs(graph.turn_rad[stretches[first - 1].leg.lane]) > TURN_RAD
         from_m, to_m = run[0].from_m, run[-1].to_m
         if turned:
-            yield from _after_turn(ground, run)
-        yield from _along(ground, from_m + 1.5 * AFTER_TURN_M, to_m - BEFORE_LINE_M, run, rng)
+            yield from _after_turn(road, run)
+        yield from _along(road, from_m + 1.5 * AFTER_TURN_M, to_m - BEFORE_LINE_M, run, rng)
         for stretch in run:
-            yield from _lead_and_cut_in(ground, stretch)
+            yield from _lead_and_cut_in(road, stretch)
 
 
-def _after_turn(ground: Ground, run: list[Stretch]) -> Iterator[Scenario]:
-    graph, leg, from_m = ground.graph, run[0].leg, run[0].from_m
+def _after_turn(road: RoadContext, run: list[Stretch]) -> Iterator[Scenario]:
+    graph, leg, from_m = road.graph, run[0].leg, run[0].from_m
     limit = float(graph.limit_mps[leg.lane])
-    if leg.to_m - leg.from_m > BEHIND_CORNER_M + 3.0 and can_stand(ground, from_m + BEHIND_CORNER_M):
+    if leg.to_m - leg.from_m > BEHIND_CORNER_M + 3.0 and can_stand(road, from_m + BEHIND_CORNER_M):
         way = Way((leg.lane, *onward(graph, leg.lane)), leg.from_m + BEHIND_CORNER_M)
         yield Scenario(ScenarioKind.OBSTACLE_BEHIND_CORNER, from_m + BEHIND_CORNER_M, limit, ways=(way,))
     if run[-1].to_m > from_m + AFTER_TURN_M:
         for category in (Category.PEDESTRIAN, Category.BICYCLE):
-            yield from crossing(ground, from_m + AFTER_TURN_M, limit, category, SEEN_AFTER_TURN_M)
+            yield from crossing(road, from_m + AFTER_TURN_M, limit, category, SEEN_AFTER_TURN_M)
 
 
 def _along(
-    ground: Ground, from_m: float, to_m: float, run: list[Stretch], rng: np.random.Generator
+    road: RoadContext, from_m: float, to_m: float, run: list[Stretch], rng: np.random.Generator
 ) -> Iterator[Scenario]:
     """Yield the crossings on a stretch."""
-    for at_m in np.arange(from_m + rng.uniform(0.0, 3.0), to_m, STRAY_EVERY_M).tolist():
+    for at_m in np.arange(from_m + rng.uniform(0.0, 3.0), to_m, CROSSING_EVERY_M).tolist():
         lane = next((s.leg.lane for s in run if at_m <= s.to_m), run[-1].leg.lane)
-        limit = float(ground.graph.limit_mps[lane])
+        limit = float(road.graph.limit_mps[lane])
         category = Category.PEDESTRIAN if rng.random() < 0.5 else Category.BICYCLE
-        yield from crossing(ground, at_m, limit, category, min(stopping_m(limit) + SPARE_M, at_m))
+        yield from crossing(road, at_m, limit, category, min(stopping_m(limit) + SPARE_M, at_m))
 
 
-def _lead_and_cut_in(ground: Ground, stretch: Stretch) -> Iterator[Scenario]:
-    graph, (leg, from_m, to_m) = ground.graph, stretch
+def _lead_and_cut_in(road: RoadContext, stretch: Stretch) -> Iterator[Scenario]:
+    graph, (leg, from_m, to_m) = road.graph, stretch
     lane, limit = leg.lane, float(graph.limit_mps[leg.lane])
-    if leg.to_m - leg.from_m < LEAST_STRETCH_M or not can_drive_ahead(ground, from_m, to_m):
+    if leg.to_m - leg.from_m < MIN_STRETCH_M or not can_drive_ahead(road, from_m, to_m):
         return
     way = Way((lane, *onward(graph, lane)), leg.to_m)
     yield Scenario(ScenarioKind.LEAD_BRAKES, to_m, limit, ways=(way,))

@@ -16,7 +16,7 @@ from foredrive.towns.labels.captions import MIN_VISIBILITY, CaptionActor, FrameF
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.sensing.actor_shapes import VAN_HEIGHT_M, VAN_LENGTH_M
 from foredrive.towns.traffic.expert import DriveSnapshot
-from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, Control, LaneGraph
+from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneControl, LaneGraph
 from foredrive.towns.traffic.routes import Route
 
 STANDING_MPS = 0.3
@@ -202,7 +202,11 @@ class FactCollector:
             if begin_m > axle_m + LIGHT_M:
                 break
             zone = int(self._lanes.zone[lane])
-            if begin_m > axle_m and self._lanes.control[lane] == Control.LIGHT and zone in self._signal_xyz:
+            if (
+                begin_m > axle_m
+                and self._lanes.control[lane] == LaneControl.LIGHT
+                and zone in self._signal_xyz
+            ):
                 lamps = self._signal_xyz[zone] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
                 in_view = any(np.linalg.norm(lamp) < LAMPS_M and is_visible(lamp) for lamp in lamps)
                 return _COLOUR_OF_LIGHT.get(LightState(int(snapshot.lights[zone]))) if in_view else None

@@ -42,7 +42,7 @@ CROSSABLE = (
 """Lines between lanes of one direction that may be crossed, as seen from the lane."""
 
 
-class Control(enum.IntEnum):
+class LaneControl(enum.IntEnum):
     """The control at the start of a lane."""
 
     NONE = 0
@@ -52,9 +52,9 @@ class Control(enum.IntEnum):
 
 
 CONTROL_OF_ZONE = {
-    StopZoneKind.TRAFFIC_LIGHT: Control.LIGHT,
-    StopZoneKind.STOP_SIGN: Control.STOP,
-    StopZoneKind.YIELD_SIGN: Control.YIELD,
+    StopZoneKind.TRAFFIC_LIGHT: LaneControl.LIGHT,
+    StopZoneKind.STOP_SIGN: LaneControl.STOP,
+    StopZoneKind.YIELD_SIGN: LaneControl.YIELD,
 }
 
 
@@ -106,7 +106,7 @@ class LaneGraph:
     junction: Int[np.ndarray, "L"]
     """Junction id, -1 outside junctions."""
     control: Int[np.ndarray, "L"]
-    """`Control` at the start of the lane."""
+    """`LaneControl` at the start of the lane."""
     zone: Int[np.ndarray, "L"]
     """Index of the stop zone that guards the lane, -1 for none."""
     siblings: LaneOverlaps
@@ -159,8 +159,8 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
     count = np.array([len(line) for line in lines])
     successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
-    limit = np.where(control == Control.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
-    to_light = _to_light_m(control == Control.LIGHT, length, successors)
+    limit = np.where(control == LaneControl.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
+    to_light = _to_light_m(control == LaneControl.LIGHT, length, successors)
     limits = [_limits(*lane) for lane in zip(limit, length, lines, to_light, strict=True)]
     predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
     junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
@@ -192,7 +192,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         siblings=siblings,
         conflicts=conflicts,
         contested=_contested(
-            (np.diff(conflicts.first) > 0) | (control != Control.NONE),
+            (np.diff(conflicts.first) > 0) | (control != LaneControl.NONE),
             length,
             successors,
             predecessors,
@@ -299,11 +299,11 @@ def _limits(
 
 
 def _lane_controls(town: TownMap, index: dict[str, int], lane_count: int) -> tuple[np.ndarray, np.ndarray]:
-    control = np.full(lane_count, int(Control.NONE))
+    control = np.full(lane_count, int(LaneControl.NONE))
     zone = np.full(lane_count, -1)
     for i, stop in enumerate(town.stop_zones):
         lanes = [index[name] for name in stop.lane_ids if name in index]
-        control[lanes] = CONTROL_OF_ZONE.get(stop.kind, Control.NONE)
+        control[lanes] = CONTROL_OF_ZONE.get(stop.kind, LaneControl.NONE)
         zone[lanes] = i
     return control, zone
 

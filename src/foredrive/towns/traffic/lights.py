@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene.traffic_light import LightState
-from foredrive.towns.traffic.lane_graph import Control, LaneGraph
+from foredrive.towns.traffic.lane_graph import LaneControl, LaneGraph
 
 GREEN_S = 8.0
 YELLOW_S = 4.0
@@ -38,7 +38,7 @@ class SignalPlan:
 
 def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:
     """Plan one phase per axis of a junction, in turn. Each junction starts at a random point of its cycle."""
-    guarded = graph.control == Control.LIGHT
+    guarded = graph.control == LaneControl.LIGHT
     green_from_s = np.zeros(len(guarded))
     cycle_s = np.full(len(guarded), PHASE_S)
     start = graph.xyz[graph.first + 1] - graph.xyz[graph.first]

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.lane_graph import TURN_RAD, Control, LaneGraph
+from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneControl, LaneGraph
 from foredrive.towns.traffic.leaders import STANDSTILL_M, Leaders, add_occupant, link_occupants, motion_arrays
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 
@@ -82,7 +82,7 @@ def claim_junctions(
     lane = vehicles.path[np.arange(len(kept)), column]
     inside = graph.contested[vehicles.lane]
     cut_off = inside & _is_cut_off(graph, vehicles, kept, column)
-    at_light = cut_off & (graph.control[lane] == Control.LIGHT)
+    at_light = cut_off & (graph.control[lane] == LaneControl.LIGHT)
     goes_on = cut_off & ~at_light
     leader = leaders.leader
     queued = (leader >= 0) & (leaders.leader_gap_m < line_gap) & (kept[leader] == 0) & ~inside[leader]
@@ -90,7 +90,7 @@ def claim_junctions(
     near = vehicles.active & (line_gap < reach) & ((~queued & (~inside | at_light)) | goes_on)
     if may_request is not None:
         near &= may_request
-    stop_made = (graph.control[lane] != Control.STOP) | vehicles.has_stopped
+    stop_made = (graph.control[lane] != LaneControl.STOP) | vehicles.has_stopped
     let_go = runs | _is_green(graph, vehicles.path, column, green)
     requests = near & ((let_go & stop_made) | goes_on)
     requested_s = np.where(near, np.minimum(vehicles.requested_s, time_s), np.inf)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from foredrive.towns.map.ground_plan import WALKWAY_RAISE_M
 from foredrive.towns.map.town_map import StripKind, TownMap
-from foredrive.towns.traffic.lane_graph import Control, LaneGraph
+from foredrive.towns.traffic.lane_graph import LaneControl, LaneGraph
 
 JOIN_M = 1.5
 """Distance below which ends of walkways are one place, m."""
@@ -142,7 +142,7 @@ def _crossings(
     lines = shapely.STRtree([shapely.LineString(walk[:, :2]) for walk in walks])
     chords = [_chord(crosswalk.outline_xyz, lines) for crosswalk in town.crosswalks]
     marked = np.array([c.outline_xyz[:-1].mean(axis=0) for c in town.crosswalks]).reshape(-1, 3)
-    for zone in np.unique(lanes.zone[lanes.control == Control.LIGHT]):
+    for zone in np.unique(lanes.zone[lanes.control == LaneControl.LIGHT]):
         start = lanes.position(np.flatnonzero(lanes.zone == zone)[:1], np.array([PAST_LINE_M]))[0]
         if np.linalg.norm(marked - start, axis=1).min(initial=np.inf) > MARKED_NEARBY_M:
             lane = int(np.flatnonzero(lanes.zone == zone)[0])

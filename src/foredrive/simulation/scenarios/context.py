@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinds import Scenario, Way
 from foredrive.simulation.scenarios.kinematics import arrival_s, stopping_m
+from foredrive.simulation.scenarios.scenario import Scenario, Way
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.state import TrafficState
@@ -27,12 +27,12 @@ it, m/s²."""
 
 
 @dataclass(frozen=True)
-class Play:
+class ScenarioProgress:
     """Progress of the scenarios of a route. They are played one after the other, never two at a time."""
 
     number: int = 0
     """Number of the current scenario. Those before are over, or have been missed."""
-    cast: tuple[int, ...] = ()
+    slots: tuple[int, ...] = ()
     """Slots of the vehicles that have been placed for it."""
     way: int = 0
     """Index of the way that they take, among the scenario's ways."""
@@ -49,18 +49,18 @@ class Play:
     begun: tuple[tuple[int, float], ...] = ()
     """Numbers of all scenarios that have begun, and their start times in the drive, s."""
     pace_mps: tuple[float, ...] = ()
-    """Speed of each stray, m/s, once it has begun."""
+    """Speed of each crossing actor, m/s, once it has begun."""
 
-    def after(self) -> "Play":
-        """Return the play with the next scenario as the current one."""
-        return Play(self.number + 1, begun=self.begun, pace_mps=self.pace_mps)
+    def after(self) -> "ScenarioProgress":
+        """Return the progress with the next scenario as the current one."""
+        return ScenarioProgress(self.number + 1, begun=self.begun, pace_mps=self.pace_mps)
 
-    def beginning(self, t_s: float) -> "Play":
-        """Return the play in which the current scenario begins now."""
+    def beginning(self, t_s: float) -> "ScenarioProgress":
+        """Return the progress in which the current scenario begins now."""
         return dataclasses.replace(self, since_s=t_s, begun=(*self.begun, (self.number, t_s)))
 
 
-class Ego(NamedTuple):
+class ScenarioEgo(NamedTuple):
     """The ego vehicle as scenarios see it."""
 
     t_s: float
@@ -100,21 +100,21 @@ class Ego(NamedTuple):
         return arrival_s(gap_m, *motion)
 
 
-class Scene(NamedTuple):
+class ScenarioContext(NamedTuple):
     """A scenario at one time."""
 
     traffic: Traffic
     scenario: Scenario
-    play: Play
+    progress: ScenarioProgress
     state: TrafficState
-    ego: Ego
+    ego: ScenarioEgo
     orders: Orders
     """Filled in while the scenario is played."""
 
     @property
     def way(self) -> Way:
         """Return the way that the vehicles take."""
-        return self.scenario.ways[self.play.way]
+        return self.scenario.ways[self.progress.way]
 
     def along_m(self, slot: int) -> float | None:
         """Return the position of a vehicle's middle along the way, m. None if it has left the way."""
@@ -133,7 +133,7 @@ class Scene(NamedTuple):
         """Return whether another vehicle stands because of the scenario's first vehicle."""
         v, graph = self.state.vehicles, self.traffic.lanes
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
-        return bool((v.active & (leader == self.play.cast[0]) & (v.speed_mps < STANDS_MPS))[1:].any())
+        return bool((v.active & (leader == self.progress.slots[0]) & (v.speed_mps < STANDS_MPS))[1:].any())
 
     def half_m(self, slot: int) -> float:
         """Return half the length of a vehicle, m."""

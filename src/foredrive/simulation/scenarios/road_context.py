@@ -25,7 +25,7 @@ class Stretch(NamedTuple):
     to_m: float
 
 
-class Ground(NamedTuple):
+class RoadContext(NamedTuple):
     """The route and the town in which scenarios are searched."""
 
     route: DriveRoute
@@ -34,9 +34,9 @@ class Ground(NamedTuple):
     world: World
 
 
-def stretches_of(ground: Ground) -> list[Stretch]:
+def stretches_of(road: RoadContext) -> list[Stretch]:
     """Return the route's legs with their start and end on the route."""
-    route, graph, at_m, found = ground.route, ground.graph, 0.0, []
+    route, graph, at_m, found = road.route, road.graph, 0.0, []
     for leg in route.legs:
         ends = graph.position(np.array([leg.lane, leg.lane]), np.array([leg.from_m, leg.to_m]))
         from_m = arc_m(route, ends[0], at_m)

@@ -1,21 +1,21 @@
-"""Strays (crossing pedestrians and cyclists): when they start, and how they avoid vehicles."""
+"""Crossing actors (pedestrians and cyclists): when they start, and how they avoid vehicles."""
 
 import numpy as np
 from jaxtyping import Float64
 
 from foredrive.scene import Category
 from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.simulation.scenarios.context import ScenarioEgo
 from foredrive.simulation.scenarios.kinematics import SPARE_M, cruise_mps
-from foredrive.simulation.scenarios.scene import Ego
+from foredrive.simulation.scenarios.scenario import Scenario, ScenarioKind
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 from foredrive.towns.traffic.scripted_actors import ACCELERATION_MPS2, ScriptedActor
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
 
-SLOWEST_EGO_MPS = 1.5
+MIN_EGO_MPS = 1.5
 PREFERRED_MPS = {Category.PEDESTRIAN: 1.4, Category.BICYCLE: 3.5}
-SLOWEST_MPS, FASTEST_MPS = 0.8, {Category.PEDESTRIAN: 3.0, Category.BICYCLE: 6.0}
+MIN_MPS, MAX_MPS = 0.8, {Category.PEDESTRIAN: 3.0, Category.BICYCLE: 6.0}
 STEP_OUT_MPS = 1.5
 STAYS_S = 9.0
 """A pedestrian that steps out before a parked car goes back after this time, s."""
@@ -25,60 +25,60 @@ STANDS_MPS = 0.5
 LATE_M = 3.0
 SAFE_S = 4.0
 BACK_MPS = -0.8
-"""Speed of a stray that steps back because a vehicle blocks its way, m/s."""
+"""Speed of a crossing actor that steps back because a vehicle blocks its way, m/s."""
 BESIDE_M = 0.4
 
 
-def pace_to_begin(scenario: Scenario, stray: ScriptedActor, ego: Ego) -> float | None:
-    """Return the speed at which a stray starts now to meet the ego vehicle, m/s.
+def pace_to_begin(scenario: Scenario, actor: ScriptedActor, ego: ScenarioEgo) -> float | None:
+    """Return the speed at which a crossing actor starts now to meet the ego vehicle, m/s.
 
     Returns None if it is too early, or no longer fair.
     """
     gap_m, speed = ego.front_gap_m(scenario.at_m) - HALF_WIDTH_M, ego.speed_mps
     spare_m = gap_m - ego.stopping_m()
-    if speed < SLOWEST_EGO_MPS:
+    if speed < MIN_EGO_MPS:
         return None
     if scenario.kind is ScenarioKind.DOOR_ZONE:  # visible in the lane while the ego vehicle can still stop
         spare_m -= speed * scenario.meet_m / STEP_OUT_MPS
         return STEP_OUT_MPS if SPARE_M - LATE_M < spare_m < SPARE_M else None
     arrives_s = ego.arrival_s(scenario)
-    early = arrives_s > scenario.meet_m / PREFERRED_MPS[stray.category] and spare_m > SPARE_M
+    early = arrives_s > scenario.meet_m / PREFERRED_MPS[actor.category] and spare_m > SPARE_M
     if spare_m < 0 or early:
         return None
     pace = cruise_mps(scenario.meet_m, arrives_s, 0.0, ACCELERATION_MPS2)
-    return min(max(pace, SLOWEST_MPS), FASTEST_MPS[stray.category])
+    return min(max(pace, MIN_MPS), MAX_MPS[actor.category])
 
 
-def is_on_the_spot(scenario: Scenario, stray: ScriptedActor, since_s: float) -> bool:
-    """Return whether a stray waits where it is: a pedestrian that has stepped out before a parked car."""
+def is_on_the_spot(scenario: Scenario, actor: ScriptedActor, since_s: float) -> bool:
+    """Return whether an actor waits in the lane: a pedestrian that has stepped out before a parked car."""
     waits = scenario.kind is ScenarioKind.DOOR_ZONE and since_s < STAYS_S
-    return waits and stray.s_m >= scenario.meet_m - NEARLY_M
+    return waits and actor.s_m >= scenario.meet_m - NEARLY_M
 
 
-def walks_into(stray: ScriptedActor, pace_mps: float, others: MovingBoxes) -> bool:
-    """Return whether a stray that goes on hits a vehicle that it would not hit if it stood still."""
-    to_go_m = stray.length_m - stray.s_m if pace_mps > 0 else stray.s_m
+def would_hit(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> bool:
+    """Return whether a crossing actor that goes on hits a vehicle that it would not hit if it stood still."""
+    to_go_m = actor.length_m - actor.s_m if pace_mps > 0 else actor.s_m
     left_s = to_go_m / abs(pace_mps)
-    goes = time_to_collision_s(_box(stray, pace_mps), others).min(initial=np.inf)
-    stands = time_to_collision_s(_box(stray, 0.0), others).min(initial=np.inf)
+    goes = time_to_collision_s(_box(actor, pace_mps), others).min(initial=np.inf)
+    stands = time_to_collision_s(_box(actor, 0.0), others).min(initial=np.inf)
     return bool(goes < min(left_s, SAFE_S) and stands > goes)
 
 
-def pace_among(stray: ScriptedActor, pace_mps: float, others: MovingBoxes) -> float:
-    """Return the speed of a stray among vehicles, m/s.
+def pace_among(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> float:
+    """Return the speed of a crossing actor among vehicles, m/s.
 
     It waits for vehicles that approach, and steps back from vehicles that block its way.
     """
-    if not walks_into(stray, pace_mps, others):
+    if not would_hit(actor, pace_mps, others):
         return pace_mps
     stand = np.hypot(*others.velocity_mps.T) < STANDS_MPS
-    if walks_into(stray, pace_mps, others.only(stand)) and not walks_into(stray, BACK_MPS, others):
+    if would_hit(actor, pace_mps, others.only(stand)) and not would_hit(actor, BACK_MPS, others):
         return BACK_MPS
     return 0.0
 
 
-def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxes:
-    """Return the vehicles that strays avoid: all except vehicle 0, and vehicle 0 too while it stands."""
+def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: ScenarioEgo) -> MovingBoxes:
+    """Return the vehicles that crossing actors avoid: all, but vehicle 0 only while it stands."""
     v, poses = state.vehicles, traffic.poses(state)
     rows = np.flatnonzero(v.active)
     rows = rows[rows > 0]
@@ -91,7 +91,7 @@ def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: Ego) -> MovingBoxe
     return MovingBoxes(*(np.concatenate(pair) for pair in zip(boxes, own, strict=True)))
 
 
-def _box(stray: ScriptedActor, pace_mps: float) -> MovingBoxes:
-    size = stray.size_lwh[:2] + 2 * BESIDE_M
-    velocity = pace_mps * stray.ahead
-    return MovingBoxes(stray.xyz[None, :2], size[None], np.array([stray.yaw_rad]), velocity[None])
+def _box(actor: ScriptedActor, pace_mps: float) -> MovingBoxes:
+    size = actor.size_lwh[:2] + 2 * BESIDE_M
+    velocity = pace_mps * actor.ahead
+    return MovingBoxes(actor.xyz[None, :2], size[None], np.array([actor.yaw_rad]), velocity[None])

@@ -66,7 +66,7 @@ class Scenario:
     """Side to which a vehicle cuts in (0 left, 1 right)."""
     ego_lane: int = -1
     """Lane of the ego vehicle in the junction, whose light it has. -1 outside of junctions."""
-    stray: ScriptedActor | None = None
+    actor: ScriptedActor | None = None
     """The crossing road user in its waiting state, if there is one."""
     meet_m: float = 0.0
     """Distance along the crossing road user's way at which it meets the route, m."""

@@ -8,14 +8,14 @@ from jaxtyping import Float64
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
 from foredrive.simulation.collisions import SOLID
-from foredrive.simulation.scenarios.ground import Ground, pose
-from foredrive.simulation.scenarios.kinds import Scenario, ScenarioKind
+from foredrive.simulation.scenarios.road_context import RoadContext, pose
+from foredrive.simulation.scenarios.scenario import Scenario, ScenarioKind
 from foredrive.towns.traffic.scripted_actors import FIRST_TRACK_ID, ScriptedActor
 from foredrive.towns.world import World
 
 STEP_M, OFF_LANES_M = 0.5, 1.0
 """The road ends where there is no lane for `OFF_LANES_M`; `STEP_M` is the search step."""
-FURTHEST_RIGHT_M, FURTHEST_LEFT_M = 12.0, 26.0
+MAX_RIGHT_M, MAX_LEFT_M = 12.0, 26.0
 RUN_UP_M = 3.0
 """Additional distance from which cyclists start, m."""
 HEIGHTS_M = (0.4, 0.9)
@@ -36,37 +36,40 @@ PEDESTRIAN_LWH, CYCLIST_LWH = (0.5, 0.55, 1.72), (1.75, 0.6, 1.7)
 
 
 def crossing(
-    ground: Ground, at_m: float, limit_mps: float, category: Category, seen_m: float
+    road: RoadContext, at_m: float, limit_mps: float, category: Category, seen_m: float
 ) -> Iterator[Scenario]:
     """Yield a crossing from the right, if its way is clear and the ego vehicle sees its start in time.
 
     Args:
         seen_m: distance before the crossing from which its start must be visible, m.
     """
-    point, ahead = pose(ground.route, at_m)
+    point, ahead = pose(road.route, at_m)
     left = np.array([-ahead[1], ahead[0], 0.0])
-    right_m = _to_edge_m(ground, point, -left, FURTHEST_RIGHT_M)
-    left_m = _to_edge_m(ground, point, left, FURTHEST_LEFT_M)
+    right_m = _to_edge_m(road, point, -left, MAX_RIGHT_M)
+    left_m = _to_edge_m(road, point, left, MAX_LEFT_M)
     if right_m is None or left_m is None:
         return
     cycles = category is Category.BICYCLE
     start_m = right_m + (RUN_UP_M if cycles else 0.0)
     way = np.stack([point - start_m * left, point + left_m * left])
-    eye, _ = pose(ground.route, max(at_m - seen_m, 0.0))
-    if not _is_clear(ground.world, way[0], way[1]) or not _is_seen(ground.world, eye, way[0]):
+    eye, _ = pose(road.route, max(at_m - seen_m, 0.0))
+    if not _is_clear(road.world, way[0], way[1]) or not _is_seen(road.world, eye, way[0]):
         return
     kind = ScenarioKind.CROSSING_CYCLIST if cycles else ScenarioKind.CROSSING_PEDESTRIAN
     size = np.array(CYCLIST_LWH if cycles else PEDESTRIAN_LWH)
-    stray = ScriptedActor(FIRST_TRACK_ID, category, 0, size, way)
-    yield Scenario(kind, at_m, limit_mps, stray=stray, meet_m=start_m)
+    actor = ScriptedActor(FIRST_TRACK_ID, category, 0, size, way)
+    yield Scenario(kind, at_m, limit_mps, actor=actor, meet_m=start_m)
 
 
 def _to_edge_m(
-    ground: Ground, point: Float64[np.ndarray, "3"], aside: Float64[np.ndarray, "3"], furthest_m: float
+    road: RoadContext,
+    point: Float64[np.ndarray, "3"],
+    aside: Float64[np.ndarray, "3"],
+    max_m: float,
 ) -> float | None:
     """Return the distance straight to one side at which the lanes end, m. None if they do not."""
-    graph, near, free_m = ground.graph, ground.near, 0.0
-    for away_m in np.arange(0.0, furthest_m, STEP_M).tolist():
+    graph, near, free_m = road.graph, road.near, 0.0
+    for away_m in np.arange(0.0, max_m, STEP_M).tolist():
         here = point + away_m * aside
         samples = near.within(here, 3.0)
         off_m = np.hypot(*(near.xyz[samples, :2] - here[:2]).T) - 0.5 * graph.width_m[near.lane[samples]]
@@ -76,42 +79,42 @@ def _to_edge_m(
     return None
 
 
-def beside_parked(ground: Ground) -> Iterator[Scenario]:
+def beside_parked(road: RoadContext) -> Iterator[Scenario]:
     """Yield the pedestrians that may step out before parked cars."""
-    route, graph = ground.route, ground.graph
-    for car in ground.world.parked:
+    route, graph = road.route, road.graph
+    for car in road.world.parked:
         away_m = np.hypot(*(route.xyz[:, :2] - car.centre_m[:2]).T)
         if away_m.min() > PARKED_ASIDE_M[1]:
             continue
         at_m = float(route.arc_m[np.argmin(away_m)]) + 0.5 * float(car.size_lwh[0]) + STEPS_OUT_M
-        scenario = _before_car(ground, car, at_m) if 0.0 < at_m < route.length_m - CLEAR_OF_END_M else None
-        if scenario is not None and graph.junction[_lane_at(ground, at_m)] < 0:
+        scenario = _before_car(road, car, at_m) if 0.0 < at_m < route.length_m - CLEAR_OF_END_M else None
+        if scenario is not None and graph.junction[_lane_at(road, at_m)] < 0:
             yield scenario
 
 
-def _before_car(ground: Ground, car: ActorState, at_m: float) -> Scenario | None:
-    point, ahead = pose(ground.route, at_m)
+def _before_car(road: RoadContext, car: ActorState, at_m: float) -> Scenario | None:
+    point, ahead = pose(road.route, at_m)
     right = np.array([ahead[1], -ahead[0], 0.0])
     aside_m = float((car.centre_m - point) @ right)
     skew = (car.yaw - np.arctan2(ahead[1], ahead[0]) + 0.5 * np.pi) % np.pi - 0.5 * np.pi
-    _, before = pose(ground.route, max(at_m - STRAIGHT_M, 0.0))
+    _, before = pose(road.route, max(at_m - STRAIGHT_M, 0.0))
     is_beside = PARKED_ASIDE_M[0] < aside_m < PARKED_ASIDE_M[1] and abs(skew) < PARKED_SKEW_RAD
     if not is_beside or before @ ahead < STRAIGHT_COS:
         return None
     start, out = point + aside_m * right, point + INTO_LANE_M * right
-    if not _is_clear(ground.world, start, out):
+    if not _is_clear(road.world, start, out):
         return None
-    limit = float(ground.graph.limit_mps[_lane_at(ground, at_m)])
-    stray = ScriptedActor(
+    limit = float(road.graph.limit_mps[_lane_at(road, at_m)])
+    actor = ScriptedActor(
         FIRST_TRACK_ID, Category.PEDESTRIAN, 0, np.array(PEDESTRIAN_LWH), np.stack([start, out, start])
     )
-    return Scenario(ScenarioKind.DOOR_ZONE, at_m, limit, stray=stray, meet_m=aside_m - INTO_LANE_M)
+    return Scenario(ScenarioKind.DOOR_ZONE, at_m, limit, actor=actor, meet_m=aside_m - INTO_LANE_M)
 
 
-def _lane_at(ground: Ground, at_m: float) -> int:
-    point, _ = pose(ground.route, at_m)
-    _, sample = ground.near.tree.query(point[:2])
-    return int(ground.near.lane[sample])
+def _lane_at(road: RoadContext, at_m: float) -> int:
+    point, _ = pose(road.route, at_m)
+    _, sample = road.near.tree.query(point[:2])
+    return int(road.near.lane[sample])
 
 
 def _is_clear(world: World, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.scenarios.ground import Ground
-from foredrive.simulation.scenarios.kinds import MEETINGS, ScenarioKind, Way
-from foredrive.simulation.scenarios.scene import Scene
+from foredrive.simulation.scenarios.context import ScenarioContext
+from foredrive.simulation.scenarios.road_context import RoadContext
+from foredrive.simulation.scenarios.scenario import MEETINGS, ScenarioKind, Way
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, points_along
 from foredrive.towns.traffic.spawning import SPAWN_MIN_M
 
@@ -31,54 +31,54 @@ SAMPLES_M = 4.0
 APPROACHING_MPS = 3.0
 
 
-def can_stand(ground: Ground, at_m: float) -> bool:
+def can_stand(road: RoadContext, at_m: float) -> bool:
     """Return whether a standing vehicle can be placed at a point of a route unseen."""
     if at_m < EARLY_M:
         return True
     away_m = np.arange(SPAWN_MIN_M, EARLY_M, SAMPLES_M)
-    return _is_far(ground, np.full(len(away_m), at_m), at_m - away_m)
+    return _is_far(road, np.full(len(away_m), at_m), at_m - away_m)
 
 
-def can_drive_ahead(ground: Ground, from_m: float, to_m: float) -> bool:
+def can_drive_ahead(road: RoadContext, from_m: float, to_m: float) -> bool:
     """Return whether a lead vehicle can be placed on a stretch of a route unseen."""
     if from_m <= AHEAD_AT_START_M <= to_m - SHARED_AT_START_M:
         return True
     ahead_m = np.arange(max(from_m, AHEAD_M), to_m - SHARED_M, SAMPLES_M)
-    return _is_far(ground, ahead_m, ahead_m - AHEAD_M)
+    return _is_far(road, ahead_m, ahead_m - AHEAD_M)
 
 
-def _is_far(ground: Ground, ahead_m: Float64[np.ndarray, "n"], behind_m: Float64[np.ndarray, "n"]) -> bool:
+def _is_far(road: RoadContext, ahead_m: Float64[np.ndarray, "n"], behind_m: Float64[np.ndarray, "n"]) -> bool:
     """Return whether at least one of some pairs of points on a route is too far apart for sight.
 
     Two points cannot be seen from each other if they are further apart than `SPAWN_MIN_M`.
     """
-    xy, arc_m = ground.route.xyz.T[:2], ground.route.arc_m
+    xy, arc_m = road.route.xyz.T[:2], road.route.arc_m
     there, here = (np.stack([np.interp(m, arc_m, axis) for axis in xy]) for m in (ahead_m, behind_m))
     return bool((np.hypot(*(there - here)) > SPAWN_MIN_M).any())
 
 
-def call(scene: Scene, at_start: bool) -> Scene:
-    """Return the scene with its vehicles on the road, if they can be placed now.
+def place_vehicles(context: ScenarioContext, at_start: bool) -> ScenarioContext:
+    """Return the context with its vehicles on the road, if they can be placed now.
 
     Args:
         at_start: whether the drive is about to begin, so that vehicles may also appear in sight.
     """
-    gap_m = scene.ego.middle_gap_m(scene.scenario.at_m)
+    gap_m = context.ego.middle_gap_m(context.scenario.at_m)
     if not 0.0 < gap_m < EARLY_M:
-        return scene
-    for number, way in enumerate(scene.scenario.ways):
-        begin_m, speed_mps = _begin(scene, way, gap_m, at_start)
+        return context
+    for number, way in enumerate(context.scenario.ways):
+        begin_m, speed_mps = _begin(context, way, gap_m, at_start)
         if begin_m is None or begin_m < BEGIN_M:
             continue
-        called = _called(scene, number, begin_m, speed_mps, at_start)
+        called = _placed(context, number, begin_m, speed_mps, at_start)
         if called is not None:
             return called
-    return scene
+    return context
 
 
-def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float | None, float]:
+def _begin(context: ScenarioContext, way: Way, gap_m: float, at_start: bool) -> tuple[float | None, float]:
     """Return where along a way the first vehicle begins, m (None: not now), and its speed, m/s."""
-    scenario, ego = scene.scenario, scene.ego
+    scenario, ego = context.scenario, context.ego
     if scenario.kind is ScenarioKind.OBSTACLE_BEHIND_CORNER:
         return way.meet_m, 0.0
     if scenario.kind in MEETINGS:
@@ -87,7 +87,7 @@ def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float 
         if at_start:
             return way.meet_m - min(max(gap_m, AT_START_M[0]), AT_START_M[1]), 0.0
         arrives_s = ego.arrival_s(scenario)
-        if ego.speed_mps < APPROACHING_MPS or not is_let_go(scene, arrives_s):
+        if ego.speed_mps < APPROACHING_MPS or not is_let_go(context, arrives_s):
             return None, 0.0
         return way.meet_m - scenario.limit_mps * arrives_s, scenario.limit_mps
     ahead_m, shared_m = (AHEAD_AT_START_M, SHARED_AT_START_M) if at_start else (AHEAD_M, SHARED_M)
@@ -96,26 +96,28 @@ def _begin(scene: Scene, way: Way, gap_m: float, at_start: bool) -> tuple[float 
     return way.meet_m - (gap_m - ahead_m), 0.0
 
 
-def is_let_go(scene: Scene, after_s: float) -> bool:
+def is_let_go(context: ScenarioContext, after_s: float) -> bool:
     """Return whether the ego vehicle will have no red light at the scenario's junction."""
-    shows = scene.traffic.signals.light_states(scene.state.time_s + after_s)
-    return bool(shows[scene.scenario.ego_lane] != LightState.RED)
+    shows = context.traffic.signals.light_states(context.state.time_s + after_s)
+    return bool(shows[context.scenario.ego_lane] != LightState.RED)
 
 
-def _called(scene: Scene, number: int, begin_m: float, speed_mps: float, at_start: bool) -> Scene | None:
-    traffic, way, kind = scene.traffic, scene.scenario.ways[number], scene.scenario.kind
+def _placed(
+    context: ScenarioContext, number: int, begin_m: float, speed_mps: float, at_start: bool
+) -> ScenarioContext | None:
+    traffic, way, kind = context.traffic, context.scenario.ways[number], context.scenario.kind
     count = STREAM if kind is ScenarioKind.ONCOMING_TRAFFIC else 1
     begins_m = [begin_m - k * STREAM_APART_M for k in range(count)]
     begins_m = [m for m in begins_m if m >= BEGIN_M]
     places = points_along(traffic.lanes, way.lanes, np.array(begins_m))
-    if not at_start and np.linalg.norm(places - scene.ego.centre_m, axis=1).min() < SPAWN_MIN_M:
+    if not at_start and np.linalg.norm(places - context.ego.centre_m, axis=1).min() < SPAWN_MIN_M:
         return None
     until_m = way.meet_m if kind is ScenarioKind.RED_LIGHT_RUNNER else begin_m + 2 * SAMPLES_M
     from_m = begins_m[-1] - 2 * SAMPLES_M
     if kind in (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN) and at_start:
         from_m = begin_m - AHEAD_AT_START_M + 2 * SAMPLES_M
     room = points_along(traffic.lanes, way.lanes, np.arange(max(from_m, 0.0), until_m, SAMPLES_M))
-    state = clear_area(traffic, scene.state, room, 0.0 if at_start else SPAWN_MIN_M - 5.0)
+    state = clear_area(traffic, context.state, room, 0.0 if at_start else SPAWN_MIN_M - 5.0)
     free = (
         [] if state is None else [slot for slot in traffic.scenario_slots if not state.vehicles.active[slot]]
     )
@@ -123,5 +125,5 @@ def _called(scene: Scene, number: int, begin_m: float, speed_mps: float, at_star
         return None
     for slot, along_m in zip(free, begins_m, strict=False):
         state = add_vehicle(traffic, state, slot, way.lanes, along_m, speed_mps)
-    play = dataclasses.replace(scene.play, cast=tuple(free[: len(begins_m)]), way=number)
-    return scene._replace(state=state, play=play)
+    progress = dataclasses.replace(context.progress, slots=tuple(free[: len(begins_m)]), way=number)
+    return context._replace(state=state, progress=progress)
