@@ -65,7 +65,7 @@ def happens(simulator: TownSimulator, route: DriveRoute, scenario: Scenario, wha
     for attentive in (False, True):
         simulator.reset(town_scenario(route, (scenario,)))
         events, states = drive(simulator, Driver(route, scenario.limit_mps, attentive))
-        progress = states[-1].progress
+        progress = states[-1].scenarios
         assert [number for number, _ in progress.begun] == [0]
         actors = {str(actor.track_id) for actor in states[-1].decided.scripted_actors} or {"1", "2", "3"}
         hits = [event for event in events if event.kind == f"collision_{what}"]
@@ -119,10 +119,10 @@ def test_a_scenario_is_over_and_the_vehicle_in_the_way_drives_on(
     route, scenario = places[ScenarioKind.OBSTACLE_BEHIND_CORNER]
     simulator.reset(town_scenario(route, (scenario,)))
     events, states = drive(simulator, Driver(route, scenario.limit_mps, attentive=True))
-    (slot,) = states[0].progress.slots
+    (slot,) = states[0].scenarios.slots
     assert {float(state.decided.vehicles.speed_mps[slot]) for state in states[:100]} == {0.0}
     waited = [state.t_s for state in states if state.ego.speed_mps == 0.0 and state.t_s > 5.0]
-    over_s = next(state.t_s for state in states if state.progress.number == 1)
+    over_s = next(state.t_s for state in states if state.scenarios.number == 1)
     assert over_s == pytest.approx(waited[0] + 3.0, abs=0.5)
     assert states[-1].decided.vehicles.speed_mps[slot] > 3.0
     assert [(event.kind, event.what) for event in events] == [("scenario", "obstacle_behind_corner")]
@@ -160,7 +160,7 @@ def test_a_drive_with_a_scenario_goes_on_bit_by_bit(
     _, again = drive(simulator, driver)
     assert len(again) == len(states) - states.index(middle)
     assert again[-1].ego == states[-1].ego
-    assert again[-1].progress == states[-1].progress
+    assert again[-1].scenarios == states[-1].scenarios
     for first, second in zip(
         states[-1].decided.scripted_actors, again[-1].decided.scripted_actors, strict=True
     ):
