@@ -27,7 +27,9 @@ ARMS: dict[str, RebuildRecipe] = {
     "gaussians_tiny": RECIPE,
     "shorter": SHORTER,
     "static_only": dataclasses.replace(SHORTER, actors=False),
-    "no_rolling_shutter": dataclasses.replace(SHORTER, rolling=False),
+    "no_rolling_shutter": dataclasses.replace(
+        SHORTER, scene=dataclasses.replace(SHORTER.scene, rolling=False)
+    ),
     "no_drop": dataclasses.replace(
         SHORTER,
         drop=False,

@@ -1,7 +1,9 @@
 """A log rebuilt in seconds: hardly any Gaussians, hardly trained."""
 
 from foredrive.recipes.gaussians import RebuildRecipe
+from foredrive.rendering.decoders import CameraDecoderConfig
 from foredrive.rendering.initial import InitialGaussians
+from foredrive.rendering.scene_config import SceneConfig
 from foredrive.training.rebuilding import RebuildSchedule
 
 SMALLEST = RebuildRecipe(
@@ -11,5 +13,5 @@ SMALLEST = RebuildRecipe(
         lidar_points=1100, unseen_points=400, pixel_points=1000, near_points=0, actor_points=80, features=2
     ),
     schedule=RebuildSchedule(steps=2, max_gaussians=3000, beam_stride=4),
-    decoder_width=8,
+    scene=SceneConfig(CameraDecoderConfig(width=8)),
 )

@@ -156,8 +156,8 @@ def test_a_setting_that_does_not_fit_is_one_line(setting: str, said: str) -> Non
 def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
     save_recipe(find_rebuild_recipe("gaussians_tiny"), own)
-    chosen = find_rebuild_recipe(str(own), ("schedule.steps=7", "rolling=false"))
-    assert (chosen.schedule.steps, chosen.rolling) == (7, False)
+    chosen = find_rebuild_recipe(str(own), ("schedule.steps=7", "scene.rolling=false"))
+    assert (chosen.schedule.steps, chosen.scene.rolling) == (7, False)
     assert chosen.initial == find_rebuild_recipe("gaussians_tiny").initial
     with pytest.raises(InputError, match="near: gaussians_tiny"):
         find_rebuild_recipe("gaussian_tiny")

@@ -1,13 +1,16 @@
 """Sensors that move while they look, and corrections of them, on scenes of a few Gaussians."""
 
 import dataclasses
+from typing import Literal
 
 import pytest
 import torch
 
 from foredrive.geometry.se3 import exp_se3, transform_points
+from foredrive.rendering.decoders import CameraDecoder, CameraDecoderConfig, LidarDecoder
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.rebuilt import UNSEEN_RGB, RebuiltScene
+from foredrive.rendering.scene_config import SceneConfig
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
@@ -18,7 +21,7 @@ FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 
 """Camera (x right, y down, z forward) in a frame with x forward and z up."""
 
 
-def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, *, rolling: bool = True) -> RebuiltScene:
+def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, config: SceneConfig | None = None) -> RebuiltScene:
     """Small, hard, white Gaussians."""
     count = len(mean_m)
     gaussians = Gaussians(
@@ -29,7 +32,8 @@ def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, *, rolling: bool = True)
         feature=torch.tensor([[1.0, 1, 1, 0, 0]]).repeat(count, 1),
     )
     torch.manual_seed(0)
-    return RebuiltScene(SceneGraph(gaussians, torch.full((count,), STATIC), tracks), 1, rolling)
+    graph = SceneGraph(gaussians, torch.full((count,), STATIC), tracks)
+    return RebuiltScene(graph, 1, config, frames=2)
 
 
 @pytest.fixture
@@ -71,7 +75,7 @@ def test_a_pole_leans_when_the_camera_passes_it(nobody: ActorTracks) -> None:
     camera = view([10.0, 0, 0, 0, 0, 0], readout_s=0.04)
     top, bottom = (centre_px(scene_of(pole, nobody), camera, rows) for rows in (slice(4, 12), slice(52, 60)))
     assert top - bottom == pytest.approx(10 * 0.04 * 48 / 64 * 60 / 6, abs=0.05)
-    still = scene_of(pole, nobody, rolling=False)
+    still = scene_of(pole, nobody, SceneConfig(rolling=False))
     assert centre_px(still, camera, slice(4, 12)) == pytest.approx(48.0, abs=0.05)
 
 
@@ -134,6 +138,61 @@ def test_a_moving_lidar_measures_from_where_each_beam_left(nobody: ActorTracks) 
     assert torch.allclose(seen.range_m, along.norm(dim=-1), atol=0.05)
     assert seen.alpha_before_hit is not None
     assert float(seen.alpha_before_hit.max()) < 1e-3
-    one_moment = scene_of(transform_points(T_scene_ego, targets), nobody, rolling=False)
+    one_moment = scene_of(transform_points(T_scene_ego, targets), nobody, SceneConfig(rolling=False))
     missed = one_moment.sweep(one_moment.graph, one_moment.prepare_sweep(sweep), 0.5)
     assert float(missed.alpha[[1, 3]].max()) < 0.2  # those abeam
+
+
+def test_the_velocity_of_a_frame_is_used_for_that_frame_alone(nobody: ActorTracks) -> None:
+    pole = torch.stack([torch.full((81,), 10.0), torch.zeros(81), torch.linspace(-4, 4, 81)], -1)
+    scene = scene_of(pole, nobody, SceneConfig(frame_velocities=True))
+    assert scene.frame_velocity is not None
+    assert scene.frame_turn is not None
+    with torch.no_grad():
+        scene.frame_turn.zero_()
+        scene.frame_velocity.copy_(torch.tensor([[0.0, 0, 0], [6.0, 0, 0]]))
+        still, passing = view([0.0] * 6, 0.05), view([6.0, 0, 0, 0, 0, 0], 0.05)
+        expected = scene(scene.graph, passing).rgb
+        torch.testing.assert_close(scene(scene.graph, still, frame=1).rgb, expected)
+        assert torch.equal(scene(scene.graph, still, frame=0).rgb, scene(scene.graph, still).rgb)
+        assert not torch.equal(scene(scene.graph, still).rgb, expected)
+
+
+def test_a_background_after_the_decoder_fills_what_nothing_covers(nobody: ActorTracks) -> None:
+    scene = scene_of(torch.tensor([[2.0, 0, 0]]), nobody, SceneConfig(background="after_decoder"))
+    camera, red = view([0.0] * 6, 0.0), torch.tensor([1.0, 0.25, 0.0])
+    with torch.no_grad():
+        black, coloured = (scene(scene.graph, camera, background_rgb=rgb) for rgb in (torch.zeros(3), red))
+        unseen = scene(scene.graph, camera)
+    assert float(black.alpha.max()) > 0.9
+    torch.testing.assert_close(coloured.rgb - black.rgb, (1 - black.alpha) * red[:, None, None])
+    torch.testing.assert_close(
+        unseen.rgb - black.rgb, (1 - black.alpha) * torch.tensor(UNSEEN_RGB)[:, None, None]
+    )
+
+
+def test_what_is_nearer_than_the_near_plane_is_not_seen(nobody: ActorTracks) -> None:
+    near, camera = torch.tensor([[0.4, 0.0, 0.0]]), view([0.0] * 6, 0.0)
+    with torch.no_grad():
+        for config, seen in ((SceneConfig(), True), (SceneConfig(camera_near_m=0.5), False)):
+            scene = scene_of(near, nobody, config)
+            assert bool(scene(scene.graph, camera).alpha.max() > 0.5) is seen
+
+
+def test_the_network_alone_may_decide_which_beams_return(nobody: ActorTracks) -> None:
+    """Half of the light is stopped: half as many beams return, or as many."""
+    feature, direction = torch.rand(4, 5), torch.tensor([[1.0, 0, 0]]).expand(4, 3)
+    for from_alpha in (True, False):
+        torch.manual_seed(0)
+        decoder = LidarDecoder(2, from_alpha)
+        full, half = (decoder(feature, torch.full((4,), alpha), direction)[1] for alpha in (1.0, 0.5))
+        returns = (-half).sigmoid() / (-full).sigmoid()
+        torch.testing.assert_close(returns, torch.full((4,), 0.5 if from_alpha else 1.0))
+
+
+@pytest.mark.parametrize(("blocks", "count"), [("plain", 16_390), ("residual", 35_686)])
+def test_parameters_of_a_camera_decoder(blocks: Literal["plain", "residual"], count: int) -> None:
+    """3x3 of 24 to 32 channels: 6,944; of 32 to 32: 9,248; 1x1 to 6: 198; 1x1 shortcut of 24 to 32: 800."""
+    decoder = CameraDecoder(13, 2, CameraDecoderConfig(32, blocks))
+    assert sum(parameter.numel() for parameter in decoder.net.parameters()) == count
+    assert decoder(torch.rand(6, 8, 16), torch.rand(6, 8, 3), 1).shape == (3, 6, 8)

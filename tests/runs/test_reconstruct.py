@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import math
 import shutil
 from pathlib import Path
 
@@ -22,11 +23,13 @@ from foredrive.recipes.gaussians import (
     RebuildRecipe,
     find_rebuild_recipe,
     gaussians_base,
+    gaussians_published,
     gaussians_tiny,
     load_rebuild_recipe,
 )
 from foredrive.rendering.initial import InitialGaussians
 from foredrive.rendering.scene_graph import STATIC
+from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import (
     initial_model,
     memory_needed_gib,
@@ -34,7 +37,8 @@ from foredrive.runs.rebuild.reconstruct import (
     reconstruct,
 )
 from foredrive.training import loop
-from foredrive.training.rebuilding import LearningRates, RebuildSchedule
+from foredrive.training.gaussian_rates import LearningRates, Rate
+from foredrive.training.rebuilding import RebuildSchedule
 
 STEPS = 40
 
@@ -49,14 +53,14 @@ def recipe(steps: int = STEPS) -> RebuildRecipe:
             pixel_points=300,
             near_points=0,
             actor_points=50,
-            actor_points_most=100,
+            max_actor_points=100,
             features=2,
             scale=0.7,
         ),
         schedule=RebuildSchedule(
             steps=steps,
             max_gaussians=2200,
-            rates=LearningRates(mean_m=1e-3, albedo=1e-2),
+            rates=LearningRates(mean_m=Rate(1e-3, final=0.01), albedo=Rate(1e-2)),
             images_per_sweep=2,
             beam_stride=2,
             shrink_steps=(10,),
@@ -184,10 +188,76 @@ def test_too_little_memory_is_said_before(
 
 def test_named_recipes() -> None:
     assert find_rebuild_recipe("gaussians_tiny") == gaussians_tiny()
-    with pytest.raises(InputError, match="near: gaussians_base, gaussians_tiny"):
+    with pytest.raises(InputError, match="near: gaussians_"):
         find_rebuild_recipe("gaussians_huge")
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
+
+
+def test_the_published_recipe_has_the_choices_of_the_reference() -> None:
+    chosen = gaussians_published()
+    assert memory_needed_gib(chosen, frames=80, cameras=6) < 40
+    initial, scene, rates = chosen.initial, chosen.scene, chosen.schedule.rates
+    assert (scene.decoder.blocks, scene.decoder.width, scene.background) == ("residual", 32, "after_decoder")
+    assert initial.random_features
+    assert initial.random_rotations
+    assert (initial.random_far_points, initial.random_near_points) == (300_000, 300_000)
+    assert (initial.pixel_points, initial.near_points) == (0, 0)
+    kinds = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature", "decoders")
+    last = {name: getattr(rates, name).at(30_000, 30_000) / getattr(rates, name).first for name in kinds}
+    assert last.pop("mean_m") == pytest.approx(0.01)
+    assert set(last.values()) == {1.0}
+    actors = rates.actor_offset
+    assert [actors.at(step, 30_000) for step in (0, 2_500, 20_001)] == pytest.approx([0, 1e-3, 1e-4])
+    assert scene.frame_velocities
+    assert (rates.frame_velocity.first, rates.frame_turn.first) == (1e-3, 2e-4)
+    assert (rates.camera_twist.first, rates.camera_offset.first, rates.camera_late_s.first) == (0, 0, 2e-4)
+    weights = chosen.schedule.weights
+    assert (weights.frame_velocity, weights.frame_turn) == (1e-6, 1e-5)
+    assert (scene.camera_near_m, scene.lidar_reach_m, scene.drop_from_alpha) == (0.5, 300.0, False)
+    assert chosen.schedule.lidar_losses == "published"
+
+
+def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Path) -> None:
+    """Its own settings, with the sizes of a test: built, trained for 12 steps, saved and opened."""
+    published, small = gaussians_published(), recipe(12)
+    chosen = dataclasses.replace(
+        published,
+        image_hw=small.image_hw,
+        cameras=small.cameras,
+        initial=dataclasses.replace(
+            published.initial,
+            lidar_points=1100,
+            unseen_points=400,
+            random_far_points=200,
+            random_near_points=100,
+            features=2,
+            max_actor_points=100,
+        ),
+        schedule=dataclasses.replace(
+            published.schedule, steps=12, max_gaussians=2200, beam_stride=2, grow_from=2, grow_every=5
+        ),
+    )
+    data = read_reconstruction_data(chosen, log, tmp_path / "cache")
+    before = initial_model(chosen, data)
+    frames = len(data.train.cameras) + len(data.train.sweeps)
+    assert before.frame_velocity is not None
+    assert before.frame_velocity.shape == (frames, 3)
+    assert before.reach_m == 300.0
+    static = before.graph.of_actor(STATIC).map_tensors(torch.Tensor.detach)
+    assert float(static.feature[:, 3:].std()) == pytest.approx(1.0, abs=0.1)
+    assert float(static.quaternion.abs().mean(0).std()) < 0.05
+    assert int((static.mean_m.norm(dim=-1) > 50).sum()) >= 200
+    found = reconstruct(chosen, log, tmp_path / "run", tmp_path / "cache")
+    assert np.isfinite(float(found.summary["psnr_db"] or math.nan))
+    weights = load_file(tmp_path / "run" / "model.safetensors")
+    assert torch.equal(weights["camera_offset"], torch.zeros(1, 6))
+    assert torch.equal(weights["camera_twist"], torch.zeros(1, 6))
+    assert not torch.equal(weights["frame_velocity"], before.frame_velocity)
+    opened, camera = open_rebuilt(tmp_path / "run").scene, data.held_out.cameras[0]
+    with torch.no_grad():
+        shown, again = (scene(scene.graph, camera).rgb for scene in (opened, found.scene))
+    torch.testing.assert_close(shown, again)
 
 
 def test_a_log_of_one_frame_is_said_not_to_be_evaluated(

@@ -8,8 +8,11 @@ from foredrive.errors import InputError
 from foredrive.recipes.config import is_recipe_file, overridden, read_values, validated
 from foredrive.recipes.known import nearest_name
 from foredrive.recipes.old_formats import upgraded_reconstruction
+from foredrive.rendering.decoders import CameraDecoderConfig
 from foredrive.rendering.initial import InitialGaussians
-from foredrive.training.rebuilding import LearningRates, RebuildSchedule
+from foredrive.rendering.scene_config import SceneConfig
+from foredrive.training.gaussian_rates import LearningRates, Rate
+from foredrive.training.rebuilding import RebuildSchedule
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,7 @@ class RebuildRecipe:
     """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
     actors: bool = True
     """Give moving actors their own Gaussians. If False, everything is static."""
-    decoder_width: int = 32
-    """Channels of the camera decoder."""
-    rolling: bool = True
-    """Rows of an image and beams of a sweep have their own times."""
+    scene: SceneConfig = field(default_factory=SceneConfig)
     drop: bool = True
     """Beams may fail to return. If False, all return."""
     about: str = field(default="", compare=False)
@@ -49,13 +49,15 @@ def gaussians_tiny() -> RebuildRecipe:
             pixel_points=100_000,
             near_points=0,
             actor_points=50,
-            actor_points_most=1000,
+            max_actor_points=1000,
             features=8,
         ),
         schedule=RebuildSchedule(
             steps=steps,
             max_gaussians=275_000,
-            rates=LearningRates(mean_m=5e-4, albedo=1e-2, feature=5e-3, decoders=3e-3),
+            rates=LearningRates(
+                mean_m=Rate(5e-4, final=0.01), albedo=Rate(1e-2), feature=Rate(5e-3), decoders=Rate(3e-3)
+            ),
             images_per_sweep=2,
             beam_stride=4,
             shrink_steps=(steps // 10,),
@@ -64,15 +66,15 @@ def gaussians_tiny() -> RebuildRecipe:
             grow_every=50,
             checkpoint_every=100,
         ),
-        decoder_width=12,
+        scene=SceneConfig(CameraDecoderConfig(width=12)),
     )
 
 
 def gaussians_base() -> RebuildRecipe:
-    """Return SplatAD as published, for a GPU: all cameras, full size, 30 000 steps, 5 million Gaussians."""
+    """Return our version of SplatAD in its sizes, for a GPU. `gaussians_published` is nearer to it."""
     return RebuildRecipe(
         name="gaussians_base",
-        about="SplatAD's sizes, for a GPU",
+        about="our version of SplatAD in its sizes, for a GPU",
         image_hw=(1080, 1920),
         initial=InitialGaussians(
             lidar_points=1_500_000,
@@ -80,7 +82,7 @@ def gaussians_base() -> RebuildRecipe:
             pixel_points=300_000,
             near_points=300_000,
             actor_points=500,
-            actor_points_most=100_000,
+            max_actor_points=100_000,
             features=13,
             scale=0.2,
         ),
@@ -90,8 +92,64 @@ def gaussians_base() -> RebuildRecipe:
     )
 
 
+def gaussians_published() -> RebuildRecipe:
+    """Return SplatAD with the choices of its reference implementation, for a GPU.
+
+    docs/architecture.md lists what still differs.
+    """
+    return RebuildRecipe(
+        name="gaussians_published",
+        about="SplatAD with the choices of its reference implementation, for a GPU",
+        image_hw=(1080, 1920),
+        initial=InitialGaussians(
+            lidar_points=1_500_000,
+            unseen_points=500_000,
+            pixel_points=0,
+            near_points=0,
+            actor_points=500,
+            max_actor_points=2_000_000,
+            features=13,
+            near_opacity=0.5,
+            scale=0.2,
+            random_far_points=300_000,
+            random_near_points=300_000,
+            random_features=True,
+            random_rotations=True,
+        ),
+        schedule=RebuildSchedule(
+            steps=30_000,
+            max_gaussians=5_000_000,
+            shrink_steps=(3_000, 6_000),
+            checkpoint_every=1_000,
+            lidar_losses="published",
+            rates=LearningRates(
+                quaternion=Rate(1e-3, final=1.0),
+                log_scale=Rate(5e-3, final=1.0),
+                opacity_logit=Rate(5e-2, final=1.0),
+                albedo=Rate(2.5e-3, final=1.0),
+                feature=Rate(2.5e-3, final=1.0),
+                decoders=Rate(1e-3, final=1.0, warmup_steps=500),
+                actor_offset=Rate(1e-3, final=0.1, warmup_steps=2_500, until_step=20_001),
+                camera_offset=Rate(0.0),
+                camera_twist=Rate(0.0),
+                camera_late_s=Rate(2e-4, final=5e-4, warmup_steps=10_000),
+                frame_velocity=Rate(1e-3, final=1e-3, warmup_steps=1_000),
+                frame_turn=Rate(2e-4, final=5e-4, warmup_steps=1_000),
+            ),
+        ),
+        scene=SceneConfig(
+            decoder=CameraDecoderConfig(blocks="residual"),
+            background="after_decoder",
+            drop_from_alpha=False,
+            camera_near_m=0.5,
+            lidar_reach_m=300.0,
+            frame_velocities=True,
+        ),
+    )
+
+
 REBUILD_RECIPES: dict[str, RebuildRecipe] = {
-    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base())
+    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base(), gaussians_published())
 }
 
 

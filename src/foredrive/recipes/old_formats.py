@@ -24,8 +24,33 @@ def _stage(written: Any) -> Any:
 
 
 def upgraded_reconstruction(written: Any) -> Any:
-    """Return the values of a reconstruction's recipe in today's format, as `upgraded` does."""
-    return _renamed(written, "schedule", most_gaussians="max_gaussians")
+    """Return the values of a reconstruction's recipe in today's format, as `upgraded` does.
+
+    Until November 2026 all rates of learning fell to the same fraction, and the scene had no config.
+    """
+    written = _renamed(written, "schedule", most_gaussians="max_gaussians")
+    written = _renamed(written, "initial", actor_points_most="max_actor_points")
+    schedule = written.get("schedule") if isinstance(written, Mapping) else None
+    rates = schedule.get("rates") if isinstance(schedule, Mapping) else None
+    if isinstance(schedule, Mapping) and isinstance(rates, Mapping):
+        written = {**written, "schedule": {**schedule, "rates": _with_own_finals(rates)}}
+    if not isinstance(written, Mapping) or not written.keys() & {"decoder_width", "rolling"}:
+        return written
+    scene = {"decoder": {"width": written.get("decoder_width", 32)}, "rolling": written.get("rolling", True)}
+    kept = {key: value for key, value in written.items() if key not in ("decoder_width", "rolling")}
+    return {**kept, "scene": scene}
+
+
+def _with_own_finals(rates: Mapping[str, Any]) -> dict[str, Any]:
+    """Give each rate of learning its own final fraction."""
+    finals = {"mean_m": rates.get("final_mean", 0.01)}
+    return {
+        name: rate
+        if isinstance(rate, Mapping)
+        else {"first": rate, "final": finals.get(name, rates.get("final", 0.1))}
+        for name, rate in rates.items()
+        if name not in ("final", "final_mean")
+    }
 
 
 _FLAT_PARTS = {"plane", "observation_hidden", "expanded", "volume_hidden", "statics", "prompt"}

@@ -1,5 +1,8 @@
 """Decoders from composited features to sensor readings (Hess et al., "SplatAD", 2025, §3.4)."""
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -14,6 +17,33 @@ _LEAST_CHANCE = 1e-4
 """Bound on the probabilities that a beam returns or does not."""
 
 
+@dataclass(frozen=True)
+class CameraDecoderConfig:
+    """Sizes of a `CameraDecoder`."""
+
+    width: int = 32
+    """Channels of the hidden layers."""
+    blocks: Literal["plain", "residual"] = "plain"
+    """Two convolutions, or two residual blocks of two convolutions (SplatAD's reference implementation)."""
+
+
+class ResidualConvolutions(nn.Module):
+    """Two 3×3 convolutions and a shortcut: a 1×1 convolution where the number of channels changes."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.shortcut = nn.Identity() if channels == width else nn.Conv2d(channels, width, 1)
+        self.net = nn.Sequential(*_convolution(channels, width), nn.Conv2d(width, width, 3, padding=1))
+
+    def forward(self, x: Float[Tensor, "n C H W"]) -> Float[Tensor, "n D H W"]:
+        """Return features of the same height and width."""
+        return (self.shortcut(x) + self.net(x)).relu()
+
+
+def _convolution(channels: int, width: int) -> list[nn.Module]:
+    return [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+
+
 class CameraDecoder(nn.Module):
     """A decoder of colour that depends on view and camera.
 
@@ -21,21 +51,20 @@ class CameraDecoder(nn.Module):
     the camera and the viewing direction.
     """
 
-    def __init__(self, features: int, cameras: int, appearance: int = 8, width: int = 32) -> None:
+    def __init__(self, features: int, cameras: int, config: CameraDecoderConfig, appearance: int = 8) -> None:
         """Create a decoder for `features` features besides albedo."""
         super().__init__()
         self.appearance = nn.Parameter(0.1 * torch.randn(cameras, appearance))
+        channels, width = features + appearance + 3, config.width
         last = nn.Conv2d(width, 2 * ALBEDO, 1)
         with torch.no_grad():
             last.weight *= _LAST_LAYER_GAIN
             last.bias.zero_()  # type: ignore[union-attr]
-        self.net: nn.Module = nn.Sequential(
-            nn.Conv2d(features + appearance + 3, width, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.ReLU(),
-            last,
-        )
+        hidden: list[nn.Module] = []
+        for inputs in (channels, width):
+            plain = config.blocks == "plain"
+            hidden += _convolution(inputs, width) if plain else [ResidualConvolutions(inputs, width)]
+        self.net: nn.Module = nn.Sequential(*hidden, last)
         for parameter in self.net.parameters():
             if parameter.dim() == 4:  # same memory layout as composited features
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
@@ -58,11 +87,20 @@ class CameraDecoder(nn.Module):
 
 
 class LidarDecoder(nn.Module):
-    """A decoder of intensity and ray drop: an MLP over features, appearance code and direction."""
+    """A decoder of intensity and ray drop: an MLP over features, appearance code and direction.
 
-    def __init__(self, features: int, appearance: int = 8, width: int = 32) -> None:
-        """Create a decoder for `features` features besides albedo."""
+    A beam returns if something stops it (alpha) and the surface sends it back (the output of the MLP).
+
+    Args:
+        features: number of features besides albedo.
+        drop_from_alpha: multiply the two. If False, the output of the MLP alone decides.
+    """
+
+    def __init__(
+        self, features: int, drop_from_alpha: bool = True, appearance: int = 8, width: int = 32
+    ) -> None:
         super().__init__()
+        self.drop_from_alpha = drop_from_alpha
         self.appearance = nn.Parameter(0.1 * torch.randn(appearance))
         last = nn.Linear(width, 2)
         with torch.no_grad():
@@ -80,8 +118,6 @@ class LidarDecoder(nn.Module):
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Return intensity in 0 to 1 and the logit of the probability that the beam does not return.
 
-        A beam returns if something stops it (`alpha`) and the surface sends it back (the output of the MLP).
-
         Args:
             feature: composited albedo and features.
             alpha: share of the beam's light that is stopped.
@@ -90,5 +126,7 @@ class LidarDecoder(nn.Module):
         appearance = self.appearance.expand(len(feature), -1)
         seen = torch.cat([feature[:, ALBEDO:], appearance, direction], dim=-1)
         intensity, sent_back = self.net(seen).unbind(-1)
+        if not self.drop_from_alpha:
+            return intensity.sigmoid(), -sent_back
         returns = (alpha * sent_back.sigmoid()).clamp(_LEAST_CHANCE, 1 - _LEAST_CHANCE)
         return intensity.sigmoid(), -returns.logit()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from foredrive.geometry.quaternions import quaternion_from_matrix
 from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.random_points import drive_bounds, random_points
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, joined, mirrored
 from foredrive.rendering.seed_points import (
     GREY,
@@ -19,6 +20,7 @@ from foredrive.rendering.seed_points import (
     colour_from_neighbours,
     empty_points,
     lidar_points,
+    neighbour_distance_m,
     points_along_pixels,
     points_at_random_ranges,
     subsample,
@@ -27,8 +29,9 @@ from foredrive.rendering.seed_points import (
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
-_NEIGHBOURS = 3
 _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
+_AHEAD_LEFT_UP = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""Transform from axes ahead, left, up to those of a camera."""
 _PATCH = 8
 """Number of neighbours that set the shape of a Gaussian where no camera looks."""
 _FLATTEST_M = 0.03
@@ -49,7 +52,7 @@ class InitialGaussians:
     """Points along random pixels at any range."""
     actor_points: int = 500
     """Minimum number of points per actor. Where lidar saw fewer, random points in its box are added."""
-    actor_points_most: int = 5000
+    max_actor_points: int = 5000
     features: int = 8
     """Number of features besides albedo."""
     opacity: float = 0.5
@@ -64,6 +67,14 @@ class InitialGaussians:
     """Far points lie in a thin shell from here to `far_m`. It then stays closed for a vehicle on another
     path."""
     far_m: float = 2000.0
+    random_far_points: int = 0
+    random_near_points: int = 0
+    """Points of random colours, see `random_points`."""
+    random_features: bool = False
+    """Draw features from a normal distribution. If False, they are 0."""
+    random_rotations: bool = False
+    """Draw rotations uniformly. If False, Gaussians begin without rotation, and flat on their surface where
+    no camera saw it."""
 
 
 def initial_scene(
@@ -100,11 +111,18 @@ def initial_scene(
         anywhere += size.lidar_points + size.unseen_points + size.pixel_points
     beside = points_at_random_ranges(cameras, anywhere, size.scale, near, generator)
     parts = [
-        _gaussians(standing[standing.seen], size, size.opacity, by_neighbours=True),
-        _patches(standing[~standing.seen], size),
-        _gaussians(along, size, size.opacity),
-        _gaussians(beside, size, size.near_opacity if sweeps else size.opacity),
+        _gaussians(standing[standing.seen], size, size.opacity, generator, by_neighbours=True),
+        _patches(standing[~standing.seen], size, generator),
+        _gaussians(along, size, size.opacity, generator),
+        _gaussians(beside, size, size.near_opacity if sweeps else size.opacity, generator),
     ]
+    if size.random_far_points or size.random_near_points:
+        poses = [view.T_scene_ego for view in sweeps] or [
+            view.T_scene_cam @ _AHEAD_LEFT_UP for view in cameras
+        ]
+        bounds, counts = drive_bounds(torch.stack(poses)), (size.random_far_points, size.random_near_points)
+        around = random_points(bounds, *counts, size.scale, generator)
+        parts.append(_gaussians(around, size, size.opacity, generator))
     actor = [torch.full((len(part.opacity_logit),), STATIC) for part in parts]
     for row, points in enumerate(of_actors):
         part = _actor(points, tracks.size_lwh[row], bool(tracks.mirrored[row]), size, generator)
@@ -121,8 +139,8 @@ def _actor(
     generator: torch.Generator,
 ) -> Gaussians:
     """Build an actor from its lidar points (on both sides if symmetric) and random points in its box."""
-    points = colour_from_neighbours(subsample(points, size.actor_points_most, generator))
-    part = _gaussians(points, size, size.opacity, by_neighbours=True)
+    points = colour_from_neighbours(subsample(points, size.max_actor_points, generator))
+    part = _gaussians(points, size, size.opacity, generator, by_neighbours=True)
     if both_sides:
         part = joined([part, mirrored(part)])
     missing = max(size.actor_points - len(part.opacity_logit), 0)
@@ -136,31 +154,40 @@ def _actor(
         torch.zeros(missing, dtype=torch.bool),
         torch.full((missing,), size.scale * apart_m),
     )
-    return joined([part, _gaussians(inside, size, size.near_opacity)])
+    return joined([part, _gaussians(inside, size, size.near_opacity, generator)])
 
 
 def _gaussians(
-    points: SeedPoints, size: InitialGaussians, opacity: float, *, by_neighbours: bool = False
+    points: SeedPoints,
+    size: InitialGaussians,
+    opacity: float,
+    generator: torch.Generator,
+    *,
+    by_neighbours: bool = False,
 ) -> Gaussians:
     count = len(points.xyz_m)
-    quaternion = torch.zeros(count, 4)
-    quaternion[:, 0] = 1
+    quaternion, feature = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), torch.zeros(count, size.features)
+    if size.random_rotations:
+        quaternion = F.normalize(torch.randn(count, 4, generator=generator), dim=-1)
+    if size.random_features:
+        feature = torch.randn(count, size.features, generator=generator)
     scale_m = points.scale_m
     if by_neighbours:
-        scale_m = scale_m.minimum(size.scale * _neighbour_distance_m(points.xyz_m))
+        apart_m = neighbour_distance_m(points.xyz_m).clamp(_LEAST_SCALE_M, _GREATEST_SCALE_M)
+        scale_m = scale_m.minimum(size.scale * apart_m)
     return Gaussians(
         mean_m=points.xyz_m.float(),
         quaternion=quaternion,
         log_scale=scale_m.log()[:, None].repeat(1, 3),
         opacity_logit=torch.full((count,), opacity).logit(),
-        feature=F.pad(points.rgb.float(), (0, size.features)),
+        feature=torch.cat([points.rgb.float(), feature], dim=-1),
     )
 
 
-def _patches(points: SeedPoints, size: InitialGaussians) -> Gaussians:
+def _patches(points: SeedPoints, size: InitialGaussians, generator: torch.Generator) -> Gaussians:
     """Build Gaussians with the covariance axes of their neighbours: flat where the neighbours are flat."""
-    found = _gaussians(points, size, size.opacity)
-    if len(points.xyz_m) <= _PATCH:
+    found = _gaussians(points, size, size.opacity, generator, by_neighbours=size.random_rotations)
+    if len(points.xyz_m) <= _PATCH or size.random_rotations:
         return found
     xyz = points.xyz_m.numpy().astype(np.float64)
     _, near = cKDTree(xyz).query(xyz, k=_PATCH + 1)
@@ -170,13 +197,3 @@ def _patches(points: SeedPoints, size: InitialGaussians) -> Gaussians:
     scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
     quaternion, log_scale = quaternion_from_matrix(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
     return dataclasses.replace(found, quaternion=quaternion.float(), log_scale=log_scale.float())
-
-
-def _neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Return the mean distance to the nearest neighbours, within bounds."""
-    if len(xyz_m) <= _NEIGHBOURS:
-        return torch.full((len(xyz_m),), 0.1)
-    points = xyz_m.numpy()
-    distance, _ = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
-    mean = torch.from_numpy(np.asarray(distance, dtype=np.float32)[:, 1:].mean(-1))
-    return mean.clamp(_LEAST_SCALE_M, _GREATEST_SCALE_M)

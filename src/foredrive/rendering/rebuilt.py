@@ -24,6 +24,7 @@ from foredrive.rendering.gaussians import (
     scan_times,
     tiled_lidar_beams,
 )
+from foredrive.rendering.scene_config import SceneConfig
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, place_gaussians
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
@@ -31,6 +32,10 @@ from foredrive.sensors import TimedRays
 
 BACKGROUND = 0.5
 """Albedo of the background, where no Gaussian covers a pixel."""
+UNSEEN_RGB = (0.149, 0.1647, 0.2157)
+"""Colour of the background "after_decoder" outside of training, as in SplatAD's reference implementation."""
+_FIRST_VELOCITY_MPS, _FIRST_TURN_RADPS = 0.05, 5e-5
+"""Bounds of the initial corrections of the frames' velocities."""
 GAUSSIAN_PARAMETERS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
 """Parameters with one row per Gaussian."""
 _LEAST_ALPHA = 1e-6
@@ -100,9 +105,9 @@ class RebuiltScene(nn.Module):
     Args:
         graph: initial scene.
         cameras: number of cameras in the rig.
-        rolling: rows of an image and beams of a sweep have their own times. False treats all as simultaneous.
-        decoder_width: channels of the camera decoder.
-        reach_m: maximum lidar range. Nothing beyond it stops a beam.
+        config: parts of the scene.
+        reach_m: reach of the log's lidar.
+        frames: number of training images and sweeps, in this order, with velocities of their own.
     """
 
     actor: Tensor
@@ -117,11 +122,13 @@ class RebuiltScene(nn.Module):
         self,
         graph: SceneGraph,
         cameras: int,
-        rolling: bool = True,
-        decoder_width: int = 32,
+        config: SceneConfig | None = None,
         reach_m: float = math.inf,
+        frames: int = 0,
     ) -> None:
         super().__init__()
+        self.config = config = config or SceneConfig()
+        self.reach_m = reach_m if config.lidar_reach_m is None else config.lidar_reach_m
         own = graph.gaussians
         self.mean_m = nn.Parameter(own.mean_m)
         self.quaternion = nn.Parameter(own.quaternion)
@@ -143,10 +150,12 @@ class RebuiltScene(nn.Module):
         self.camera_late_s = nn.Parameter(torch.zeros(cameras))
         """Delay of each camera's exposure with respect to its logged time, s."""
         features = self.feature.shape[1]
-        self.camera_decoder = CameraDecoder(features, cameras, width=decoder_width)
-        self.lidar_decoder = LidarDecoder(features)
-        self.rolling = rolling
-        self.reach_m = reach_m
+        self.camera_decoder = CameraDecoder(features, cameras, config.decoder)
+        self.lidar_decoder = LidarDecoder(features, config.drop_from_alpha)
+        self.frame_velocity = self.frame_turn = None
+        if config.frame_velocities:
+            self.frame_velocity = nn.Parameter(_FIRST_VELOCITY_MPS * (2 * torch.rand(frames, 3) - 1))
+            self.frame_turn = nn.Parameter(_FIRST_TURN_RADPS * (2 * torch.rand(frames, 3) - 1))
 
     @property
     def gaussians(self) -> Gaussians:
@@ -194,8 +203,19 @@ class RebuiltScene(nn.Module):
         none = self.actor.new_full((len(gaussians.opacity_logit),), STATIC)
         self.actor = torch.cat([self.actor, none])
 
+    def frame_twist(self, frame: int | None) -> Float[Tensor, "6"]:
+        """Return the learned correction of a training frame's twist; 0 for None, and if there are none."""
+        if frame is None or self.frame_velocity is None or self.frame_turn is None:
+            return self.mean_m.new_zeros(6)
+        return torch.cat([self.frame_velocity[frame], self.frame_turn[frame]])
+
     def forward(
-        self, graph: SceneGraph, view: CameraView, mirror: Bool[Tensor, "A"] | None = None
+        self,
+        graph: SceneGraph,
+        view: CameraView,
+        mirror: Bool[Tensor, "A"] | None = None,
+        frame: int | None = None,
+        background_rgb: Float[Tensor, "3"] | None = None,
     ) -> RenderedImage:
         """Render an image.
 
@@ -203,8 +223,12 @@ class RebuiltScene(nn.Module):
             graph: this scene, or an edited version of it.
             view: the camera; its image is not read.
             mirror: see `place_gaussians`.
+            frame: index of a training image, for `frame_twist`.
+            background_rgb: colour of the background "after_decoder"; None: `UNSEEN_RGB`.
         """
         late_s, twist = self.camera_late_s[view.sensor], view.twist_cam + self.camera_twist[view.sensor]
+        if frame is not None:
+            twist = twist + self.frame_twist(frame)
         T_scene_cam = view.T_scene_cam @ exp_se3(self.camera_offset[view.sensor]) @ exp_se3(late_s * twist)
         placed = place_gaussians(graph, view.t_s + late_s, mirror)
         splats = project_camera(
@@ -215,18 +239,24 @@ class RebuiltScene(nn.Module):
             view.size_hw,
             velocity_mps=placed.velocity_mps,
             twist_cam=twist,
+            near_m=self.config.camera_near_m,
         )
-        seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.rolling else 0.0))
-        empty = (1 - seen.alpha)[:, None]
-        background = seen.feature.new_tensor([BACKGROUND] * ALBEDO)
-        feature = torch.cat([seen.feature[:, :ALBEDO] + empty * background, seen.feature[:, ALBEDO:]], dim=-1)
+        seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.config.rolling else 0.0))
+        feature = seen.feature
+        if self.config.background == "albedo":
+            grey = BACKGROUND * (1 - seen.alpha)[:, None]
+            feature = torch.cat([feature[:, :ALBEDO] + grey, feature[:, ALBEDO:]], dim=-1)
         rays = pixels_to_rays(pixel_centres(view.size_hw).to(view.K).flatten(0, 1), view.K, view.dist)
         direction = rotate_vectors(view.T_scene_cam, rays)
         alpha = seen.alpha.unflatten(0, view.size_hw)
+        rgb = self.camera_decoder(
+            feature.unflatten(0, view.size_hw), direction.unflatten(0, view.size_hw), view.sensor
+        )
+        if self.config.background == "after_decoder":
+            colour = rgb.new_tensor(UNSEEN_RGB) if background_rgb is None else background_rgb.to(rgb)
+            rgb = rgb + (1 - alpha) * colour[:, None, None]
         return RenderedImage(
-            rgb=self.camera_decoder(
-                feature.unflatten(0, view.size_hw), direction.unflatten(0, view.size_hw), view.sensor
-            ),
+            rgb=rgb,
             range_m=seen.expected_range_m.unflatten(0, view.size_hw) / alpha.clamp_min(_LEAST_ALPHA),
             alpha=alpha,
         )
@@ -243,7 +273,7 @@ class RebuiltScene(nn.Module):
         if len(beams.dt_s):
             T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
         twist, middle_s = view.twist_ego, 0.0
-        if not self.rolling:
+        if not self.config.rolling:
             twist, rays = torch.zeros_like(twist), dataclasses.replace(rays, dt_s=torch.zeros_like(rays.dt_s))
         elif len(rays.dt_s):
             middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
@@ -265,6 +295,7 @@ class RebuiltScene(nn.Module):
         hit_range_m: Float[Tensor, "P"] | None = None,
         mirror: Bool[Tensor, "A"] | None = None,
         before_hit: BeforeHit = "weights",
+        frame: int | None = None,
     ) -> RenderedSweep:
         """Render a sweep.
 
@@ -274,13 +305,19 @@ class RebuiltScene(nn.Module):
             t_s: time of the sweep.
             hit_range_m, before_hit: see `composite_splats`.
             mirror: see `place_gaussians`.
+            frame: index of a training sweep, counted after the images, for `frame_twist`.
         """
         placed = place_gaussians(graph, t_s + points.middle_s, mirror)
+        T_scene_lidar = points.T_scene_lidar.to(placed.velocity_mps)
+        twist = points.twist_lidar.to(placed.velocity_mps)
+        if frame is not None:
+            more = self.frame_twist(frame)
+            T_scene_lidar, twist = T_scene_lidar @ exp_se3(points.middle_s * more), twist + more
         splats = project_lidar(
             placed.gaussians,
-            inverse_se3(points.T_scene_lidar.to(placed.velocity_mps)),
+            inverse_se3(T_scene_lidar),
             velocity_mps=placed.velocity_mps,
-            twist_lidar=points.twist_lidar.to(placed.velocity_mps),
+            twist_lidar=twist,
             reach_m=self.reach_m,
             scan_s=None if points.scan_s is None else points.scan_s.to(placed.velocity_mps),
         )

@@ -27,6 +27,7 @@ BEAM_WIDTH_RAD = 0.01
 NEAR_IN_IMAGE = 0.06
 """Maximum distance from a pixel to a beam that sets its range, in image heights."""
 _BOX_MARGIN_M = 0.1
+_NEIGHBOURS = 3
 _ALIKE = 5
 """Number of neighbours that set the colour of a point that no camera saw."""
 
@@ -107,7 +108,7 @@ def points_along_pixels(
         standing = actor_rows(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
         T_cam_scene = inverse_se3(view.T_scene_cam)
         uv_beam, _, inside = project(transform_points(T_cam_scene, xyz), view.K, view.dist, view.size_hw)
-        away_m = _even_in_inverse(share, far_m, generator)
+        away_m = even_in_inverse(share, far_m, generator)
         if not bool(inside.any()):
             range_m, kept = away_m, torch.ones(share, dtype=torch.bool)
         else:
@@ -134,7 +135,7 @@ def points_at_random_ranges(
     found = [empty_points()]
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
-        away_m = _even_in_inverse(share, range_m, generator)
+        away_m = even_in_inverse(share, range_m, generator)
         scale_m = scale * away_m * _pixels_apart_rad(view, share)
         found.append(_at(view, uv, direction, away_m, scale_m))
     return all_points(found)
@@ -185,6 +186,15 @@ def colour_from_neighbours(points: SeedPoints) -> SeedPoints:
     index = torch.from_numpy(np.asarray(near)).view(int((~points.seen).sum()), -1)
     rgb[~points.seen] = points.rgb[points.seen][index].median(1).values
     return dataclasses.replace(points, rgb=rgb)
+
+
+def neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    """Return the mean distance of each point to its nearest neighbours; 0.1 m for a few points."""
+    if len(xyz_m) <= _NEIGHBOURS:
+        return torch.full((len(xyz_m),), 0.1)
+    points = xyz_m.numpy()
+    distance, _ = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
+    return torch.from_numpy(np.asarray(distance, dtype=np.float32)[:, 1:].mean(-1))
 
 
 def empty_points() -> SeedPoints:
@@ -251,9 +261,10 @@ def _random_pixels(
     return uv, rotate_vectors(view.T_scene_cam, pixels_to_rays(uv, view.K, view.dist))
 
 
-def _even_in_inverse(
+def even_in_inverse(
     count: int, range_m: tuple[float, float], generator: torch.Generator
 ) -> Float[Tensor, "N"]:
+    """Return random ranges between two bounds, uniform in 1/m."""
     near, far = 1 / range_m[0], 1 / range_m[1]
     return 1 / (torch.rand(count, generator=generator) * (near - far) + far)
 

@@ -26,31 +26,12 @@ from foredrive.rendering.relocation import random_walk_m
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint
+from foredrive.training.gaussian_rates import LearningRates
 from foredrive.training.gaussian_steps import grow, relocate
 from foredrive.training.loop import CHECKPOINTS, check_finite, step_counter
 
 _SMOOTHING = 0.05
 """Weight of the newest image in the displayed PSNR."""
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Learning rates of Adam at the first step. All decay exponentially to the fraction `final`."""
-
-    mean_m: float = 1.6e-4
-    quaternion: float = 1e-3
-    log_scale: float = 5e-3
-    opacity_logit: float = 5e-2
-    albedo: float = 2.5e-3
-    feature: float = 2.5e-3
-    decoders: float = 1e-3
-    actor_offset: float = 1e-4
-    camera_offset: float = 1e-5
-    camera_twist: float = 1e-4
-    camera_late_s: float = 1e-5
-    final: float = 0.1
-    final_mean: float = 0.01
-    """The final fraction for centres."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +48,9 @@ class RebuildWeights:
     """Share of the returned beams that count for `depth`. The worst hit something thin or moving."""
     scale: float = 1e-3
     opacity: float = 5e-3
+    frame_velocity: float = 1e-6
+    frame_turn: float = 1e-5
+    """Weights of the mean length of the corrections of the frames' velocities, if they are learned."""
 
 
 @dataclass(frozen=True)
@@ -150,13 +134,13 @@ def make_optimizer(scene: RebuiltScene, rates: LearningRates) -> Adam:
     """Return Adam with one group per kind of parameter, named as in `LearningRates`."""
     groups = []
     for rate in dataclasses.fields(rates):
-        if rate.name in ("final", "final_mean"):
-            continue
         if rate.name == "decoders":
             parameters = [*scene.camera_decoder.parameters(), *scene.lidar_decoder.parameters()]
+        elif getattr(scene, rate.name) is None:
+            continue
         else:
             parameters = [getattr(scene, rate.name)]
-        groups.append({"params": parameters, "name": rate.name, "lr": getattr(rates, rate.name)})
+        groups.append({"params": parameters, "name": rate.name, "lr": getattr(rates, rate.name).first})
     return Adam(groups, eps=1e-15)
 
 
@@ -173,13 +157,14 @@ class _Trainer:
         schedule = self.schedule
         generator = torch.Generator().manual_seed((schedule.seed * 1_000_003 + step) * 1009)
         for group in self.optimizer.param_groups:
-            final = schedule.rates.final_mean if group["name"] == "mean_m" else schedule.rates.final
-            group["lr"] = getattr(schedule.rates, group["name"]) * final ** (step / schedule.steps)
+            group["lr"] = getattr(schedule.rates, group["name"]).at(step, schedule.steps)
         kind, number = self._item(step)
         mirrored = torch.rand(len(self.scene.track_id), generator=generator) < schedule.mirror_share
         mirror = mirrored.to(self.scene.actor.device) & self.scene.tracks.mirrored
         if kind == "image":
-            losses = self._image(self.views.cameras[number].shrunk(schedule.shrink_at(step)), mirror)
+            random = self.scene.config.background == "after_decoder"
+            background_rgb = torch.rand(3, generator=generator) if random else None
+            losses = self._image(number, schedule.shrink_at(step), mirror, background_rgb)
         else:
             losses = self._sweep(number, mirror)
         losses["loss"] = losses["loss"] + self._regularisers()
@@ -204,11 +189,13 @@ class _Trainer:
         order = torch.randperm(items, generator=torch.Generator().manual_seed(seed))
         return int(order[number % items])
 
-    def _image(self, view: CameraView, mirror: Tensor) -> dict[str, Tensor]:
-        view = view.to(self.scene.actor.device)
+    def _image(
+        self, number: int, shrink: int, mirror: Tensor, background_rgb: Tensor | None
+    ) -> dict[str, Tensor]:
+        view = self.views.cameras[number].shrunk(shrink).to(self.scene.actor.device)
         assert view.image is not None
         real = view.image.float() / 255
-        rgb = self.scene(self.scene.graph, view, mirror).rgb
+        rgb = self.scene(self.scene.graph, view, mirror, number, background_rgb).rgb
         loss = photometric_loss(rgb, real, self.schedule.weights.ssim)
         psnr = -10 * ((rgb.detach().clamp(0, 1) - real) ** 2).mean().log10()
         return {"loss": loss, "photometric": loss, "psnr_db": psnr}
@@ -224,7 +211,13 @@ class _Trainer:
         hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
         published = self.schedule.lidar_losses == "published"
         rendered = self.scene.sweep(
-            self.scene.graph, points, view.t_s, hit_m, mirror, "opacities" if published else "weights"
+            self.scene.graph,
+            points,
+            view.t_s,
+            hit_m,
+            mirror,
+            "opacities" if published else "weights",
+            len(self.views.cameras) + number,
         )
         losses = self._published_losses(rendered, beams) if published else self._our_losses(rendered, beams)
         if view.misses_known:
@@ -256,7 +249,11 @@ class _Trainer:
     def _regularisers(self) -> Tensor:
         weights = self.schedule.weights
         small = self.scene.log_scale.exp().mean()
-        return weights.scale * small + weights.opacity * self.scene.opacity_logit.sigmoid().mean()
+        loss = weights.scale * small + weights.opacity * self.scene.opacity_logit.sigmoid().mean()
+        for name in ("frame_velocity", "frame_turn"):
+            if (correction := getattr(self.scene, name)) is not None:
+                loss = loss + getattr(weights, name) * correction.norm(dim=-1).mean()
+        return loss
 
     @torch.no_grad()
     def _evolve(self, step: int, generator: torch.Generator) -> None:

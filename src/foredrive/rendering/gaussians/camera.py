@@ -30,6 +30,7 @@ def project_camera(
     velocity_mps: Float[Tensor, "N 3"] | None = None,
     twist_cam: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
+    near_m: float = NEAR_M,
 ) -> Splats:
     """Return splats on the image plane, for `pixel_points`. Those that cannot reach the image are left out.
 
@@ -44,13 +45,14 @@ def project_camera(
         twist_cam: velocity (m/s) then turn rate (rad/s) of the camera in its own axes, for rolling shutter;
             None: it is static. See `geometry.se3.sensor_twist`.
         compensate: lower the opacity by as much as ε = 0.3 px² widens a splat.
+        near_m: minimum depth of the centre of a visible Gaussian.
     """
     position = positions_in_sensor(gaussians, T_cam_scene)
     lower, upper = _limits(K.detach(), dist.detach(), size_hw)
     with torch.no_grad():
         reach_m = REACH * gaussians.log_scale.amax(-1).exp()
         x, y, z = position
-        seen = z > NEAR_M
+        seen = z > near_m
         for across, low, high in ((x, lower[0], upper[0]), (y, lower[1], upper[1])):
             seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
             seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m

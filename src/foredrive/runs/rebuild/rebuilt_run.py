@@ -46,10 +46,10 @@ def open_rebuilt(folder: Path) -> OpenedReconstruction:
         raise InputError(f"{folder}: of before runs kept their sensors (no {VEHICLE}): rebuild the log anew")
     vehicle = load_vehicle(folder / VEHICLE)
     try:
-        graph, cameras = _read_graph(folder / WEIGHTS)
+        graph, cameras, frames = _read_graph(folder / WEIGHTS)
     except (OSError, SafetensorError, KeyError) as error:
         raise InputError(f"{folder / WEIGHTS}: not the weights of a scene: {error}") from error
-    scene = RebuiltScene(graph, cameras, recipe.rolling, recipe.decoder_width, vehicle.reach_m)
+    scene = RebuiltScene(graph, cameras, recipe.scene, vehicle.reach_m, frames)
     load_weights(scene, folder / WEIGHTS)
     return OpenedReconstruction(folder, scene, vehicle)
 
@@ -59,8 +59,8 @@ def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> EditedScene:
     return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
 
 
-def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
-    """Return a graph of the saved sizes, and the number of cameras."""
+def _read_graph(weights: Path) -> tuple[SceneGraph, int, int]:
+    """Return a graph of the saved sizes, and the numbers of cameras and of frames with velocities."""
     saved = load_file(weights)
     features = saved["albedo"].shape[1] + saved["feature"].shape[1]
     gaussians = Gaussians(
@@ -78,7 +78,8 @@ def _read_graph(weights: Path) -> tuple[SceneGraph, int]:
         saved["T_scene_actor"],
         saved["present"],
     )
-    return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"])
+    frames = len(saved.get("frame_velocity", ()))
+    return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"]), frames
 
 
 def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:

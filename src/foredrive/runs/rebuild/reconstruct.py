@@ -168,9 +168,9 @@ def initial_model(recipe: RebuildRecipe, data: ReconstructionData) -> RebuiltSce
     return RebuiltScene(
         graph,
         len(data.vehicle.rig.names),
-        recipe.rolling,
-        recipe.decoder_width,
+        recipe.scene,
         data.vehicle.reach_m,
+        frames=len(data.train.cameras) + len(data.train.sweeps),
     )
 
 

@@ -1,0 +1,28 @@
+"""Settings of a rebuilt scene."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from foredrive.rendering.decoders import CameraDecoderConfig
+from foredrive.rendering.gaussians.camera import NEAR_M
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Parts of a `RebuiltScene`."""
+
+    decoder: CameraDecoderConfig = field(default_factory=CameraDecoderConfig)
+    rolling: bool = True
+    """Rows of an image and beams of a sweep have their own times. If False, all are simultaneous."""
+    background: Literal["albedo", "after_decoder"] = "albedo"
+    """Colour where no Gaussian covers a pixel: a grey albedo, which is decoded, or a colour that is added to
+    the decoded image. The latter is random in every step of training."""
+    drop_from_alpha: bool = True
+    """See `LidarDecoder`."""
+    camera_near_m: float = NEAR_M
+    """Minimum depth of the Gaussians that a camera sees, m."""
+    lidar_reach_m: float | None = None
+    """Nothing beyond stops a beam, m. None: the reach of the log's lidar."""
+    frame_velocities: bool = False
+    """Learn corrections of the velocity and turn rate of each training image and sweep. They are not used for
+    other views."""
