@@ -31,8 +31,8 @@ def reconstruct(
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: Folder of the run. If it holds this run already, the run continues from the last checkpoint.
         method: Representation of the scene.
-        recipe: Name of the recipe, gaussians_tiny (minutes on two cores) or gaussians_base (a GPU), or a YAML
-            file.
+        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_base or
+            gaussians_published (a GPU), or a YAML file.
         cameras: Use only these cameras, by their own names or 123D's, such as pcam_f0; by default the
             recipe's.
         image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or

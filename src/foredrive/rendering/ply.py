@@ -12,19 +12,31 @@ from foredrive.rendering.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
 """Albedo is 0.5 plus this factor times the constant coefficient."""
+_HIGHER = 3 * (4**2 - 1)
+"""Number of coefficients of degrees 1 to 3. Some viewers open no other degree. Ours are 0."""
 _COLUMNS = (
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{number}" for number in range(_HIGHER)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+_COMMENTS = [
+    "opacity: logit, for renderers that lower it as they widen small splats by 0.3 px^2 (antialiased)",
+    "colour: albedo alone, without the decoders; f_rest is 0",
+]
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write centres, rotations, scales, opacities and albedo. The file cannot hold the effect of decoders."""
+    """Write centres, rotations, scales, opacities and albedo. The file cannot hold the effect of decoders.
+
+    Opacities assume compensation (`project_camera`): in viewers that widen small splats without it, far
+    surfaces look denser and thin things thicker.
+    """
     gaussians = gaussians.map_tensors(lambda tensor: tensor.detach().cpu())
     columns = [
         gaussians.mean_m,
         torch.zeros_like(gaussians.mean_m),
         (gaussians.feature[:, :3] - 0.5) / SH_DEGREE_0,
+        gaussians.mean_m.new_zeros(len(gaussians.mean_m), _HIGHER),
         gaussians.opacity_logit[:, None],
         gaussians.log_scale,
         torch.nn.functional.normalize(gaussians.quaternion, dim=-1),
@@ -32,4 +44,4 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     table = torch.cat(columns, dim=-1).numpy()
     rows = unstructured_to_structured(table, np.dtype([(name, "<f4") for name in _COLUMNS]))
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(temporary)
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=_COMMENTS).write(temporary)
