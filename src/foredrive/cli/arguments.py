@@ -17,7 +17,7 @@ Number = float | int
 
 RUN_CONFIG = "config.yaml"
 """A file that folders of runs contain, and folders of logs do not."""
-LARGEST_IMAGE_PX = 16_384
+MAX_IMAGE_PX = 16_384
 
 
 def check_number(
@@ -56,8 +56,8 @@ def check_number(
 
 def check_image_size(size: tuple[int, int] | None) -> None:
     """Check --image-size. Raise `InputError` if the size is impossible."""
-    if size is not None and not all(0 < side <= LARGEST_IMAGE_PX for side in size):
-        raise InputError(f"--image-size is {size[0]} {size[1]}: sides are 1 to {LARGEST_IMAGE_PX} px")
+    if size is not None and not all(0 < side <= MAX_IMAGE_PX for side in size):
+        raise InputError(f"--image-size is {size[0]} {size[1]}: sides are 1 to {MAX_IMAGE_PX} px")
 
 
 def check_out_folder(folder: Path | None) -> None:

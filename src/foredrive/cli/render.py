@@ -8,7 +8,7 @@ import tyro
 from foredrive.cli.arguments import OptionalPath, check_file, check_number, check_rebuilt
 from foredrive.lazy import importing
 
-LARGEST_SHIFT_M = 100.0
+MAX_SHIFT_M = 100.0
 
 
 def render(
@@ -51,7 +51,7 @@ def render(
     from foredrive.view.video import check_video
 
     check_video(out)
-    check_number("--shift-left", shift_left, low=-LARGEST_SHIFT_M, high=LARGEST_SHIFT_M)
+    check_number("--shift-left", shift_left, low=-MAX_SHIFT_M, high=MAX_SHIFT_M)
     check_number("--start", start)
     check_number("--seconds", seconds, above=0)
     check_number("--rate-hz", rate_hz, above=0)

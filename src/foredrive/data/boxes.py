@@ -20,7 +20,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category
 
 _KEY = ModalityType.BOX_DETECTIONS_SE3.serialize()
-_LONGEST_DIFFERENCE_S = 1.5
+_MAX_DIFFERENCE_S = 1.5
 """Maximum time between two observations of a track for a velocity, as in the nuScenes devkit's
 `box_velocity`."""
 
@@ -178,7 +178,7 @@ def _track_velocity(
     """Return the difference between the observations before and after each box; one-sided at the ends."""
     order = np.lexsort((t_s, track_id))
     track, at, xyz = track_id[order], t_s[order], centre[order]
-    joined = (np.diff(track) == 0) & (np.diff(at) <= _LONGEST_DIFFERENCE_S)
+    joined = (np.diff(track) == 0) & (np.diff(at) <= _MAX_DIFFERENCE_S)
     before = np.arange(len(order)) - np.concatenate([[False], joined])[: len(order)]
     after = np.arange(len(order)) + np.concatenate([joined, [False]])[: len(order)]
     span_s = at[after] - at[before]

@@ -13,8 +13,8 @@ from foredrive.data.logs import Log
 from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams
 from foredrive.scene import LidarSweep
 
-_LONGEST_SWEEP_US = 1_000_000
-_NEAREST_RETURN_M = 1e-3
+_MAX_SWEEP_US = 1_000_000
+_MIN_RANGE_M = 1e-3
 
 
 def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
@@ -74,7 +74,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
     dt_us = np.zeros(count)
     if lidar.timestamps is not None:
         since = lidar.timestamps - log.t_us[frame]
-        if (np.abs(since) <= _LONGEST_SWEEP_US).all():  # some datasets use another clock for point times
+        if (np.abs(since) <= _MAX_SWEEP_US).all():  # some datasets use another clock for point times
             dt_us = since.astype(np.float64)
     if origins is None:
         origins = _origins(log, frame, lidar, dt_us)
@@ -83,7 +83,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
     intensity = lidar.intensity if lidar.intensity is not None else np.zeros(count)
     beam = lidar.channel if lidar.channel is not None else np.full(count, -1)
     sweep = _sweep(points, origins, intensity / 255.0, dt_us * 1e-6, beam)
-    real = torch.isfinite(sweep.range_m) & (sweep.range_m > _NEAREST_RETURN_M)
+    real = torch.isfinite(sweep.range_m) & (sweep.range_m > _MIN_RANGE_M)
     return sweep if bool(real.all()) else sweep[real]
 
 
@@ -111,7 +111,7 @@ def _sweep(
     """Return a sweep of beams from `origins` that returned at `ends`."""
     along = ends - origins
     range_m = np.linalg.norm(along, axis=-1)
-    direction = along / np.maximum(range_m, _NEAREST_RETURN_M)[:, None]
+    direction = along / np.maximum(range_m, _MIN_RANGE_M)[:, None]
     return LidarSweep(
         origin_ego=_float_tensor(origins),
         dir_ego=_float_tensor(direction),

@@ -17,7 +17,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Trajectory
 
 _EGO = ModalityType.EGO_STATE_SE3.serialize()
-_LONGEST_GAP_S = 1.0
+_MAX_GAP_S = 1.0
 """Maximum time between ego poses for interpolation."""
 
 
@@ -139,7 +139,7 @@ class Log:
         out = np.tile(np.eye(4), (len(t_us), 1, 1))
         after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
         gap_us = at[after] - at[after - 1]
-        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (gap_us <= _LONGEST_GAP_S * 1e6)
+        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (gap_us <= _MAX_GAP_S * 1e6)
         inside = t_us.clip(at[0], at[-1])
         span = slice(after.min() - 1, after.max() + 1)
         since_s = (at[span] - at[span][0]) * 1e-6

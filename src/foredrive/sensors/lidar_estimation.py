@@ -10,7 +10,7 @@ from foredrive.geometry.se3 import exp_se3, rotate_vectors
 from foredrive.scene import LidarSweep
 from foredrive.sensors.lidar import SpinningLidar
 
-_MOST_SPREAD_RAD = math.radians(0.25)
+_MAX_SPREAD_RAD = math.radians(0.25)
 """Maximum standard deviation of the elevations of one channel. If it is larger, the beams are not from one
 channel, or the lidar is tilted."""
 
@@ -36,7 +36,7 @@ def estimate_lidar(
     upwards = rotate_vectors(T_then_ego, sweep.dir_ego[:, None])[:, 0, 2]
     elevation = torch.asin(upwards.clamp(-1, 1))
     channels = [elevation[sweep.beam == channel] for channel in sweep.beam.unique()]
-    if max(float(channel.std(correction=0)) for channel in channels) > _MOST_SPREAD_RAD:
+    if max(float(channel.std(correction=0)) for channel in channels) > _MAX_SPREAD_RAD:
         return None
     steps = max(len(channel) for channel in channels)
     span_s = float(sweep.dt_s.max() - sweep.dt_s.min())

@@ -84,14 +84,14 @@ def comfort_of(
     turning = smoothed(yaw_rate, ACCELERATION_S, 0)
     turning_more = smoothed(yaw_rate, JERK_S, 1)
     kept = (along >= bounds.min_longitudinal_mps2) & (along <= bounds.max_longitudinal_mps2)
-    for values, most in (
+    for values, bound in (
         (aside, bounds.max_lateral_mps2),
         (jerk, bounds.max_jerk_mps3),
         (jerk_along, bounds.max_longitudinal_jerk_mps3),
         (turning, bounds.max_yaw_rate_radps),
         (turning_more, bounds.max_yaw_acceleration_radps2),
     ):
-        kept &= np.abs(values) <= most
+        kept &= np.abs(values) <= bound
     return Comfort(
         braking_mps2=max(0.0, float(-along.min())),
         acceleration_mps2=max(0.0, float(along.max())),

@@ -22,7 +22,7 @@ STEERING_DELAY_S = 0.1
 """Look-ahead time on the path, s: the wheel needs time to turn."""
 KEEPING_RADPS = 1.0
 """ω, rad/s: errors along the path decay within a few seconds."""
-LARGEST_LAG_M = 3.0
+MAX_LAG_M = 3.0
 PREVIEW_S = 0.3
 """Time over which the plan's acceleration is averaged for the feed-forward, s."""
 STANDING_MPS = 0.1
@@ -75,7 +75,7 @@ def _track(plan: Plan, state: BicycleState, after_s: float, vehicle: Vehicle) ->
     speed, soon = plan.speed_mps(after_s), plan.speed_mps(soon_s)
     if max(speed, soon, state.speed_mps) < STANDING_MPS:
         return Control(-HOLDING_MPS2, state.steering_rad)
-    lag_m = min(max(plan.progress_m(after_s) - way_m, -LARGEST_LAG_M), LARGEST_LAG_M)
+    lag_m = min(max(plan.progress_m(after_s) - way_m, -MAX_LAG_M), MAX_LAG_M)
     too_slow = speed - state.speed_mps
     fed_forward = (soon - speed) / PREVIEW_S
     acceleration = fed_forward + KEEPING_RADPS**2 * lag_m + math.sqrt(2) * KEEPING_RADPS * too_slow

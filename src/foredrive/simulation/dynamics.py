@@ -93,6 +93,6 @@ def _clamped(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-def _towards(wanted: float, now: float, most: float) -> float:
-    """Move from `now` towards `wanted` by at most `most`."""
-    return _clamped(wanted, now - most, now + most)
+def _towards(wanted: float, now: float, max_change: float) -> float:
+    """Move from `now` towards `wanted` by at most `max_change`."""
+    return _clamped(wanted, now - max_change, now + max_change)

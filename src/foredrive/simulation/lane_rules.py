@@ -30,7 +30,7 @@ OUTSIDE_BY_M = 1.3
 WRONG_WAY_RAD = np.deg2rad(120.0)
 """CARLA's OutsideRouteLanesTest: the vehicle is more than `OUTSIDE_BY_M` beside all lanes, or its heading
 differs by more than `WRONG_WAY_RAD` from that of its lane."""
-LEAST_LEFT_M = 0.5
+MIN_LEFT_M = 0.5
 """A shorter distance outside of the lanes, m, gives no event, but still counts in the score."""
 
 
@@ -124,7 +124,7 @@ def way_driven(
         left_at = left_at or (float(middle[0]), float(middle[1]))
         left_m += moved_m
     elif left_at is not None:
-        if left_m > LEAST_LEFT_M:
+        if left_m > MIN_LEFT_M:
             events.append(left_lanes(left_at, left_m, t_s))
         left_at, left_m = None, 0.0
     return events, dataclasses.replace(

@@ -26,7 +26,7 @@ CHANGE_M, HURRIED_M2, CLOSED_M = 10.0, 250.0, 50.0
 """Cost of a lane change in metres of detour. Each change costs `CHANGE_M` plus `HURRIED_M2` / room,
 because hurried changes are worse. A change that traffic would not make costs `CLOSED_M` more: over solid
 lines, and to lanes that only begin there."""
-LEAST_ROOM_M = 1.0
+MIN_ROOM_M = 1.0
 """Lane changes need at least this much room, m."""
 
 
@@ -81,13 +81,13 @@ def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[LanePoi
         off = np.linalg.norm(start + part[:, None] * along - xyz, axis=1)
         k = int(np.argmin(off))
         places.append(LanePoint(lane, float((k + part[k]) * graph.step_m[lane]), float(off[k])))
-    least = min(place.aside_m for place in places)
-    return [place for place in places if place.aside_m <= _also(least)]
+    min_aside_m = min(place.aside_m for place in places)
+    return [place for place in places if place.aside_m <= _max_aside_m(min_aside_m)]
 
 
-def _also(nearest_m: float) -> float:
+def _max_aside_m(min_m: float) -> float:
     """Return the maximum distance of lanes that a waypoint may mean, m, given that of the nearest."""
-    return min(ALSO_NEAR * nearest_m, nearest_m + NO_FURTHER_M) + ALSO_NEAR_M
+    return min(ALSO_NEAR * min_m, min_m + NO_FURTHER_M) + ALSO_NEAR_M
 
 
 def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[list[Leg], list[LanePoint]]:
@@ -110,8 +110,8 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
         is_last = number == len(choices) - 1
         found: list[tuple[float, int, list[Leg]]] = []
         for end in here:  # of the last waypoint only the cheapest place counts
-            most = min((total for total, *_ in found), default=np.inf) if is_last else np.inf
-            found.append(_best_onto(graph, before, costs, end, most))
+            max_cost = min((total for total, *_ in found), default=np.inf) if is_last else np.inf
+            found.append(_best_onto(graph, before, costs, end, max_cost))
         if not any(np.isfinite(total) for total, *_ in found):
             raise InputError(f"no way leads from waypoint {number} to waypoint {number + 1}")
         ways = [joined(ways[b], legs) for _, b, legs in found]
@@ -122,12 +122,12 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
 
 
 def _best_onto(
-    graph: LaneGraph, starts: Sequence[LanePoint], costs: Sequence[float], end: LanePoint, most: float
+    graph: LaneGraph, starts: Sequence[LanePoint], costs: Sequence[float], end: LanePoint, max_cost: float
 ) -> tuple[float, int, list[Leg]]:
     """Find the cheapest way to `end` from one of several start places with known costs.
 
     Returns the cost, which includes both places, the index of the start place, and the legs. The cost is
-    infinite if no way costs less than `most`. The most promising start places are searched first.
+    infinite if no way costs less than `max_cost`. The most promising start places are searched first.
     """
     index, s_m = np.array([place.lane for place in (end, *starts)]), [place.s_m for place in (end, *starts)]
     here, *there = graph.position(index, np.array(s_m))
@@ -135,9 +135,9 @@ def _best_onto(
     promised = aside - BACK_M + np.array(costs) + np.linalg.norm(np.array(there) - here, axis=1)
     best: tuple[float, int, list[Leg]] = (np.inf, 0, [])
     for b in np.argsort(promised).tolist():
-        if promised[b] >= min(most, best[0]):
+        if promised[b] >= min(max_cost, best[0]):
             break
-        cost, legs = _shortest(graph, starts[b], end, min(most, best[0]) - aside - costs[b])
+        cost, legs = _shortest(graph, starts[b], end, min(max_cost, best[0]) - aside - costs[b])
         best = min(best, (aside + costs[b] + cost, b, legs), key=lambda item: item[0])
     return best
 
@@ -150,10 +150,10 @@ def joined(first: Sequence[Leg], second: Sequence[Leg]) -> list[Leg]:
     return [*first[:-1], middle, *second[1:]]
 
 
-def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, most_m: float) -> tuple[float, list[Leg]]:
+def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, max_m: float) -> tuple[float, list[Leg]]:
     """Find the cheapest way from one place to another (Dijkstra 1959).
 
-    Returns its cost and its legs. The cost is infinite if no way costs less than `most_m`. A node of the
+    Returns its cost and its legs. The cost is infinite if no way costs less than `max_m`. A node of the
     search is a lane together with its part of the way. The cost of a node is the cost to the beginning of its
     lane.
     """
@@ -172,7 +172,7 @@ def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, most_m: float)
             continue
         done.add(node)
         for onward, price in _steps(graph, node, start, end):
-            if so_far + price < min(cost.get(onward, np.inf), most_m):
+            if so_far + price < min(cost.get(onward, np.inf), max_m):
                 cost[onward], came_from[onward] = so_far + price, node
                 heapq.heappush(queue, (so_far + price, onward))
     else:
@@ -196,7 +196,7 @@ def _steps(graph: LaneGraph, node: _Node, start: LanePoint, end: LanePoint) -> I
             yield (onward, _Part.BETWEEN), length_m
             yield (onward, _Part.LAST), length_m
     room_m = {_Part.FIRST: length_m - start.s_m, _Part.BETWEEN: length_m, _Part.LAST: end.s_m}[part]
-    if room_m < LEAST_ROOM_M or graph.junction[lane] >= 0:
+    if room_m < MIN_ROOM_M or graph.junction[lane] >= 0:
         return
     for beside, may_cross in zip(graph.sides.lane[:, lane], graph.may_cross[:, lane], strict=True):
         if beside >= 0:
@@ -237,7 +237,7 @@ def _legs(graph: LaneGraph, start: LanePoint, end: LanePoint, lanes: list[int]) 
             if number == len(stretches) - 1:
                 until_m = _opposite(graph, end, stretch[k:])
             changes = len(stretch) - 1 - k
-            if k == 0 and until_m - at_m < (LEAST_ROOM_M if changes else -BACK_M):
+            if k == 0 and until_m - at_m < (MIN_ROOM_M if changes else -BACK_M):
                 return None
             # When there are several lanes, the first and the last are driven half as long as those between.
             share = 1.0 if not changes else 0.5 / (changes if k == 0 else changes + 0.5)

@@ -59,8 +59,8 @@ class LoggedDrive:
         speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
         turned = np.remainder(_yaw(after) - _yaw(before) + np.pi, 2 * np.pi) - np.pi
         curvature = turned / (to_s - from_s) / speed if speed > STEERS_FROM_MPS else 0.0
-        most = EGO.max_steering_rad
-        steering = np.clip(np.arctan(EGO.wheelbase_m * curvature), -most, most)
+        max_rad = EGO.max_steering_rad
+        steering = np.clip(np.arctan(EGO.wheelbase_m * curvature), -max_rad, max_rad)
         return BicycleState(float(now[0, 3]), float(now[1, 3]), _yaw(now), speed, float(steering))
 
     def route_from(self, t_s: float) -> Float64[np.ndarray, "M 3"]:

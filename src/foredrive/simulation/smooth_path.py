@@ -17,7 +17,7 @@ BEYOND_M = 10.0
 """The path continues straight beyond its end, m, for vehicles that overshoot."""
 SMOOTHING_S5 = 3e-4
 """Weight of the jerk: 1 m/s³ for 1 s costs as much as missing a knot by 1.7 cm."""
-SLOWEST_MPS = 4.0
+MIN_MPS = 4.0
 """Slower paths are smoothed as if driven at this speed, m/s."""
 STEERING_S = 0.3
 """The initial curvature may differ from the current one by as much as steering changes in this time, s."""
@@ -68,7 +68,7 @@ def fit_path(waypoints: Float64[np.ndarray, "T 2"], dt_s: float, curvature_now: 
     chords = np.diff(waypoints[index], axis=0, prepend=np.zeros((1, 2)))
     chord_m = np.hypot(chords[:, 0], chords[:, 1])
     direction = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-    pace_mps = np.hypot(chord_m / (dt_s * np.diff(index, prepend=-1)), SLOWEST_MPS)
+    pace_mps = np.hypot(chord_m / (dt_s * np.diff(index, prepend=-1)), MIN_MPS)
     unit = np.eye(len(index) + 1)
     heading, offset = np.zeros(len(unit)), np.zeros(len(unit))  # as linear functions of the curvatures
     firm = np.sqrt(SMOOTHING_S5 / STEERING_S) * pace_mps[0] ** 2

@@ -24,7 +24,7 @@ AFTER_S = 4.0
 """Time after the start at which an ego vehicle that drives on as in the log is hit, s."""
 THREAT_MPS = 5.0
 """Speed of the other vehicle, m/s."""
-LEAST_MPS = 2.0
+MIN_MPS = 2.0
 """If the log is slower than this at the time of impact, m/s, there is nothing to avoid."""
 BEST, AFTER_COLLISION = 5.0, 4.0
 
@@ -49,9 +49,9 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     at_s = start_s + AFTER_S
     if at_s > drive.end_s or drive.way_left_m(at_s) < ARRIVED_M:
         raise InputError(f"the log ends at {drive.end_s:.1f} s, too early to meet anybody at {at_s:.1f} s")
-    if drive.state_at(at_s).speed_mps < LEAST_MPS:
+    if drive.state_at(at_s).speed_mps < MIN_MPS:
         raise InputError(f"the log hardly moves at {at_s:.1f} s: nobody would be met")
-    row, tracks = _most_seen_car(graph), graph.tracks
+    row, tracks = _car_with_most_points(graph), graph.tracks
     length_m, _, height_m = tracks.size_lwh[row].tolist()
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
     heading_rad, ahead_m = {
@@ -92,7 +92,7 @@ def threat_score(impact_mps: float | None, reference: float) -> float:
     return BEST if impact_mps is None else AFTER_COLLISION * max(0.0, 1.0 - impact_mps / reference)
 
 
-def _most_seen_car(graph: SceneGraph) -> int:
+def _car_with_most_points(graph: SceneGraph) -> int:
     """Return the row of the car with the most Gaussians."""
     rows = (graph.tracks.category == Category.CAR).nonzero()[:, 0].tolist()
     if not rows:

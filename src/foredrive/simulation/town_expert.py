@@ -116,11 +116,11 @@ class TownExpert:
         """
         now, xyz = self._imagined[0], self._simulator.scenario.route_xyz
         arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
-        most_m = traffic.to_light_m(now.traffic)
+        max_m = traffic.to_light_m(now.traffic)
         way_m, speed, points = 0.0, here.speed_mps, [here.axle_xyz[:2]]
         for then in self._imagined[1:]:
             speed = min(speed + EDGES_MPS2 * DECISION_S, EDGES_MPS)
-            way_m = min(way_m + speed * DECISION_S, max(most_m, way_m))
+            way_m = min(way_m + speed * DECISION_S, max(max_m, way_m))
             at = now.progress.done_m + way_m + np.array([0.0, LOOK_M])
             (x, ahead_x), (y, ahead_y) = (np.interp(at, arc_m, axis) for axis in xyz.T[:2])
             yaw = math.atan2(ahead_y - y, ahead_x - x)

@@ -51,15 +51,15 @@ def draw_routes(town: str, spec: RouteSetSpec, seed: int = 0) -> list[RouteWaypo
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
     met: Counter[int] = Counter()
     while len(chosen) < spec.per_town:
-        best, most = None, -math.inf
+        best, best_worth = None, -math.inf
         while best is None:
             for _ in range(CANDIDATES):
                 length_m = float(rng.uniform(spec.min_m, spec.max_m))
                 drawn = draw_route(graph, starts, rng, length_m, from_s=0.0, until_s=math.inf)
                 found = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, spec)
                 worth = -math.inf if found is None else _worth(found[1], [route for _, route in chosen], met)
-                if worth > most:
-                    best, most = found, worth
+                if worth > best_worth:
+                    best, best_worth = found, worth
         chosen.append(best)
         met.update(_manoeuvres(best[1]))
     return [waypoints for waypoints, _ in chosen]

@@ -45,7 +45,7 @@ class ModelPanel:
             self.boxes = {name: gui.add_checkbox(name, True) for name in NODES}
             self.colour_by = gui.add_dropdown("coloured by", ("height", "features"))
             self.above = gui.add_slider("probability >", 0.05, 0.95, 0.05, 0.5)
-            self.lowest_m = gui.add_slider(
+            self.min_height_m = gui.add_slider(
                 "height, m >", low_m, high_m, spec.voxel_m, min(above_road, high_m)
             )
             render = gui.add_button(
@@ -54,7 +54,7 @@ class ModelPanel:
                 visible=self._predictor.renders,
             )
             self._rendered = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
-        for slider in (self.frame, self.above, self.lowest_m):
+        for slider in (self.frame, self.above, self.min_height_m):
             slider.on_update(lambda _: self.show(self._index))
         for box in self.boxes.values():
             box.on_update(lambda _: self.show(self._index))
@@ -70,7 +70,7 @@ class ModelPanel:
             with self._server.atomic():
                 if prediction is not None:
                     spec = self.spec
-                    shown = shown_voxels(prediction, k, spec, self.above.value, self.lowest_m.value)
+                    shown = shown_voxels(prediction, k, spec, self.above.value, self.min_height_m.value)
                     colour_by = cast(Literal["height", "features"], self.colour_by.value)
                     show_occupancy(scene, prediction, k, spec, shown, colour_by)
                     show_flow(scene, prediction, k, spec, shown)

@@ -26,12 +26,12 @@ def thin_out(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -
     """
     opacity = gaussians.opacity_logit.sigmoid()
     seen = (opacity >= MIN_OPACITY).nonzero()[:, 0]
-    most = round(share * len(opacity))
-    if len(seen) > most:
+    max_count = round(share * len(opacity))
+    if len(seen) > max_count:
         scale_m = gaussians.log_scale.exp().sort(dim=-1).values
         range_m = torch.cdist(gaussians.mean_m, from_m).amin(-1).clamp_min(MIN_DISTANCE_M)
         covers = opacity * scale_m[:, 1] * scale_m[:, 2] / range_m**2
-        seen = seen[covers[seen].topk(most).indices].sort().values
+        seen = seen[covers[seen].topk(max_count).indices].sort().values
     return gaussians[seen]
 
 

@@ -31,7 +31,7 @@ _CUBE_FACES = np.array(
 
 
 def shown_voxels(
-    prediction: DisplayPrediction, k: int, spec: VoxelSpec, above: float, lowest_m: float
+    prediction: DisplayPrediction, k: int, spec: VoxelSpec, above: float, min_height_m: float
 ) -> Bool[Tensor, "Z Y X"]:
     """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
@@ -39,7 +39,7 @@ def shown_voxels(
         lowest_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
     """
     z = spec.centres_m()[..., 2]
-    return (prediction.occupancy_logit[k].sigmoid() > above) & (z >= lowest_m)
+    return (prediction.occupancy_logit[k].sigmoid() > above) & (z >= min_height_m)
 
 
 def show_occupancy(

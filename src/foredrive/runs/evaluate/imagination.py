@@ -53,8 +53,8 @@ def imagine_run(
         raise InputError(f"at least one future of {clips.frame_dt_s:g} s from one moment can be imagined")
     world = load_agent(run).world_model
     if world.max_steps is not None and steps > world.max_steps:
-        farthest_s = world.max_steps * clips.frame_dt_s
-        raise InputError(f"{run.folder}: this model imagines {farthest_s:g} s at most, not {seconds:g} s")
+        max_s = world.max_steps * clips.frame_dt_s
+        raise InputError(f"{run.folder}: this model imagines {max_s:g} s at most, not {seconds:g} s")
     config = dataclasses.replace(clips, future_frames=steps, future_images=True)
     dataset = open_clips([log], config, run.cache_dir)
     generator = torch.Generator().manual_seed(SEED)

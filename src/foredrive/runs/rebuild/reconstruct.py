@@ -232,11 +232,11 @@ def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> LoggedVehicl
     fullest = max(seen, key=lambda view: len(view.beams.dt_s))
     beams, T_ego_lidar = fullest.beams, torch.eye(4)
     T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
-    farthest_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
+    max_range_m = max(float(view.beams.range_m[view.beams.returned].max()) for view in seen)
     lidar = lidar_of(log.metadata.dataset, T_ego_lidar) or estimate_lidar(
-        beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=farthest_m
+        beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=max_range_m
     )
-    reach_m = farthest_m if lidar is None else lidar.max_range_m
+    reach_m = max_range_m if lidar is None else lidar.max_range_m
     return read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
 
 

@@ -22,7 +22,7 @@ LIDARS: dict[str, Callable[[Float[Tensor, "4 4"]], SpinningLidar]] = {
     "vlp16": vlp16,
 }
 """Lidars by name; each is mounted at the pose of the log's lidar."""
-_LEAST_STEP_S = 1e-3
+_MIN_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ def plan_frames(
     vehicle.check_time(end_s)
     steps_s = vehicle.t_s.diff()
     step_s = 1 / rate_hz if rate_hz else float(steps_s.median()) if len(steps_s) else 1.0
-    if not (step_s >= _LEAST_STEP_S and end_s >= start_s):
+    if not (step_s >= _MIN_STEP_S and end_s >= start_s):
         raise InputError(f"{rate_hz or 0:g} times a second over {end_s - start_s:g} s cannot be filmed")
-    count = int((end_s - start_s) / step_s + _LEAST_STEP_S) + 1
+    count = int((end_s - start_s) / step_s + _MIN_STEP_S) + 1
     return RenderPlan(tuple(min(start_s + k * step_s, last_s) for k in range(count)), step_s, chosen, beams)
 
 

@@ -22,9 +22,9 @@ CATEGORY_OF_BASE_TYPE = {
 }
 """By the blueprints' attribute `base_type`."""
 SAME_S, SAME_M = 5.0, 5.0
-LEAST_MPS = 0.1
+MIN_MPS = 0.1
 """CARLA's CollisionTest: contacts with one actor within `SAME_S`, or at places within `SAME_M`, are one
-collision. A vehicle slower than `LEAST_MPS` has caused none."""
+collision. A vehicle slower than `MIN_MPS` has caused none."""
 
 
 def category_of(type_id: str, attributes: dict[str, str]) -> Category | None:
@@ -86,7 +86,7 @@ def collision(
         last = dataclasses.replace(last, xy=None)
     same = known is not None and known == last.actor_id and t_s - last.t_s <= SAME_S
     category = category_of(other.type_id, other.attributes)
-    if same or last.xy is not None or speed_mps < LEAST_MPS or other.type_id.startswith("static.sidewalk"):
+    if same or last.xy is not None or speed_mps < MIN_MPS or other.type_id.startswith("static.sidewalk"):
         return None, last
     kind, what, severity = "collision_static", other.type_id.removeprefix("static."), speed_mps
     if category is not None:

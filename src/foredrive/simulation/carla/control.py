@@ -22,7 +22,7 @@ COASTING_MPS2, COASTING_PER_M = 0.3, 8e-4
 squared."""
 CATCH_UP_PER_S = 2.0
 """Additional acceleration per m/s that the speed lags behind, 1/s."""
-MOST_BEHIND_MPS = 1.5
+MAX_BEHIND_MPS = 1.5
 CURVATURE_AT_LOCK_PER_M = 0.278
 """Curvature at full steering, 1/m; smaller steering gives proportionally less. It is the slope of the
 bicycle model that Chen et al. ("Learning to drive from a world on rails", ICCV 2021) fitted to CARLA's
@@ -52,7 +52,7 @@ def actuate(control: Control, speed_mps: float, commanded: CommandedSpeed) -> tu
     """Return pedals and steering for the step that begins now, and the state for the next step."""
     wanted = min(max(control.acceleration_mps2, -EGO.max_braking_mps2), EGO.max_acceleration_mps2)
     behind = 0.0 if commanded.speed_mps is None else commanded.speed_mps - speed_mps
-    behind = min(max(behind, -MOST_BEHIND_MPS), MOST_BEHIND_MPS)
+    behind = min(max(behind, -MAX_BEHIND_MPS), MAX_BEHIND_MPS)
     stands = speed_mps < STANDING_MPS
     if stands and wanted <= 0:  # standing as commanded
         behind, due = 0.0, speed_mps

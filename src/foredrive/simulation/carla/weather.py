@@ -6,7 +6,7 @@ from typing import Any
 from foredrive.scene.conditions import Conditions
 from foredrive.simulation.carla.client import import_carla
 
-HIGHEST_SUN_DEG, LOWEST_SUN_DEG = 75.0, -60.0
+MAX_SUN_DEG, MIN_SUN_DEG = 75.0, -60.0
 """Altitude of the sun at noon and at midnight, degrees. It is 0 at 6 and at 18 o'clock."""
 HEAVY_RAIN_MMPH = 50.0
 FOG_VISIBILITY_M = 1000.0
@@ -29,7 +29,7 @@ def weather_of(conditions: Conditions) -> Any:
         precipitation_deposits=wet if conditions.rain_mmph > 0 else 0.5 * wet,
         wind_intensity=10.0,
         sun_azimuth_angle=(15.0 * conditions.hour) % 360.0,
-        sun_altitude_angle=phase * (HIGHEST_SUN_DEG if phase > 0 else -LOWEST_SUN_DEG),
+        sun_altitude_angle=phase * (MAX_SUN_DEG if phase > 0 else -MIN_SUN_DEG),
         fog_density=100.0 * min(thinned, 1.0),
         fog_distance=0.0,
         fog_falloff=0.2,
