@@ -9,7 +9,7 @@ from scenes import straight
 
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.place.looks import LookTable, Surface
+from foredrive.towns.place.materials import MaterialTable, Surface
 from foredrive.towns.place.mesh import Mesh, box, frustum, join, prism, walls
 from foredrive.towns.place.parking import footprint
 from foredrive.towns.place.road_mesh import build_roads
@@ -44,7 +44,7 @@ def look_down(world: World, from_xyz: np.ndarray) -> tuple[np.ndarray, np.ndarra
     down = np.tile(np.array([0, 0, -1], np.float32), (len(from_xyz), 1))
     hits = TriangleScene(world.static.mesh).cast(from_xyz.astype(np.float32), down)
     assert (hits.triangle != MISS).all()
-    surface = world.surfaces[world.static.mesh.look[hits.triangle]]
+    surface = world.surfaces[world.static.mesh.material[hits.triangle]]
     return from_xyz[:, 2] - hits.t, surface
 
 
@@ -98,7 +98,7 @@ def test_a_road_over_another_is_a_bridge_with_room_below() -> None:
     plan = make_ground_plan(town)
     assert {p.strip.id for p in plan.pieces if p.bridge} == {"2"}
     assert all(p.whole for p in plan.pieces)  # neither road cuts the other
-    table = LookTable()
+    table = MaterialTable()
     terrain = make_terrain(plan, town.bounds_m, np.random.default_rng(0))
     mesh = join([build_roads(town, plan, table), build_terrain(terrain, plan, table)])
     scene, up = TriangleScene(mesh), np.array([[0.0, 0.0, 1.0]], np.float32)
@@ -114,7 +114,7 @@ def test_a_road_over_another_is_a_bridge_with_room_below() -> None:
 def test_buildings_and_parked_cars_keep_off_the_roads(world02: World, town02: TownMap) -> None:
     lanes = shapely.union_all([strip.polygon for strip in town02.strips])
     mesh = world02.static.mesh
-    building = world02.surfaces[mesh.look] == Surface.BUILDING
+    building = world02.surfaces[mesh.material] == Surface.BUILDING
     shapely.prepare(lanes)
     corners = mesh.xyz[building].reshape(-1, 3)
     assert not shapely.contains_xy(lanes, corners[:, 0], corners[:, 1]).any()
@@ -135,7 +135,7 @@ def test_nothing_hovers(world02: World) -> None:
 
 def test_the_same_seed_gives_the_same_town(world02: World, town02: TownMap) -> None:
     again = World(town02, seed=3, conditions=world02.conditions)
-    for name in ("xyz", "uvw", "look"):
+    for name in ("xyz", "uvw", "material"):
         a, b = getattr(world02.static.mesh, name), getattr(again.static.mesh, name)
         assert a.tobytes() == b.tobytes()
     assert world02.light.sun.tobytes() == again.light.sun.tobytes()

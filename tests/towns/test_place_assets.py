@@ -7,10 +7,10 @@ from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.place.actor_looks import MeshLooks
+from foredrive.towns.place.actor_materials import MeshMaterials
 from foredrive.towns.place.actor_meshes import PEOPLE, SHAPES_OF_KIND, VEHICLES
 from foredrive.towns.place.assets import AssetSet, asset_set_of, assets_of
-from foredrive.towns.place.looks import LookTable, Surface, Texture
+from foredrive.towns.place.materials import MaterialTable, Surface, Texture
 from foredrive.towns.place.styles import STYLES
 from foredrive.towns.sensing.actor_shapes import make_shape_library, unit_to_world
 from foredrive.towns.world import World
@@ -55,7 +55,7 @@ def test_no_asset_is_in_both_sets() -> None:
 
 @pytest.mark.parametrize("chosen", list(AssetSet))
 def test_every_kind_of_road_user_has_a_shape_in_each_set(chosen: AssetSet) -> None:
-    library = make_shape_library(LookTable(), assets_of(chosen))
+    library = make_shape_library(MaterialTable(), assets_of(chosen))
     heights = {"low_car": 1.45, "high_car": 1.7}
     seen = set()
     for category in SIZES:
@@ -71,7 +71,7 @@ def test_every_kind_of_road_user_has_a_shape_in_each_set(chosen: AssetSet) -> No
 @pytest.mark.parametrize("name", [*VEHICLES, *PEOPLE])
 def test_shapes_are_sane(name: str) -> None:
     """No empty triangles, about as large as they should be, mirrored left and right, feet on the ground."""
-    mesh = {**VEHICLES, **PEOPLE}[name](MeshLooks(LookTable()))
+    mesh = {**VEHICLES, **PEOPLE}[name](MeshMaterials(MaterialTable()))
     area = np.linalg.norm(np.cross(mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]), axis=1)
     assert (area > 1e-7).mean() > 0.98
     low, high = mesh.xyz.reshape(-1, 3).min(0), mesh.xyz.reshape(-1, 3).max(0)
@@ -86,7 +86,7 @@ def test_shapes_are_sane(name: str) -> None:
 
 
 def test_shapes_stay_in_their_boxes() -> None:
-    library = make_shape_library(LookTable(), assets_of(AssetSet.MIXED))
+    library = make_shape_library(MaterialTable(), assets_of(AssetSet.MIXED))
     for category in SIZES:
         for style in range(4):
             state = actor(category, style, velocity_mps=np.array([1.2, 0.0, 0.0]))
@@ -98,7 +98,7 @@ def test_shapes_stay_in_their_boxes() -> None:
 
 
 def test_legs_move_with_the_distance_walked() -> None:
-    library = make_shape_library(LookTable(), assets_of(AssetSet.TRAIN))
+    library = make_shape_library(MaterialTable(), assets_of(AssetSet.TRAIN))
 
     def pose(x_m: float) -> int:
         state = actor(
@@ -118,12 +118,12 @@ def test_a_held_out_world_shows_no_look_of_training(world02: World, town02: Town
     other = World(town02, seed=3, assets=AssetSet.TEST)
 
     def seen(world: World, *surfaces: Surface) -> set[tuple[float, ...]]:
-        looks = world._looks
-        used = np.unique(world.static.mesh.look)
-        patterned = np.isin(looks.texture[used], (Texture.FACADE, Texture.FOLIAGE, Texture.TILES))
-        used = used[patterned & np.isin(looks.surface[used], surfaces)]
-        kinds = np.where(looks.texture[used] == Texture.FACADE, looks.params[used, 8] + 1, 0)
-        return {(k, *rgb) for k, rgb in zip(kinds.tolist(), looks.albedo[used].tolist(), strict=True)}
+        materials = world._materials
+        used = np.unique(world.static.mesh.material)
+        patterned = np.isin(materials.texture[used], (Texture.FACADE, Texture.FOLIAGE, Texture.TILES))
+        used = used[patterned & np.isin(materials.surface[used], surfaces)]
+        kinds = np.where(materials.texture[used] == Texture.FACADE, materials.params[used, 8] + 1, 0)
+        return {(k, *rgb) for k, rgb in zip(kinds.tolist(), materials.albedo[used].tolist(), strict=True)}
 
     for surface in (Surface.BUILDING, Surface.VEGETATION):
         assert len(seen(world02, surface)) > 3

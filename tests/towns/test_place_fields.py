@@ -8,7 +8,7 @@ from scenes import straight
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.fields import HEDGE_M, ROAD_SETBACK_M, build_on_fields, lay_out_fields
-from foredrive.towns.place.looks import LookTable, Surface, Texture
+from foredrive.towns.place.materials import MaterialTable, Surface, Texture
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.terrain import build_terrain, make_terrain
 
@@ -23,7 +23,7 @@ def site() -> Site:
 def test_fields_keep_off_roads_and_what_stands_and_each_other(site: Site) -> None:
     barn = shapely.box(20.0, 30.0, 35.0, 40.0)
     site.take(barn)
-    table = LookTable()
+    table = MaterialTable()
     fields = lay_out_fields(site, table, np.random.default_rng(1))
     assert len(fields) > 2
     areas = [field.area for field in fields]
@@ -34,11 +34,11 @@ def test_fields_keep_off_roads_and_what_stands_and_each_other(site: Site) -> Non
     assert not any(site.is_free(area) for area in areas)
 
     plain, tilled = (build_terrain(site.terrain, site.plan, table, some) for some in ((), fields))
-    assert len(plain.look) == len(tilled.look)
-    crop = np.isin(tilled.look, [n for n, x in enumerate(table.looks) if x.texture is Texture.FIELD])
+    assert len(plain.material) == len(tilled.material)
+    crop = np.isin(tilled.material, [n for n, x in enumerate(table.materials) if x.texture is Texture.FIELD])
     inside = tilled.uvw[crop][..., 2] > 0.0
     points = shapely.points(tilled.xyz[crop][inside][:, :2].astype(np.float64))
-    sown = shapely.union_all([field.area for field in fields if field.look is not None])
+    sown = shapely.union_all([field.area for field in fields if field.material is not None])
     assert (shapely.distance(sown, points) < 1e-3).all()
 
     mesh, thin = build_on_fields(fields, site, table, np.random.default_rng(2))

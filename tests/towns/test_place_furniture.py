@@ -8,12 +8,12 @@ from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import Lane, MarkingKind, Strip, StripKind, TownMap
 from foredrive.towns.place.assets import AssetSet, assets_of
 from foredrive.towns.place.furniture_meshes import (
-    FurnitureLooks,
+    FurnitureMaterials,
     furniture_items,
     guard_rail,
     sound_barrier,
 )
-from foredrive.towns.place.looks import LookTable, Surface
+from foredrive.towns.place.materials import MaterialTable, Surface
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.street_furniture import build_street_furniture
 from foredrive.towns.place.terrain import make_terrain
@@ -46,7 +46,7 @@ def site() -> Site:
 
 
 def test_furniture_is_solid_and_rooted() -> None:
-    for name, thing in furniture_items(FurnitureLooks(LookTable())).items():
+    for name, thing in furniture_items(FurnitureMaterials(MaterialTable())).items():
         assert volume(thing.mesh.xyz) > 0, name
         low, high = thing.mesh.xyz.reshape(-1, 3).min(0), thing.mesh.xyz.reshape(-1, 3).max(0)
         assert -0.7 < low[2] < -0.1, name  # reaches into the ground
@@ -59,7 +59,7 @@ def test_furniture_is_solid_and_rooted() -> None:
 @pytest.mark.parametrize("build", [guard_rail, sound_barrier])
 def test_rails_face_outwards(build) -> None:
     feet = np.column_stack([np.arange(0.0, 41.0, 4.0), np.zeros(11), np.zeros(11)])
-    mesh = build(feet, FurnitureLooks(LookTable()))
+    mesh = build(feet, FurnitureMaterials(MaterialTable()))
     assert volume(mesh.xyz) > 0.1
     corners = mesh.xyz.reshape(-1, 3)
     assert corners[:, 0].min() > -0.2
@@ -67,7 +67,7 @@ def test_rails_face_outwards(build) -> None:
 
 
 def test_a_motorway_has_rails_off_its_lanes(site: Site) -> None:
-    mesh, thin = build_street_furniture(motorway(), site, LookTable(), np.random.default_rng(1))
+    mesh, thin = build_street_furniture(motorway(), site, MaterialTable(), np.random.default_rng(1))
     corners = mesh.xyz.reshape(-1, 3)
     beside = corners[(corners[:, 0] > 0.0) & (corners[:, 0] < 400.0)]
     assert np.abs(beside[:, 1]).min() > 2.0  # nothing over the lane
@@ -78,7 +78,7 @@ def test_a_motorway_has_rails_off_its_lanes(site: Site) -> None:
 
 def test_things_keep_off_each_other(site: Site) -> None:
     taken = len(site.taken)
-    build_vegetation(site, assets_of(AssetSet.TRAIN), LookTable(), np.random.default_rng(2))
+    build_vegetation(site, assets_of(AssetSet.TRAIN), MaterialTable(), np.random.default_rng(2))
     trees = site.taken[taken:]
     assert len(trees) > 20
     tree = shapely.STRtree(site.taken[:taken])
@@ -90,7 +90,7 @@ def test_thin_points_lie_on_the_town(world02: World) -> None:
     mesh, thin = world02.static.mesh, world02.static.thin
     chosen = np.random.default_rng(0).choice(len(thin.xyz), 400, replace=False)
     solid = np.isin(
-        world02.surfaces[mesh.look], (Surface.POLE, Surface.SIGN, Surface.STRUCTURE, Surface.VEGETATION)
+        world02.surfaces[mesh.material], (Surface.POLE, Surface.SIGN, Surface.STRUCTURE, Surface.VEGETATION)
     )
     low, high = mesh.xyz[solid].min(axis=1), mesh.xyz[solid].max(axis=1)
     for point in thin.xyz[chosen]:
@@ -101,7 +101,7 @@ def test_furniture_stands_on_the_ground_and_off_the_paved(world02: World, site: 
     town = world02.town
     plan = make_ground_plan(town)
     ground = Site(plan, make_terrain(plan, town.bounds_m, np.random.default_rng(0)))
-    mesh, thin = build_street_furniture(town, ground, LookTable(), np.random.default_rng(4))
+    mesh, thin = build_street_furniture(town, ground, MaterialTable(), np.random.default_rng(4))
     corners = mesh.xyz.reshape(-1, 3)
     low = corners[corners[:, 2] < 6.0]  # wires hang over roads
     shapely.prepare(plan.lanes)

@@ -18,7 +18,7 @@ from foredrive.scene.traffic_light import LightState
 from foredrive.sensors import SpinningLidar
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.patterns import band, bands
 from foredrive.towns.world import NO_ACTOR, World

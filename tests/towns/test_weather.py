@@ -11,7 +11,7 @@ from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import CONDITIONS, Conditions, find_conditions
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture
+from foredrive.towns.place.materials import Material, MaterialArrays, MaterialTable, Surface, Texture
 from foredrive.towns.sensing import lens
 from foredrive.towns.sensing.air import BACKSCATTER_RATIO, make_air, rain_extinction_per_m
 from foredrive.towns.sensing.beams import MAX_LATERAL_M, add_beams, phase
@@ -32,15 +32,15 @@ from foredrive.towns.world import NO_ACTOR, SensorFrame, World
 DOWN = np.array([0.0, 0.0, 1.0], np.float32)
 
 
-def looks_of(*looks: Look) -> LookArrays:
-    table = LookTable()
-    for look in looks:
-        table.add(look)
+def materials_of(*materials: Material) -> MaterialArrays:
+    table = MaterialTable()
+    for material in materials:
+        table.add(material)
     return table.arrays()
 
 
-WALL = looks_of(Look(Surface.BUILDING, Texture.PLAIN, (0.6, 0.6, 0.6), 0.4))
-ROAD = looks_of(Look(Surface.ROAD, Texture.PLAIN, (0.35, 0.35, 0.35), 0.4))
+WALL = materials_of(Material(Surface.BUILDING, Texture.PLAIN, (0.6, 0.6, 0.6), 0.4))
+ROAD = materials_of(Material(Surface.ROAD, Texture.PLAIN, (0.35, 0.35, 0.35), 0.4))
 
 
 def met(count: int, normal: np.ndarray, cosine: float = 1.0) -> Surfaces:
@@ -54,13 +54,13 @@ def met(count: int, normal: np.ndarray, cosine: float = 1.0) -> Surfaces:
     )
 
 
-def returned_share(conditions: Conditions, range_m: float, looks: LookArrays = WALL) -> float:
+def returned_share(conditions: Conditions, range_m: float, materials: MaterialArrays = WALL) -> float:
     count = 20_000
     chance = np.random.default_rng(1).random((count, 2), dtype=np.float32)
-    normal = DOWN if looks is ROAD else np.array([1.0, 0.0, 0.0])
+    normal = DOWN if materials is ROAD else np.array([1.0, 0.0, 0.0])
     t = np.full(count, range_m, np.float32)
     air = make_air(conditions)
-    _, returned, _ = lidar_returns(looks, met(count, normal), t, np.float32(200.0), chance, air)
+    _, returned, _ = lidar_returns(materials, met(count, normal), t, np.float32(200.0), chance, air)
     return float(returned.mean())
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64
 from foredrive.scene import BicycleState, Category, Event
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, touched
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 from foredrive.towns.world import World
 
 PASSABLE = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN, Surface.HIDDEN)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-MIN_TIME_TO_COLLISION_S = 0.95
+NEAR_COLLISION_S = 0.95
 """nuPlan's bound, s: a shorter time is not safe (Karnchanachari et al. 2024,
 time_to_collision_within_bound)."""
 

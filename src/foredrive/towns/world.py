@@ -18,11 +18,18 @@ from foredrive.towns.labels.semantics import NO_ACTOR, SKY
 from foredrive.towns.labels.visibility import visibility
 from foredrive.towns.map.ground_plan import make_ground_plan
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.place.actor_looks import MeshLooks
+from foredrive.towns.place.actor_materials import MeshMaterials
 from foredrive.towns.place.assets import Assets, AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.buildings import build_buildings
 from foredrive.towns.place.fields import build_on_fields, lay_out_fields
-from foredrive.towns.place.looks import Look, LookArrays, LookTable, Surface, Texture, srgb_to_linear
+from foredrive.towns.place.materials import (
+    Material,
+    MaterialArrays,
+    MaterialTable,
+    Surface,
+    Texture,
+    srgb_to_linear,
+)
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.parking import build_car_parks, park_on_strips, with_track_ids
 from foredrive.towns.place.props import (
@@ -80,7 +87,7 @@ class SensorFrame:
 
 @dataclass(frozen=True)
 class VehicleLights:
-    """Looks of vehicle lights: while driving, while braking, and on parked vehicles."""
+    """Materials of vehicle lights: while driving, while braking, and on parked vehicles."""
 
     front: int
     rear: int
@@ -89,12 +96,12 @@ class VehicleLights:
     rear_off: int
 
     @classmethod
-    def of(cls, table: LookTable) -> "VehicleLights":
-        """Return the looks of the shapes' lights, and add one more look for each state."""
-        front = MeshLooks(table).front_light
-        rear = table.add(Look(Surface.VEHICLE, Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08))
-        brake = table.add(replace(table.looks[rear], params=(0.0, 2.0)))
-        off = [table.add(replace(table.looks[look], params=(0.0, 1.0))) for look in (front, rear)]
+    def of(cls, table: MaterialTable) -> "VehicleLights":
+        """Return the materials of the shapes' lights, and add one more material for each state."""
+        front = MeshMaterials(table).front_light
+        rear = table.add(Material(Surface.VEHICLE, Texture.PLAIN, (0.55, 0.03, 0.03), 0.9, 0.08))
+        brake = table.add(replace(table.materials[rear], params=(0.0, 2.0)))
+        off = [table.add(replace(table.materials[material], params=(0.0, 1.0))) for material in (front, rear)]
         return cls(front, rear, brake, *off)
 
 
@@ -116,7 +123,7 @@ class World:
     """A town generated from a seed. The same map, seed and conditions give the same world.
 
     The conditions change only the light and the air; None draws bright daylight from the seed. By default the
-    assets are those of the town's split, so a held-out town has looks and shapes that never occur in
+    assets are those of the town's split, so a held-out town has materials and shapes that never occur in
     training.
     """
 
@@ -128,7 +135,7 @@ class World:
         assets: AssetSet | None = None,
     ) -> None:
         rng, weather_rng = np.random.default_rng([seed, *town.name.encode()]).spawn(2)
-        table = LookTable()
+        table = MaterialTable()
         chosen = assets_of(assets or asset_set_of(town.name))
         self.town = town
         self.conditions = conditions or draw_daylight(weather_rng)
@@ -137,10 +144,10 @@ class World:
         self._lens_seed = int(weather_rng.integers(1 << 30))
         self._shapes = make_shape_library(table, chosen)
         self.static = build_static(town, table, self._shapes, chosen, rng)
-        self._looks = table.arrays()
+        self._materials = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
         static = self.static
-        self._columns = make_columns(static.mesh, self._scene, self._looks.surface, static.thin)
+        self._columns = make_columns(static.mesh, self._scene, self._materials.surface, static.thin)
 
     def under(self, conditions: Conditions) -> "World":
         """Return the same town under other conditions.
@@ -161,8 +168,8 @@ class World:
 
     @property
     def surfaces(self) -> Int[np.ndarray, "L"]:
-        """Return the `Surface` of each look in the static mesh."""
-        return self._looks.surface
+        """Return the `Surface` of each material in the static mesh."""
+        return self._materials.surface
 
     def render(
         self,
@@ -243,16 +250,16 @@ class World:
         """
         hits = self._scene.cast(origin, direction)
         met = hits.triangle != shading.MISS
-        surface = self._looks.surface[self.static.mesh.look[np.where(met, hits.triangle, 0)]]
+        surface = self._materials.surface[self.static.mesh.material[np.where(met, hits.triangle, 0)]]
         return np.where(met, hits.t, np.float32(np.inf)), np.where(met, surface, SKY)
 
     @cached_property
     def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
         """Return points on the lamps of each traffic light, by the index of its stop zone."""
-        look, xyz = self.static.mesh.look, self.static.mesh.xyz
+        material, xyz = self.static.mesh.material, self.static.mesh.xyz
         points = {}
         for head in self.static.heads:
-            middle = xyz[look == head.lamps[1]].mean(axis=1, dtype=np.float64)
+            middle = xyz[material == head.lamps[1]].mean(axis=1, dtype=np.float64)
             _, first = np.unique(np.round(middle), axis=0, return_index=True)  # over the road and on the post
             points[head.zone] = middle[first]
         return points
@@ -275,7 +282,7 @@ class World:
             static=_triangles(self.static.mesh),
             shapes=_triangles(self._shapes.triangles),
             actors=shading.ActorArrays(placed.T_world_unit, first, paint),
-            looks=self._lit_looks(lights),
+            materials=self._lit_materials(lights),
         )
         light = self.light
         if street_lamps_on(self.conditions):
@@ -299,8 +306,8 @@ class World:
         ]
         return np.stack(drops)
 
-    def _lit_looks(self, lights: Int[np.ndarray, "Z"] | None) -> LookArrays:
-        """Return the looks with the lights that are on."""
+    def _lit_materials(self, lights: Int[np.ndarray, "Z"] | None) -> MaterialArrays:
+        """Return the materials with the lights that are on."""
         shining: dict[int, Rgb] = {self.static.vehicle_lights.brake: BRAKE_LIT}
         if headlights_on(self.conditions):
             shining |= {
@@ -308,19 +315,19 @@ class World:
                 self.static.vehicle_lights.rear: TAIL_LIT,
             }
         if street_lamps_on(self.conditions):
-            shining[self.static.lamps.look] = STREET_LAMP_LIT
+            shining[self.static.lamps.material] = STREET_LAMP_LIT
         if lights is not None:
             for head in self.static.heads:
                 for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, LAMP_LIT, strict=True):
                     if lights[head.zone] == shown:
                         shining[lamp] = rgb
-        texture, albedo = self._looks.texture.copy(), self._looks.albedo.copy()
+        texture, albedo = self._materials.texture.copy(), self._materials.albedo.copy()
         texture[list(shining)] = Texture.GLOW
         albedo[list(shining)] = np.array(list(shining.values()))
-        return self._looks._replace(texture=texture, albedo=albedo)
+        return self._materials._replace(texture=texture, albedo=albedo)
 
     def _surfaces(self, buffer: HitBuffer) -> Int[np.ndarray, "N"]:
-        return surface_ids(buffer, self._looks.surface, SKY)
+        return surface_ids(buffer, self._materials.surface, SKY)
 
     def _track_ids(self, buffer: HitBuffer, actors: list[ActorState]) -> Int[np.ndarray, "N"]:
         of_actor = np.array([actor.track_id for actor in actors], dtype=np.int64)
@@ -328,7 +335,7 @@ class World:
 
 
 def build_static(
-    town: TownMap, table: LookTable, shapes: ShapeLibrary, assets: Assets, rng: np.random.Generator
+    town: TownMap, table: MaterialTable, shapes: ShapeLibrary, assets: Assets, rng: np.random.Generator
 ) -> StaticWorld:
     """Generate the static content of a town.
 
@@ -357,8 +364,10 @@ def build_static(
     place = join([place, furniture, lamps.mesh, land, farm, plants])
     vehicle_lights = VehicleLights.of(table)
     vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
-    track = [np.full(len(place.look), NO_ACTOR, dtype=np.int32)]
-    track += [np.full(len(v.look), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)]
+    track = [np.full(len(place.material), NO_ACTOR, dtype=np.int32)]
+    track += [
+        np.full(len(v.material), c.track_id, dtype=np.int32) for v, c in zip(vehicles, parked, strict=True)
+    ]
     return StaticWorld(
         mesh=join([place, *vehicles]),
         track=np.concatenate(track),
@@ -374,14 +383,14 @@ def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> M
     """Build the mesh of a parked car as a part of the town, with its lights off."""
     shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car, lights.rear_off)
     moved = shape.transformed(unit_to_world(car))
-    slot = np.clip(-1 - moved.look, 0, SLOTS - 1)
-    look = np.where(moved.look < 0, paint[slot], moved.look)
-    look = np.where(look == lights.front, lights.front_off, look)
-    return Mesh(moved.xyz, moved.uvw, look.astype(np.int32))
+    slot = np.clip(-1 - moved.material, 0, SLOTS - 1)
+    material = np.where(moved.material < 0, paint[slot], moved.material)
+    material = np.where(material == lights.front, lights.front_off, material)
+    return Mesh(moved.xyz, moved.uvw, material.astype(np.int32))
 
 
 def _triangles(mesh: Mesh) -> shading.Triangles:
-    return shading.Triangles(mesh.xyz, mesh.uvw, mesh.look)
+    return shading.Triangles(mesh.xyz, mesh.uvw, mesh.material)
 
 
 def _distance(actor: ActorState, T_world_ego: Float64[np.ndarray, "4 4"]) -> float:

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from foredrive.simulation.drive_record import DriveRecord
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.scores import InfractionKind
-from foredrive.simulation.time_to_collision import MIN_TIME_TO_COLLISION_S
+from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import start_path_map
@@ -127,5 +127,5 @@ def _near(nearest_s: Sequence[float | None]) -> list[tuple[float, float]]:
     return [
         (FRAME_DT_S * (k - 0.5), FRAME_DT_S * (k + 0.5))
         for k, seconds in enumerate(nearest_s)
-        if seconds is not None and seconds < MIN_TIME_TO_COLLISION_S
+        if seconds is not None and seconds < NEAR_COLLISION_S
     ]

@@ -15,7 +15,7 @@ from foredrive.runs.folder import DRIVES, SUMMARY
 from foredrive.simulation.drive_record import DriveRecord, ThreatResult
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
-from foredrive.simulation.time_to_collision import MIN_TIME_TO_COLLISION_S
+from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
 from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.html import MetricTile, Provenance, inline_svg, write_page
@@ -120,7 +120,7 @@ def write_drive_report(out: Path) -> Path:
         letters={LETTERS[kind]: words(kind) for kind in LETTERS if summary[f"infractions.{kind}"]},
         table=_drive_table(drives),
         drives=[_show_drive(name, drives[name]) for name in worst_first],
-        near_collision_s=f"{MIN_TIME_TO_COLLISION_S:g}",
+        near_collision_s=f"{NEAR_COLLISION_S:g}",
         all_metrics=full_table(summary),
     )
     return out / REPORT
@@ -139,9 +139,7 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         *tiles,
         MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),
         MetricTile("Comfortable time, %", comfortable, note="within nuPlan's bounds"),
-        MetricTile(
-            "Near collision, % of time", near, note=f"time to collision below {MIN_TIME_TO_COLLISION_S:g} s"
-        ),
+        MetricTile("Near collision, % of time", near, note=f"time to collision below {NEAR_COLLISION_S:g} s"),
         MetricTile("Planning time", number(summary["plan_ms"], 0), "ms", "median"),
     ]
 

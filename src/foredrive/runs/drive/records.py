@@ -16,7 +16,7 @@ from foredrive.simulation.drive_record import DriveRecord
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import score_suite
 from foredrive.simulation.threats import Threat
-from foredrive.simulation.time_to_collision import MIN_TIME_TO_COLLISION_S
+from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
 
 _RECORD = TypeAdapter(DriveRecord)
 Figures = dict[str, float | int | str | None]
@@ -81,9 +81,7 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
     out |= {f"scenarios.{kind}": begun[kind] for kind in ScenarioKind}
     comfortable = [drive.comfort.comfortable_share for drive in drives if drive.comfort]
     near = [
-        seconds is not None and seconds < MIN_TIME_TO_COLLISION_S
-        for drive in drives
-        for seconds in drive.nearest_s
+        seconds is not None and seconds < NEAR_COLLISION_S for drive in drives for seconds in drive.nearest_s
     ]
     plan_ms = [1000 * seconds for drive in drives for seconds in drive.act_s]
     out["comfortable_share"] = statistics.fmean(comfortable) if comfortable else None

@@ -12,7 +12,7 @@ from foredrive.data.modalities import FullOccupancy
 from foredrive.errors import InputError
 from foredrive.scene import VoxelSpec
 from foredrive.scene.actors import ActorState
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 from foredrive.towns.sensing.actor_shapes import Shape, unit_to_world
 from foredrive.towns.sensing.columns import COLUMN_M, TownColumns
 

@@ -10,7 +10,7 @@ from py123d.datatypes import DefaultLidarSegmentationLabel as LidarLabel
 from foredrive.errors import InputError
 from foredrive.scene import CameraRig, Category
 from foredrive.scene.actors import ActorState
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 
 SKY = -1
 """Value in place of a `Surface` where a ray hit nothing."""

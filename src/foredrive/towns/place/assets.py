@@ -4,7 +4,7 @@ import enum
 from dataclasses import dataclass, fields
 
 from foredrive.towns.map.names import TEST_TOWNS
-from foredrive.towns.place.looks import WallKind, WindowKind
+from foredrive.towns.place.materials import WallKind, WindowKind
 
 Rgb = tuple[float, float, float]
 Palette = tuple[Rgb, ...]

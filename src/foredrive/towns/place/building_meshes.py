@@ -7,7 +7,15 @@ import shapely
 from jaxtyping import Float
 
 from foredrive.towns.place.assets import Assets, Rgb
-from foredrive.towns.place.looks import GroundFloor, Look, LookTable, Surface, Texture, WallKind, WindowKind
+from foredrive.towns.place.materials import (
+    GroundFloor,
+    Material,
+    MaterialTable,
+    Surface,
+    Texture,
+    WallKind,
+    WindowKind,
+)
 from foredrive.towns.place.mesh import (
     Mesh,
     Vector,
@@ -32,9 +40,9 @@ BALCONY_M = 1.15
 
 @dataclass(frozen=True)
 class _Facade:
-    """The properties of a façade's look that attached parts need."""
+    """The properties of a façade's material that attached parts need."""
 
-    look: int
+    material: int
     storey_m: float
     bay_m: float
     ground_m: float
@@ -50,7 +58,7 @@ class _Facade:
 class BuildingMaker:
     """A maker of building meshes in the style of a town, from the town's assets."""
 
-    table: LookTable
+    table: MaterialTable
     rng: np.random.Generator
     assets: Assets
     style: Style
@@ -59,11 +67,11 @@ class BuildingMaker:
     _metal: int = field(init=False)
 
     def __post_init__(self) -> None:
-        hedge = Look(Surface.VEGETATION, Texture.FOLIAGE, self.assets.leaves[-1], 0.5)
+        hedge = Material(Surface.VEGETATION, Texture.FOLIAGE, self.assets.leaves[-1], 0.5)
         self._hedge = self.table.add(hedge)
-        wood = Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.56, 0.48), 0.4, params=(1.5,))
+        wood = Material(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.56, 0.48), 0.4, params=(1.5,))
         self._wood = self.table.add(wood)
-        self._metal = self.table.add(Look(Surface.BUILDING, Texture.PLAIN, (0.20, 0.21, 0.22), 0.3))
+        self._metal = self.table.add(Material(Surface.BUILDING, Texture.PLAIN, (0.20, 0.21, 0.22), 0.3))
 
     def build(self, kind: str, plot: Plot, base: float, detail: bool) -> Mesh:
         """Build the mesh of a building.
@@ -102,7 +110,7 @@ class BuildingMaker:
         return options[int(self.rng.integers(len(options)))]
 
     def _plain(self, rgb: Rgb, reflectivity: float, texture: Texture = Texture.PLAIN) -> int:
-        return self.table.add(Look(Surface.BUILDING, texture, rgb, reflectivity, params=(1.0,)))
+        return self.table.add(Material(Surface.BUILDING, texture, rgb, reflectivity, params=(1.0,)))
 
     def _facade(
         self,
@@ -117,8 +125,8 @@ class BuildingMaker:
         kinds = (float(wall[0]), float(windows), float(ground_floor), float(accent))
         params = (storey, bay, *share, ground, *kinds)
         reflectivity = 0.55 if wall[0] is WallKind.SHEET else 0.3 + 0.25 * float(np.mean(wall[1]))
-        look = Look(Surface.BUILDING, Texture.FACADE, wall[1], reflectivity, params=params)
-        return _Facade(self.table.add(look), storey, bay, ground)
+        material = Material(Surface.BUILDING, Texture.FACADE, wall[1], reflectivity, params=params)
+        return _Facade(self.table.add(material), storey, bay, ground)
 
     def _wall(self, *but: WallKind) -> tuple[WallKind, Rgb]:
         options = [wall for wall in self.assets.walls if wall[0] not in but]
@@ -139,11 +147,11 @@ class BuildingMaker:
         eaves = base + ground_m + (storeys - 1) * storey_m
         w, d = plot.width_m, plot.depth_m
         ridge = eaves + rng.uniform(0.5, 0.85) * 0.5 * d
-        parts = [plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look)]
+        parts = [plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.material)]
         if w > d + 1.0 and rng.random() < 0.35:
             parts.append(hip_roof(plot, eaves, ridge, roof))
         else:
-            parts.append(gable_roof(plot, eaves, ridge, roof, facade.look))
+            parts.append(gable_roof(plot, eaves, ridge, roof, facade.material))
         if rng.random() < 0.6:
             x, y = rng.uniform(0.35, 0.6) * w, 0.5 * d + rng.uniform(0.3, 1.2)
             brick = self._plain((0.45, 0.30, 0.26), 0.35)
@@ -151,7 +159,7 @@ class BuildingMaker:
         if rng.random() < 0.5:
             x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(1.6, 3.0)
             parts.append(plot.box((x, -0.6), (wide, 1.4), (base + 2.55, base + 2.7), self._metal))
-            parts.append(plot.box((x, -0.5), (wide, 1.1), (base - 0.5, base + 0.15), facade.look))
+            parts.append(plot.box((x, -0.5), (wide, 1.1), (base - 0.5, base + 0.15), facade.material))
             for side in (-0.46, 0.46):
                 post = (x + side * wide, -1.15)
                 parts.append(plot.box(post, (0.12, 0.12), (base, base + 2.55), self._wood))
@@ -167,8 +175,8 @@ class BuildingMaker:
         roof = self._plain(self._choose(self.assets.roofs), 0.4, Texture.TILES)
         eaves, ridge = base + ground, base + ground + rng.uniform(0.6, 0.9) * 0.5 * d
         parts = [
-            plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.look),
-            gable_roof(plot, eaves, ridge, roof, facade.look),
+            plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.material),
+            gable_roof(plot, eaves, ridge, roof, facade.material),
         ]
         if rng.random() < 0.6:
             steel = self._plain((0.70, 0.71, 0.72), 0.6)
@@ -196,7 +204,7 @@ class BuildingMaker:
         top = base + ground + PARAPET_M
         ring: list[Vector] = [[0, 0], [w, 0], [w, d], [0, d]]
         parts = [
-            plot.walls(ring, base, top, facade.look),
+            plot.walls(ring, base, top, facade.material),
             polygon_cap(plot.polygon(), top - PARAPET_M, roof),
             *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(2, 6))),
         ]
@@ -223,7 +231,7 @@ class BuildingMaker:
             outline = [[0, 0], [w, 0], [w, d], [x, d], [x, y], [0, y]]
         area = shapely.Polygon(plot.world(np.array(outline, float)))
         parts = [
-            plot.walls(outline, base, top, facade.look),
+            plot.walls(outline, base, top, facade.material),
             polygon_cap(area, top - PARAPET_M, roof),
             *self._roof_boxes(plot, top - PARAPET_M, roof, int(rng.integers(1, 4))),
         ]
@@ -272,12 +280,12 @@ class BuildingMaker:
         floors = base + facade.ground_m + np.arange(storeys - 1) * facade.storey_m
         x, z = (a.ravel() for a in np.meshgrid(some, floors))
 
-        def part(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, look: int) -> Mesh:
+        def part(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, material: int) -> Mesh:
             low, high = (
                 np.column_stack([x + dx, np.full_like(x, y), z + dz])
                 for dx, y, dz in ((x0, y0, z0), (x1, y1, z1))
             )
-            return boxes(low, high, look)
+            return boxes(low, high, material)
 
         y = -BALCONY_M
         parts = [
@@ -288,19 +296,19 @@ class BuildingMaker:
         ]
         return [plot.placed(join(parts))]
 
-    def _roof_boxes(self, plot: Plot, z: float, look: int, count: int) -> list[Mesh]:
+    def _roof_boxes(self, plot: Plot, z: float, material: int, count: int) -> list[Mesh]:
         """Build boxes on a flat roof for stairs, lifts and air conditioning."""
         rng = self.rng
         parts = []
         for _ in range(count):
             size = tuple(rng.uniform(1.5, 4.0, 2))
             centre = (rng.uniform(0.2, 0.8) * plot.width_m, rng.uniform(0.15, 0.35) * plot.depth_m)
-            parts.append(plot.box(centre, size, (z - 0.2, z + rng.uniform(1.0, 2.6)), look))
+            parts.append(plot.box(centre, size, (z - 0.2, z + rng.uniform(1.0, 2.6)), material))
         return parts
 
     def _awning(self, plot: Plot, z: float) -> Mesh:
         rng = self.rng
-        look = self._plain(self._choose(self.assets.awnings), 0.4)
+        material = self._plain(self._choose(self.assets.awnings), 0.4)
         start, width = rng.uniform(0.1, 0.3) * plot.width_m, rng.uniform(0.3, 0.6) * plot.width_m
         reach, thick, low = 1.0, 0.08, z - 0.45
         x0, x1 = start, start + width
@@ -313,4 +321,4 @@ class BuildingMaker:
                 [x0, 0.0, z - sink],
             ]
 
-        return plot.placed(hexahedron(slab(thick), slab(0.0), [look] * 6))
+        return plot.placed(hexahedron(slab(thick), slab(0.0), [material] * 6))

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from foredrive.towns.place.assets import Assets
 from foredrive.towns.place.building_meshes import BuildingMaker
-from foredrive.towns.place.looks import LookTable
+from foredrive.towns.place.materials import MaterialTable
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.plot import Plot
 from foredrive.towns.place.site import Frontage, Site, frontages
@@ -38,7 +38,7 @@ _DEPTH_M = {
 
 
 def build_buildings(
-    site: Site, town_name: str, assets: Assets, table: LookTable, rng: np.random.Generator
+    site: Site, town_name: str, assets: Assets, table: MaterialTable, rng: np.random.Generator
 ) -> Mesh:
     """Build rows of buildings along the frontages, then a sparser second row.
 

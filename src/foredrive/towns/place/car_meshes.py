@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from foredrive.towns.place.actor_looks import BODY, MeshLooks
+from foredrive.towns.place.actor_materials import BODY, MeshMaterials
 from foredrive.towns.place.mesh import Mesh, box, frustum, join, quads, triangles
 
 HALF_WIDTH_M = 0.9
@@ -90,7 +90,7 @@ FORMS = {
 def loft(
     x: Float[np.ndarray, "S"],
     rings: Float[np.ndarray, "S K 2"],
-    looks: Sequence[Sequence[int]],
+    mats: Sequence[Sequence[int]],
     ends: tuple[int, int],
 ) -> Mesh:
     """Build a closed solid through S cross-sections.
@@ -98,33 +98,33 @@ def loft(
     Each cross-section has K points (y, z), counter-clockwise seen from ahead.
 
     Args:
-        looks: looks of the faces, segment by segment from the rear, then around the ring from its first
+        mats: materials of the faces, segment by segment from the rear, then around the ring from its first
             point.
-        ends: looks of the rear and the front face.
+        ends: materials of the rear and the front face.
     """
     xyz = np.concatenate([np.broadcast_to(x[:, None, None], (*rings.shape[:2], 1)), rings], axis=-1)
     after = np.roll(xyz, -1, axis=1)
     corners = np.stack([xyz[:-1], after[:-1], after[1:], xyz[1:]], axis=2).reshape(-1, 4, 3)
     sides = quads(corners, 0)
-    look = np.repeat(np.array(looks, dtype=np.int32).ravel(), 2)
+    material = np.repeat(np.array(mats, dtype=np.int32).ravel(), 2)
     fans = []
     for end, ring in zip(ends, (xyz[0, ::-1], xyz[-1]), strict=True):
         hub = np.broadcast_to(ring.mean(axis=0), ring.shape)
         fans.append(triangles(np.stack([hub, ring, np.roll(ring, -1, axis=0)], axis=1), end))
-    return join([Mesh(sides.xyz, sides.uvw, look), *fans])
+    return join([Mesh(sides.xyz, sides.uvw, material), *fans])
 
 
 def wheels(
-    positions_m: Sequence[float], half_width: float, radius: float, looks: MeshLooks, arches: int | None
+    positions_m: Sequence[float], half_width: float, radius: float, mats: MeshMaterials, arches: int | None
 ) -> Mesh:
-    """Build pairs of wheels. With the look `arches`, add wheel arches on a body of this half width."""
+    """Build pairs of wheels. With the material `arches`, add wheel arches on a body of this half width."""
     parts = []
     for x in positions_m:
         for side in (-1.0, 1.0):
             outer, inner = side * (half_width + 0.012), side * (half_width - 0.22)
-            parts.append(frustum((x, inner, radius), (x, outer, radius), (radius, radius), 12, looks.tyre))
+            parts.append(frustum((x, inner, radius), (x, outer, radius), (radius, radius), 12, mats.tyre))
             hub = (x, outer, radius), (x, outer + side * 0.012, radius)
-            parts.append(frustum(*hub, (0.62 * radius, 0.5 * radius), 7, looks.hub))
+            parts.append(frustum(*hub, (0.62 * radius, 0.5 * radius), 7, mats.hub))
             if arches is not None:
                 angle = np.linspace(0.0, np.pi, 9)
                 rim = np.stack([x + 1.2 * radius * np.cos(angle), radius + 1.2 * radius * np.sin(angle)], -1)
@@ -136,37 +136,37 @@ def wheels(
     return join(parts)
 
 
-def car(looks: MeshLooks, form: CarForm) -> Mesh:
+def car(mats: MeshMaterials, form: CarForm) -> Mesh:
     """Build a car with body, cabin, wheels, lights, bumpers, plates and mirrors."""
     w, rear, front = HALF_WIDTH_M, -2.25, 2.25
     belt_z = float(np.interp(form.cabin[3], *np.array(form.deck).T))
     parts = [
-        _body(looks, form),
-        _cabin(looks, form),
-        wheels((-1.38, 1.4), w - 0.01, 0.33, looks, looks.dark),
-        box((rear - 0.03, -0.7 * w, 0.3), (rear + 0.1, 0.7 * w, 0.48), looks.dark),
-        box((front - 0.2, -0.62 * w, 0.28), (front + 0.02, 0.62 * w, 0.5), looks.dark),
-        box((rear - 0.05, -0.26, 0.62), (rear + 0.02, 0.26, 0.73), looks.plate),
-        box((front - 0.05, -0.26, 0.36), (front + 0.04, 0.26, 0.47), looks.plate),
+        _body(mats, form),
+        _cabin(mats, form),
+        wheels((-1.38, 1.4), w - 0.01, 0.33, mats, mats.dark),
+        box((rear - 0.03, -0.7 * w, 0.3), (rear + 0.1, 0.7 * w, 0.48), mats.dark),
+        box((front - 0.2, -0.62 * w, 0.28), (front + 0.02, 0.62 * w, 0.5), mats.dark),
+        box((rear - 0.05, -0.26, 0.62), (rear + 0.02, 0.26, 0.73), mats.plate),
+        box((front - 0.05, -0.26, 0.36), (front + 0.04, 0.26, 0.47), mats.plate),
     ]
     nose_z, tail_z = form.deck[-1][1], form.deck[0][1]
     for side in (-1.0, 1.0):
         y0, y1 = sorted((side * 0.72 * w, side * 0.46 * w))
         parts.append(
-            box((front - 0.16, y0, nose_z - 0.1), (front + 0.005, y1, nose_z + 0.03), looks.front_light)
+            box((front - 0.16, y0, nose_z - 0.1), (front + 0.005, y1, nose_z + 0.03), mats.front_light)
         )
         y0, y1 = sorted((side * 0.87 * w, side * 0.62 * w))
-        parts.append(box((rear - 0.02, y0, tail_z - 0.14), (rear + 0.1, y1, tail_z + 0.02), looks.rear_light))
+        parts.append(box((rear - 0.02, y0, tail_z - 0.14), (rear + 0.1, y1, tail_z + 0.02), mats.rear_light))
         y0, y1 = sorted((side * (w - 0.06), side * (w + 0.1)))
         mirror_x = form.cabin[3] - 0.4
         parts.append(box((mirror_x - 0.1, y0, belt_z), (mirror_x + 0.05, y1, belt_z + 0.13), BODY))
     if form.bed:
         bed = (rear + 0.08, -w + 0.12, 1.0), (form.cabin[0] - 0.05, w - 0.12, 1.075)
-        parts.append(box(*bed, looks.dark))
+        parts.append(box(*bed, mats.dark))
     return join(parts)
 
 
-def _body(looks: MeshLooks, form: CarForm) -> Mesh:
+def _body(mats: MeshMaterials, form: CarForm) -> Mesh:
     """Build the body, from the sills up to the belt, the boot and the bonnet."""
     from_rear, share = np.array(_END_WIDTH).T
     deck_x, deck_z = np.array(form.deck).T
@@ -178,12 +178,12 @@ def _body(looks: MeshLooks, form: CarForm) -> Mesh:
     right = [(0.9 * half, low), (half, sill), (half, shoulder), (half - 0.09, top)]
     ring = [*right, *((-y, z) for y, z in reversed(right))]
     rings = np.stack([np.stack(np.broadcast_arrays(y, z), axis=-1) for y, z in ring], axis=1)
-    edge = looks.dark if form.cladding else BODY
-    around = [edge, BODY, BODY, BODY, BODY, BODY, edge, looks.dark]
+    edge = mats.dark if form.cladding else BODY
+    around = [edge, BODY, BODY, BODY, BODY, BODY, edge, mats.dark]
     return loft(x, rings, [around] * (len(x) - 1), (BODY, BODY))
 
 
-def _cabin(looks: MeshLooks, form: CarForm) -> Mesh:
+def _cabin(mats: MeshMaterials, form: CarForm) -> Mesh:
     """Build the cabin: windows between pillars, under a roof."""
     a, b, c, d = form.cabin
     middle = 0.5 * (b + c) - 0.1
@@ -197,8 +197,8 @@ def _cabin(looks: MeshLooks, form: CarForm) -> Mesh:
     right = [(foot, belt), (eave, top), (eave - 0.08, top + 0.035 * lean.round())]
     ring = [*right, *((-y, z) for y, z in reversed(right))]
     rings = np.stack([np.stack([y, z], axis=-1) for y, z in ring], axis=1)
-    pane, post = looks.glass, BODY
+    pane, post = mats.glass, BODY
     sides = [pane, post, pane, post, pane, post, pane]
     roofs = [pane, post, post, post, post, post, pane]
-    around = [[s, post, r, post, s, looks.dark] for s, r in zip(sides, roofs, strict=True)]
+    around = [[s, post, r, post, s, mats.dark] for s, r in zip(sides, roofs, strict=True)]
     return loft(x, rings, around, (post, post))

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture, srgb_to_linear
+from foredrive.towns.place.materials import Material, MaterialTable, Surface, Texture, srgb_to_linear
 from foredrive.towns.place.mesh import Mesh, boxes, frustum, join
 from foredrive.towns.place.props import POLE_SAMPLE_M, ThinPoints, pole_points, thin_points
 from foredrive.towns.place.site import Site
@@ -33,7 +33,7 @@ _CROPS = {
 _MEADOW = "meadow"
 
 
-def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tuple[Field, ...]:
+def lay_out_fields(site: Site, table: MaterialTable, rng: np.random.Generator) -> tuple[Field, ...]:
     """Lay out fields on the remaining land and take it from the site.
 
     Meadows have the same look as the land.
@@ -53,16 +53,16 @@ def lay_out_fields(site: Site, table: LookTable, rng: np.random.Generator) -> tu
             if area.area < MIN_AREA_M2:
                 continue
             site.take(area)
-            fields.append(Field(area.simplify(0.5), _direction(area), kind, _look(kind, table)))
+            fields.append(Field(area.simplify(0.5), _direction(area), kind, _material(kind, table)))
     return tuple(fields)
 
 
 def build_on_fields(
-    fields: Sequence[Field], site: Site, table: LookTable, rng: np.random.Generator
+    fields: Sequence[Field], site: Site, table: MaterialTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinPoints]:
     """Build fences around meadows and bales on stubble."""
-    wood = table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.47, 0.40, 0.32), 0.4, params=(1.5,)))
-    straw = table.add(Look(Surface.VEGETATION, Texture.PLAIN, (0.74, 0.63, 0.36), 0.5, params=(2.0,)))
+    wood = table.add(Material(Surface.STRUCTURE, Texture.PLAIN, (0.47, 0.40, 0.32), 0.4, params=(1.5,)))
+    straw = table.add(Material(Surface.VEGETATION, Texture.PLAIN, (0.74, 0.63, 0.36), 0.5, params=(2.0,)))
     parts, points = [], []
     for field in fields:
         if field.kind == _MEADOW:
@@ -98,15 +98,15 @@ def _direction(area: shapely.Polygon) -> Float[np.ndarray, "2"]:
     return np.asarray(side / np.linalg.norm(side))
 
 
-def _look(kind: str, table: LookTable) -> int | None:
+def _material(kind: str, table: MaterialTable) -> int | None:
     if kind == _MEADOW:
         return None
     _, crop, soil, step_m, row_m = _CROPS[kind]
     params = (step_m, row_m, *srgb_to_linear([soil])[0].tolist())
-    return table.add(Look(Surface.TERRAIN, Texture.FIELD, crop, 0.45, params=params))
+    return table.add(Material(Surface.TERRAIN, Texture.FIELD, crop, 0.45, params=params))
 
 
-def _fence(area: shapely.Polygon, site: Site, look: int) -> tuple[Mesh, Float[np.ndarray, "n 3"]]:
+def _fence(area: shapely.Polygon, site: Site, material: int) -> tuple[Mesh, Float[np.ndarray, "n 3"]]:
     """Build posts and rails around a meadow, with an open gate. Also return points on them."""
     ring = area.exterior
     count = max(int((ring.length - GATE_M) / POST_STEP_M), 1)
@@ -114,19 +114,19 @@ def _fence(area: shapely.Polygon, site: Site, look: int) -> tuple[Mesh, Float[np
     xy = shapely.get_coordinates(shapely.line_interpolate_point(ring, along))
     feet = np.column_stack([xy, site.height(xy)])
     half = np.array([0.05, 0.05, 0.0])
-    parts = [boxes(feet - half - [0.0, 0.0, 0.4], feet + half + [0.0, 0.0, POST_M], look)]
+    parts = [boxes(feet - half - [0.0, 0.0, 0.4], feet + half + [0.0, 0.0, POST_M], material)]
     points = [pole_points(foot[:2], foot[2], POST_M) for foot in feet]
     for a, b in itertools.pairwise(feet):
         steps = np.linspace(0.0, 1.0, int(np.linalg.norm(b - a) / POLE_SAMPLE_M) + 2)[:, None]
         for z in RAILS_M:
             up = np.array([0.0, 0.0, z])
             low, high = a + up, b + up
-            parts.append(frustum(tuple(low), tuple(high), (0.05, 0.05), 4, look))
+            parts.append(frustum(tuple(low), tuple(high), (0.05, 0.05), 4, material))
             points.append(low + steps * (high - low))
     return join(parts), np.concatenate(points)
 
 
-def _bales(field: Field, site: Site, look: int, rng: np.random.Generator) -> list[Mesh]:
+def _bales(field: Field, site: Site, material: int, rng: np.random.Generator) -> list[Mesh]:
     """Build round bales at random places of a field."""
     x0, y0, x1, y1 = field.area.bounds
     xy = rng.uniform((x0, y0), (x1, y1), (int((x1 - x0) * (y1 - y0) * BALES_PER_M2), 2))
@@ -138,5 +138,5 @@ def _bales(field: Field, site: Site, look: int, rng: np.random.Generator) -> lis
         angle = float(rng.normal(0.0, 0.4)) + float(np.arctan2(field.along[1], field.along[0]))
         ahead = 0.5 * length * np.array([np.cos(angle), np.sin(angle), 0.0])
         middle = np.array([x, y, z + 0.93 * radius])
-        parts.append(frustum(tuple(middle - ahead), tuple(middle + ahead), (radius, radius), 14, look))
+        parts.append(frustum(tuple(middle - ahead), tuple(middle + ahead), (radius, radius), 14, material))
     return parts

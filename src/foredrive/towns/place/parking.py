@@ -7,7 +7,7 @@ from jaxtyping import Float
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
 from foredrive.towns.map.town_map import StripKind, TownMap
-from foredrive.towns.place.looks import ASPHALT_RGB, Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import ASPHALT_RGB, Material, MaterialTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, ribbon, walls
 from foredrive.towns.place.site import Frontage, Site, frontages
 
@@ -44,13 +44,15 @@ def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[
     return cars
 
 
-def build_car_parks(site: Site, table: LookTable, rng: np.random.Generator) -> tuple[Mesh, list[ActorState]]:
+def build_car_parks(
+    site: Site, table: MaterialTable, rng: np.random.Generator
+) -> tuple[Mesh, list[ActorState]]:
     """Build paved car parks between the buildings, each with a row of marked bays.
 
     The plots are taken from the site.
     """
-    asphalt = table.add(Look(Surface.TERRAIN, Texture.ROAD, ASPHALT_RGB, 0.15))
-    paint = table.add(Look(Surface.TERRAIN, Texture.PLAIN, (0.85, 0.85, 0.83), 0.7))
+    asphalt = table.add(Material(Surface.TERRAIN, Texture.ROAD, ASPHALT_RGB, 0.15))
+    paint = table.add(Material(Surface.TERRAIN, Texture.PLAIN, (0.85, 0.85, 0.83), 0.7))
     parts, cars = [], []
     for frontage in frontages(site.plan, LOT_SETBACK_M):
         if not frontage.walkway:
@@ -117,9 +119,9 @@ def _car(
 
 
 def _lot(
-    site: Site, frontage: Frontage, s: float, looks: tuple[int, int], rng: np.random.Generator
+    site: Site, frontage: Frontage, s: float, materials: tuple[int, int], rng: np.random.Generator
 ) -> tuple[list[Mesh], list[ActorState]]:
-    asphalt, paint = looks
+    asphalt, paint = materials
     end, start = frontage.at(s), frontage.at(s + rng.uniform(*LOT_WIDTH_M))
     width = float(np.linalg.norm(end - start))
     along = (end - start) / width

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import trimesh
 
-from foredrive.towns.place.actor_looks import BODY, SECOND, THIRD, MeshLooks
+from foredrive.towns.place.actor_materials import BODY, SECOND, THIRD, MeshMaterials
 from foredrive.towns.place.large_meshes import taper
 from foredrive.towns.place.mesh import Mesh, box, frustum, join, ribbon, triangles
 
@@ -17,12 +17,12 @@ HIP_M, THIGH_M, SHANK_M = 0.92, 0.44, 0.42
 HIP_SWING_RAD, KNEE_BEND_RAD, ARM_SWING_RAD = 0.42, 0.95, 0.45
 
 
-def _ball(centre: tuple[float, float, float], radius: float, look: int) -> Mesh:
+def _ball(centre: tuple[float, float, float], radius: float, material: int) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=1)
-    return triangles((sphere.vertices * radius + centre)[sphere.faces], look)
+    return triangles((sphere.vertices * radius + centre)[sphere.faces], material)
 
 
-def pedestrian(looks: MeshLooks, phase: float | None, dress: str) -> Mesh:
+def pedestrian(mats: MeshMaterials, phase: float | None, dress: str) -> Mesh:
     """Build a pedestrian who is 1.75 m tall.
 
     Args:
@@ -46,7 +46,7 @@ def pedestrian(looks: MeshLooks, phase: float | None, dress: str) -> Mesh:
         legs += [
             frustum((0.0, y, HIP_M), (knee_x, y, knee_z), (0.09, 0.065), 6, SECOND),
             frustum((knee_x, y, knee_z), (foot_x, y, foot_z + 0.06), (0.065, 0.045), 6, SECOND),
-            box((foot_x - 0.07, y - 0.045, foot_z), (foot_x + 0.16, y + 0.045, foot_z + 0.08), looks.dark),
+            box((foot_x - 0.07, y - 0.045, foot_z), (foot_x + 0.16, y + 0.045, foot_z + 0.08), mats.dark),
         ]
     low = min(feet)
     parts = [*legs, *_arms(phase)]
@@ -56,15 +56,15 @@ def pedestrian(looks: MeshLooks, phase: float | None, dress: str) -> Mesh:
         frustum((0, 0, 1.4), (0, 0, 1.49), (0.2, 0.09), 8, BODY),
         frustum((0, 0, 1.45), (0, 0, 1.54), (0.06, 0.055), 6, THIRD),
         _ball((0.01, 0.0, 1.63), 0.115, THIRD),
-        _ball((-0.04, 0.0, 1.67), 0.11, looks.hair),
+        _ball((-0.04, 0.0, 1.67), 0.11, mats.hair),
     ]
     if coat:
         parts.append(frustum((0, 0, 0.5), (0, 0, 1.02), (0.24, 0.16), 8, BODY))
-        parts.append(_ball((-0.06, 0.0, 1.58), 0.12, looks.hair))
+        parts.append(_ball((-0.06, 0.0, 1.58), 0.12, mats.hair))
     if dress == "backpack":
-        parts.append(box((-0.34, -0.15, 1.0), (-0.13, 0.15, 1.42), looks.tank))
+        parts.append(box((-0.34, -0.15, 1.0), (-0.13, 0.15, 1.42), mats.tank))
     mesh = join(parts)
-    return Mesh((mesh.xyz - np.array([0.0, 0.0, low])).astype(np.float32), mesh.uvw, mesh.look)
+    return Mesh((mesh.xyz - np.array([0.0, 0.0, low])).astype(np.float32), mesh.uvw, mesh.material)
 
 
 def _arms(phase: float | None) -> list[Mesh]:
@@ -91,32 +91,34 @@ def _hand(at: tuple[float, float, float]) -> Mesh:
     return box((x - 0.035, y - 0.025, z - 0.1), (x + 0.035, y + 0.025, z + 0.01), THIRD)
 
 
-def _rim(x: float, radius: float, thick: float, look: int) -> Mesh:
+def _rim(x: float, radius: float, thick: float, material: int) -> Mesh:
     """Build an open tyre whose axis is along y."""
     angle = np.arange(15) * (2 * np.pi / 14)
     circle = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
     centre, aside = np.array([x, 0.0, radius]), np.array([0.0, thick, 0.0])
     inner, outer = (1.0 - 0.1 - thick) * radius, radius
     rings = [inner * circle - aside, outer * circle - aside, outer * circle + aside, inner * circle + aside]
-    bands = [ribbon(centre + a, centre + b, look) for a, b in zip(rings, rings[1:] + rings[:1], strict=True)]
+    bands = [
+        ribbon(centre + a, centre + b, material) for a, b in zip(rings, rings[1:] + rings[:1], strict=True)
+    ]
     return join(bands)
 
 
-def _two_wheeler(looks: MeshLooks, wheel_m: float, thick: float, frame_look: int) -> Mesh:
+def _two_wheeler(mats: MeshMaterials, wheel_m: float, thick: float, frame_material: int) -> Mesh:
     """Build a bicycle or motorcycle with its rider."""
     reach = 0.95 - wheel_m
     parts = []
     for x in (-reach, reach):
-        parts.append(_rim(x, wheel_m, thick, looks.tyre))
+        parts.append(_rim(x, wheel_m, thick, mats.tyre))
     seat, bar = 0.9, 1.0
     tube = 0.6 * thick + 0.02
     parts += [
-        frustum((-reach, 0, wheel_m), (0.0, 0, 0.45), (tube, tube), 6, frame_look),
-        frustum((0.0, 0, 0.45), (reach * 0.75, 0, bar - 0.1), (tube, tube), 6, frame_look),
-        frustum((-0.25, 0, seat - 0.05), (reach * 0.75, 0, bar - 0.15), (tube, tube), 6, frame_look),
-        frustum((reach, 0, wheel_m), (reach * 0.7, 0, bar), (tube, tube), 6, frame_look),
-        box((reach * 0.66, -0.3, bar), (reach * 0.72, 0.3, bar + 0.04), looks.dark),
-        box((-0.4, -0.1, seat - 0.05), (-0.1, 0.1, seat + 0.02), looks.dark),
+        frustum((-reach, 0, wheel_m), (0.0, 0, 0.45), (tube, tube), 6, frame_material),
+        frustum((0.0, 0, 0.45), (reach * 0.75, 0, bar - 0.1), (tube, tube), 6, frame_material),
+        frustum((-0.25, 0, seat - 0.05), (reach * 0.75, 0, bar - 0.15), (tube, tube), 6, frame_material),
+        frustum((reach, 0, wheel_m), (reach * 0.7, 0, bar), (tube, tube), 6, frame_material),
+        box((reach * 0.66, -0.3, bar), (reach * 0.72, 0.3, bar + 0.04), mats.dark),
+        box((-0.4, -0.1, seat - 0.05), (-0.1, 0.1, seat + 0.02), mats.dark),
         frustum((-0.25, 0, seat), (0.02, 0, 1.45), (0.15, 0.18), 8, BODY),
         _ball((0.12, 0.0, 1.62), 0.12, THIRD),
     ]
@@ -132,42 +134,42 @@ def _two_wheeler(looks: MeshLooks, wheel_m: float, thick: float, frame_look: int
     return join(parts)
 
 
-def bicycle(looks: MeshLooks) -> Mesh:
+def bicycle(mats: MeshMaterials) -> Mesh:
     """Build a bicycle with a diamond frame."""
-    return _two_wheeler(looks, 0.34, 0.02, looks.dark)
+    return _two_wheeler(mats, 0.34, 0.02, mats.dark)
 
 
-def motorcycle(looks: MeshLooks) -> Mesh:
+def motorcycle(mats: MeshMaterials) -> Mesh:
     """Build a motorcycle and a rider with a helmet."""
     bulk = [
-        taper((-0.6, 0.5), (0.35, 0.85), (0.17, 0.12), (0.1, 0.2), (looks.tank, looks.tank, looks.dark)),
-        box((0.5, -0.12, 0.85), (0.62, 0.12, 1.05), looks.front_light),
-        box((-0.75, -0.1, 0.75), (-0.6, 0.1, 0.85), looks.rear_light),
-        _ball((0.12, 0.0, 1.64), 0.15, looks.helmet),
+        taper((-0.6, 0.5), (0.35, 0.85), (0.17, 0.12), (0.1, 0.2), (mats.tank, mats.tank, mats.dark)),
+        box((0.5, -0.12, 0.85), (0.62, 0.12, 1.05), mats.front_light),
+        box((-0.75, -0.1, 0.75), (-0.6, 0.1, 0.85), mats.rear_light),
+        _ball((0.12, 0.0, 1.64), 0.15, mats.helmet),
     ]
-    return join([_two_wheeler(looks, 0.31, 0.07, looks.dark), *bulk])
+    return join([_two_wheeler(mats, 0.31, 0.07, mats.dark), *bulk])
 
 
-def city_bike(looks: MeshLooks) -> Mesh:
+def city_bike(mats: MeshMaterials) -> Mesh:
     """Build a bicycle with mudguards, a basket and a rear rack."""
     reach = 0.95 - 0.34
     extra = [
-        box((reach + 0.02, -0.17, 0.78), (reach + 0.3, 0.17, 1.0), looks.hub),
-        box((-reach - 0.3, -0.07, 0.72), (-reach + 0.25, 0.07, 0.75), looks.dark),
-        box((-reach - 0.32, -0.03, 0.55), (-reach - 0.28, 0.03, 0.65), looks.rear_light),
+        box((reach + 0.02, -0.17, 0.78), (reach + 0.3, 0.17, 1.0), mats.hub),
+        box((-reach - 0.3, -0.07, 0.72), (-reach + 0.25, 0.07, 0.75), mats.dark),
+        box((-reach - 0.32, -0.03, 0.55), (-reach - 0.28, 0.03, 0.65), mats.rear_light),
     ]
-    return join([_two_wheeler(looks, 0.34, 0.025, looks.tank), *extra])
+    return join([_two_wheeler(mats, 0.34, 0.025, mats.tank), *extra])
 
 
-def scooter(looks: MeshLooks) -> Mesh:
+def scooter(mats: MeshMaterials) -> Mesh:
     """Build a motor scooter with a leg shield and a top case."""
     extra = [
-        taper((-0.85, -0.05), (0.3, 0.85), (0.2, 0.15), (0.1, 0.1), (looks.dark, looks.tank, looks.tank)),
-        taper((0.4, 0.6), (0.25, 1.0), (0.22, 0.16), (0.02, 0.1), (looks.tank, looks.tank, looks.tank)),
-        box((-0.1, -0.16, 0.25), (0.45, 0.16, 0.33), looks.dark),
-        box((0.5, -0.1, 0.85), (0.6, 0.1, 1.0), looks.front_light),
-        box((-0.98, -0.18, 0.85), (-0.6, 0.18, 1.15), looks.dark),
-        box((-0.92, -0.1, 0.68), (-0.84, 0.1, 0.78), looks.rear_light),
-        _ball((0.12, 0.0, 1.64), 0.15, looks.helmet),
+        taper((-0.85, -0.05), (0.3, 0.85), (0.2, 0.15), (0.1, 0.1), (mats.dark, mats.tank, mats.tank)),
+        taper((0.4, 0.6), (0.25, 1.0), (0.22, 0.16), (0.02, 0.1), (mats.tank, mats.tank, mats.tank)),
+        box((-0.1, -0.16, 0.25), (0.45, 0.16, 0.33), mats.dark),
+        box((0.5, -0.1, 0.85), (0.6, 0.1, 1.0), mats.front_light),
+        box((-0.98, -0.18, 0.85), (-0.6, 0.18, 1.15), mats.dark),
+        box((-0.92, -0.1, 0.68), (-0.84, 0.1, 0.78), mats.rear_light),
+        _ball((0.12, 0.0, 1.64), 0.15, mats.helmet),
     ]
-    return join([_two_wheeler(looks, 0.25, 0.09, looks.dark), *extra])
+    return join([_two_wheeler(mats, 0.25, 0.09, mats.dark), *extra])

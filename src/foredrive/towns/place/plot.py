@@ -45,15 +45,15 @@ class Plot:
         T[:2, 0], T[:2, 1], T[:2, 3] = self.along, self.into, self.corner
         return mesh.transformed(T)
 
-    def walls(self, outline: Sequence[Vector], base: float, top: float, look: int) -> Mesh:
+    def walls(self, outline: Sequence[Vector], base: float, top: float, material: int) -> Mesh:
         """Build walls over a local outline that reach into the ground. A façade's v starts at the base."""
         ring = self.world(np.array([*outline, outline[0]], float))
-        mesh = walls(ring, base - FOUNDATION_M, top, look)
+        mesh = walls(ring, base - FOUNDATION_M, top, material)
         mesh.uvw[..., 1] -= FOUNDATION_M
         return mesh
 
-    def box(self, centre: Vector, size: Vector, z: tuple[float, float], look: int) -> Mesh:
+    def box(self, centre: Vector, size: Vector, z: tuple[float, float], material: int) -> Mesh:
         """Build a box around a local point, without texture coordinates."""
         (x, y), (a, b) = centre, (0.5 * size[0], 0.5 * size[1])
-        moved = self.placed(box((x - a, y - b, z[0]), (x + a, y + b, z[1]), look))
-        return Mesh(moved.xyz, np.zeros_like(moved.uvw), moved.look)
+        moved = self.placed(box((x - a, y - b, z[0]), (x + a, y + b, z[1]), material))
+        return Mesh(moved.xyz, np.zeros_like(moved.uvw), moved.material)

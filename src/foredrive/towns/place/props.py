@@ -8,7 +8,7 @@ import shapely
 from jaxtyping import Float, Int
 
 from foredrive.towns.map.town_map import StopZone, StopZoneKind, TownMap
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import Material, MaterialTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, box, frustum, join
 from foredrive.towns.place.site import Site, frontages
 
@@ -23,7 +23,7 @@ POLE_SAMPLE_M = 0.2
 
 @dataclass(frozen=True)
 class SignalHead:
-    """The looks of one traffic light's lamps in the look table: red, yellow, green."""
+    """The materials of one traffic light's lamps in the material table: red, yellow, green."""
 
     zone: int
     """Index into the town's stop zones."""
@@ -35,7 +35,7 @@ class StreetLamps:
     """The light sources along the streets at night."""
 
     xyz: Float[np.ndarray, "N 3"]
-    look: int
+    material: int
     """Look of the luminous part."""
 
 
@@ -58,24 +58,24 @@ class ThinPoints:
 
 
 @dataclass
-class _Looks:
-    table: LookTable
+class _Materials:
+    table: MaterialTable
 
     def __post_init__(self) -> None:
         add = self.table.add
-        self.metal = add(Look(Surface.POLE, Texture.PLAIN, (0.42, 0.43, 0.44), 0.45, gloss=0.03))
-        self.dark = add(Look(Surface.SIGNAL, Texture.PLAIN, (0.16, 0.17, 0.17), 0.25))
-        self.lamp = add(Look(Surface.POLE, Texture.PLAIN, (0.90, 0.90, 0.86), 0.6))
-        self.red_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.75, 0.09, 0.09), 1.0))
-        self.white_sign = add(Look(Surface.SIGN, Texture.PLAIN, (0.92, 0.92, 0.92), 1.0))
+        self.metal = add(Material(Surface.POLE, Texture.PLAIN, (0.42, 0.43, 0.44), 0.45, gloss=0.03))
+        self.dark = add(Material(Surface.SIGNAL, Texture.PLAIN, (0.16, 0.17, 0.17), 0.25))
+        self.lamp = add(Material(Surface.POLE, Texture.PLAIN, (0.90, 0.90, 0.86), 0.6))
+        self.red_sign = add(Material(Surface.SIGN, Texture.PLAIN, (0.75, 0.09, 0.09), 1.0))
+        self.white_sign = add(Material(Surface.SIGN, Texture.PLAIN, (0.92, 0.92, 0.92), 1.0))
 
 
-def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
+def build_posts(town: TownMap, site: Site, table: MaterialTable) -> Props:
     """Build traffic lights and signs at their places in the map, moved off the lanes.
 
     They are placed first.
     """
-    looks = _Looks(table)
+    mats = _Materials(table)
     parts, heads, poles = [], [], []
     lanes = site.plan.lanes
     shapely.prepare(lanes)
@@ -86,20 +86,20 @@ def build_posts(town: TownMap, site: Site, table: LookTable) -> Props:
         site.take(shapely.Point(foot[:2]).buffer(0.4))
         z = float(site.height(foot[None, :2])[0])
         if zone.kind is StopZoneKind.TRAFFIC_LIGHT:
-            lamps = _lamp_looks(table, index)
-            parts.append(_traffic_light(town, zone, np.array([*foot[:2], z]), lamps, looks))
+            lamps = _lamp_materials(table, index)
+            parts.append(_traffic_light(town, zone, np.array([*foot[:2], z]), lamps, mats))
             heads.append(SignalHead(index, lamps))
             poles.append(pole_points(foot, z, MAST_HEIGHT_M))
         else:
-            parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), looks))
+            parts.append(_stop_or_yield(zone, np.array([*foot[:2], z]), mats))
             poles.append(pole_points(foot, z, SIGN_HEIGHT_M))
-    unlit = StreetLamps(np.zeros((0, 3)), looks.lamp)
+    unlit = StreetLamps(np.zeros((0, 3)), mats.lamp)
     return Props(join(parts), tuple(heads), thin_points(poles, Surface.POLE), unlit)
 
 
-def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -> Props:
+def build_street_lamps(site: Site, table: MaterialTable, rng: np.random.Generator) -> Props:
     """Build lamps along the roads."""
-    looks = _Looks(table)
+    mats = _Materials(table)
     parts, poles, lamps = [], [], []
     for frontage in frontages(site.plan, LAMP_SETBACK_M):
         for s in np.arange(rng.uniform(0.0, LAMP_SPACING_M), frontage.line.length, LAMP_SPACING_M):
@@ -108,12 +108,12 @@ def build_street_lamps(site: Site, table: LookTable, rng: np.random.Generator) -
                 site.take(shapely.Point(foot).buffer(0.4))
                 ahead = frontage.at(min(s + 0.5, frontage.line.length)) - foot
                 z = float(site.height(foot[None])[0])
-                parts.append(_lamp(foot, z, ahead, looks))
+                parts.append(_lamp(foot, z, ahead, mats))
                 over_road = (LAMP_ARM_M + 0.2) * np.array([-ahead[1], ahead[0]]) / np.linalg.norm(ahead)
                 lamps.append([*(foot + over_road), z + LAMP_HEIGHT_M + 0.1])
                 poles.append(pole_points(foot, z, LAMP_HEIGHT_M))
     thin = thin_points(poles, Surface.POLE)
-    return Props(join(parts), (), thin, StreetLamps(np.array(lamps).reshape(-1, 3), looks.lamp))
+    return Props(join(parts), (), thin, StreetLamps(np.array(lamps).reshape(-1, 3), mats.lamp))
 
 
 def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"] | None:
@@ -129,14 +129,14 @@ def _off_lanes(zone: StopZone, lanes: shapely.Geometry) -> Float[np.ndarray, "3"
     return None
 
 
-def _lamp_looks(table: LookTable, zone: int) -> tuple[int, int, int]:
-    """Return the looks of a light's three lamps, unlit.
+def _lamp_materials(table: MaterialTable, zone: int) -> tuple[int, int, int]:
+    """Return the materials of a light's three lamps, unlit.
 
     The zone separates them from those of other lights.
     """
     off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
     red, yellow, green = (
-        table.add(Look(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
+        table.add(Material(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
     )
     return red, yellow, green
 
@@ -149,15 +149,15 @@ def _turned(mesh: Mesh, xyz: Float[np.ndarray, "3"], yaw: float) -> Mesh:
 
 
 def _traffic_light(
-    town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks
+    town: TownMap, zone: StopZone, foot: Float[np.ndarray, "3"], lamps: tuple[int, int, int], mats: _Materials
 ) -> Mesh:
     """Build a post with a head at eye level.
 
     If it serves several lanes, add an arm with one head for each lane.
     """
     # In the post's frame x points along the traffic, so the lights face the negative x direction.
-    parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, looks.metal)]
-    parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, looks))
+    parts = [frustum((0, 0, -0.3), (0, 0, MAST_HEIGHT_M), (0.1, 0.08), 8, mats.metal)]
+    parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, mats))
     lanes = {lane.lane_id: lane for lane in town.lanes}
     left = np.array([-np.sin(zone.post_yaw), np.cos(zone.post_yaw)])
     starts = np.array([lanes[i].centreline_xyz[0, :2] for i in zone.lane_ids])
@@ -166,46 +166,46 @@ def _traffic_light(
     if len(reach):
         tip = reach[np.abs(reach).argmax()]
         end = (0.0, float(tip), MAST_HEIGHT_M - 0.1)
-        parts.append(frustum((0.0, 0.0, MAST_HEIGHT_M - 0.15), end, (0.07, 0.05), 6, looks.metal))
+        parts.append(frustum((0.0, 0.0, MAST_HEIGHT_M - 0.15), end, (0.07, 0.05), 6, mats.metal))
         last = None
         for y in sorted(reach, key=abs):
             if last is None or abs(y - last) >= HEAD_GAP_M:
-                parts.append(_head(np.array([-0.2, y, MAST_HEIGHT_M - 0.75]), lamps, looks))
+                parts.append(_head(np.array([-0.2, y, MAST_HEIGHT_M - 0.75]), lamps, mats))
                 last = y
     return _turned(join(parts), foot, zone.post_yaw)
 
 
-def _head(centre: Float[np.ndarray, "3"], lamps: tuple[int, int, int], looks: _Looks) -> Mesh:
+def _head(centre: Float[np.ndarray, "3"], lamps: tuple[int, int, int], mats: _Materials) -> Mesh:
     x, y, z = centre
-    parts = [box((x - 0.1, y - 0.17, z - 0.5), (x + 0.1, y + 0.17, z + 0.5), looks.dark)]
+    parts = [box((x - 0.1, y - 0.17, z - 0.5), (x + 0.1, y + 0.17, z + 0.5), mats.dark)]
     for lamp, dz in zip(lamps, (0.3, 0.0, -0.3), strict=True):
         disc = frustum((x - 0.1, y, z + dz), (x - 0.13, y, z + dz), (0.12, 0.12), 8, lamp)
         parts.append(disc)
     return join(parts)
 
 
-def _stop_or_yield(zone: StopZone, foot: Float[np.ndarray, "3"], looks: _Looks) -> Mesh:
+def _stop_or_yield(zone: StopZone, foot: Float[np.ndarray, "3"], mats: _Materials) -> Mesh:
     sides = 8 if zone.kind is StopZoneKind.STOP_SIGN else 3
-    pole = frustum((0, 0, -0.3), (0, 0, SIGN_HEIGHT_M), (0.035, 0.035), 6, looks.metal)
-    rim = frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.42, 0.42), sides, looks.white_sign)
-    inner = looks.red_sign if sides == 8 else looks.white_sign
+    pole = frustum((0, 0, -0.3), (0, 0, SIGN_HEIGHT_M), (0.035, 0.035), 6, mats.metal)
+    rim = frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.42, 0.42), sides, mats.white_sign)
+    inner = mats.red_sign if sides == 8 else mats.white_sign
     outer = (
         rim
         if sides == 8
-        else frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.45, 0.45), 3, looks.red_sign)
+        else frustum((-0.05, 0, SIGN_HEIGHT_M), (-0.08, 0, SIGN_HEIGHT_M), (0.45, 0.45), 3, mats.red_sign)
     )
     face_m = 0.37 if sides == 8 else 0.28
     face = frustum((-0.08, 0, SIGN_HEIGHT_M), (-0.09, 0, SIGN_HEIGHT_M), (face_m, face_m), sides, inner)
     return _turned(join([pole, outer, face]), foot, zone.post_yaw)
 
 
-def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"], looks: _Looks) -> Mesh:
+def _lamp(foot: Float[np.ndarray, "2"], z: float, ahead: Float[np.ndarray, "2"], mats: _Materials) -> Mesh:
     """Build a street lamp whose arm reaches over the road, to the left of `ahead`."""
     top = LAMP_HEIGHT_M
     parts = [
-        frustum((0, 0, -0.5), (0, 0, top), (0.09, 0.05), 6, looks.metal),
-        frustum((0, 0, top - 0.05), (0, LAMP_ARM_M, top + 0.25), (0.04, 0.03), 5, looks.metal),
-        box((-0.12, LAMP_ARM_M - 0.1, top + 0.14), (0.12, LAMP_ARM_M + 0.5, top + 0.26), looks.lamp),
+        frustum((0, 0, -0.5), (0, 0, top), (0.09, 0.05), 6, mats.metal),
+        frustum((0, 0, top - 0.05), (0, LAMP_ARM_M, top + 0.25), (0.04, 0.03), 5, mats.metal),
+        box((-0.12, LAMP_ARM_M - 0.1, top + 0.14), (0.12, LAMP_ARM_M + 0.5, top + 0.26), mats.lamp),
     ]
     return _turned(join(parts), np.array([*foot, z]), float(np.arctan2(ahead[1], ahead[0])))
 

@@ -8,7 +8,15 @@ from jaxtyping import Float
 
 from foredrive.towns.map.ground_plan import GroundPlan, Piece
 from foredrive.towns.map.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
-from foredrive.towns.place.looks import ASPHALT_RGB, GRASS_RGB, LinePattern, Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import (
+    ASPHALT_RGB,
+    GRASS_RGB,
+    LinePattern,
+    Material,
+    MaterialTable,
+    Surface,
+    Texture,
+)
 from foredrive.towns.place.mesh import Mesh, frustum, join, polygon_triangles, quads, ribbon, triangles, walls
 
 KERB_FOOT_M = 0.3
@@ -35,8 +43,8 @@ CONCRETE_RGB = (0.60, 0.585, 0.56)
 
 
 @dataclass(frozen=True)
-class RoadLooks:
-    """Numbers of the looks of roads."""
+class RoadMaterials:
+    """Numbers of the materials of roads."""
 
     walkway: int
     kerb: int
@@ -46,56 +54,58 @@ class RoadLooks:
     concrete: int
 
 
-def add_road_looks(table: LookTable) -> RoadLooks:
-    """Add the looks of roads to a table."""
-    kerb = Look(Surface.SIDEWALK, Texture.PLAIN, (0.66, 0.65, 0.62), 0.4, params=(0.5,))
-    stripes = Look(
+def add_road_materials(table: MaterialTable) -> RoadMaterials:
+    """Add the materials of roads to a table."""
+    kerb = Material(Surface.SIDEWALK, Texture.PLAIN, (0.66, 0.65, 0.62), 0.4, params=(0.5,))
+    stripes = Material(
         Surface.ROAD, Texture.STRIPES, (0.86, 0.86, 0.84), 0.75, params=(STRIPE_PERIOD_M, STRIPE_M)
     )
-    return RoadLooks(
-        walkway=table.add(Look(Surface.SIDEWALK, Texture.SLABS, CONCRETE_RGB, 0.35, params=(1.2,))),
+    return RoadMaterials(
+        walkway=table.add(Material(Surface.SIDEWALK, Texture.SLABS, CONCRETE_RGB, 0.35, params=(1.2,))),
         kerb=table.add(kerb),
-        median=table.add(Look(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45)),
+        median=table.add(Material(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45)),
         stripes=table.add(stripes),
-        line=table.add(Look(Surface.ROAD, Texture.PLAIN, (0.86, 0.86, 0.84), 0.75, params=(0.5,))),
-        concrete=table.add(Look(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.61, 0.58), 0.35, params=(1.0,))),
+        line=table.add(Material(Surface.ROAD, Texture.PLAIN, (0.86, 0.86, 0.84), 0.75, params=(0.5,))),
+        concrete=table.add(
+            Material(Surface.STRUCTURE, Texture.PLAIN, (0.62, 0.61, 0.58), 0.35, params=(1.0,))
+        ),
     )
 
 
-def build_roads(town: TownMap, plan: GroundPlan, table: LookTable) -> Mesh:
+def build_roads(town: TownMap, plan: GroundPlan, table: MaterialTable) -> Mesh:
     """Build all paved surfaces of a town."""
-    looks = add_road_looks(table)
-    parts = [_surface(piece, looks, table) for piece in plan.pieces]
-    parts += [_kerbs(piece, looks) for piece in plan.pieces if piece.raise_m > 0]
+    mats = add_road_materials(table)
+    parts = [_surface(piece, mats, table) for piece in plan.pieces]
+    parts += [_kerbs(piece, mats) for piece in plan.pieces if piece.raise_m > 0]
     plain = table.add(_asphalt(None, None))
     parts += [drape(fill, plan, plain, 0.0) for fill in plan.fills]
-    parts += _crosswalks(town, plan, looks) + _stop_lines(town, looks)
-    parts += _bridges(plan, looks)
+    parts += _crosswalks(town, plan, mats) + _stop_lines(town, mats)
+    parts += _bridges(plan, mats)
     return join(parts)
 
 
-def drape(area: shapely.Geometry, plan: GroundPlan, look: int, lift_m: float) -> Mesh:
+def drape(area: shapely.Geometry, plan: GroundPlan, material: int, lift_m: float) -> Mesh:
     """Lay a polygon over the surrounding roads."""
     xy = polygon_triangles(area)
     z = plan.borders.road(xy) + lift_m
-    return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+    return triangles(np.concatenate([xy, z[..., None]], axis=-1), material)
 
 
-def _asphalt(left: Marking | None, right: Marking | None) -> Look:
+def _asphalt(left: Marking | None, right: Marking | None) -> Material:
     params: list[float] = []
     for marking in (left, right):
         if marking is None or marking.kind not in _PATTERN:
             params += [float(LinePattern.NONE), 0.0, 0.0]
         else:
             params += [float(_PATTERN[marking.kind]), float(marking.yellow), marking.width_m]
-    return Look(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15, params=tuple(params))
+    return Material(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15, params=tuple(params))
 
 
-def _piece_look(piece: Piece, looks: RoadLooks, table: LookTable) -> int:
+def _piece_material(piece: Piece, mats: RoadMaterials, table: MaterialTable) -> int:
     if piece.strip.kind is StripKind.SIDEWALK:
-        return looks.walkway
+        return mats.walkway
     if piece.strip.kind is StripKind.MEDIAN:
-        return looks.median
+        return mats.median
     if piece.strip.junction_id is not None or not piece.whole:
         return table.add(_asphalt(None, None))
     middle_m = float(piece.along_m[[0, -1]].mean())
@@ -103,37 +113,36 @@ def _piece_look(piece: Piece, looks: RoadLooks, table: LookTable) -> int:
     return table.add(_asphalt(left, marking_at(piece.strip.right_markings, middle_m)))
 
 
-def _surface(piece: Piece, looks: RoadLooks, table: LookTable) -> Mesh:
-    look = _piece_look(piece, looks, table)
+def _surface(piece: Piece, mats: RoadMaterials, table: MaterialTable) -> Mesh:
+    material = _piece_material(piece, mats, table)
     lift = np.array([0.0, 0.0, piece.raise_m])
     if not piece.whole:
         xy = polygon_triangles(piece.area)
         z = piece.height(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + piece.raise_m
-        return triangles(np.concatenate([xy, z[..., None]], axis=-1), look, np.full((*xy.shape[:2], 3), 9.0))
+        return triangles(
+            np.concatenate([xy, z[..., None]], axis=-1), material, np.full((*xy.shape[:2], 3), 9.0)
+        )
     left, right = piece.left_xyz + lift, piece.right_xyz + lift
     width = np.linalg.norm(left - right, axis=1)
     zero = np.zeros_like(width)
     return ribbon(
         left,
         right,
-        look,
+        material,
         (np.column_stack([zero, width, piece.along_m]), np.column_stack([width, zero, piece.along_m])),
     )
 
 
-def _kerbs(piece: Piece, looks: RoadLooks) -> Mesh:
+def _kerbs(piece: Piece, mats: RoadMaterials) -> Mesh:
     """Build vertical faces around a raised piece. Faces between two raised pieces are hidden."""
     if piece.whole:
         ring = np.concatenate([piece.right_xyz, piece.left_xyz[::-1], piece.right_xyz[:1]])
         z = ring[:, 2]
-        return walls(ring[:, :2], z - KERB_FOOT_M, z + piece.raise_m, looks.kerb)
+        return walls(ring[:, :2], z - KERB_FOOT_M, z + piece.raise_m, mats.kerb)
     rings = [shapely.get_coordinates(r) for r in _rings(piece.area)]
     heights = [piece.height(ring) for ring in rings]
     return join(
-        [
-            walls(r, z - KERB_FOOT_M, z + piece.raise_m, looks.kerb)
-            for r, z in zip(rings, heights, strict=True)
-        ]
+        [walls(r, z - KERB_FOOT_M, z + piece.raise_m, mats.kerb) for r, z in zip(rings, heights, strict=True)]
     )
 
 
@@ -143,7 +152,7 @@ def _rings(area: shapely.Geometry) -> list[shapely.LinearRing]:
     return [ring for polygon in oriented for ring in (polygon.exterior, *polygon.interiors)]
 
 
-def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+def _crosswalks(town: TownMap, plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:
     """Build stripes along the lanes, cut off at walkways and laid over the road metre by metre."""
     walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0])
     parts = []
@@ -165,13 +174,13 @@ def _crosswalks(town: TownMap, plan: GroundPlan, looks: RoadLooks) -> list[Mesh]
                 ]
             )
             patch = area.intersection(band).difference(raised)
-            mesh = drape(patch, plan, looks.stripes, PAINT_M)
+            mesh = drape(patch, plan, mats.stripes, PAINT_M)
             u = mesh.xyz[..., :2] @ along - start
-            parts.append(triangles(mesh.xyz, looks.stripes, np.stack([u, 0 * u, 0 * u], axis=-1)))
+            parts.append(triangles(mesh.xyz, mats.stripes, np.stack([u, 0 * u, 0 * u], axis=-1)))
     return parts
 
 
-def _stop_lines(town: TownMap, looks: RoadLooks) -> list[Mesh]:
+def _stop_lines(town: TownMap, mats: RoadMaterials) -> list[Mesh]:
     """Build a line across each lane before a light or a stop sign, and before its crosswalk if there is
     one."""
     crosswalks = shapely.union_all([shapely.Polygon(c.outline_xyz[:, :2]) for c in town.crosswalks])
@@ -185,7 +194,7 @@ def _stop_lines(town: TownMap, looks: RoadLooks) -> list[Mesh]:
             right = _before_end(lane.right_boundary_xyz, gap)
             corners = np.stack([right[0], right[1], left[1], left[0]])
             if not shapely.Polygon(corners[:, :2]).buffer(STOP_LINE_GAP_M).intersects(crosswalks):
-                parts.append(quads(corners[None] + [0.0, 0.0, PAINT_M], looks.line))
+                parts.append(quads(corners[None] + [0.0, 0.0, PAINT_M], mats.line))
                 break
     return parts
 
@@ -197,7 +206,7 @@ def _before_end(line: Float[np.ndarray, "N 3"], gap_m: float) -> Float[np.ndarra
     return np.column_stack([np.interp(at, along, line[:, axis]) for axis in range(3)])
 
 
-def _bridges(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+def _bridges(plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:
     """Build decks, parapets along their open sides, and pillars where there is room."""
     bridge = [piece for piece in plan.pieces if piece.bridge]
     if not bridge:
@@ -206,11 +215,11 @@ def _bridges(plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
     parts = []
     for piece in bridge:
         down = np.array([0.0, 0.0, -DECK_M])
-        parts.append(ribbon(piece.right_xyz + down, piece.left_xyz + down, looks.concrete))
+        parts.append(ribbon(piece.right_xyz + down, piece.left_xyz + down, mats.concrete))
     decks = shapely.union_all([p.area for p in bridge]).buffer(0.05)
     for ring in _rings(shapely.orient_polygons(decks)):
-        parts += _edge(shapely.get_coordinates(ring), bridge, top, plan, looks)
-    parts += _pillars(bridge, plan, looks)
+        parts += _edge(shapely.get_coordinates(ring), bridge, top, plan, mats)
+    parts += _pillars(bridge, plan, mats)
     return parts
 
 
@@ -219,7 +228,7 @@ def _edge(
     bridge: list[Piece],
     top: shapely.STRtree,
     plan: GroundPlan,
-    looks: RoadLooks,
+    mats: RoadMaterials,
 ) -> list[Mesh]:
     """Build fascia and parapet along one ring of the decks, with no parapet where the road continues."""
     nearest = top.query_nearest(shapely.points(ring), all_matches=False)[1]
@@ -231,17 +240,17 @@ def _edge(
     road_z = plan.borders.road(beyond)
     goes_on = shapely.contains_xy(plan.ground, beyond[:, 0], beyond[:, 1])
     goes_on &= np.abs(road_z - 0.5 * (z[1:] + z[:-1])) < 1.5
-    parts = [walls(ring, z - DECK_M, z, looks.concrete)]
+    parts = [walls(ring, z - DECK_M, z, mats.concrete)]
     for i in np.flatnonzero(~goes_on & (length > 0.05)):
         inner = np.stack([ring[i], ring[i + 1]]) - PARAPET_WIDTH_M * outward[i]
         foot = np.concatenate([ring[i : i + 2], inner[::-1], ring[i : i + 1]])
         z_foot = np.concatenate([z[i : i + 2], z[i : i + 2][::-1], z[i : i + 1]])
-        parts.append(walls(foot, z_foot, z_foot + PARAPET_M, looks.concrete))
-        parts.append(quads(np.column_stack([foot[:4], z_foot[:4] + PARAPET_M])[None], looks.concrete))
+        parts.append(walls(foot, z_foot, z_foot + PARAPET_M, mats.concrete))
+        parts.append(quads(np.column_stack([foot[:4], z_foot[:4] + PARAPET_M])[None], mats.concrete))
     return parts
 
 
-def _pillars(bridge: list[Piece], plan: GroundPlan, looks: RoadLooks) -> list[Mesh]:
+def _pillars(bridge: list[Piece], plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:
     ground = shapely.prepared.prep(plan.ground)
     parts, placed = [], shapely.MultiPoint()
     for piece in bridge:
@@ -254,5 +263,5 @@ def _pillars(bridge: list[Piece], plan: GroundPlan, looks: RoadLooks) -> list[Me
         placed = placed.union(spot)
         base = float(plan.borders.road(np.array([[x, y]]))[0]) - 1.0
         radii = (PILLAR_RADIUS_M, PILLAR_RADIUS_M)
-        parts.append(frustum((x, y, base), (x, y, z - DECK_M), radii, 10, looks.concrete))
+        parts.append(frustum((x, y, base), (x, y, z - DECK_M), radii, 10, mats.concrete))
     return parts

@@ -9,7 +9,7 @@ EAVES_M = 0.45
 
 
 def gable_roof(plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> Mesh:
-    """Build two slopes of look `roof` that extend beyond the eaves, and gables of look `wall`."""
+    """Build two slopes of material `roof` that extend beyond the eaves, and gables of material `wall`."""
     w, d, e = plot.width_m, plot.depth_m, EAVES_M
     drop = (ridge - eaves) / (0.5 * d) * e
     slopes = []

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place import furniture_meshes
-from foredrive.towns.place.furniture_meshes import RAIL_STEP_M, FurnitureItem, FurnitureLooks
-from foredrive.towns.place.looks import LookTable, Surface
+from foredrive.towns.place.furniture_meshes import RAIL_STEP_M, FurnitureItem, FurnitureMaterials
+from foredrive.towns.place.materials import MaterialTable, Surface
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.props import ThinPoints, join_thin_points, thin_points
 from foredrive.towns.place.site import Frontage, Site, frontages
@@ -44,7 +44,7 @@ _ON_OPEN_ROADS = {"speed_sign": 0.5, "direction_sign": 0.25, "information_sign":
 
 
 def build_street_furniture(
-    town: TownMap, site: Site, table: LookTable, rng: np.random.Generator
+    town: TownMap, site: Site, table: MaterialTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinPoints]:
     """Build guard rails, barriers, power lines, billboards, then small objects.
 
@@ -52,7 +52,7 @@ def build_street_furniture(
     """
     fast = [x.centreline_xyz[:, :2] for x in town.lanes if (x.speed_limit_mps or 0.0) > FAST_MPS]
     motorways = shapely.STRtree([shapely.LineString(line) for line in fast])
-    placer = _FurniturePlacer(site, motorways, STYLES[town.name], FurnitureLooks(table), rng)
+    placer = _FurniturePlacer(site, motorways, STYLES[town.name], FurnitureMaterials(table), rng)
     lines = frontages(site.plan, SETBACK_M)
     for frontage in lines:
         if not frontage.walkway:
@@ -70,13 +70,13 @@ class _FurniturePlacer:
     site: Site
     motorways: shapely.STRtree
     style: Style
-    looks: FurnitureLooks
+    materials: FurnitureMaterials
     rng: np.random.Generator
     parts: list[Mesh] = field(default_factory=list)
     thin: list[ThinPoints] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._things = furniture_meshes.furniture_items(self.looks)
+        self._things = furniture_meshes.furniture_items(self.materials)
 
     def rails(self, frontage: Frontage) -> None:
         """Build guard rails or sound barriers along a motorway, section by section."""
@@ -101,9 +101,9 @@ class _FurniturePlacer:
                     continue
                 self.site.take(shapely.LineString(feet[:, :2]).buffer(0.2))
                 if u < RAILS:
-                    self.parts.append(furniture_meshes.guard_rail(feet, self.looks))
+                    self.parts.append(furniture_meshes.guard_rail(feet, self.materials))
                 else:
-                    self.parts.append(furniture_meshes.sound_barrier(feet, self.looks))
+                    self.parts.append(furniture_meshes.sound_barrier(feet, self.materials))
 
     def _free_steps(self, xy: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
         """Return for each point whether the way to the next point is free."""
@@ -117,7 +117,7 @@ class _FurniturePlacer:
             foot = self._place("power_pole", frontage, float(s), POLE_OFFSET_M)
             near = foot is not None and last is not None and np.linalg.norm(foot - last) < 1.3 * POLE_STEP_M
             if near and foot is not None and last is not None:
-                self.parts.append(furniture_meshes.wires(last, foot, self.looks.wire))
+                self.parts.append(furniture_meshes.wires(last, foot, self.materials.wire))
             last = foot
 
     def large(self, frontage: Frontage) -> None:
@@ -163,7 +163,7 @@ class _FurniturePlacer:
         T = np.eye(4)
         T[:2, 0], T[:2, 1], T[:2, 3], T[2, 3] = ahead, left, xy, heights[-1]
         moved = thing.mesh.transformed(T)
-        self.parts.append(Mesh(moved.xyz, thing.mesh.uvw, moved.look))
+        self.parts.append(Mesh(moved.xyz, thing.mesh.uvw, moved.material))
         for surface, points in thing.thin:
             self.thin.append(thin_points([points @ T[:3, :3].T + T[:3, 3]], surface))
         return T[:3, 3].copy()

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from foredrive.towns.map.ground_plan import GroundPlan
-from foredrive.towns.place.looks import ASPHALT_RGB, GRASS_RGB, Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import ASPHALT_RGB, GRASS_RGB, Material, MaterialTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join, quads, triangles
 
 CELL_M = 4.0
@@ -51,8 +51,8 @@ class Field:
     along: Float[np.ndarray, "2"]
     """Unit direction of its rows."""
     kind: str
-    look: int | None
-    """Number of its look, or None if it looks like the rest of the land."""
+    material: int | None
+    """Number of its material, or None if it looks like the rest of the land."""
 
 
 def make_terrain(
@@ -72,15 +72,17 @@ def make_terrain(
     return Terrain(origin, _below_decks(z, xy, plan))
 
 
-def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable, fields: Sequence[Field] = ()) -> Mesh:
+def build_terrain(
+    terrain: Terrain, plan: GroundPlan, table: MaterialTable, fields: Sequence[Field] = ()
+) -> Mesh:
     """Build the mesh of the land: whole cells, cells cut along the roads, and a far plain up to the horizon.
 
     Below the roads the land continues at a lower height, for rays that pass through a crack between the
     pieces of the road.
     """
-    sunk = table.add(Look(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
-    look = table.add(Look(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45))
-    asphalt = table.add(Look(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15))
+    sunk = table.add(Material(Surface.HIDDEN, Texture.PLAIN, (0.3, 0.3, 0.3), 0.15))
+    material = table.add(Material(Surface.TERRAIN, Texture.GRASS, GRASS_RGB, 0.45))
+    asphalt = table.add(Material(Surface.ROAD, Texture.ROAD, ASPHALT_RGB, 0.15))
     rows, columns = terrain.z.shape
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     lower = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
@@ -90,18 +92,18 @@ def build_terrain(terrain: Terrain, plan: GroundPlan, table: LookTable, fields: 
     cut = touched & ~shapely.contains_properly(plan.ground, cells)
     whole, tilled = ~touched, []
     for field in fields:
-        if field.look is not None:
+        if field.material is not None:
             inside = whole & shapely.intersects(field.area, cells)
-            tilled.append(_tilled(field, _cell_corners(terrain, j[inside], i[inside]), field.look))
+            tilled.append(_tilled(field, _cell_corners(terrain, j[inside], i[inside]), field.material))
             whole &= ~inside
-    edges = _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), look)
+    edges = _cut_cells(terrain, plan, cells[cut], np.stack([j[cut], i[cut]], axis=-1), material)
     return join(
         [
-            quads(_cell_corners(terrain, j[whole], i[whole]), look),
+            quads(_cell_corners(terrain, j[whole], i[whole]), material),
             *tilled,
             _paved_in_gaps(edges, plan, asphalt),
             quads(_cell_corners(terrain, j[touched], i[touched]) - np.array([0.0, 0.0, SUNK_M]), sunk),
-            _horizon(terrain, look),
+            _horizon(terrain, material),
         ]
     )
 
@@ -150,7 +152,7 @@ def _cell_corners(terrain: Terrain, j: np.ndarray, i: np.ndarray) -> Float[np.nd
     )
 
 
-def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], look: int) -> Mesh:
+def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], material: int) -> Mesh:
     """Build the cells of a field, with the distance to its border in their texture coordinates."""
     xy = corners[..., :2]
     points = shapely.points(xy)
@@ -159,10 +161,12 @@ def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], look: int) -> Mes
     across = np.array([-field.along[1], field.along[0]])
     middle = shapely.get_coordinates(field.area.centroid)[0]
     uvw = np.stack([(xy - middle) @ across, (xy - middle) @ field.along, within], axis=-1)
-    return quads(corners, look, uvw)
+    return quads(corners, material, uvw)
 
 
-def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.ndarray, look: int) -> Mesh:
+def _cut_cells(
+    terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.ndarray, material: int
+) -> Mesh:
     """Build the remainder of the cells that the roads cut.
 
     Nodes keep their height. Points on the cut have the height of the road.
@@ -180,21 +184,21 @@ def _cut_cells(terrain: Terrain, plan: GroundPlan, cells: np.ndarray, index: np.
     z = np.where(
         at_node, terrain.height(xy.reshape(-1, 2)).reshape(at_node.shape), plan.borders.top(xy) - EDGE_DROP_M
     )
-    return triangles(np.concatenate([xy, z[..., None]], axis=-1), look)
+    return triangles(np.concatenate([xy, z[..., None]], axis=-1), material)
 
 
-def _paved_in_gaps(land: Mesh, plan: GroundPlan, look: int) -> Mesh:
+def _paved_in_gaps(land: Mesh, plan: GroundPlan, material: int) -> Mesh:
     """Return the land with small gaps between lanes paved."""
     rings = [ring for part in shapely.get_parts(plan.ground) for ring in part.interiors]
     gaps = [gap for gap in map(shapely.Polygon, rings) if gap.area < GAP_M2]
     middle = land.xyz[..., :2].mean(axis=1)
     found = shapely.STRtree(gaps).query(shapely.points(middle), predicate="intersects")[0]
-    looks = land.look.copy()
-    looks[found] = look
-    return Mesh(land.xyz, np.zeros_like(land.uvw), looks)
+    materials = land.material.copy()
+    materials[found] = material
+    return Mesh(land.xyz, np.zeros_like(land.uvw), materials)
 
 
-def _horizon(terrain: Terrain, look: int) -> Mesh:
+def _horizon(terrain: Terrain, material: int) -> Mesh:
     """Build a far plain around the grid."""
     rows, columns = terrain.z.shape
     ring = [(0, i) for i in range(columns)] + [(j, columns - 1) for j in range(1, rows)]
@@ -205,4 +209,4 @@ def _horizon(terrain: Terrain, look: int) -> Mesh:
     away = inner[:, :2] - centre
     outer_xy = inner[:, :2] + away / np.linalg.norm(away, axis=1, keepdims=True) * HORIZON_M
     outer = np.column_stack([outer_xy, np.full(len(inner), inner[:, 2].mean())])
-    return quads(np.stack([inner[:-1], outer[:-1], outer[1:], inner[1:]], axis=1), look)
+    return quads(np.stack([inner[:-1], outer[:-1], outer[1:], inner[1:]], axis=1), material)

@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float
 
 from foredrive.towns.place.assets import Assets
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import Material, MaterialTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, frustum, join, triangles
 from foredrive.towns.place.props import ThinPoints, pole_points, thin_points
 from foredrive.towns.place.site import Site, frontages
@@ -24,7 +24,7 @@ TRUNK_M = 2.0
 CROWN_SPREAD = 1.35
 VARIANTS = 5
 BARK, LEAVES = 0, 1
-"""Placeholders for the looks of a tree until it is placed."""
+"""Placeholders for the materials of a tree until it is placed."""
 
 RADIUS_M = {
     "round": (1.6, 2.8),
@@ -42,7 +42,7 @@ _SPHERE, _COARSE = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.
 
 
 def build_vegetation(
-    site: Site, assets: Assets, table: LookTable, rng: np.random.Generator
+    site: Site, assets: Assets, table: MaterialTable, rng: np.random.Generator
 ) -> tuple[Mesh, ThinPoints]:
     """Place plants on the land that is still free and take their places from the site."""
     maker = _PlantMaker(assets, table, rng)
@@ -101,11 +101,11 @@ class _PlantMaker:
     """A few plants of each kind. Each placed plant is a rotated and scaled copy of one of them."""
 
     assets: Assets
-    table: LookTable
+    table: MaterialTable
     rng: np.random.Generator
 
     def __post_init__(self) -> None:
-        bark = Look(Surface.VEGETATION, Texture.PLAIN, (0.36, 0.29, 0.23), 0.35, params=(2.0,))
+        bark = Material(Surface.VEGETATION, Texture.PLAIN, (0.36, 0.29, 0.23), 0.35, params=(2.0,))
         self._bark = self.table.add(bark)
         self._leaves = [self._foliage(rgb, 0.5) for rgb in self.assets.leaves]
         self._needles = [self._foliage(rgb, 0.45) for rgb in self.assets.needles]
@@ -116,7 +116,7 @@ class _PlantMaker:
         }
 
     def _foliage(self, rgb: tuple[float, float, float], reflectivity: float) -> int:
-        return self.table.add(Look(Surface.VEGETATION, Texture.FOLIAGE, rgb, reflectivity))
+        return self.table.add(Material(Surface.VEGETATION, Texture.FOLIAGE, rgb, reflectivity))
 
     def plant(self, kind: str, foot: Float[np.ndarray, "3"], radius: float, detail: bool) -> Mesh:
         """Return a plant whose crown has about this radius (m)."""
@@ -129,8 +129,8 @@ class _PlantMaker:
         colours = self._needles if kind == "conifer" else self._leaves
         leaves = colours[-1] if kind == "palm" else colours[int(rng.integers(len(colours)))]
         moved = grown.transformed(T)
-        look = np.where(grown.look == BARK, self._bark, leaves).astype(np.int32)
-        return Mesh(moved.xyz, np.zeros_like(moved.uvw), look)
+        material = np.where(grown.material == BARK, self._bark, leaves).astype(np.int32)
+        return Mesh(moved.xyz, np.zeros_like(moved.uvw), material)
 
 
 def _grow(kind: str, detail: bool, rng: np.random.Generator) -> Mesh:
@@ -171,7 +171,7 @@ def _conifer(rng: np.random.Generator, detail: bool) -> Mesh:
     mesh = join(parts)
     sway = 1.0 + 0.1 * np.sin(7.0 * mesh.xyz[..., :1] + 5.0 * mesh.xyz[..., 1:2] + 3.0 * mesh.xyz[..., 2:])
     xyz = np.concatenate([mesh.xyz[..., :2] * sway, mesh.xyz[..., 2:]], axis=-1)
-    return Mesh(xyz.astype(np.float32), mesh.uvw, mesh.look)
+    return Mesh(xyz.astype(np.float32), mesh.uvw, mesh.material)
 
 
 def _palm(rng: np.random.Generator) -> Mesh:

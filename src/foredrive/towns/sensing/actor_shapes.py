@@ -11,10 +11,10 @@ from jaxtyping import Float, Int32
 
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
-from foredrive.towns.place.actor_looks import MeshLooks
+from foredrive.towns.place.actor_materials import MeshMaterials
 from foredrive.towns.place.actor_meshes import DRESSES, OBJECTS, PEOPLE, SHAPES_OF_KIND, VEHICLES
 from foredrive.towns.place.assets import Assets, Palette
-from foredrive.towns.place.looks import Look, LookTable, Surface, Texture
+from foredrive.towns.place.materials import Material, MaterialTable, Surface, Texture
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.people_meshes import PEDESTRIAN_BOX, POSES
 from foredrive.towns.sensing.columns import Intervals
@@ -60,7 +60,7 @@ class ShapeLibrary:
     shapes: dict[str, Shape]
     triangles: Mesh
     paints: dict[str, Int32[np.ndarray, "_"]]
-    """Looks for painting, by palette."""
+    """Materials for painting, by palette."""
 
     def shape_of(self, actor: ActorState) -> Shape:
         """Return the shape of a road user. A walking person has one of a few poses."""
@@ -73,7 +73,7 @@ class ShapeLibrary:
         return self.shapes[options[actor.style % len(options)]]
 
     def paint_of(self, actor: ActorState, rear_light: int) -> Int32[np.ndarray, "4"]:
-        """Return the looks of the paint slots. `rear_light` is the look of the rear lights."""
+        """Return the materials of the paint slots. `rear_light` is the material of the rear lights."""
         if actor.category is Category.PEDESTRIAN or actor.category in (Category.BICYCLE, Category.MOTORCYCLE):
             palettes = ("clothes", "clothes", "skin")
         elif actor.category is Category.BUS:
@@ -91,21 +91,22 @@ def _paint_numbers(style: int) -> tuple[float, ...]:
     return tuple(np.random.default_rng(style).random(PAINTS).tolist())
 
 
-def make_shape_library(table: LookTable, assets: Assets) -> ShapeLibrary:
+def make_shape_library(table: MaterialTable, assets: Assets) -> ShapeLibrary:
     """Build every shape of the assets once."""
-    looks = MeshLooks(table)
+    materials = MeshMaterials(table)
     vehicles = {name: VEHICLES[name] for name in assets.vehicles}
     shapes, first = {}, 0
     for name, build in {**vehicles, **PEOPLE, **OBJECTS}.items():
-        mesh = _into_unit_box(build(looks), PEDESTRIAN_BOX if name in PEOPLE else None)
+        mesh = _into_unit_box(build(materials), PEDESTRIAN_BOX if name in PEOPLE else None)
         scene = TriangleScene(mesh)
         shapes[name] = Shape(scene, mesh, first, _solid(scene, _USUAL_SIZE_M.get(name, (5.0, 2.0))))
-        first += len(mesh.look)
+        first += len(mesh.material)
 
     def paints(colours: Palette, gloss: float) -> Int32[np.ndarray, "_"]:
         surface = Surface.VEHICLE if gloss > 0.0 else Surface.PEDESTRIAN
         numbers = [
-            table.add(Look(surface, Texture.PLAIN, c, 0.15 + 0.5 * float(np.mean(c)), gloss)) for c in colours
+            table.add(Material(surface, Texture.PLAIN, c, 0.15 + 0.5 * float(np.mean(c)), gloss))
+            for c in colours
         ]
         return np.array(numbers, dtype=np.int32)
 
@@ -187,4 +188,4 @@ def _into_unit_box(
     corners = mesh.xyz.reshape(-1, 3)
     low, high = np.array(bounds) if bounds else (corners.min(0), corners.max(0))
     xyz = ((mesh.xyz - 0.5 * (low + high)) / (high - low)).clip(-0.5, 0.5)
-    return Mesh(np.ascontiguousarray(xyz, dtype=np.float32), np.zeros_like(mesh.uvw), mesh.look)
+    return Mesh(np.ascontiguousarray(xyz, dtype=np.float32), np.zeros_like(mesh.uvw), mesh.material)

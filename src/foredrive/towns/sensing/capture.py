@@ -143,10 +143,10 @@ class RayTracer:
         Where `known` is not negative, it is the result. It may have no rows.
         """
         mirrored = self.mirrored(found, hits, rays, ray_rad)
-        looks, light = self.scene.looks, self.light
-        out = shading.shade(looks, found, hits.t, rays.direction, lit, light, mirrored, known)
+        materials, light = self.scene.materials, self.light
+        out = shading.shade(materials, found, hits.t, rays.direction, lit, light, mirrored, known)
         if light.air.foggy and len(light.lamps.lamp_index) > 0:
-            t = np.where(found.look == shading.MISS, np.float32(np.inf), hits.t)
+            t = np.where(found.material == shading.MISS, np.float32(np.inf), hits.t)
             add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, known, out)
         return out
 
@@ -173,13 +173,13 @@ class RayTracer:
             return NOT_KNOWN
         out = np.full((len(hits.t), 3), -1.0, np.float32)
         origin, direction = np.empty_like(out), np.empty_like(out)
-        wetness, looks = self.light.air.wetness, self.scene.looks
-        wet = wet_ground.mirror_rays(looks, found, hits.t, rays.direction, wetness, origin, direction)
+        wetness, materials = self.light.air.wetness, self.scene.materials
+        wet = wet_ground.mirror_rays(materials, found, hits.t, rays.direction, wetness, origin, direction)
         dt_s = None if rays.dt_s is None else rays.dt_s[wet]
         mirrored_rays = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
         met, there, lit = self.trace(mirrored_rays, ray_rad[wet])
         out[wet] = shading.shade(
-            looks, there, met.t, mirrored_rays.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN
+            materials, there, met.t, mirrored_rays.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN
         )
         return out
 
@@ -235,7 +235,7 @@ def _render_sharp(
     tracer: RayTracer, sensors: SensorSuite, ego: EgoMotion, film: Film, buffer: HitBuffer
 ) -> None:
     """Render one ray per pixel, then several rays for pixels on outlines."""
-    count, samples = len(buffer.look), sensors.samples_per_outline_pixel
+    count, samples = len(buffer.material), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
     rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     known = ShadedPixels(rgb, normal, np.empty(count, np.bool_))
@@ -253,7 +253,7 @@ def _render_sharp(
         hits, found, lit = tracer.trace(rays, sensors.pixel_rad[part])
         radiance = tracer.radiance(hits, found, lit, rays, sensors.pixel_rad[part])
         film.expose(part, radiance, 1)
-        record_hits(buffer, part, hits, found.look)
+        record_hits(buffer, part, hits, found.material)
         known.radiance[part], known.normal[part], known.lit[part] = radiance, found.normal, lit
 
     in_parallel(trace_centres, count, PIXEL_GRAIN)
@@ -286,7 +286,7 @@ def _render_blurred(
         hits = tracer.cast(rays)
         ray_rad = sensors.pixel_rad[part]
         found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
-        record_hits(buffer, part, hits, found.look)
+        record_hits(buffer, part, hits, found.material)
         total = np.zeros((stop - start, 3), np.float32)
         for k, dt_s in enumerate(optics.sub_exposure_dt_s):
             origin, direction, row_dt_s = sensors.outline_rays
@@ -297,7 +297,7 @@ def _render_blurred(
             total += tracer.radiance(*tracer.trace(rays, ray_rad), rays, ray_rad)
         film.expose(part, total / np.float32(optics.sub_exposures), 1)
 
-    in_parallel(job, len(buffer.look), PIXEL_GRAIN)
+    in_parallel(job, len(buffer.material), PIXEL_GRAIN)
 
 
 def simulate_sweep(
@@ -328,19 +328,22 @@ def simulate_sweep(
         found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
         odds = chance[part]
         if n > 1:
-            t = np.where(found.look == shading.MISS, np.inf, hits.t).reshape(-1, n)
+            t = np.where(found.material == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
             odds = echoes.footprint_chance(odds, share)
-        look, echo = found.look, lidar_returns(tracer.scene.looks, found, hits.t, far_m, odds, air)
+        material, echo = (
+            found.material,
+            lidar_returns(tracer.scene.materials, found, hits.t, far_m, odds, air),
+        )
         if n > 1:
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
-            hits, look = shading.Hits(*(column[picked] for column in hits)), look[picked]
+            hits, material = shading.Hits(*(column[picked] for column in hits)), material[picked]
         range_m[part], returned[part], intensity[part] = echo
-        record_hits(buffer, part, hits, look)
+        record_hits(buffer, part, hits, material)
         if len(clutter):
             surfaces = range_m[part], returned[part], intensity[part]
             of_air = air_returns(air, clutter[part], lidar.pulse_m, far_m, *surfaces)
-            buffer.triangle[part][of_air], buffer.look[part][of_air] = shading.MISS, shading.MISS
+            buffer.triangle[part][of_air], buffer.material[part][of_air] = shading.MISS, shading.MISS
 
     in_parallel(job, count, BEAM_GRAIN // n)
     returned &= range_m >= lidar.min_range_m

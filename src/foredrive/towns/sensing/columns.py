@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 from foredrive.towns.place.mesh import Mesh
 from foredrive.towns.place.props import ThinPoints
 from foredrive.towns.sensing.raycast import TriangleScene
@@ -95,17 +95,17 @@ class TownColumns:
 
 
 def make_columns(
-    mesh: Mesh, scene: TriangleScene, look_surface: Int[np.ndarray, "L"], thin: ThinPoints
+    mesh: Mesh, scene: TriangleScene, material_surface: Int[np.ndarray, "L"], thin: ThinPoints
 ) -> TownColumns:
     """Prepare the columns of all static objects of a town.
 
     Args:
         mesh: the triangles of the town.
         scene: the same mesh for ray casting.
-        surface_of_look: the `Surface` of each look.
+        surface_of_look: the `Surface` of each material.
         thin: points on objects that the columns would miss.
     """
-    faces = faces_of(mesh, look_surface)
+    faces = faces_of(mesh, material_surface)
     x, y, z = thin.xyz.T.astype(np.float32)
     extra = _join([wall_intervals(mesh, faces), Intervals(x, y, z, z, thin.surface)])
     return TownColumns(scene, faces, float(mesh.xyz[..., 2].max()) + 1.0, extra)
@@ -124,11 +124,11 @@ class Faces:
     surface: Int[np.ndarray, "F"]
 
 
-def faces_of(mesh: Mesh, look_surface: Int[np.ndarray, "L"]) -> Faces:
+def faces_of(mesh: Mesh, material_surface: Int[np.ndarray, "L"]) -> Faces:
     """Return the orientation and the surface of each triangle."""
     a, b = mesh.xyz[:, 1] - mesh.xyz[:, 0], mesh.xyz[:, 2] - mesh.xyz[:, 0]
     upward = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    return Faces(upward, look_surface[mesh.look])
+    return Faces(upward, material_surface[mesh.material])
 
 
 def cast_columns(

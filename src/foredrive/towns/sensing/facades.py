@@ -9,7 +9,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from foredrive.towns.place.looks import GroundFloor, WallKind, WindowKind
+from foredrive.towns.place.materials import GroundFloor, WallKind, WindowKind
 from foredrive.towns.sensing.patterns import TEXTURED, band, bands, lattice, noise
 
 GLASS_RGB = (0.045, 0.06, 0.075)
@@ -43,9 +43,9 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 
 @_kernel
 @no_type_check
-def _ground_floor(p, look, x_in, y, bay, column, span, du, dv, out):
+def _ground_floor(p, material, x_in, y, bay, column, span, du, dv, out):
     """Compute the openings below the first storey. `_openings` describes what is written to `out`."""
-    ground, kind = p[look, 4], int(p[look, 7])
+    ground, kind = p[material, 4], int(p[material, 7])
     pick = lattice(int(column), int(span * 10.0), 11)
     if kind == _GATES:
         high = min(4.2, ground - 2.2)
@@ -74,7 +74,7 @@ def _ground_floor(p, look, x_in, y, bay, column, span, du, dv, out):
         out[2] = door * (1.0 - 0.35 * bands(y - 0.2, 0.6, 0.06, dv))
         out[1] = band(x, -0.65, 0.65, du) * band(y, 0.0, 2.65, dv) - door - out[0]
         return
-    wide, low, rim = p[look, 2] * bay, 0.85, 0.07
+    wide, low, rim = p[material, 2] * bay, 0.85, 0.07
     left, high = 0.5 * (bay - wide), max(ground - 1.5, 0.8)
     pane = band(x_in, left, left + wide, du) * band(y, low, low + high, dv)
     glass = band(x_in, left + rim, left + wide - rim, du) * band(y, low + rim, low + high - rim, dv)
@@ -102,7 +102,7 @@ def _rail(x, y, left, wide, du, dv, out):
 
 @_kernel
 @no_type_check
-def _openings(p, look, u, v, w, du, dv, out):
+def _openings(p, material, u, v, w, du, dv, out):
     """Compute the parts of a façade's footprint that are not wall.
 
     Args:
@@ -112,8 +112,13 @@ def _openings(p, look, u, v, w, du, dv, out):
     Returns:
         The number of the window, 0 where there is none or where there are too many.
     """
-    storey, nominal_bay, wide_share, high_share = p[look, 0], p[look, 1], p[look, 2], p[look, 3]
-    ground, kind = p[look, 4], int(p[look, 6])
+    storey, nominal_bay, wide_share, high_share = (
+        p[material, 0],
+        p[material, 1],
+        p[material, 2],
+        p[material, 3],
+    )
+    ground, kind = p[material, 4], int(p[material, 6])
     out[0] = out[1] = out[2] = 0.0
     out[3] = 1.0
     usable = u + w - 0.8
@@ -131,7 +136,7 @@ def _openings(p, look, u, v, w, du, dv, out):
     if x < 0.0 or w < 0.4:  # the corners are wall
         return 0
     if v < ground:
-        _ground_floor(p, look, x_in, v, bay, column, u + w, du, dv, out)
+        _ground_floor(p, material, x_in, v, bay, column, u + w, du, dv, out)
         return int(column) + 1
     row = math.floor((v - ground) / storey) + 1.0
     y = v - ground - (row - 1.0) * storey
@@ -165,9 +170,9 @@ def _openings(p, look, u, v, w, du, dv, out):
 
 @_kernel
 @no_type_check
-def _wall(p, look, u, v, du, dv):
+def _wall(p, material, u, v, du, dv):
     """Return the brightness of a façade's material: joints, single bricks and slabs, ribs."""
-    kind = int(p[look, 5])
+    kind = int(p[material, 5])
     if kind == _BRICK and du < 0.4:
         course = math.floor(v / 0.15)
         shifted = u + 0.15 * (course % 2)
@@ -189,7 +194,7 @@ def _wall(p, look, u, v, du, dv):
 
 @_kernel
 @no_type_check
-def facade(p, look, x, y, uvw, extent, i, out):
+def facade(p, material, x, y, uvw, extent, i, out):
     """Compute walls with windows, doors, shop fronts, a plinth and a ledge above the ground floor."""
     u, v, w = uvw[i, 0], uvw[i, 1], uvw[i, 2]
     du, dv = extent[i, 0], extent[i, 1]
@@ -197,16 +202,16 @@ def facade(p, look, x, y, uvw, extent, i, out):
     tint = 1.0 + 0.07 * noise(a / 3.0, v / 3.0, du / 3.0, 6) + 0.05 * noise(a * 2.0, v * 2.0, du * 2.0, 7)
     tint += 0.05 * noise(a * 1.2, v / 6.0, du * 1.2, 14)  # streaks from rain
     tint *= 0.84 + 0.16 * min(1.0, v / 1.2)
-    tint *= _wall(p, look, u, v, du, dv)
-    if int(p[look, 7]) != _GATES:
-        tint *= 1.0 + 0.25 * band(v, p[look, 4] - 0.12, p[look, 4] + 0.12, dv)
+    tint *= _wall(p, material, u, v, du, dv)
+    if int(p[material, 7]) != _GATES:
+        tint *= 1.0 + 0.25 * band(v, p[material, 4] - 0.12, p[material, 4] + 0.12, dv)
         tint *= 1.0 - 0.22 * band(v, -2.0, 0.45, dv)
     part = out[TEXTURED:]
-    number = _openings(p, look, u, v, w, du, dv, part)
+    number = _openings(p, material, u, v, w, du, dv, part)
     glass, frame, accent = part[0], part[1], part[2]
-    behind = lattice(number, look, 9)
+    behind = lattice(number, material, 9)
     bright = (0.25 + 1.5 * behind if behind > 0.75 else 1.0) * part[3]
-    row = int(p[look, 8])
+    row = int(p[material, 8])
     wood = 0.55 if row % 3 else 0.07
     rest = tint * max(0.0, 1.0 - glass - frame - accent)
     for c in range(3):

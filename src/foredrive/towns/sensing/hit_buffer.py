@@ -14,7 +14,7 @@ class HitBuffer(NamedTuple):
 
     triangle: Int32[np.ndarray, "N"]
     actor: Int32[np.ndarray, "N"]
-    look: Int32[np.ndarray, "N"]
+    material: Int32[np.ndarray, "N"]
     """Look, `MISS` where a ray hit nothing."""
     range_m: Float32[np.ndarray, "N"]
     """Distance along the ray, m; infinite where it hit nothing."""
@@ -22,14 +22,14 @@ class HitBuffer(NamedTuple):
 
 def empty_hit_buffer(count: int) -> HitBuffer:
     """Return an empty record for `count` rays."""
-    triangle, actor, look = (np.empty(count, np.int32) for _ in range(3))
-    return HitBuffer(triangle, actor, look, np.empty(count, np.float32))
+    triangle, actor, material = (np.empty(count, np.int32) for _ in range(3))
+    return HitBuffer(triangle, actor, material, np.empty(count, np.float32))
 
 
-def record_hits(buffer: HitBuffer, part: slice, hits: Hits, look: Int32[np.ndarray, "n"]) -> None:
+def record_hits(buffer: HitBuffer, part: slice, hits: Hits, material: Int32[np.ndarray, "n"]) -> None:
     """Record the hits of some of the rays."""
-    buffer.triangle[part], buffer.actor[part], buffer.look[part] = hits.triangle, hits.actor, look
-    buffer.range_m[part] = np.where(look == MISS, np.inf, hits.t)
+    buffer.triangle[part], buffer.actor[part], buffer.material[part] = hits.triangle, hits.actor, material
+    buffer.range_m[part] = np.where(material == MISS, np.inf, hits.t)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -49,9 +49,9 @@ def track_ids(buffer, of_actor, of_triangle, no_actor):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def surface_ids(buffer, of_look, sky):
-    """Return the surface of each hit [N], from the surfaces of looks [L]."""
-    out = np.empty(len(buffer.look), np.int8)
+def surface_ids(buffer, of_material, sky):
+    """Return the surface of each hit [N], from the surfaces of materials [L]."""
+    out = np.empty(len(buffer.material), np.int8)
     for i in range(len(out)):
-        out[i] = sky if buffer.look[i] == MISS else of_look[buffer.look[i]]
+        out[i] = sky if buffer.material[i] == MISS else of_material[buffer.material[i]]
     return out

@@ -6,7 +6,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from foredrive.towns.place.looks import Texture
+from foredrive.towns.place.materials import Texture
 from foredrive.towns.sensing.patterns import TEXTURE_WORDS
 from foredrive.towns.sensing.textures import PAINT_REFLECTIVITY, texture
 from foredrive.towns.sensing.wet import LEVEL_COS, is_paved, water_film
@@ -36,7 +36,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 @_kernel
 @no_type_check
-def lidar_returns(looks, found, t, max_range_m, chance, air):
+def lidar_returns(materials, found, t, max_range_m, chance, air):
     """Compute which beams return, their ranges and their intensities.
 
     The echo of a surface of reflectivity ρ at an angle of incidence θ is proportional to ρ cos θ exp(-2 α r)
@@ -44,7 +44,7 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
     falls to the detector's threshold. A film of water mirrors most of the pulse away from level ground.
 
     Args:
-        looks: `LookArrays`.
+        materials: `MaterialArrays`.
         found: `Surfaces` that the beams hit.
         t: [N] distances of the hits, m.
         max_range_m: maximum range, m.
@@ -54,7 +54,7 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
     Returns:
         range [N] m, up to the surface if a beam was lost; returned [N]; intensity [N] in 0..1, calibrated as
         by the makers of real lidars. It is the reflectance, in percent of 255, of a white matt surface that
-        looks equally bright at perpendicular incidence. Only retroreflective surfaces exceed 100/255.
+        materials equally bright at perpendicular incidence. Only retroreflective surfaces exceed 100/255.
     """
     count = len(t)
     range_m = np.empty(count, np.float32)
@@ -62,29 +62,29 @@ def lidar_returns(looks, found, t, max_range_m, chance, air):
     intensity = np.zeros(count, np.float32)
     colour = np.empty(TEXTURE_WORDS, np.float32)
     for i in range(count):
-        look = found.look[i]
+        material = found.material[i]
         range_m[i] = max_range_m
-        if look == MISS or t[i] > max_range_m:
+        if material == MISS or t[i] > max_range_m:
             continue
-        texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
+        texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
         glass, paint, cosine = colour[3], colour[4], found.cosine[i]
-        reflectivity = looks.reflectivity[look] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
+        reflectivity = materials.reflectivity[material] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
         reflectivity *= 1.0 - GLASS_LOSS * glass
         if air.wetness > 0.0:
-            level = abs(found.normal[i, 2]) > LEVEL_COS and is_paved(looks.surface[look])
+            level = abs(found.normal[i, 2]) > LEVEL_COS and is_paved(materials.surface[material])
             film = 0.0
             if level:
-                film = water_film(air.wetness, looks.surface[look], found.xyz, found.extent, i)
+                film = water_film(air.wetness, materials.surface[material], found.xyz, found.extent, i)
             reflectivity *= (1.0 - WET_LIDAR_LOSS * air.wetness) * (1.0 - FILM_LIDAR_LOSS * film)
         range_m[i] = t[i]
         dimmed = math.exp(-2.0 * air.lidar_extinction_per_m * t[i])
         echo = reflectivity * cosine * dimmed * (LIDAR_REFERENCE_M / max(t[i], 1.0)) ** 2
         if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
             returned[i] = True
-            back = 1.0 if looks.reflectivity[look] > 1.0 else RETROREFLECTED * paint
+            back = 1.0 if materials.reflectivity[material] > 1.0 else RETROREFLECTED * paint
             facing = cosine + (1.0 - cosine) * back
             intensity[i] = min(INTENSITY_OF_WHITE * reflectivity * facing * dimmed, 1.0)
-            if looks.texture[look] == _FOLIAGE:
+            if materials.texture[material] == _FOLIAGE:
                 range_m[i] += FOLIAGE_DEPTH_M * chance[i, 1]
     return range_m, returned, intensity
 

@@ -31,7 +31,7 @@ def outlines(buffer, centre, rgb, shape):
     surface.
 
     Args:
-        buffer: look and actor of each pixel.
+        buffer: material and actor of each pixel.
         centre: `ShadedPixels`.
         rgb: [C·H·W 3] 8-bit colours.
         shape: C, H, W.
@@ -44,8 +44,8 @@ def outlines(buffer, centre, rgb, shape):
             inside = (i % width) + 1 < width if step == 1 else (i // width) % height + 1 < height
             if not inside:
                 continue
-            edge = buffer.look[i] != buffer.look[j] or buffer.actor[i] != buffer.actor[j]
-            if not edge and buffer.look[i] != MISS:
+            edge = buffer.material[i] != buffer.material[j] or buffer.actor[i] != buffer.actor[j]
+            if not edge and buffer.material[i] != MISS:
                 edge = centre.lit[i] != centre.lit[j] or _bends(centre.normal, i, centre.normal, j)
             if edge:
                 for c in range(3):
@@ -69,8 +69,8 @@ def same_as_centre(pixels, samples, found, actor, lit, buffer, centre):
     out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
     for i in range(len(out)):
         pixel = pixels[i // samples]
-        same = found.look[i] == buffer.look[pixel] and actor[i] == buffer.actor[pixel]
-        if same and found.look[i] != MISS:
+        same = found.material[i] == buffer.material[pixel] and actor[i] == buffer.actor[pixel]
+        if same and found.material[i] != MISS:
             same = lit[i] == centre.lit[pixel] and not _bends(found.normal, i, centre.normal, pixel)
         if same:
             out[i] = centre.radiance[pixel]

@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from foredrive.towns.place.looks import LookArrays, Texture
+from foredrive.towns.place.materials import MaterialArrays, Texture
 from foredrive.towns.sensing.lamps import lamp_light
 from foredrive.towns.sensing.patterns import TEXTURE_WORDS
 from foredrive.towns.sensing.sky import blurred_sky, sky
@@ -40,7 +40,7 @@ class Triangles(NamedTuple):
 
     xyz: Float32[np.ndarray, "F 3 3"]
     uvw: Float32[np.ndarray, "F 3 3"]
-    look: Int32[np.ndarray, "F"]
+    material: Int32[np.ndarray, "F"]
 
 
 class ActorArrays(NamedTuple):
@@ -50,7 +50,7 @@ class ActorArrays(NamedTuple):
     first: Int32[np.ndarray, "A"]
     """First triangle of the actor's shape."""
     paint: Int32[np.ndarray, "A S"]
-    """Looks that replace the shape's negative look numbers: -1 by the first, -2 by the second."""
+    """Materials that replace the shape's negative material numbers: -1 by the first, -2 by the second."""
 
 
 class Hits(NamedTuple):
@@ -74,13 +74,13 @@ class SceneArrays(NamedTuple):
     static: Triangles
     shapes: Triangles
     actors: ActorArrays
-    looks: LookArrays
+    materials: MaterialArrays
 
 
 class Surfaces(NamedTuple):
     """The surfaces at the ends of N rays. Without meaning for a ray that missed."""
 
-    look: Int32[np.ndarray, "N"]
+    material: Int32[np.ndarray, "N"]
     """MISS for a ray that missed."""
     xyz: Float32[np.ndarray, "N 3"]
     normal: Float32[np.ndarray, "N 3"]
@@ -142,16 +142,16 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         if triangle == MISS:
             continue
         if actor < 0:
-            look = static.look[triangle]
+            material = static.material[triangle]
             for k in range(3):
                 for a in range(3):
                     corner[k, a] = static.xyz[triangle, k, a]
                     coordinate[k, a] = static.uvw[triangle, k, a]
         else:
             row = actors.first[actor] + triangle
-            look = shapes.look[row]
-            if look < 0:
-                look = actors.paint[actor, -1 - look]
+            material = shapes.material[row]
+            if material < 0:
+                material = actors.paint[actor, -1 - material]
             for k in range(3):
                 x, y, z = shapes.xyz[row, k, 0], shapes.xyz[row, k, 1], shapes.xyz[row, k, 2]
                 for a in range(3):
@@ -162,7 +162,7 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
                         + actors.T_world_unit[actor, a, 3]
                     )
                     coordinate[k, a] = shapes.uvw[row, k, a]
-        out.look[i] = look
+        out.material[i] = material
         t, u, v = hits.t[i], hits.u[i], hits.v[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         px, py, pz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
@@ -204,7 +204,7 @@ def sun_rays(found, t, sun, out_origin):
     index = np.empty(len(t), np.int64)
     count = 0
     for i in range(len(t)):
-        if found.look[i] == MISS:
+        if found.material[i] == MISS:
             continue
         nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
         if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
@@ -246,11 +246,11 @@ def _lit_window(light, glass, chance):
 
 @_kernel
 @no_type_check
-def shade(looks, found, t, direction, lit, light, mirrored, known):
+def shade(materials, found, t, direction, lit, light, mirrored, known):
     """Return the radiance [N 3] along rays.
 
     Args:
-        looks: `LookArrays`.
+        materials: `MaterialArrays`.
         found: `Surfaces` that the rays hit.
         t: [N] distances of the hits, m.
         direction: [N 3] unit directions of the rays.
@@ -267,25 +267,25 @@ def shade(looks, found, t, direction, lit, light, mirrored, known):
         if len(known) > 0 and known[i, 0] >= 0.0:
             out[i, 0], out[i, 1], out[i, 2] = known[i, 0], known[i, 1], known[i, 2]
             continue
-        look = found.look[i]
+        material = found.material[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-        if look == MISS:
+        if material == MISS:
             sky(light, dx, dy, dz, colour)
             out[i, 0], out[i, 1], out[i, 2] = colour[0], colour[1], colour[2]
             continue
-        texture(looks, look, found.xyz, found.uvw, found.extent, i, colour)
-        kind, glass, cosine = looks.texture[look], colour[3], found.cosine[i]
+        texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
+        kind, glass, cosine = materials.texture[material], colour[3], found.cosine[i]
         nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
         facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
         direct = facing if lit[i] else 0.0
         if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
             direct = (0.45 + 0.55 * facing) if lit[i] else 0.12
-        gloss = min(1.0, looks.gloss[look] + 0.35 * glass)
+        gloss = min(1.0, materials.gloss[material] + 0.35 * glass)
         if gloss > 0.0:
             gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
         film = 0.0
-        if wetness > 0.0 and nz > LEVEL_COS and is_paved(looks.surface[look]):
-            film = water_film(wetness, looks.surface[look], found.xyz, found.extent, i)
+        if wetness > 0.0 and nz > LEVEL_COS and is_paved(materials.surface[material]):
+            film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
             gloss = max(gloss, film * water_mirror(cosine))
             for c in range(3):
                 colour[c] *= 1.0 - WET_DARKENING * min(2.0 * wetness, 1.0)

@@ -8,7 +8,7 @@ from typing import no_type_check
 
 import numba
 
-from foredrive.towns.place.looks import GRASS_RGB, LinePattern, Texture, srgb_to_linear
+from foredrive.towns.place.materials import GRASS_RGB, LinePattern, Texture, srgb_to_linear
 from foredrive.towns.sensing.facades import facade
 from foredrive.towns.sensing.patterns import band, bands, lattice, noise
 
@@ -50,7 +50,7 @@ def _line(distance: float, along: float, du: float, dw: float, pattern: int, wid
 
 @_kernel
 @no_type_check
-def _road(p, look, x, y, uvw, extent, i, out):
+def _road(p, material, x, y, uvw, extent, i, out):
     """Compute asphalt: grain, wear along the wheel tracks, patches, lines."""
     size = extent[i, 3]
     shade = 1.0 + 0.10 * noise(x / 11.0, y / 11.0, size / 11.0, 1)
@@ -63,14 +63,14 @@ def _road(p, look, x, y, uvw, extent, i, out):
         shade *= 1.0 - 0.10 * math.exp(-8.0 * track * track)
     paint, yellow = 0.0, False
     for side in range(2):
-        pattern = int(p[look, 3 * side])
+        pattern = int(p[material, 3 * side])
         if pattern != _LINE_NONE:
             share = _line(
-                uvw[i, side], uvw[i, 2], extent[i, side], extent[i, 2], pattern, p[look, 3 * side + 2]
+                uvw[i, side], uvw[i, 2], extent[i, side], extent[i, 2], pattern, p[material, 3 * side + 2]
             )
             if share > paint:
                 paint = share
-                yellow = p[look, 3 * side + 1] > 0.5
+                yellow = p[material, 3 * side + 1] > 0.5
     if paint > 0.0:
         paint *= 0.92 + 0.08 * noise(x * 3.0, y * 3.0, size * 3.0, 5)
     colour = YELLOW_PAINT if yellow else WHITE_PAINT
@@ -92,10 +92,10 @@ def _grass(x, y, size):
 
 @_kernel
 @no_type_check
-def _field(p, look, x, y, uvw, extent, i, out):
+def _field(p, material, x, y, uvw, extent, i, out):
     """Compute rows of crops with the ruts of tractors, and grass beyond the border."""
     u, size = uvw[i, 0], extent[i, 3]
-    crop = bands(u + 0.06 * noise(x, y, size, 26), p[look, 0], p[look, 1], extent[i, 0])
+    crop = bands(u + 0.06 * noise(x, y, size, 26), p[material, 0], p[material, 1], extent[i, 0])
     rut = bands(u, TRAMLINES_M, RUT_M, extent[i, 0]) + bands(u + TRACK_M, TRAMLINES_M, RUT_M, extent[i, 0])
     crop *= 1.0 - 0.8 * rut
     shade = (
@@ -108,19 +108,19 @@ def _field(p, look, x, y, uvw, extent, i, out):
     inside = band(border, 0.0, 1e6, extent[i, 2])
     grass = _grass(x, y, size)
     for c in range(3):
-        tilled = shade * (out[c] * crop + p[look, 2 + c] * (1.0 - crop))
+        tilled = shade * (out[c] * crop + p[material, 2 + c] * (1.0 - crop))
         out[c] = tilled * inside + _GRASS_RGB[c] * grass[c] * (1.0 - inside)
 
 
 @_kernel
 @no_type_check
-def _tint(kind, p, look, xyz, uvw, extent, i):
+def _tint(kind, p, material, xyz, uvw, extent, i):
     """Return factors on red, green and blue of the simpler textures."""
     x, y, z, size = xyz[i, 0], xyz[i, 1], xyz[i, 2], extent[i, 3]
     if kind == _GRASS:
         return _grass(x, y, size)
     if kind == _SLABS:
-        edge = p[look, 0]
+        edge = p[material, 0]
         joint = bands(x, edge, 0.025, size) + bands(y, edge, 0.025, size)
         slab = lattice(math.floor(x / edge), math.floor(y / edge), 31) - 0.5
         shade = 1.0 - 0.35 * min(joint, 1.0) + 0.14 * slab * max(0.0, 1.0 - size / edge)
@@ -140,7 +140,7 @@ def _tint(kind, p, look, xyz, uvw, extent, i):
         shade = 1.0 + 0.2 * (lattice(math.floor(uvw[i, 0] / 0.25 + 0.5 * row), row, 61) - 0.5)
         shade *= 1.0 - 0.3 * bands(uvw[i, 1], 0.33, 0.05, extent[i, 1])
         return shade, shade, shade
-    mottling = p[look, 0]
+    mottling = p[material, 0]
     if mottling > 0.0:
         shade = 1.0 + 0.08 * mottling * noise(x / 1.3, (y + z) / 1.3, size / 1.3, 71)
         shade += 0.06 * mottling * noise(x * 3.0 + z, y * 3.0, size * 3.0, 72)
@@ -150,12 +150,12 @@ def _tint(kind, p, look, xyz, uvw, extent, i):
 
 @_kernel
 @no_type_check
-def texture(looks, look, xyz, uvw, extent, i, out):
-    """Evaluate a look at the i-th of many hits.
+def texture(materials, material, xyz, uvw, extent, i, out):
+    """Evaluate a material at the i-th of many hits.
 
     Args:
-        looks: `LookArrays`.
-        look: number of the look.
+        materials: `MaterialArrays`.
+        material: number of the material.
         xyz: [N 3] positions, m.
         uvw: [N 3] texture coordinates.
         extent: [N 4] extent of a pixel's footprint in the texture coordinates, and on the surface, m.
@@ -164,19 +164,19 @@ def texture(looks, look, xyz, uvw, extent, i, out):
             of paint, and a random number in 0..1 of the window, 0 where there is none or where there are too
             many. The others are working memory.
     """
-    kind, p = looks.texture[look], looks.params
+    kind, p = materials.texture[material], materials.params
     x, y = xyz[i, 0], xyz[i, 1]
     for c in range(3):
-        out[c] = looks.albedo[look, c]
+        out[c] = materials.albedo[material, c]
     out[3] = out[4] = out[5] = 0.0
     if kind == _ROAD:
-        _road(p, look, x, y, uvw, extent, i, out)
+        _road(p, material, x, y, uvw, extent, i, out)
     elif kind == _FIELD:
-        _field(p, look, x, y, uvw, extent, i, out)
+        _field(p, material, x, y, uvw, extent, i, out)
     elif kind == _FACADE:
-        facade(p, look, x, y, uvw, extent, i, out)
+        facade(p, material, x, y, uvw, extent, i, out)
     elif kind == _STRIPES:
-        share = bands(uvw[i, 0] - 0.25, p[look, 0], p[look, 1], extent[i, 0])
+        share = bands(uvw[i, 0] - 0.25, p[material, 0], p[material, 1], extent[i, 0])
         paint = share * (0.9 + 0.1 * noise(x * 2.0, y * 2.0, extent[i, 3] * 2.0, 51))
         for c in range(3):
             out[c] = ASPHALT * (1.0 - paint) + out[c] * paint
@@ -184,7 +184,7 @@ def texture(looks, look, xyz, uvw, extent, i, out):
     else:
         if kind == _GLASS:
             out[3] = 1.0
-        r, g, b = _tint(kind, p, look, xyz, uvw, extent, i)
+        r, g, b = _tint(kind, p, material, xyz, uvw, extent, i)
         out[0] *= r
         out[1] *= g
         out[2] *= b

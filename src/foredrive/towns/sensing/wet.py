@@ -6,7 +6,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from foredrive.towns.place.looks import Surface
+from foredrive.towns.place.materials import Surface
 from foredrive.towns.sensing.patterns import noise
 
 LEVEL_COS = 0.9
@@ -63,7 +63,7 @@ def water_mirror(cosine):
 
 @_kernel
 @no_type_check
-def mirror_rays(looks, found, t, direction, wetness, out_origin, out_direction):
+def mirror_rays(materials, found, t, direction, wetness, out_origin, out_direction):
     """Return the indices of the hits whose water mirrors enough to be followed.
 
     Fill out_origin and out_direction with the mirrored rays. Ripples deflect each ray slightly.
@@ -71,10 +71,10 @@ def mirror_rays(looks, found, t, direction, wetness, out_origin, out_direction):
     index = np.empty(len(t), np.int64)
     count = 0
     for i in range(len(t)):
-        look, nz = found.look[i], found.normal[i, 2]
-        if look < 0 or nz < LEVEL_COS or not is_paved(looks.surface[look]):
+        material, nz = found.material[i], found.normal[i, 2]
+        if material < 0 or nz < LEVEL_COS or not is_paved(materials.surface[material]):
             continue
-        film = water_film(wetness, looks.surface[look], found.xyz, found.extent, i)
+        film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
         if film * water_mirror(found.cosine[i]) < MIN_MIRROR:
             continue
         x, y, size = found.xyz[i, 0], found.xyz[i, 1], found.extent[i, 3]

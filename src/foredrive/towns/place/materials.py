@@ -1,4 +1,4 @@
-"""Looks of objects for a camera and a lidar: surfaces, textures and the table of looks."""
+"""Materials of objects for a camera and a lidar: surfaces, textures and the table of materials."""
 
 import enum
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Surface(enum.IntEnum):
 
 
 class Texture(enum.IntEnum):
-    """Procedural patterns. `u, v, w` are the interpolated corner coordinates, `p` the look's parameters."""
+    """Procedural patterns. `u, v, w` are the interpolated corner coordinates, `p` its parameters."""
 
     PLAIN = 0
     """p0: strength of the mottling."""
@@ -119,7 +119,7 @@ RETROREFLECTIVE = 3.0
 
 
 @dataclass(frozen=True)
-class Look:
+class Material:
     """The appearance of one part of a mesh."""
 
     surface: Surface
@@ -134,34 +134,36 @@ class Look:
 
 
 @dataclass
-class LookTable:
-    """Looks by number. Equal looks have the same number."""
+class MaterialTable:
+    """Materials by number. Equal materials have the same number."""
 
-    looks: list[Look] = field(default_factory=list)
-    numbers: dict[Look, int] = field(default_factory=dict)
+    materials: list[Material] = field(default_factory=list)
+    numbers: dict[Material, int] = field(default_factory=dict)
 
-    def add(self, look: Look) -> int:
-        """Return the number of a look and add the look if it is new."""
-        if look not in self.numbers:
-            self.numbers[look] = len(self.looks)
-            self.looks.append(look)
-        return self.numbers[look]
+    def add(self, material: Material) -> int:
+        """Return the number of a material and add the material if it is new."""
+        if material not in self.numbers:
+            self.numbers[material] = len(self.materials)
+            self.materials.append(material)
+        return self.numbers[material]
 
-    def arrays(self) -> "LookArrays":
+    def arrays(self) -> "MaterialArrays":
         """Return the table as arrays, for compiled functions."""
-        params = [(*look.params, *[0.0] * (PARAMETERS - len(look.params))) for look in self.looks]
-        return LookArrays(
-            surface=np.array([look.surface for look in self.looks], dtype=np.int64),
-            texture=np.array([look.texture for look in self.looks], dtype=np.int64),
-            albedo=srgb_to_linear([look.rgb for look in self.looks]),
-            reflectivity=np.array([look.reflectivity for look in self.looks], dtype=np.float32),
-            gloss=np.array([look.gloss for look in self.looks], dtype=np.float32),
+        params = [
+            (*material.params, *[0.0] * (PARAMETERS - len(material.params))) for material in self.materials
+        ]
+        return MaterialArrays(
+            surface=np.array([material.surface for material in self.materials], dtype=np.int64),
+            texture=np.array([material.texture for material in self.materials], dtype=np.int64),
+            albedo=srgb_to_linear([material.rgb for material in self.materials]),
+            reflectivity=np.array([material.reflectivity for material in self.materials], dtype=np.float32),
+            gloss=np.array([material.gloss for material in self.materials], dtype=np.float32),
             params=np.array(params, dtype=np.float32),
         )
 
 
-class LookArrays(NamedTuple):
-    """L looks as one array per property."""
+class MaterialArrays(NamedTuple):
+    """L materials as one array per property."""
 
     surface: Int64[np.ndarray, "L"]
     texture: Int64[np.ndarray, "L"]
