@@ -31,7 +31,7 @@ def encoder() -> LidarEncoder:
 @pytest.fixture(scope="module")
 def attention() -> WindowAttention:
     torch.manual_seed(0)
-    return WindowAttention(blocks=2, width=8, heads=2, hidden=8, side=4).eval()
+    return WindowAttention(layers=2, width=8, heads=2, hidden=8, side=4).eval()
 
 
 @given(st.integers(0, 1000), st.integers(1, 60), st.integers(1, 9))
@@ -136,7 +136,18 @@ def test_a_scene_moved_by_a_whole_window_is_attended_to_alike(attention: WindowA
     assert not torch.allclose(askew, here, atol=1e-3)
 
 
-def test_every_other_block_looks_across_the_borders_of_the_first(attention: WindowAttention) -> None:
+def test_a_block_of_two_layers_is_two_blocks_of_one() -> None:
+    small = {"width": 16, "heads": 2, "hidden": 16}
+    torch.manual_seed(0)
+    full = LidarEncoder(LidarEncoderConfig(**small, blocks=2, block_layers=2), dim=6).eval()
+    torch.manual_seed(0)
+    flat = LidarEncoder(LidarEncoderConfig(**small, blocks=4), dim=6).eval()
+    assert len(full.attention.blocks) == 4
+    made = cloud(3, items=2)
+    torch.testing.assert_close(full(made, 2), flat(made, 2), rtol=0, atol=0)
+
+
+def test_every_other_layer_looks_across_the_borders_of_the_first(attention: WindowAttention) -> None:
     features = torch.zeros(2, 8, requires_grad=True)
     beside = torch.tensor([[0, 3], [0, 4]])
     reached = attention(features, beside, torch.zeros(2, dtype=torch.int64))[0].square().sum()

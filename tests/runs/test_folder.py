@@ -16,7 +16,7 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.folder import RunFolder, held
 from foredrive.runs.search.indexing import index_logs
-from foredrive.runs.search.tower_training import embedded_recipe, train_towers
+from foredrive.runs.search.tower_training import tower_recipe, train_towers
 
 HOLDER = """
 import sys, time
@@ -48,7 +48,7 @@ def test_a_second_process_is_refused_by_everything_that_goes_on(
     for second in (
         lambda: train_run(miniature(), [log], run),
         lambda: drive_suite(DriveSuite("stop", TownRoutes("town05-short")), run, workers=1),
-        lambda: train_towers(embedded_recipe(), [log], run),
+        lambda: train_towers(tower_recipe(), [log], run),
         lambda: index_logs([log], str(run), "embedded", 1.0, 1),
     ):
         with pytest.raises(InputError, match=f"{run}: another process is writing to it"):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from miniature import write_log
+from pydantic import TypeAdapter
 from small_towers import SMALL, WORDS, save_clip, save_tokenizer
 from transformers import BertConfig, BertModel
 
@@ -25,10 +26,10 @@ from foredrive.runs.search.tower_data import (
     image_targets,
     text_targets,
 )
-from foredrive.runs.search.tower_training import TowerRecipe, train_towers
-from foredrive.runs.search.towers import find_towers
+from foredrive.runs.search.tower_training import TowerRecipe, tower_recipe, train_towers
+from foredrive.runs.search.towers import SHIPPED, find_towers
 from foredrive.search.crops import Crop
-from foredrive.search.embedded import SentenceTowers, load_towers
+from foredrive.search.embedded import CARD, LidarTowers, SentenceTowers, load_towers
 from foredrive.training import Schedule, read_metrics
 
 
@@ -117,6 +118,30 @@ def test_a_lidar_tower_beside_clip_needs_nothing_that_could_be_said(
     towers = find_towers(str(train_towers(recipe, [log], tmp_path / "run", tmp_path, beside=str(clip))))
     assert (towers.dim, towers.has_lidar) == (find_towers(str(clip)).dim, True)
     assert not (tmp_path / "run" / "image").exists()
+
+
+def test_recipes_that_were_stored_before_open_unchanged() -> None:
+    told = json.loads((SHIPPED / CARD).read_text())["trained"]["recipe"]
+    assert "block_layers" not in told["lidar"]
+    assert "one_cycle" not in told["distil"]
+    read = TypeAdapter(TowerRecipe).validate_python(told)
+    assert read == tower_recipe("tiny", image_steps=2400, lidar_steps=900)
+
+
+def test_a_lidar_tower_of_full_depth_beside_clip(log: LogPath, tmp_path: Path) -> None:
+    recipe = tower_recipe("base", lidar_steps=2)
+    assert recipe.lidar.blocks * recipe.lidar.block_layers == 8  # four blocks of two layers, as in SST
+    recipe = dataclasses.replace(
+        recipe,
+        distil=dataclasses.replace(recipe.distil, batch_size=2),
+        lidar=dataclasses.replace(recipe.lidar, width=16, heads=2, hidden=16),
+        stride_s=1.0,
+    )
+    towers = train_towers(recipe, [log], tmp_path / "run", beside=str(save_clip(tmp_path / "clip")))
+    loaded = find_towers(str(towers))
+    assert isinstance(loaded, LidarTowers)
+    assert len(loaded.encoder.attention.blocks) == 8
+    assert loaded.crop is Crop.MIDDLE_SQUARE
 
 
 def test_views_are_read_once_and_hold_what_their_sector_does(

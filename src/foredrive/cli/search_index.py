@@ -66,6 +66,7 @@ def search_train(
     out: Path,
     cache: OptionalPath = None,
     beside: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None,
+    size: Literal["tiny", "base"] | None = None,
     loss: Literal["mse", "cosine"] = "mse",
     image_steps: int | None = None,
     lidar_steps: int | None = None,
@@ -82,9 +83,11 @@ def search_train(
         cache: Folder for views; by default "cache" in the run's folder.
         beside: Towers whose image embeddings train the lidar tower: embedded, a folder, or a CLIP or SigLIP
             model.
+        size: Lidar tower: tiny, like the shipped one, for processors; or base, that of LidarCLIP with its
+            schedule, for a GPU. By default base beside other towers than the shipped ones, and else tiny.
         loss: Loss of the lidar tower: mean squared error, or 1 - cosine.
         image_steps: Training steps of the image tower; by default 20 epochs.
-        lidar_steps: Training steps of the lidar tower; by default 10 epochs.
+        lidar_steps: Training steps of the lidar tower; by default 10 epochs (tiny) or 1 (base).
         seed: Seed of the weights and of the order of the data.
     """
     check_number("--image-steps", image_steps, low=1)
@@ -94,9 +97,10 @@ def search_train(
     found = find_all_logs(logs)
 
     with importing():
-        from foredrive.runs.search.tower_training import embedded_recipe, train_towers
+        from foredrive.runs.search.tower_training import tower_recipe, train_towers
 
-    recipe = embedded_recipe(loss, image_steps, lidar_steps, seed)
+    size = size or ("tiny" if beside in (None, TOWERS) else "base")
+    recipe = tower_recipe(size, loss, image_steps, lidar_steps, seed)
     towers = train_towers(recipe, found, out, cache, beside)
     print(f"next: foredrive search index LOGS --towers {towers}")
 

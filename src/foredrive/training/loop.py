@@ -19,6 +19,7 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path, naming
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
+from foredrive.training.one_cycle import OneCycle
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
@@ -46,6 +47,8 @@ CONDITIONS = "conditions.json"
 class Schedule:
     """Length and learning rate of a training: AdamW, linear warm-up, then a cosine to `final_lr_fraction`.
 
+    With `one_cycle`, learning rate and momentum follow this policy instead.
+
     The length is given in steps, or in epochs over the data when `steps` is None. Steps, here and in
     `warmup_steps`, are those of one process: N processes consume N batches at a time and so take 1/N as many.
     """
@@ -62,6 +65,7 @@ class Schedule:
     checkpoint_every: int = 200
     workers: int = 0
     seed: int = 0
+    one_cycle: OneCycle | None = None
 
     def total_steps(self, items: int, processes: int = 1) -> int:
         """Return the number of steps over a data set of `items` that several processes share."""
@@ -74,6 +78,8 @@ class Schedule:
 
     def lr_at(self, step: int, total: int, processes: int = 1) -> float:
         """Return the learning rate of step `step` (from 0) of `total`."""
+        if self.one_cycle is not None:
+            return self.lr * self.one_cycle.at(step, total)[0]
         warmup = math.ceil(self.warmup_steps / processes)
         if step < warmup:
             return self.lr * (step + 1) / warmup
@@ -229,6 +235,8 @@ def _one_step(
 ) -> dict[str, Tensor]:
     for group in optimizer.param_groups:
         group["lr"] = schedule.lr_at(step, total, fabric.world_size)
+        if schedule.one_cycle is not None:
+            group["betas"] = (schedule.one_cycle.at(step, total)[1], group["betas"][1])
     seed = (schedule.seed * 1_000_003 + step) * 1009 + fabric.global_rank
     torch.manual_seed(seed)  # dropout
     losses: dict[str, Tensor] = model(example, torch.Generator().manual_seed(seed))

@@ -21,6 +21,9 @@ class LidarEncoderConfig:
     hidden: int = 256
     """Width of the feed-forward layers."""
     blocks: int = 4
+    block_layers: int = 1
+    """Layers of attention in a block. SST has two, in plain and in shifted windows; towers that were stored
+    without this number have one, by turns in plain and in shifted windows."""
     window: int = 12
     """Side of a window of attention, in pillars."""
     point_width: int = 64
@@ -53,7 +56,11 @@ class LidarEncoder(nn.Module):
         self.register_buffer("cell_waves", torch.cat([angle.sin(), angle.cos()], dim=-1), persistent=False)
         self.place = nn.Linear(4 * config.waves, width)
         self.attention = WindowAttention(
-            blocks=config.blocks, width=width, heads=heads, hidden=config.hidden, side=config.window
+            layers=config.blocks * config.block_layers,
+            width=width,
+            heads=heads,
+            hidden=config.hidden,
+            side=config.window,
         )
         self.pool = AttentionPool(width, heads, dim)
 

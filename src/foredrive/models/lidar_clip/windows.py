@@ -31,7 +31,7 @@ class Windows(NamedTuple):
         return cls(order, counts, inside[:, 0] * side + inside[:, 1])
 
 
-class WindowBlock(nn.Module):
+class WindowLayer(nn.Module):
     """Pre-norm attention within windows and a feed-forward layer. Queries and keys get a place code.
 
     Args:
@@ -64,12 +64,13 @@ class WindowBlock(nn.Module):
 
 
 class WindowAttention(nn.Module):
-    """Blocks with windows that are shifted by half a window in every other block (Liu et al. 2021)."""
+    """Layers whose windows are shifted by half a window in every other layer (Liu et al. 2021)."""
 
-    def __init__(self, *, blocks: int, width: int, heads: int, hidden: int, side: int) -> None:
+    def __init__(self, *, layers: int, width: int, heads: int, hidden: int, side: int) -> None:
         super().__init__()
         self.side = side
-        self.blocks = nn.ModuleList([WindowBlock(width, heads, hidden, side) for _ in range(blocks)])
+        # The weights of stored towers have this name; it is one layer each.
+        self.blocks = nn.ModuleList([WindowLayer(width, heads, hidden, side) for _ in range(layers)])
 
     def forward(
         self, features: Float[Tensor, "K D"], cell_yx: Int[Tensor, "K 2"], item: Int[Tensor, "K"]
@@ -78,6 +79,6 @@ class WindowAttention(nn.Module):
         if len(features) == 0:
             return features
         both = [Windows.cut(cell_yx, item, self.side, shift) for shift in (0, self.side // 2)]
-        for number, block in enumerate(self.blocks):
-            features = block(features, both[number % 2])
+        for number, layer in enumerate(self.blocks):
+            features = layer(features, both[number % 2])
         return features

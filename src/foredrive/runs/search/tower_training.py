@@ -31,6 +31,7 @@ from foredrive.search.embedded import LidarTowers, SentenceTowers, TowerCard, lo
 from foredrive.search.towers import Towers
 from foredrive.training import Schedule, train
 from foredrive.training.alignment import ContrastConfig, ContrastObjective, DistillationObjective
+from foredrive.training.one_cycle import OneCycle
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -59,22 +60,32 @@ class TowerRecipe:
     """Temperatures and cropping of the image tower's training."""
 
 
-def embedded_recipe(
+def tower_recipe(
+    size: Literal["tiny", "base"] = "tiny",
     loss: Literal["mse", "cosine"] = "mse",
     image_steps: int | None = None,
     lidar_steps: int | None = None,
     seed: int = 0,
 ) -> TowerRecipe:
-    """Return the recipe of the towers that need no download; `image_steps` and `lidar_steps` set its
-    length.
+    """Return the recipe of towers.
+
+    Args:
+        size: size of the lidar tower and length of its training. "tiny" is that of the shipped towers, for
+            processors. "base" is LidarCLIP's (Hess et al. 2024), for a GPU: SST at its full depth, Adam with
+            the 1cycle policy, batches of 128, one epoch. The image tower is the same in both.
+        image_steps, lidar_steps: training steps in place of epochs.
     """
     contrast = Schedule(batch_size=64, lr=1e-3, epochs=20, weight_decay=0.05, warmup_steps=100, seed=seed)
-    distil = Schedule(batch_size=32, lr=1e-3, epochs=10, weight_decay=0.05, warmup_steps=100, seed=seed)
+    if size == "tiny":
+        distil = Schedule(batch_size=32, lr=1e-3, epochs=10, weight_decay=0.05, warmup_steps=100, seed=seed)
+    else:
+        cycle = OneCycle()
+        distil = Schedule(batch_size=128, lr=1e-3, epochs=1, weight_decay=0.0, seed=seed, one_cycle=cycle)
     return TowerRecipe(
         contrast=_with_steps(contrast, image_steps),
         distil=_with_steps(distil, lidar_steps),
         image=ImageTowerConfig(widths=(32, 64, 128, 256), depths=(2, 2, 2, 2), heads=8, side_px=128),
-        lidar=LidarEncoderConfig(),
+        lidar=LidarEncoderConfig(block_layers=1 if size == "tiny" else 2),
         loss=loss,
     )
 
