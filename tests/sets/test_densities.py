@@ -18,6 +18,7 @@ from foredrive.sets import (
     SumPoisson,
     UniformPoisson,
     poisson_log_prob,
+    set_nll,
 )
 
 
@@ -125,6 +126,35 @@ def test_softmax_and_sigmoid_detectors() -> None:
     assert sigmoid.log_class.exp()[0].tolist() == pytest.approx([0.25, 0.75])
     sure = MultiBernoulli.from_sigmoid(torch.tensor([[60.0, -60.0]]), boxes)
     assert sure.log_absence.item() == pytest.approx(-60)  # 1 - r is 0 in float64
+
+
+def test_two_readings_of_one_sigmoid_per_class() -> None:
+    """80 classes, top score .90, others .01: r · p(c) is s_c as published; ours shares r = .90 by scores."""
+    scores = torch.full((1, 80), 0.01, dtype=torch.float64)
+    scores[0, 3] = 0.90
+    boxes = BoxDensity(torch.zeros(1, 1), torch.ones(1, 1, 1))
+    ours, published = (
+        MultiBernoulli.from_sigmoid(torch.logit(scores), boxes, classes)
+        for classes in ("normalised", "published")
+    )
+    peak = stats.norm.logpdf(0)
+    for label, share in ((3, 0.90), (7, 0.01)):
+        truth = LabelledBoxes(torch.tensor([label]), torch.zeros(1, 1))
+        nll = [set_nll(PoissonMultiBernoulli(found), truth).nll.item() for found in (ours, published)]
+        assert nll[0] == pytest.approx(-math.log(0.90 * share / (0.90 + 79 * 0.01)) - peak, abs=1e-9)
+        assert nll[1] == pytest.approx(-math.log(share) - peak, abs=1e-9)
+        assert nll[0] - nll[1] == pytest.approx(0.630, abs=5e-4)
+    for found in (ours, published):  # a detection without an object costs -log(1 - r)
+        none = set_nll(PoissonMultiBernoulli(found), truth[:0]).nll
+        assert none.item() == pytest.approx(-math.log(0.10), abs=1e-9)
+    mixtures = [
+        PoissonMultiBernoulli.from_detections(found, confidence=0.95).background
+        for found in (ours, published)
+    ]
+    one, other = (mixture.log_intensity(truth).item() for mixture in mixtures if mixture is not None)
+    assert one == pytest.approx(other, abs=1e-12)  # the Poisson process has normalised classes in both
+    with pytest.raises(InputError, match="cannot be drawn"):
+        published.sample(np.random.default_rng(0))
 
 
 def test_poisson_densities_by_hand() -> None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -35,13 +35,16 @@ class MultiBernoulli(Record):
     log_class: Float[Tensor, "*b M K"]
     """Log-probability of each class, given that the object exists."""
     boxes: BoxDensity
+    normalised: bool = True
+    """Whether class probabilities add up to 1. If they do not, likelihoods are not those of a density."""
 
     def __post_init__(self) -> None:
         require("existence", self.log_existence <= _ROUNDING)
         require("absence", self.log_absence <= _ROUNDING)
         total = torch.logaddexp(self.log_existence, self.log_absence)
         require("existence (which adds up to 1 with absence)", total.abs() <= _ROUNDING)
-        require("class distribution", self.log_class.logsumexp(-1).abs() <= _ROUNDING)
+        if self.normalised:
+            require("class distribution", self.log_class.logsumexp(-1).abs() <= _ROUNDING)
 
     @classmethod
     def from_softmax(cls, logits: Float[Tensor, "*b M K_1"], boxes: BoxDensity) -> "MultiBernoulli":
@@ -51,17 +54,24 @@ class MultiBernoulli(Record):
         return cls(log_existence, log_prob[..., -1], log_prob[..., :-1] - log_existence[..., None], boxes)
 
     @classmethod
-    def from_sigmoid(cls, logits: Float[Tensor, "*b M K"], boxes: BoxDensity) -> "MultiBernoulli":
-        """Convert the logits of a detector with one sigmoid per class (RetinaNet).
+    def from_sigmoid(
+        cls,
+        logits: Float[Tensor, "*b M K"],
+        boxes: BoxDensity,
+        classes: Literal["normalised", "published"] = "normalised",
+    ) -> "MultiBernoulli":
+        """Convert the logits of a detector with one sigmoid s_c per class (RetinaNet). r is the largest s_c.
 
-        r is the largest sigmoid. The class probabilities are proportional to the sigmoids.
+        With `classes` "normalised", the class probabilities are proportional to the sigmoids. With
+        "published", r · p(c) = s_c as in Paper A: the probabilities add up to more than 1.
         """
         top = logits.double().amax(-1)
         log_score = torch.nn.functional.logsigmoid(logits.double())
-        log_class = log_score - log_score.logsumexp(-1, keepdim=True)
-        return cls(
-            torch.nn.functional.logsigmoid(top), torch.nn.functional.logsigmoid(-top), log_class, boxes
-        )
+        log_existence = torch.nn.functional.logsigmoid(top)
+        normalised = classes == "normalised"
+        log_total = log_score.logsumexp(-1) if normalised else log_existence
+        log_absence = torch.nn.functional.logsigmoid(-top)
+        return cls(log_existence, log_absence, log_score - log_total[..., None], boxes, normalised)
 
     def log_label(self, objects: LabelledBoxes) -> Float[Tensor, "*b M N"]:
         """Return the log-probability that each object exists with its label."""
@@ -77,7 +87,13 @@ class MultiBernoulli(Record):
         return self.log_existence[component].double() + log_class.double()
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
-        """Draw one set. The process must have one frame only."""
+        """Draw one set. The process must have one frame only.
+
+        Raises:
+            InputError: the class probabilities do not add up to 1.
+        """
+        if not self.normalised:
+            raise InputError("class probabilities that do not add up to 1 cannot be drawn from")
         exists = torch.as_tensor(rng.random(len(self.log_existence)) < self.log_existence.exp().cpu().numpy())
         state, yaw = self.boxes.sample(rng)
         label = _sample_labels(self.log_class, rng)
@@ -205,12 +221,14 @@ class PoissonMultiBernoulli:
     ) -> "PoissonMultiBernoulli":
         """Convert the detections of one frame into a PMB density (Paper A).
 
-        Detections with r ≤ `confidence` become the Poisson process. The process `other`, such as a uniform
-        one, is added to it. Without it, objects far from every detection have almost zero density.
+        Detections with r ≤ `confidence` become the Poisson process, always with normalised classes. The
+        process `other`, such as a uniform one, is added to it. Without it, objects far from every detection
+        have almost zero density.
         """
         low = detections.log_existence <= math.log(confidence)
-        few = detections[low]
-        mixture = MixturePoisson(few.log_existence, few.log_class, few.boxes)
+        unsure = detections[low]
+        log_class = unsure.log_class if unsure.normalised else unsure.log_class.log_softmax(-1)
+        mixture = MixturePoisson(unsure.log_existence, log_class, unsure.boxes)
         return cls(detections[~low], mixture if other is None else SumPoisson((mixture, other)))
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
