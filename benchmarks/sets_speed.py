@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.score import ScoreConfig, score_frames
 from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.sets import (
@@ -230,7 +230,7 @@ def validation(seed: int) -> dict[str, float]:
         started, wall_started = time.process_time(), time.perf_counter()
         read = read_detections(results, truth)
     reading_s, after_reading_gib = time.process_time() - started, peak_rss_gib()
-    scores = score_frames(read, k=K)
+    scores = score_frames(read, ScoreConfig(k=K))
     frames_s = time.process_time() - started - reading_s
     summarise_scores(read, scores)
     return {

@@ -46,6 +46,16 @@ def test_figures_and_a_report_that_loads_nothing(files: dict[str, Path], tmp_pat
     assert not re.search(r'(src|href)="(?!data:|#)', page)
 
 
+def test_the_background_can_be_switched_off(files: dict[str, Path], tmp_path: Path) -> None:
+    """An object of which nothing is said makes its frame impossible: counted in the summary."""
+    lone = write_nuscenes(tmp_path / "lone.json", {"a": [box(5.0, 0.0, "<car>", detection_score=0.9)]})
+    arguments = ["--truth", str(files["truth"]), "--out", str(tmp_path / "out"), "--background-rate", "0"]
+    assert main(["score", str(lone), *arguments]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["background_rate"], summary["pmb_nll.frames_infinite"]) == (0, 2)
+    assert "pmb_nll.mean" not in summary
+
+
 def test_names_from_outside_run_nothing(tmp_path: Path) -> None:
     frames = {EVIL: [box(5.0, 0.0, EVIL, scene_token=EVIL, detection_score=0.9)]}
     truth, results, other = (

@@ -8,6 +8,7 @@ import pytest
 from foredrive.metrics.detection import (
     average_precision_coco,
     average_precision_nuscenes,
+    descending,
     match_greedily,
     mean_of_valid,
     overlaps,
@@ -23,9 +24,22 @@ def test_overlaps_by_hand() -> None:
 def test_the_best_scored_takes_its_object_first() -> None:
     """The second would be closer to the only object, but is scored lower."""
     closeness = np.array([[-1.5], [-0.5]])
-    assert match_greedily(np.array([0.9, 0.8]), closeness, -2.0).tolist() == [0, -1]
-    assert match_greedily(np.array([0.9, 0.8]), closeness, -1.0).tolist() == [-1, 0]
-    assert match_greedily(np.zeros(2), np.zeros((2, 0)), 0.0).tolist() == [-1, -1]
+    order = descending(np.array([0.9, 0.8]))
+    assert match_greedily(order, closeness, -2.0).tolist() == [0, -1]
+    assert match_greedily(order, closeness, -1.0).tolist() == [-1, 0]
+    assert match_greedily(order[::-1], closeness, -2.0).tolist() == [-1, 0]
+    assert match_greedily(order, np.zeros((2, 0)), 0.0).tolist() == [-1, -1]
+
+
+def test_equal_scores_are_ordered_as_each_data_set_does() -> None:
+    """COCO's sort is stable; the devkit's is reversed as a whole."""
+    score = np.array([0.5, 0.9, 0.5])
+    assert descending(score).tolist() == [1, 0, 2]
+    assert descending(score, ties_reversed=True).tolist() == [1, 2, 0]
+    hit = np.array([True, False, False])  # the hit comes second, or last
+    assert average_precision_coco(score, hit, 1) == pytest.approx(1 / 2)
+    # The precision rises linearly with recall, to 1/3: above 0.1 at recall 0.31 … 1, whose sum is 45.85.
+    assert average_precision_nuscenes(score, hit, 1) == pytest.approx((45.85 / 3 - 70 * 0.1) / 90 / 0.9)
 
 
 def test_average_precision_of_coco_by_hand() -> None:

@@ -22,20 +22,27 @@ def overlaps(boxes: Float[ndarray, "M 4"], others: Float[ndarray, "N 4"]) -> Flo
     return np.divide(shared, either, out=np.zeros_like(shared), where=either > 0)
 
 
+def descending(score: Float[ndarray, "n"], *, ties_reversed: bool = False) -> Int[ndarray, "n"]:
+    """Return indices by descending score. Equal scores keep their order, or reverse it as nuScenes does."""
+    if ties_reversed:
+        return np.argsort(score, kind="stable")[::-1]
+    return np.argsort(-score, kind="stable")
+
+
 def match_greedily(
-    score: Float[ndarray, "M"], closeness: Float[ndarray, "M N"], min_closeness: float
+    order: Int[ndarray, "M"], closeness: Float[ndarray, "M N"], min_closeness: float
 ) -> Int[ndarray, "M"]:
-    """Match the detections of one frame, best score first, with the closest object that is left.
+    """Match the detections of one frame, in the given order, with the closest object that is left.
 
     Args:
-        score: of detections.
+        order: of detections, as `descending` returns it.
         closeness: larger for better pairs, -inf between classes.
         min_closeness: of a pair.
 
     Returns:
         The object of each detection; -1: none.
     """
-    return _match_greedily(np.argsort(-score, kind="stable"), closeness, min_closeness)
+    return _match_greedily(np.ascontiguousarray(order), closeness, min_closeness)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -55,33 +62,35 @@ def _match_greedily(order, closeness, min_closeness):
 
 
 def precision_recall(
-    score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int
+    hit: Bool[ndarray, "n"], objects: int
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
-    """Return precision and recall over all frames as the threshold falls; precision is made monotone."""
-    order = np.argsort(-score, kind="stable")
-    hits = np.cumsum(hit[order])
-    precision = hits / np.arange(1, len(score) + 1)
-    return np.maximum.accumulate(precision[::-1])[::-1], hits / max(objects, 1)
+    """Return precision and recall of the first detections, for each number of them."""
+    hits = np.cumsum(hit)
+    return hits / np.arange(1, len(hit) + 1), hits / objects
 
 
 def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
-    """Return COCO's: the mean of the precision at recall 0, 0.01 … 1; NaN without objects."""
+    """Return the average precision of COCO; NaN without objects.
+
+    It is the mean, at recall 0, 0.01 … 1, of the largest precision at this recall or beyond.
+    """
     if objects == 0:
         return float("nan")
-    precision, recall = precision_recall(score, hit, objects)
+    precision, recall = precision_recall(hit[descending(score)], objects)
     at = np.searchsorted(recall, np.linspace(0, 1, 101), side="left")
-    return float(np.append(precision, 0.0)[at].mean())
+    return float(np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)[at].mean())
 
 
 def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
-    """Return nuScenes': mean precision above 0.1 over recall above 0.1, over 0.9; NaN without objects."""
+    """Return the average precision of nuScenes' devkit; NaN without objects.
+
+    It is the mean, at recall 0.11, 0.12 … 1, of the precision above 0.1, divided by 0.9.
+    """
     if objects == 0:
         return float("nan")
     if not hit.any():
         return 0.0
-    order = np.argsort(-score, kind="stable")
-    hits = np.cumsum(hit[order])
-    precision, recall = hits / np.arange(1, len(score) + 1), hits / objects
+    precision, recall = precision_recall(hit[descending(score, ties_reversed=True)], objects)
     at = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
     return float(np.clip(at[11:] - 0.1, 0.0, None).mean() / 0.9)
 

@@ -1,4 +1,4 @@
-"""The report on a file of detections: metrics, reliability, and the frames that lost most likelihood."""
+"""The report on a file of detections: metrics, reliability, and the frames with the largest NLL."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ COMPARED = {
 
 
 def score_table(figures: Summary) -> Table:
-    """Return a table of the main metrics, beside those of the other file if there is one."""
+    """Return a table of the main metrics, with those of the other file beside them if there is one."""
     other = figures.get("against")
     prefixes = ("",) if other is None else ("", "against.")
     names = ("",) if other is None else ("results", Path(str(other)).name)
@@ -60,7 +60,7 @@ def write_score_report(
 
     Args:
         figures: the summary, with the figures of the other file if there is one.
-        worst: number of frames to draw: those that lost most likelihood.
+        worst: number of frames to draw, beginning with the largest NLL.
     """
     ranked = sorted(zip(scored.detections.frames, scored.frames, strict=True), key=lambda pair: -pair[1].nll)
     write_page(

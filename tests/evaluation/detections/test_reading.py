@@ -25,7 +25,11 @@ def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
     read = read_detections(results, truth)
     assert read.is_3d
     assert read.classes == ["car"]
-    assert read.counts == {"frames_without_detections": 1, "boxes_without_covariance": 0}
+    assert read.counts == {
+        "frames_without_detections": 1,
+        "boxes_without_covariance": 0,
+        "frames_without_ego": 1,  # the empty one
+    }
     frame, empty = read.frames
     assert (frame.name, frame.sequence, empty.name) == ("a", "s", "b")
     expected = [3.0, 4.0, 0.5, math.log(4), math.log(2), math.log(1.5)]
@@ -41,6 +45,18 @@ def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
     assert frame.visibility is not None
     assert frame.visibility.tolist() == [7.0]
     assert len(empty.detected.log_existence) == len(empty.objects.label) == 0
+
+
+def test_files_as_the_devkit_serialises_boxes(tmp_path: Path) -> None:
+    """No `results` key, and zeros where nobody computed the boxes' place beside the ego vehicle."""
+    unset = {"ego_translation": [0.0, 0.0, 0.0], "num_pts": -1, "attribute_name": "", "velocity": [0.0, 0.0]}
+    content = {"a": [box(1003.0, 504.0, detection_score=-1.0, sample_token="a", **unset)], "b": []}
+    (tmp_path / "gt.json").write_text(json.dumps(content))
+    results = write_nuscenes(tmp_path / "found.json", {"a": [box(1003.0, 504.0, detection_score=0.5)]})
+    read = read_detections(results, tmp_path / "gt.json")
+    assert [frame.name for frame in read.frames] == ["a", "b"]
+    assert read.counts["frames_without_ego"] == 2
+    assert read.frames[0].objects.state[0, :2].tolist() == [0.0, 0.0]  # around the frame's boxes
 
 
 def test_coco_boxes_and_class_probabilities(tmp_path: Path) -> None:
@@ -91,21 +107,21 @@ def test_kitti_boxes_forward_left_up(tmp_path: Path) -> None:
     [
         ({"size": [0.0, 4.0, 1.5]}, r"frame a, box 1 has the size"),
         ({"size": [2.0, 4.0]}, r"box 1 has no size of 3"),
-        ({"translation": [float("nan"), 0.0, 0.0]}, r"frame a, box 1 has a translation that is not finite"),
+        ({"translation": [float("nan"), 0.0, 0.0]}, r"frame a, box 1: its translation is not finite"),
         ({"rotation": [0.0, 0.0, 0.0, 0.0]}, r"frame a, box 1 has the rotation"),
-        ({"detection_score": 1.2}, r"detection 1 has a score outside"),
-        ({"detection_score": float("nan")}, r"box 1 has a detection_score that is not finite"),
-        ({"covariance": [1, 1, 1, 1, 1, -1]}, r"detection 1 has a covariance that is not positive"),
+        ({"detection_score": 1.2}, r"box 1 has a score outside"),
+        ({"detection_score": float("nan")}, r"box 1: its detection_score is not finite"),
+        ({"covariance": [1, 1, 1, 1, 1, -1]}, r"box 1 has a covariance that is not positive"),
         ({"covariance": [1, 2]}, r"box 1: its covariance is neither"),
-        ({"yaw_std": 0.0}, r"detection 1 has a standard deviation of its heading"),
+        ({"yaw_std": 0.0}, r"box 1 has a standard deviation of its heading"),
         ({"class_probabilities": {"moon": 1.0}}, r"box 1: class_probabilities"),
         ({"class_probabilities": {"car": "x"}}, r"box 1: class_probabilities must be numbers"),
         ({"covariance": ["x"] * 6}, r"box 1: its covariance is not made of numbers"),
-        ({"class_probabilities": {"car": 0.4}}, r"detection 1 has class probabilities"),
+        ({"class_probabilities": {"car": 0.4}}, r"box 1 has class probabilities"),
         ({"detection_name": None}, r"box 1 has no detection_name"),
-        ({"translation": [1e200, 0.0, 0.0]}, r"box 1 has a translation beyond 1e\+12"),
+        ({"translation": [1e200, 0.0, 0.0]}, r"box 1: its translation is beyond 1e\+12"),
         ({"size": [10**400, 4.0, 1.5]}, r"box 1 has no size of 3"),
-        ({"yaw_std": 1e-200}, r"detection 1 has a standard deviation of its heading below"),
+        ({"yaw_std": 1e-200}, r"box 1 has a standard deviation of its heading below"),
     ],
 )
 def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> None:
@@ -121,9 +137,12 @@ def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> No
     [
         ({"size": [0.0, 4.0, 1.5]}, r"gt\.json: frame a, box 0 has the size"),
         ({"ego_translation": "x"}, r"gt\.json: frame a, box 0 has no ego_translation of 3"),
-        ({"ego_translation": [1.0, math.nan, 0.0]}, r"gt\.json: frame a, box 0 has a ego_translation"),
-        ({"num_pts": None}, r"gt\.json: frame a, box 0 has a num_pts that is not finite"),
-        ({"relevance": -1.0}, r"gt\.json: frame a, object 0 has a relevance below 0"),
+        (
+            {"ego_translation": [1.0, math.nan, 0.0]},
+            r"gt\.json: frame a, box 0: its ego_translation is not finite",
+        ),
+        ({"num_pts": None}, r"gt\.json: frame a, box 0: its num_pts is not finite"),
+        ({"relevance": -1.0}, r"gt\.json: frame a, box 0 has a relevance below 0"),
     ],
 )
 def test_wrong_truth_is_named(tmp_path: Path, change: dict, message: str) -> None:
@@ -160,8 +179,8 @@ def test_wrong_lines_are_named(tmp_path: Path) -> None:
         (good, "line 2 has 15 fields, not 16"),
         (f"{good} x", "line 2 has something that is not a number"),
         (f"{good} nan", "line 2 has a number that is not finite"),
-        (f"{good} 3.5", "detection 1 has a score outside"),
-        (good.replace("1.5 2 4", "0 2 4") + " 0.9", "box 1 has no size"),
+        (f"{good} 3.5", "line 2 has a score outside"),
+        (good.replace("1.5 2 4", "0 2 4") + " 0.9", "line 2 has a box without size"),
     ):
         (tmp_path / "found" / "0.txt").write_text(f"{good} 0.5\n{line}\n")
         with pytest.raises(InputError, match=rf"0\.txt: {message}"):

@@ -10,7 +10,7 @@ from evaluation.detections.files_of_detections import box, write_coco_truth, wri
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.files import read_detections
 from foredrive.evaluation.detections.frames import DetectionSet
-from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.score import ScoreConfig, score_frames
 from foredrive.evaluation.detections.summary import compare_scores, summarise_scores
 
 
@@ -152,6 +152,26 @@ def test_no_detections_at_all(tmp_path: Path) -> None:
     assert figures["frames_without_detections"] == 1
 
 
+def test_the_rate_of_the_uniform_background_is_an_option(tmp_path: Path) -> None:
+    """λ is its rate over the region. Without background and detections an object is impossible, and counted."""
+    truth = {"a": [box(0.0, 0.0)], "b": [box(5.0, 5.0)], "c": []}
+    found = {"b": [box(5.0, 5.0, detection_score=0.9)]}
+    read = read_detections(
+        write_nuscenes(tmp_path / "found.json", found), write_nuscenes(tmp_path / "gt.json", truth)
+    )
+    one, three, none = (score_frames(read, ScoreConfig(background_rate=rate)) for rate in (1.0, 3.0, 0.0))
+    assert three[0].nll == pytest.approx(one[0].nll + 2.0 - math.log(3), abs=1e-9)
+    assert three[2].nll == pytest.approx(3.0)
+    assert none[0].nll == none[0].parts["missed"] == math.inf
+    assert none[1].nll == pytest.approx(none[1].parts["localisation"] - math.log(0.9), abs=1e-9)
+    assert none[2].nll == 0.0
+    figures = summarise_scores(read, none).figures
+    assert figures["pmb_nll.frames_infinite"] == 1
+    assert figures["pmb_nll.mean"] == pytest.approx(none[1].nll / 2)
+    assert figures["object_cost"] == pytest.approx(none[1].nll)
+    assert figures["by_class.car.objects"] == 1
+
+
 def test_what_else_a_detector_names_changes_no_other_frame(tmp_path: Path) -> None:
     """The background is of the truth's classes, so that two detectors are compared by the same one."""
     truth = write_nuscenes(tmp_path / "gt.json", {"a": [box(5.0, 5.0)], "b": [box(30.0, 5.0, "bus")]})
@@ -176,5 +196,6 @@ def test_ranges_are_those_of_frames_where_the_ego_vehicle_is_known(tmp_path: Pat
     for each in at.values():
         each.pop("ego_translation", None)
     truth = write_nuscenes(tmp_path / "gt.json", {name: [each] for name, each in at.items()})
-    read = read_detections(tmp_path / "found.json", truth)
+    found = {name: [{**each, "detection_score": 0.9}] for name, each in at.items()}
+    read = read_detections(write_nuscenes(tmp_path / "found.json", found), truth)
     assert not [key for key in summarise_scores(read, score_frames(read)).figures if "range" in key]

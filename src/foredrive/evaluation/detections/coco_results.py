@@ -20,6 +20,7 @@ from foredrive.evaluation.detections.frames import (
     STD_PX,
     DetectionFrame,
     DetectionSet,
+    StatedDetections,
     enclosing_region,
     make_detections,
     make_objects,
@@ -40,7 +41,7 @@ def read_coco(
     """Return the images of the truth, in its order, without crowds.
 
     Raises:
-        InputError: that names the wrong record.
+        InputError: a record is wrong. The message names the first.
     """
     images, categories = _named(truth, "images", truth_path), _named(truth, "categories", truth_path)
     label_of = {category["id"]: n for n, category in enumerate(categories)}
@@ -89,26 +90,29 @@ def _frame(
     truth_path: Path,
     family: Family,
 ) -> DetectionFrame:
-    where, true_where = f"{path}: image {image['id']}", f"{truth_path}: image {image['id']}"
+    where = f"{truth_path}: image {image['id']}"
     corners, true_corners = _corners(predicted, path), _corners(true, truth_path)
     records = [record for _, record in predicted]
-    names = [f"{path}: record {n}" for n, _ in predicted]
-    share = read_class_probabilities(
-        records, [label_of[record["category_id"]] for record in records], classes, names
+    names, true_names = (
+        [f"{path}: record {n}" for n, _ in predicted],
+        [f"{truth_path}: record {n}" for n, _ in true],
     )
+    label = [label_of[record["category_id"]] for record in records]
+    share = read_class_probabilities(records, label, classes, names)
     covariance = read_covariances(records, _defaults(corners), names)
     score = read_number_rows(records, "score", 1, names)[:, 0]
-    labels = [label_of[record["category_id"]] for _, record in true]
-    height, width = (read_numbers(image, key, 1, true_where)[0] for key in ("height", "width"))
+    true_label = [label_of[record["category_id"]] for _, record in true]
+    height, width = (read_numbers(image, key, 1, where)[0] for key in ("height", "width"))
     if not (height > 0 and width > 0):
-        raise InputError(f"{true_where} has the size {width:g} x {height:g}")
+        raise InputError(f"{where} has the size {width:g} x {height:g}")
     return DetectionFrame(
         str(image.get("file_name", image["id"])),
         str(image.get("sequence", image["id"])),
-        make_detections(where, score, share, corners, covariance, family=family),
-        make_objects(true_where, labels, true_corners),
+        make_detections(names, score, share, corners, covariance, family=family),
+        make_objects(true_names, true_label, true_corners),
         *enclosing_region(np.zeros(4), np.array([width, height, width, height]), true_corners),
-        relevance=read_relevance([record for _, record in true], true_where),
+        relevance=read_relevance([record for _, record in true], true_names),
+        stated=StatedDetections(np.array(label, dtype=np.int64), score, np.ones(len(label), bool)),
     )
 
 

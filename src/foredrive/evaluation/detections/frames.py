@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
@@ -45,6 +45,20 @@ class DetectionFrame:
     """Visibility of each object as the data set measures it: lidar points, or a level of occlusion."""
     relevance: Float[ndarray, "N"] | None = None
     """Weight of each object, where the truth has one."""
+    stated: "StatedDetections | None" = None
+    """Detections as the file states them. None: the likeliest class, and its probability."""
+    object_counts: Bool[ndarray, "N"] | None = None
+    """Whether average precision counts the object. None: it counts all."""
+
+
+@dataclass(frozen=True)
+class StatedDetections:
+    """Detections as average precision reads them from a file."""
+
+    label: Int[ndarray, "M"]
+    score: Float[ndarray, "M"]
+    counts: Bool[ndarray, "M"]
+    """Whether average precision counts the detection."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,7 @@ class DetectionSet:
 
 
 def make_detections(
-    where: str,
+    names: Sequence[str],
     score: Float[ndarray, "M"],
     class_probability: Float[ndarray, "M K"],
     mean: Float[ndarray, "M D"],
@@ -71,7 +85,11 @@ def make_detections(
     *,
     family: Family = "gaussian",
 ) -> MultiBernoulli:
-    """Check and convert the detections of one frame; raises `InputError` with the first that is wrong."""
+    """Check and convert the detections of one frame.
+
+    Raises:
+        InputError: a detection is wrong. The message begins with the name of the first.
+    """
     chol, definite = _cholesky(covariance)
     checks = {
         "a score outside [0, 1]": (score >= 0) & (score <= 1),
@@ -82,11 +100,11 @@ def make_detections(
     }
     if yaw is not None and yaw_std is not None:
         checks["a heading that is not finite"] = np.isfinite(yaw)
-        name = f"a standard deviation of its heading below {MIN_STD_YAW_RAD:g} rad"
-        checks[name] = yaw_std >= MIN_STD_YAW_RAD
-    for fault, fine in checks.items():
-        if not fine.all():
-            raise InputError(f"{where}: detection {int(np.flatnonzero(~fine)[0])} has {fault}")
+        fault = f"a standard deviation of its heading below {MIN_STD_YAW_RAD:g} rad"
+        checks[fault] = yaw_std >= MIN_STD_YAW_RAD
+    for fault, valid in checks.items():
+        if not valid.all():
+            raise InputError(f"{names[int(np.flatnonzero(~valid)[0])]} has {fault}")
     r = torch.as_tensor(np.clip(score, MIN_PROBABILITY, 1 - MIN_PROBABILITY))
     share = np.clip(class_probability, MIN_PROBABILITY, None)
     boxes = BoxDensity(
@@ -101,16 +119,19 @@ def make_detections(
 
 
 def make_objects(
-    where: str,
+    names: Sequence[str],
     label: Sequence[int],
     state: Float[ndarray, "N D"],
     yaw: Float[ndarray, "N"] | None = None,
 ) -> LabelledBoxes:
-    """Check and convert the objects of one frame; raises `InputError` with the first that is wrong."""
-    fine = np.isfinite(state).all(1) & (True if yaw is None else np.isfinite(yaw))
-    if not fine.all():
-        first = int(np.flatnonzero(~fine)[0])
-        raise InputError(f"{where}: object {first} has a box that is not finite, or of no size")
+    """Check and convert the objects of one frame.
+
+    Raises:
+        InputError: a box is not finite. The message begins with the name of the first.
+    """
+    valid = np.isfinite(state).all(1) & (True if yaw is None else np.isfinite(yaw))
+    if not valid.all():
+        raise InputError(f"{names[int(np.flatnonzero(~valid)[0])]} has a box that is not finite")
     headings = None if yaw is None else torch.as_tensor(yaw)
     return LabelledBoxes(torch.as_tensor(np.asarray(label, dtype=np.int64)), torch.as_tensor(state), headings)
 
@@ -118,7 +139,7 @@ def make_objects(
 def _cholesky(
     covariance: Float[ndarray, "M D D"],
 ) -> tuple[Float[ndarray, "M D D"], Bool[ndarray, "M"]]:
-    """Return lower factors, and which covariances have one; factors are zeros unless all do."""
+    """Return the lower factors, and whether each covariance has one. The factors are zeros unless all do."""
     finite = np.isfinite(covariance).all((1, 2))
     try:
         if finite.all():
@@ -128,7 +149,7 @@ def _cholesky(
     min_eigenvalue = np.zeros(len(covariance))
     min_eigenvalue[finite] = np.linalg.eigvalsh(covariance[finite]).min(-1)
     definite = min_eigenvalue > 0
-    if definite.all():  # but for rounding, which the factor does not forgive
+    if definite.all():  # eigenvalues round otherwise than the factor, which failed
         definite[min_eigenvalue.argmin()] = False
     return np.zeros_like(covariance), definite
 
@@ -136,7 +157,7 @@ def _cholesky(
 def read_covariances(
     records: Sequence[Mapping[str, Any]], default: Float[ndarray, "n D D"], names: Sequence[str]
 ) -> Float[ndarray, "n D D"]:
-    """Return the covariances in records, given as matrices or variances; the default where there is none."""
+    """Return the covariances of records, given as matrices or variances, or else the default."""
     stated = [n for n, record in enumerate(records) if record.get("covariance") is not None]
     covariance = np.array(default)
     if stated:
@@ -149,7 +170,7 @@ def read_covariances(
 def _covariance_matrices(
     values: Sequence[object], dims: int, names: Sequence[str]
 ) -> Float[ndarray, "n D D"]:
-    """Convert all at once if they have one form, which is much faster, else one by one."""
+    """Convert all covariances at once if they have the same form, else one by one, which is much slower."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -160,7 +181,7 @@ def _covariance_matrices(
         return array[:, :, None] * np.eye(dims)
     if array.shape == (len(values), dims, dims):
         slack = 1e-6 * np.abs(array).max((1, 2), keepdims=True)
-        if not (np.abs(array - array.swapaxes(1, 2)) > slack).any():  # what is not finite is found later
+        if not (np.abs(array - array.swapaxes(1, 2)) > slack).any():  # NaN passes: `make_detections` checks
             return array
     if len(values) == 1:
         raise InputError(
@@ -176,7 +197,7 @@ def read_class_probabilities(
     classes: Sequence[str],
     names: Sequence[str],
 ) -> Float[ndarray, "n K"]:
-    """Return the class probabilities in records; all on the label where there are none."""
+    """Return the class probabilities of records. A record without them has its label with probability 1."""
     share, place = np.zeros((len(records), len(classes))), {name: n for n, name in enumerate(classes)}
     for n, (record, label) in enumerate(zip(records, labels, strict=True)):
         stated = record.get("class_probabilities")
@@ -195,9 +216,9 @@ def read_class_probabilities(
 
 
 def order_classes(true: set[str], found: set[str]) -> tuple[list[str], int]:
-    """Return the truth's classes, then those of detections alone, and the number of the truth's.
+    """Return the classes of the truth, then those of detections alone, and the number of the former.
 
-    All are the truth's if it has none.
+    If the truth has no classes, those of the detections count as its own.
     """
     return sorted(true) + sorted(found - true), len(true) or len(found)
 
@@ -205,14 +226,14 @@ def order_classes(true: set[str], found: set[str]) -> tuple[list[str], int]:
 def enclosing_region(
     lower: Float[ndarray, "D"], upper: Float[ndarray, "D"], states: Float[ndarray, "N D"]
 ) -> tuple[Float[ndarray, "D"], Float[ndarray, "D"]]:
-    """Return a region, enlarged to hold all states."""
+    """Return the region, enlarged so that it contains all states."""
     if len(states) == 0:
         return lower, upper
     return np.minimum(lower, states.min(0)), np.maximum(upper, states.max(0))
 
 
 def read_numbers(record: Mapping[str, Any], key: str, count: int, where: str) -> Float[ndarray, "n"]:
-    """Return numbers that a record must have: finite, none beyond `MAX_NUMBER`."""
+    """Return `count` finite numbers of a record, none beyond `MAX_NUMBER`."""
     try:
         value = np.atleast_1d(np.asarray(record[key], dtype=np.float64))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -220,16 +241,16 @@ def read_numbers(record: Mapping[str, Any], key: str, count: int, where: str) ->
     if value.shape != (count,):
         raise InputError(f"{where} has no {key} of {count} number(s)")
     if not np.isfinite(value).all():
-        raise InputError(f"{where} has a {key} that is not finite")
+        raise InputError(f"{where}: its {key} is not finite")
     if not (np.abs(value) <= MAX_NUMBER).all():
-        raise InputError(f"{where} has a {key} beyond {MAX_NUMBER:g}")
+        raise InputError(f"{where}: its {key} is beyond {MAX_NUMBER:g}")
     return value
 
 
 def read_number_rows(
     records: Sequence[Mapping[str, Any]], key: str, count: int, names: Sequence[str]
 ) -> Float[ndarray, "n count"]:
-    """Return `read_numbers` every record."""
+    """Return `read_numbers` of every record."""
     try:
         values = np.array([record[key] for record in records], dtype=np.float64)
         shape = (len(records), count) if count > 1 else (len(records),)
@@ -241,14 +262,14 @@ def read_number_rows(
     return np.array(found).reshape(-1, count)
 
 
-def read_relevance(objects: Sequence[Mapping[str, Any]], where: str) -> Float[ndarray, "N"] | None:
-    """Return the weights of objects; 1 for those without, None if none has one."""
+def read_relevance(objects: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float[ndarray, "N"] | None:
+    """Return the weights of objects: 1 where a record has none, None if no record has one."""
     if not any("relevance" in record for record in objects):
         return None
     weight = np.ones(len(objects))
     for n, record in enumerate(objects):
         if "relevance" in record:
-            weight[n] = read_numbers(record, "relevance", 1, f"{where}, object {n}")[0]
+            weight[n] = read_numbers(record, "relevance", 1, names[n])[0]
             if weight[n] < 0:
-                raise InputError(f"{where}, object {n} has a relevance below 0")
+                raise InputError(f"{names[n]} has a relevance below 0")
     return weight

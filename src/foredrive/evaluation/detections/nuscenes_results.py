@@ -1,17 +1,23 @@
 """3-D detections in nuScenes' results format, and truth in the same.
 
-`results` has a list of boxes by sample token: `translation` (m, global), `size` (w, l, h in m), `rotation`
-(quaternion w x y z), `detection_name`, `detection_score`. Beyond the format, a box may have `covariance` (of
-centre and log l, w, h in m), `yaw_std` (rad) and `class_probabilities` (by name). Truth may have `num_pts`
-and `ego_translation`, as the devkit writes them, `scene_token` and `relevance`.
+A file has lists of boxes by sample token: under `results`, or alone, as the devkit's `EvalBoxes.serialize`
+writes them. A box has `translation` (m, global), `size` (w, l, h in m), `rotation` (quaternion w x y z),
+`detection_name` and `detection_score`.
+
+Beyond the format, a detection may have `covariance` (of centre and log l, w, h in m), `yaw_std` (rad) and
+`class_probabilities` (by name). Truth may have `num_pts` and `ego_translation`, as the devkit writes them,
+`scene_token`, `relevance`, and boxes with the name `BICYCLE_RACK`, which are no objects.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
@@ -21,6 +27,7 @@ from foredrive.evaluation.detections.frames import (
     STD_YAW_RAD,
     DetectionFrame,
     DetectionSet,
+    StatedDetections,
     enclosing_region,
     make_detections,
     make_objects,
@@ -31,12 +38,21 @@ from foredrive.evaluation.detections.frames import (
     read_numbers,
     read_relevance,
 )
-from foredrive.sets import Family
+from foredrive.geometry.boxes import points_in_boxes
+from foredrive.sets import Family, MultiBernoulli
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])
 """Region of objects: around the ego vehicle, or the middle of the frame's boxes, in m and log m."""
 DEFAULT_COVARIANCE = np.diag(np.square([*STD_M, *[STD_LOG_SIZE] * 3]))
+CLASS_RANGE_M = {
+    **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), 50.0),
+    **dict.fromkeys(("pedestrian", "motorcycle", "bicycle"), 40.0),
+    **dict.fromkeys(("traffic_cone", "barrier"), 30.0),
+}
+"""Range over ground within which the devkit (detection_cvpr_2019) counts a class."""
+BICYCLE_RACK = "static_object.bicycle_rack"
+_IN_RACKS = ("bicycle", "motorcycle")
 
 Box = Mapping[str, Any]
 
@@ -44,77 +60,130 @@ Box = Mapping[str, Any]
 def read_nuscenes(
     results: Mapping[str, Any], truth: Mapping[str, Any], path: Path, truth_path: Path, family: Family
 ) -> DetectionSet:
-    """Return the frames of the truth, in its order. Raises `InputError` that names the wrong record."""
+    """Return the frames of the truth, in its order.
+
+    Raises:
+        InputError: a record is wrong. The message names the first.
+    """
     found, true = _by_frame(results, path), _by_frame(truth, truth_path)
     unknown = sorted(set(found) - set(true))
     if unknown:
         raise InputError(f"{path}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth_path}")
-    classes, true_classes = order_classes(
-        *({box["detection_name"] for boxes in each.values() for box in boxes} for each in (true, found))
+    true_names, names = (
+        {box["detection_name"] for boxes in each.values() for box in boxes} for each in (true, found)
     )
-    counts = {"frames_without_detections": len(set(true) - set(found)), "boxes_without_covariance": 0}
+    classes, true_classes = order_classes(true_names - {BICYCLE_RACK}, names)
     frames = []
     for token, boxes in true.items():
-        predicted = found.get(token, ())
-        counts["boxes_without_covariance"] += sum(box.get("covariance") is None for box in predicted)
-        frames.append(_frame(token, predicted, boxes, classes, path, truth_path, family))
+        predicted = _Boxes.of(found.get(token, ()), f"{path}: frame {token}")
+        frames.append(
+            _frame(token, predicted, _Boxes.of(boxes, f"{truth_path}: frame {token}"), classes, family)
+        )
+    counts = {
+        "frames_without_detections": len(set(true) - set(found)),
+        "boxes_without_covariance": sum(
+            box.get("covariance") is None for boxes in found.values() for box in boxes
+        ),
+        "frames_without_ego": sum(frame.range_m is None for frame in frames),
+    }
     return DetectionSet(frames, classes, True, counts, true_classes)
 
 
+@dataclass(frozen=True)
+class _Boxes:
+    """Boxes of one frame, with the ego vehicle's place if they tell it."""
+
+    records: Sequence[Box]
+    names: Sequence[str]
+    state: Float[ndarray, "n 6"]
+    """Centre (m, global) and log length, width, height (m)."""
+    yaw: Float[ndarray, "n"]
+    ego: Float[ndarray, "3"] | None
+
+    @classmethod
+    def of(cls, records: Sequence[Box], where: str) -> "_Boxes":
+        names = [f"{where}, box {n}" for n in range(len(records))]
+        state, yaw = _states(records, names)
+        return cls(records, names, state, yaw, _ego(records, state, names))
+
+    def __getitem__(self, which: Bool[ndarray, "n"]) -> "_Boxes":
+        records, names = list(compress(self.records, which)), list(compress(self.names, which))
+        return _Boxes(records, names, self.state[which], self.yaw[which], self.ego)
+
+    def labels(self, classes: Sequence[str]) -> list[int]:
+        return [classes.index(box["detection_name"]) for box in self.records]
+
+    def count_in_precision(self, ego: Float[ndarray, "3"] | None, racks: "_Boxes") -> Bool[ndarray, "n"]:
+        """Return whether the devkit counts each box: in range, with points, not in a bicycle rack."""
+        kinds = [box["detection_name"] for box in self.records]
+        points = [box.get("num_pts", -1) for box in self.records]
+        counts = np.array([number != 0 for number in points], bool)
+        if ego is not None:
+            limit = np.array([CLASS_RANGE_M.get(kind, np.inf) for kind in kinds])
+            counts &= np.linalg.norm(self.state[:, :2] - ego[:2], axis=1) < limit
+        centre, rack = torch.as_tensor(self.state[:, :3]), torch.as_tensor(racks.state)
+        inside = points_in_boxes(centre, rack[:, :3], rack[:, 3:].exp(), torch.as_tensor(racks.yaw)).any(1)
+        return counts & ~(inside.numpy() & np.isin(kinds, _IN_RACKS))
+
+
 def _frame(
-    token: str,
-    predicted: Sequence[Box],
-    true: Sequence[Box],
-    classes: Sequence[str],
-    path: Path,
-    truth_path: Path,
-    family: Family,
+    token: str, predicted: _Boxes, true: _Boxes, classes: Sequence[str], family: Family
 ) -> DetectionFrame:
-    where, true_where = f"{path}: frame {token}", f"{truth_path}: frame {token}"
-    state, yaw = _states(predicted, where)
-    true_state, true_yaw = _states(true, true_where)
-    ego = _ego(true, true_state, true_where)
-    every = np.concatenate([true_state, state])[:, :3]
+    sequence = str(true.records[0].get("scene_token", token)) if true.records else token
+    is_rack = np.array([box["detection_name"] == BICYCLE_RACK for box in true.records], bool)
+    racks, true = true[is_rack], true[~is_rack]
+    ego = predicted.ego if true.ego is None else true.ego
+    every = np.concatenate([true.state, predicted.state])[:, :3]
     origin = ego if ego is not None else every.mean(0) if len(every) else np.zeros(3)
-    state[:, :3] -= origin
-    true_state[:, :3] -= origin
-    label = [classes.index(box["detection_name"]) for box in predicted]
-    names = [f"{where}, box {n}" for n in range(len(predicted))]
-    yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in predicted]
-    detected = make_detections(
-        where,
-        read_number_rows(predicted, "detection_score", 1, names)[:, 0],
-        read_class_probabilities(predicted, label, classes, names),
-        state,
-        read_covariances(predicted, np.tile(DEFAULT_COVARIANCE, (len(predicted), 1, 1)), names),
-        yaw,
-        read_number_rows(yaw_std, "yaw_std", 1, names)[:, 0],
-        family=family,
-    )
-    objects = make_objects(
-        true_where, [classes.index(box["detection_name"]) for box in true], true_state, true_yaw
-    )
-    true_names = [f"{true_where}, box {n}" for n in range(len(true))]
+    shift = np.concatenate([origin, np.zeros(3)])
+    true_state = true.state - shift
     seen = [
         read_numbers(box, "num_pts", 1, name)[0] if "num_pts" in box else np.nan
-        for box, name in zip(true, true_names, strict=True)
+        for box, name in zip(true.records, true.names, strict=True)
     ]
+    score = read_number_rows(predicted.records, "detection_score", 1, predicted.names)[:, 0]
+    label = predicted.labels(classes)
     return DetectionFrame(
         token,
-        str(true[0].get("scene_token", token)) if true else token,
-        detected,
-        objects,
+        sequence,
+        _detections(predicted, predicted.state - shift, score, classes, family),
+        make_objects(true.names, true.labels(classes), true_state, true.yaw),
         *enclosing_region(LOWER, UPPER, true_state),
         range_m=None if ego is None else np.linalg.norm(true_state[:, :2], axis=1),
         visibility=np.array(seen),
-        relevance=read_relevance(true, true_where),
+        relevance=read_relevance(true.records, true.names),
+        stated=StatedDetections(
+            np.array(label, dtype=np.int64), score, predicted.count_in_precision(ego, racks)
+        ),
+        object_counts=true.count_in_precision(ego, racks),
+    )
+
+
+def _detections(
+    boxes: _Boxes,
+    state: Float[ndarray, "M 6"],
+    score: Float[ndarray, "M"],
+    classes: Sequence[str],
+    family: Family,
+) -> MultiBernoulli:
+    records, names = boxes.records, boxes.names
+    yaw_std = [{"yaw_std": box.get("yaw_std", STD_YAW_RAD)} for box in records]
+    return make_detections(
+        names,
+        score,
+        read_class_probabilities(records, boxes.labels(classes), classes, names),
+        state,
+        read_covariances(records, np.tile(DEFAULT_COVARIANCE, (len(records), 1, 1)), names),
+        boxes.yaw,
+        read_number_rows(yaw_std, "yaw_std", 1, names)[:, 0],
+        family=family,
     )
 
 
 def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
-    boxes = content.get("results")
+    boxes = content.get("results", content)
     if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
-        raise InputError(f"{path}: `results` must have a list of boxes by sample token")
+        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
     for token, each in boxes.items():
         for n, box in enumerate(each):
             if not isinstance(box, dict) or not isinstance(box.get("detection_name"), str):
@@ -122,9 +191,8 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
     return boxes
 
 
-def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
+def _states(boxes: Sequence[Box], names: Sequence[str]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
     """Return centre and log length, width, height; and heading."""
-    names = [f"{where}, box {n}" for n in range(len(boxes))]
     centre, size, rotation = (
         read_number_rows(boxes, key, count, names)
         for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
@@ -140,8 +208,11 @@ def _states(boxes: Sequence[Box], where: str) -> tuple[Float[ndarray, "n 6"], Fl
     return np.concatenate([centre, np.log(size[:, [1, 0, 2]])], axis=1), yaw
 
 
-def _ego(true: Sequence[Box], true_state: Float[ndarray, "N 6"], where: str) -> Float[ndarray, "3"] | None:
-    """Return the ego vehicle's place, if the truth has it: the devkit writes boxes relative to it."""
-    if not true or "ego_translation" not in true[0]:
+def _ego(
+    boxes: Sequence[Box], state: Float[ndarray, "n 6"], names: Sequence[str]
+) -> Float[ndarray, "3"] | None:
+    """Return the ego vehicle's place if the first box tells it. The devkit writes zeros if it is unknown."""
+    if not boxes or "ego_translation" not in boxes[0]:
         return None
-    return true_state[0, :3] - read_numbers(true[0], "ego_translation", 3, f"{where}, box 0")
+    offset = read_numbers(boxes[0], "ego_translation", 3, names[0])
+    return state[0, :3] - offset if offset.any() else None

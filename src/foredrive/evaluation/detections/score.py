@@ -9,22 +9,37 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
-from foredrive.metrics.detection import COCO_OVERLAPS, NUSCENES_DISTANCES_M, match_greedily, overlaps
+from foredrive.metrics.detection import (
+    COCO_OVERLAPS,
+    NUSCENES_DISTANCES_M,
+    descending,
+    match_greedily,
+    overlaps,
+)
 from foredrive.metrics.gospa import Gospa, gospa, wasserstein_distance
 from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
 from foredrive.metrics.proper_scores import object_brier
 from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
 
 PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
-LOW_CONFIDENCE = 0.1
-"""Detections of no more confidence become the Poisson background (Paper A)."""
-UNEXPLAINED_PER_FRAME = 1.0
-"""Further expected objects, evenly over classes and the frame's region: no object is impossible."""
 NEAR_M, NEAR_OVERLAP = (1.0, 2.0), (0.5, 0.75)
 """Detections near an object, for object-level calibration."""
 GOSPA_CUTOFF_M, GOSPA_CUTOFF_PX = 2.0, 50.0
 GOSPA_CONFIDENCE = 0.5
 """GOSPA has no probabilities: detections below this one are left out of it."""
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """Options of the likelihood of a file of detections."""
+
+    background_rate: float = 1.0
+    """Expected number of further objects a frame, uniform over the truth's classes and the frame's region.
+    With 0, as in Paper A, the NLL is infinite where nothing explains an object."""
+    low_confidence: float = 0.1
+    """Detections of no more confidence become the Poisson background (Paper A)."""
+    k: int = 25
+    """Number of best associations to sum if there are too many to sum all."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +71,18 @@ class DetectionScores:
     hit: Bool[ndarray, "T M"]
     """Whether it hits an object at each threshold of average precision, by greedy matching."""
     overlap: Float[ndarray, "M"]
-    """Overlap with the object that it hits, else 0; NaN for is_3d boxes."""
+    """Overlap with the object that it hits, else 0; NaN for 3-D boxes."""
+
+
+@dataclass(frozen=True)
+class PrecisionScores:
+    """Detections and objects that average precision counts."""
+
+    label: Int[ndarray, "m"]
+    score: Float[ndarray, "m"]
+    hit: Bool[ndarray, "T m"]
+    """Whether the detection hits an object at each threshold, by greedy matching among the counted ones."""
+    true_label: Int[ndarray, "n"]
 
 
 @dataclass(frozen=True)
@@ -73,58 +99,68 @@ class FrameScore:
     gospa: Gospa
     pgospa: Gospa
     detections: DetectionScores
+    precision: PrecisionScores
     objects: ObjectScores
     pdq: PdqCounts | None
-    """Of image boxes."""
+    """None for 3-D boxes."""
 
 
 def score_frames(
-    detection_set: DetectionSet, *, k: int = 25, on_frame: Callable[[int], None] | None = None
+    detection_set: DetectionSet,
+    config: ScoreConfig = ScoreConfig(),
+    *,
+    on_frame: Callable[[int], None] | None = None,
 ) -> list[FrameScore]:
     """Score every frame. `on_frame` is called with the number of frames that are done."""
     scores = []
     with torch.no_grad():
         for done, frame in enumerate(detection_set.frames, 1):
-            scores.append(_score_frame(frame, detection_set, k))
+            scores.append(_score_frame(frame, detection_set, config))
             if on_frame is not None:
                 on_frame(done)
     return scores
 
 
-def predicted_set(frame: DetectionFrame, classes: int, true_classes: int) -> PoissonMultiBernoulli:
+def predicted_set(
+    frame: DetectionFrame, classes: int, true_classes: int, config: ScoreConfig
+) -> PoissonMultiBernoulli:
     """Return a frame's detections as a PMB, with a background of unsure ones and a uniform process.
 
-    The uniform process is over the first `true_classes` alone: other classes that a detector names do not
-    change it.
+    The uniform process has the first `true_classes` alone. Classes that only a detector names do not change
+    it.
     """
+    if config.background_rate == 0:
+        return PoissonMultiBernoulli.from_detections(frame.detected, config.low_confidence)
     rate = torch.zeros(classes, dtype=torch.float64)
-    rate[:true_classes] = UNEXPLAINED_PER_FRAME / true_classes
+    rate[:true_classes] = config.background_rate / true_classes
     uniform = UniformPoisson(
         rate,
         torch.as_tensor(frame.lower),
         torch.as_tensor(frame.upper),
         frame.objects.yaw is not None,
     )
-    return PoissonMultiBernoulli.from_detections(frame.detected, LOW_CONFIDENCE, uniform)
+    return PoissonMultiBernoulli.from_detections(frame.detected, config.low_confidence, uniform)
 
 
-def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, k: int) -> FrameScore:
-    pmb = predicted_set(frame, len(detection_set.classes), detection_set.true_classes)
-    result = set_nll(pmb, frame.objects, k=k)
-    sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(LOW_CONFIDENCE))
-    closeness = _closeness(frame, detection_set.is_3d)
-    detections = _detections(frame, result, sure, closeness, detection_set.is_3d)
-    brier = _object_brier(frame, sure, closeness, detection_set.is_3d)
+def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: ScoreConfig) -> FrameScore:
+    is_3d = detection_set.is_3d
+    pmb = predicted_set(frame, len(detection_set.classes), detection_set.true_classes, config)
+    result = set_nll(pmb, frame.objects, k=config.k)
+    sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(config.low_confidence))
+    closeness = _closeness(frame, is_3d)
+    detections = _detections(frame, result, sure, closeness, is_3d)
+    brier = _object_brier(frame, sure, closeness, is_3d)
     return FrameScore(
         frame.name,
         frame.sequence,
         float(result.nll),
         float(result.nll) - result.lower if result.nll.isfinite() else 0.0,
         {part: float(getattr(result, part)) for part in PARTS},
-        *_gospas(frame, detections, detection_set.is_3d),
+        *_gospas(frame, detections, is_3d),
         detections,
+        _precision(frame, detections, closeness, is_3d),
         _objects(frame, result, sure, brier),
-        None if detection_set.is_3d else _pdq(frame, detections),
+        None if is_3d else _pdq(frame, detections),
     )
 
 
@@ -151,7 +187,7 @@ def _objects(
         missed = np.where(found.background > 0, -found.background * log_background, 0.0)
     return ObjectScores(
         frame.objects.label.numpy(),
-        np.bincount(found.object, box, count).astype(float),  # of nothing it would be whole numbers
+        np.bincount(found.object, box, count).astype(float),  # bincount of no pairs returns integers
         np.bincount(found.object, label, count).astype(float),
         missed,
         found.background,
@@ -182,19 +218,36 @@ def _detections(
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
     has_object[sure] = 1.0 - result.associations.absent
-    thresholds = [-distance for distance in NUSCENES_DISTANCES_M] if is_3d else COCO_OVERLAPS
-    hit, overlap = np.zeros((len(thresholds), len(label)), bool), np.full(len(label), np.nan)
-    if not is_3d:
-        overlap[:] = 0.0
-    true = objects.label.numpy()
+    true, overlap = objects.label.numpy(), np.full(len(label), np.nan if is_3d else 0.0)
     near = np.where(label[:, None] == true, closeness, -np.inf)
-    for t, threshold in enumerate(thresholds):
-        hit[t] = match_greedily(score, near, threshold) >= 0
     if not is_3d:
-        taken = match_greedily(score, near, np.nextafter(0.0, 1.0))
+        taken = match_greedily(descending(score), near, np.nextafter(0.0, 1.0))
         which = np.flatnonzero(taken >= 0)
         overlap[which] = near[which, taken[which]]
-    return DetectionScores(label, score, detected.log_existence.exp().numpy(), has_object, hit, overlap)
+    existence = detected.log_existence.exp().numpy()
+    return DetectionScores(label, score, existence, has_object, _hits(score, near, is_3d), overlap)
+
+
+def _precision(
+    frame: DetectionFrame, detections: DetectionScores, closeness: Float[ndarray, "M N"], is_3d: bool
+) -> PrecisionScores:
+    """Match the detections and objects that average precision counts, by the file's labels and scores."""
+    label, score, true = detections.label, detections.score, frame.objects.label.numpy()
+    counts = frame.object_counts
+    if frame.stated is not None:
+        which = np.flatnonzero(frame.stated.counts)
+        label, score, closeness = frame.stated.label[which], frame.stated.score[which], closeness[which]
+    if counts is not None:
+        true, closeness = true[counts], closeness[:, counts]
+    near = np.where(label[:, None] == true, closeness, -np.inf)
+    return PrecisionScores(label, score, _hits(score, near, is_3d), true)
+
+
+def _hits(score: Float[ndarray, "m"], near: Float[ndarray, "m n"], is_3d: bool) -> Bool[ndarray, "T m"]:
+    """Return whether each detection hits an object, at each distance (nuScenes) or overlap (COCO)."""
+    order = descending(score, ties_reversed=is_3d)
+    thresholds = [np.nextafter(-d, 0.0) for d in NUSCENES_DISTANCES_M] if is_3d else COCO_OVERLAPS
+    return np.array([match_greedily(order, near, threshold) >= 0 for threshold in thresholds])
 
 
 def _closeness(frame: DetectionFrame, is_3d: bool) -> Float[ndarray, "M N"]:

@@ -61,7 +61,7 @@ def compare_scores(
     """Return the mean of ours minus theirs over frames where both are finite, and the number of the others.
 
     Raises:
-        InputError: if the frames are not the same, or none can be compared.
+        InputError: the frames are not the same, or none can be compared.
     """
     if [score.name for score in scores] != [other.name for other in others]:
         raise InputError("two files of detections can be compared on the same frames only")
@@ -126,8 +126,8 @@ def _precision(
     detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator
 ) -> Figures:
     """Return average precision by class and threshold, as the data sets define it."""
-    label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
-    hit, true = _joined(scores, "detections", "hit"), _joined(scores, "objects", "label")
+    label, score = _joined(scores, "precision", "label"), _joined(scores, "precision", "score")
+    hit, true = _joined(scores, "precision", "hit"), _joined(scores, "precision", "true_label")
     thresholds = NUSCENES_DISTANCES_M if detection_set.is_3d else COCO_OVERLAPS
     average = average_precision_nuscenes if detection_set.is_3d else average_precision_coco
     table = np.array(
@@ -167,8 +167,8 @@ def _diagrams(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> dict
     diagrams = {"d_ece": reliability(score, hit[at])}
     existence = _joined(scores, "detections", "existence")
     has_object = _joined(scores, "detections", "has_object")
-    sure = ~np.isnan(has_object)
-    diagrams["existence"] = reliability(existence[sure], has_object[sure])
+    bernoulli = ~np.isnan(has_object)
+    diagrams["existence"] = reliability(existence[bernoulli], has_object[bernoulli])
     return diagrams
 
 
@@ -231,29 +231,36 @@ def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.ra
 
 
 def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.random.Generator) -> Figures:
-    """Return the cost of objects by class, size, range and visibility, nats an object."""
+    """Return the cost of objects by class, size, range and visibility, nats an object.
+
+    Objects of frames with an infinite likelihood are left out.
+    """
+    pairs = [
+        (frame, score)
+        for frame, score in zip(detection_set.frames, scores, strict=True)
+        if np.isfinite(score.nll)
+    ]
+    if not pairs:
+        return {}
+    frames, scores = [frame for frame, _ in pairs], [score for _, score in pairs]
     label = _joined(scores, "objects", "label")
-    figures: Figures = _relevance(detection_set, scores)
-    size = np.concatenate([_size(frame.objects, detection_set.is_3d) for frame in detection_set.frames])
+    figures: Figures = _relevance(frames, scores)
+    size = np.concatenate([_size(frame.objects, detection_set.is_3d) for frame in frames])
     steps, unit = (LENGTHS_M, "m") if detection_set.is_3d else (SIDES_PX, "px")
     for low, high in pairwise(steps):
         inside = np.flatnonzero((size >= low) & (size < high))
         figures |= _slice(f"by_size.from_{low:g}_{unit}", scores, inside)
     for c, name in enumerate(detection_set.classes):
         figures |= _slice(f"by_class.{name}", scores, np.flatnonzero(label == c))
-    if any(frame.range_m is not None for frame in detection_set.frames):
-        unknown = [np.full(len(frame.objects.label), np.nan) for frame in detection_set.frames]
+    if any(frame.range_m is not None for frame in frames):
         range_m = np.concatenate(
-            [
-                nan if f.range_m is None else f.range_m
-                for f, nan in zip(detection_set.frames, unknown, strict=True)
-            ]
+            [np.full(len(f.objects.label), np.nan) if f.range_m is None else f.range_m for f in frames]
         )
         for low, high in pairwise(RANGES_M):
             inside = np.flatnonzero((range_m >= low) & (range_m < high))
             figures |= _slice(f"by_range.from_{low:g}_m", scores, inside)
-    seen = [frame.visibility for frame in detection_set.frames if frame.visibility is not None]
-    if len(seen) == len(scores) and not np.isnan(np.concatenate(seen)).any():
+    seen = [frame.visibility for frame in frames if frame.visibility is not None]
+    if len(seen) == len(frames) and not np.isnan(np.concatenate(seen)).any():
         visibility = np.concatenate(seen)
         edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else visibility
         for low, high in pairwise([*edges.tolist(), np.inf]):
@@ -262,16 +269,14 @@ def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.r
     return figures
 
 
-def _relevance(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> Figures:
+def _relevance(frames: Sequence[DetectionFrame], scores: Sequence[FrameScore]) -> Figures:
     """Return the mean cost of an object, plain and weighted where the truth has weights."""
     cost = sum(_joined(scores, "objects", part) for part in ("localisation", "classification", "missed"))
     if not np.size(cost):
         return {}
     figures: Figures = {"object_cost": float(np.mean(cost))}
-    weights = [
-        np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in detection_set.frames
-    ]
-    if any(frame.relevance is not None for frame in detection_set.frames):
+    weights = [np.ones(len(f.objects.label)) if f.relevance is None else f.relevance for f in frames]
+    if any(frame.relevance is not None for frame in frames):
         weight = np.concatenate(weights)
         weighted = float((weight * cost).sum() / weight.sum()) if weight.any() else None
         figures["object_cost.by_relevance"] = weighted
@@ -279,7 +284,7 @@ def _relevance(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> Fig
 
 
 def _detection_range_m(frame: DetectionFrame) -> Float[ndarray, "M"]:
-    """Return distances over ground; NaN where the ego vehicle's place is unknown."""
+    """Return the distance of each detection over ground. It is NaN if the ego vehicle's place is unknown."""
     if frame.range_m is None:
         return np.full(len(frame.detected.log_existence), np.nan)
     return frame.detected.boxes.mean[:, :2].norm(dim=-1).numpy()
@@ -324,4 +329,4 @@ FIGURE_FUNCTIONS: tuple[Callable[[DetectionSet, Sequence[FrameScore], np.random.
     _pairs,
     _slices,
 )
-"""All figures, in the order of a summary; the generator is drawn from in this order, too."""
+"""Functions of all figures, in the order of a summary. They draw from the generator in this order."""

@@ -1,14 +1,14 @@
 """Score a file of detections into a folder of results, alone or against another file."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.progress import Progress
 
 from foredrive.evaluation.detections.files import read_detections, write_frame_scores
 from foredrive.evaluation.detections.frames import DetectionSet
-from foredrive.evaluation.detections.score import FrameScore, score_frames
+from foredrive.evaluation.detections.score import FrameScore, ScoreConfig, score_frames
 from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
@@ -31,46 +31,46 @@ def score_detections(
     truth: Path,
     out: Path,
     *,
+    config: ScoreConfig,
     against: Path | None = None,
     family: Family = "gaussian",
-    k: int = 25,
 ) -> tuple[ScoredDetections, Figures]:
     """Score detections; write `out/summary.json` and `out/frames.jsonl`.
 
     Args:
         results, truth: files or folders of one format, see `read_detections`.
+        config: options of the likelihood.
         against: other results on the same frames; their figures and the difference are in the summary too.
         family: family of the box densities.
-        k: number of best associations to sum if there are too many to sum all.
 
     Returns:
-        the scores, and the summary as it was written.
+        The scores, and the written summary.
 
     Raises:
         InputError: a file cannot be read, or the two results are not on the same frames.
     """
     started = time.perf_counter()
-    scored = _score(results, truth, family, k)
+    scored = _score(results, truth, family, config)
     figures = dict(scored.summary.figures)
     if against is not None:
-        figures |= _compare(scored, _score(against, truth, family, k), against)
-    figures |= {"family": family, "k": k, "wall_s": time.perf_counter() - started}
+        figures |= _compare(scored, _score(against, truth, family, config), against)
+    figures |= {"family": family, **asdict(config), "wall_s": time.perf_counter() - started}
     figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
     write_summary(out / SUMMARY, figures)
     write_frame_scores(out / FRAMES, scored.frames)
     return scored, figures
 
 
-def _score(results: Path, truth: Path, family: Family, k: int) -> ScoredDetections:
+def _score(results: Path, truth: Path, family: Family, config: ScoreConfig) -> ScoredDetections:
     detections = read_detections(results, truth, family)
     with Progress(transient=True) as progress:
         task = progress.add_task(results.name, total=len(detections.frames))
-        frames = score_frames(detections, k=k, on_frame=lambda done: progress.update(task, completed=done))
+        frames = score_frames(detections, config, on_frame=lambda done: progress.update(task, completed=done))
     return ScoredDetections(detections, frames, summarise_scores(detections, frames))
 
 
 def _compare(scored: ScoredDetections, other: ScoredDetections, against: Path) -> Figures:
-    """Return the other file's figures, and the difference to them."""
+    """Return the figures of the other file, and the difference from it."""
     difference, uncompared = compare_scores(scored.frames, other.frames)
     return {f"against.{key}": value for key, value in other.summary.figures.items()} | {
         "against": str(against),
