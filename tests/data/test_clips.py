@@ -13,10 +13,11 @@ from py123d.geometry import PoseSE3
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
+from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.scene import Command, Example, VoxelSpec
+from foredrive.scene import Command, Example, MapPatch, VoxelSpec
 
 SPEC = VoxelSpec((-10.0, -10.0, -0.75), 1.0, (3, 20, 20))
 
@@ -234,6 +235,14 @@ def test_a_batch_pads_what_differs(tmp_path: Path) -> None:
     assert batch.flow.values.shape == (3, 2, 3, *SPEC.shape_zyx)
     assert batch.clip.now == 1
     assert batch.clip.rig.names == ("ahead", "left")
+
+
+def test_padding_is_no_channel_and_no_kind_of_line() -> None:
+    beams = stack_records([world.sweep(0.0)[:3], world.sweep(0.0)[:5]])
+    assert beams.beam[:, 3:].tolist() == [[-1, -1], [0, 0]]
+    assert beams.valid.tolist() == [[True] * 3 + [False] * 2, [True] * 5]
+    lines = [MapPatch(torch.zeros(n, 2, 3), torch.ones(n, 2) > 0, torch.zeros(n).long()) for n in (1, 2)]
+    assert stack_records(lines).kind.tolist() == [[0, -1], [0, 0]]
 
 
 def test_items_that_do_not_go_together_are_refused(flat_root: Path) -> None:

@@ -11,6 +11,7 @@ import torch
 from foredrive.evaluation.baselines import ConstantVelocity, StandStill
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.metrics import METRICS
+from foredrive.evaluation.metrics.images import ImageMetric
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.evaluation.run import evaluate
 from foredrive.scene import Clip, Example
@@ -118,6 +119,17 @@ def test_a_predictor_is_asked_for_what_the_metrics_need(make_example: MakeExampl
     assert predictor.asked == {frozenset({"plan", "images"})}
     assert "heading.error_rad" in summary
     assert "views.count" not in summary
+
+
+def test_an_image_that_is_missing_is_not_averaged_over(make_example: MakeExample) -> None:
+    truth = make_example(0)
+    now = slice(truth.clip.now, truth.clip.now + 1)
+    rendered = truth.clip.images[:, now, :, :, 1::2, 1::2] / 255 + 0.1
+    rendered[:, :, 1] = 0.0
+    truth.clip.image_valid[:, now, 1] = False
+    metric = ImageMetric(EvaluationContext(0.5))
+    metric.update(Prediction(images=rendered, image_stride=2), truth)
+    assert metric.result()["psnr_db"] == pytest.approx(20.0, abs=1e-3)
 
 
 def test_metrics_know_all_parts_of_a_prediction() -> None:

@@ -26,3 +26,10 @@ def test_points_in_boxes() -> None:
         [False, False],
         [False, True],
     ]
+
+
+def test_a_box_that_is_askew_holds_points_along_its_own_length() -> None:
+    along = torch.tensor([math.cos(0.5), math.sin(0.5), 0.0])
+    points = torch.stack([1.9 * along, 1.9 * along * torch.tensor([1.0, -1.0, 1.0])])
+    inside = points_in_boxes(points, torch.zeros(1, 3), torch.tensor([[4.0, 1.0, 1.0]]), torch.tensor([0.5]))
+    assert inside.tolist() == [[True], [False]]

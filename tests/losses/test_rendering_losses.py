@@ -68,3 +68,8 @@ def test_published_losses_count_the_worst_beams_as_zero_everywhere() -> None:
 def test_published_losses_of_a_sweep_without_returns_are_zero() -> None:
     nothing = published_lidar_losses(*torch.ones(5, 3), torch.zeros(3, dtype=torch.bool), 0.95)
     assert [float(value) for value in nothing.values()] == [0.0, 0.0, 0.0]
+
+
+def test_ranges_count_up_to_the_quantile_of_their_errors() -> None:
+    rendered, real = torch.tensor([11.0, 8.0, 13.0, 6.0, 20.0]), torch.full((5,), 10.0)
+    assert float(range_loss(rendered, real, torch.ones(5, dtype=torch.bool), 0.8)) == (1 + 2 + 3 + 4) / 4

@@ -21,6 +21,15 @@ def test_bootstrap_draws_whole_sequences() -> None:
     assert result.low < result.mean < result.high
 
 
+def test_a_long_sequence_weighs_as_many_frames_as_it_has() -> None:
+    """Thirty sequences of one frame of 0, and thirty of 99 frames of 1."""
+    names = [f"short{n}" for n in range(30)] + [f"long{n}" for n in range(30) for _ in range(99)]
+    values = np.concatenate([np.zeros(30), np.ones(30 * 99)])
+    result = bootstrap_mean(values, names, np.random.default_rng(0))
+    assert result.mean == pytest.approx(0.99)
+    assert 0.95 < result.low < result.mean < result.high
+
+
 def test_p_values_are_small_where_the_mean_is_far_from_0() -> None:
     rng = np.random.default_rng(5)
     names = [str(n) for n in range(40)]

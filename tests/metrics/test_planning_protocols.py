@@ -183,6 +183,8 @@ def test_without_annotations_there_is_no_collision_number(name: str) -> None:
     scores = score(name, straight(5.0), straight(5.0), obstacles(annotated_steps=4))
     assert bool(scores.counted)
     assert not bool(scores.collision_counted)
+    unseen = dataclasses.replace(obstacles(), annotated_now=torch.zeros(1, dtype=torch.bool))
+    assert not bool(score(name, straight(5.0), straight(5.0), unseen).collision_counted)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -216,6 +216,8 @@ def test_actions_are_those_that_led_from_pose_to_pose(clip: Clip) -> None:
     torch.testing.assert_close(done[0], expected, atol=2e-3, rtol=0)
     unknown = dataclasses.replace(clip, ego_speed_valid=torch.zeros_like(clip.ego_speed_valid))
     torch.testing.assert_close(actions_of(unknown)[0], expected, atol=2e-3, rtol=0)
+    faster = dataclasses.replace(clip, ego_speed_mps=torch.tensor([[3.0, 4.0, 5.0]] * 2))
+    assert actions_of(faster)[0, :, 0].tolist() == [3.0, 4.0, 0.0]  # the speed at its beginning
     still = dataclasses.replace(clip, T_world_ego=clip.T_world_ego[:, :1].expand(-1, PAST + 1, -1, -1))
     assert actions_of(still)[..., 1].abs().max() == 0
 

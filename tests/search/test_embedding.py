@@ -120,5 +120,7 @@ def test_sectors_without_cameras_share_every_return(log: LogPath) -> None:
     hits = found[0][found[0].returned]
     parts = [sector.sweep(hits) for sector in blind_sectors().values()]
     assert sum(len(part.valid) for part in parts) == len(hits.valid)
+    left = Sector(0.5 * math.pi).sweep(hits)
+    assert (left.points_ego[:, 0] > 0).all()
     behind = Sector(math.pi).sweep(hits)
     assert (behind.points_ego[:, 0] > 0).all()  # turned about, what lies behind lies ahead

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from foredrive.scene import LidarSweep
 from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
+from foredrive.sensors.lidar_estimation import estimate_lidar
 
 STILL = torch.zeros(6)
 HDL32E_FIRING_DEG = (
@@ -89,6 +91,27 @@ def test_a_footprint_fills_the_cone() -> None:
     mean = rays.dir_ego.reshape(-1, 16, 3).mean(1)
     assert ((mean - beams.dir_ego).norm(dim=-1) < 0.1 * lidar.divergence_rad).all()
     torch.testing.assert_close(rays.dt_s, beams.dt_s.repeat_interleave(16))
+
+
+def test_a_lidar_is_estimated_from_the_beams_that_it_fires() -> None:
+    T_ego_lidar = torch.eye(4)
+    T_ego_lidar[:3, 3] = torch.tensor([1.0, 0.2, 1.8])
+    lidar = SpinningLidar((-0.2, 0.0, 0.1), 90, 20.0, 1.0, 60.0, 0.0, T_ego_lidar)
+    twist = torch.tensor([10.0, 0.0, 0.0, 0.0, 0.0, 0.3])
+    beams, count = lidar.beams(twist), 3 * 90
+    yes = torch.ones(count, dtype=torch.bool)
+    sweep = LidarSweep(
+        beams.origin_ego, beams.dir_ego, torch.full((count,), 7.0), yes, torch.zeros(count), beams.dt_s,
+        lidar.channel, yes,
+    )  # fmt: skip
+    found = estimate_lidar(sweep, twist, period_s=0.1, reach_m=60.0)
+    assert found is not None
+    assert (found.azimuth_steps, found.max_range_m, found.min_range_m) == (90, 60.0, 7.0)
+    assert found.rate_hz == pytest.approx(20.0, rel=1e-4)
+    assert found.elevation_rad == pytest.approx(lidar.elevation_rad, abs=1e-5)
+    torch.testing.assert_close(found.T_ego_lidar, T_ego_lidar, atol=1e-4, rtol=0)
+    unknown = dataclasses.replace(sweep, beam=torch.full((count,), -1))
+    assert estimate_lidar(unknown, twist, period_s=0.1, reach_m=60.0) is None
 
 
 def test_tables_that_do_not_fit_are_refused() -> None:

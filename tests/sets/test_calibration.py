@@ -36,6 +36,12 @@ def test_isotonic_existence_by_hand() -> None:
     np.testing.assert_allclose(fitted(np.array([0.1, 0.2, 0.3, 0.4, 0.9])), [0.125, 0.5, 0.5, 0.5, 0.875])
 
 
+def test_a_probability_weighs_as_often_as_it_was_said() -> None:
+    """Three of 0.2 happened, one of 0.4 did not: pooled to three quarters."""
+    fitted = fit_existence(np.array([0.2, 0.2, 0.2, 0.4]), np.array([True, True, True, False]))
+    np.testing.assert_allclose(fitted(np.array([0.2, 0.4])), 0.75)
+
+
 def test_existence_that_was_too_sure_is_mended() -> None:
     rng = np.random.default_rng(0)
     true = rng.uniform(0.02, 0.98, 20_000)
