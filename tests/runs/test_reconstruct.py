@@ -12,12 +12,14 @@ import pytest
 import synthetic_log as world
 import torch
 from plyfile import PlyData
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
+from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.models.inception import InceptionFeatures
 from foredrive.recipes.config import save_recipe
 from foredrive.recipes.gaussians import (
     RebuildRecipe,
@@ -192,6 +194,28 @@ def test_named_recipes() -> None:
         find_rebuild_recipe("gaussians_huge")
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
+
+
+@pytest.mark.slow
+def test_metrics_with_networks_are_added_to_a_finished_run(run: Path, log: LogPath, tmp_path: Path) -> None:
+    """FID of a set of images and itself is 0; random weights suffice for that."""
+    folder, networks = tmp_path / "run", tmp_path / "networks"
+    shutil.copytree(run, folder)
+    networks.mkdir()
+    torch.manual_seed(0)
+    save_file(InceptionFeatures().state_dict(), networks / "inception.safetensors")
+    metrics = PerceptualMetrics(PerceptualWeights(inception=networks / "inception.safetensors"))
+    before = json.loads((folder / "summary.json").read_text())
+    found = reconstruct(recipe(), log, folder, None, metrics)
+    assert float(found.summary["fid"] or 0) > 0
+    assert "lpips" not in found.summary
+    assert {name: found.summary[name] for name in before} == before
+    cameras = found.held_out.cameras
+    shown = []
+    for camera in cameras:
+        rgb = found.scene(found.scene.graph, camera).rgb.detach().clamp(0, 1)
+        shown.append(dataclasses.replace(camera, image=(255 * rgb).round().byte()))
+    assert metrics.evaluate(found.scene, shown)["fid"] == pytest.approx(0.0, abs=1e-4)
 
 
 def test_the_published_recipe_has_the_choices_of_the_reference() -> None:

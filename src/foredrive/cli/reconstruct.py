@@ -19,6 +19,8 @@ def reconstruct(
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
     image_size: ImageSize | None = None,
     cache: OptionalPath = None,
+    lpips_weights: OptionalPath = None,
+    fid_weights: OptionalPath = None,
     set: Settings = (),
 ) -> None:
     """Reconstruct a log as a scene that renders cameras and lidars, or continue an interrupted run.
@@ -38,6 +40,8 @@ def reconstruct(
         image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or
             1080 1920.
         cache: Folder for shrunk images; by default "cache" in the run's folder.
+        lpips_weights: Evaluate LPIPS too, with this file of torchvision's AlexNet (.pth or .safetensors).
+        fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
         set: Entries of the recipe to replace, such as schedule.steps=2000; `foredrive recipes RECIPE` prints
             all entries.
     """
@@ -46,6 +50,7 @@ def reconstruct(
     found = find_one_log(log)
 
     with importing():
+        from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
         from foredrive.recipes.gaussians import find_rebuild_recipe
         from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
 
@@ -54,7 +59,10 @@ def reconstruct(
         chosen = dataclasses.replace(chosen, cameras=cameras)
     if image_size is not None:
         chosen = dataclasses.replace(chosen, image_hw=image_size)
-    run = rebuild_log(chosen, found, out, cache)
+    perceptual = None
+    if lpips_weights is not None or fid_weights is not None:
+        perceptual = PerceptualMetrics(PerceptualWeights(lpips_weights, fid_weights))
+    run = rebuild_log(chosen, found, out, cache, perceptual)
     if run.held_out.cameras:
         from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
@@ -64,7 +72,7 @@ def reconstruct(
         print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
     print(f"rebuilt {found.name} by {method}: {out}")
     for name in (
-        *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim"),
+        *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
         *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
     ):
         if run.summary.get(name) is not None:

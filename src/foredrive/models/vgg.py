@@ -1,16 +1,13 @@
 """VGG-16 features for the perceptual loss."""
 
 from pathlib import Path
-from pickle import UnpicklingError
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from foredrive.errors import InputError
 from foredrive.models.backbone import normalise_rgb
+from foredrive.models.published_weights import load_published, load_state
 
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512))
 TORCHVISION_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
@@ -38,14 +35,11 @@ class Vgg16Features(nn.Module):
             self.taps.append(len(layers) - 1)
             layers.append(nn.MaxPool2d(2))
         self.features = nn.Sequential(*layers[:-1])
-        state = _read_weights(weights)
-        wanted = {key: state[key] for key in self.state_dict() if key in state}
-        missing = set(self.state_dict()) - set(wanted)
-        if missing:
-            raise InputError(f"{weights}: not VGG-16 weights, lacks {sorted(missing)[0]}")
-        self.load_state_dict(wanted)
-        self.requires_grad_(False)
-        self.eval()
+        if str(weights) == "download":
+            state = dict(torch.hub.load_state_dict_from_url(TORCHVISION_URL, weights_only=True))
+            load_state(self, state, TORCHVISION_URL, "VGG-16")
+        else:
+            load_published(self, Path(weights), "VGG-16")
 
     def train(self, mode: bool = True) -> "Vgg16Features":
         """Stay in evaluation mode, because the features are fixed."""
@@ -62,15 +56,3 @@ class Vgg16Features(nn.Module):
             if index in self.taps:
                 taps.append(x)
         return tuple(taps)
-
-
-def _read_weights(weights: str | Path) -> dict[str, Tensor]:
-    if str(weights) == "download":
-        return dict(torch.hub.load_state_dict_from_url(TORCHVISION_URL, weights_only=True))
-    path = Path(weights)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file of VGG-16 weights")
-    try:
-        return load_file(path) if path.suffix == ".safetensors" else torch.load(path, weights_only=True)
-    except (OSError, RuntimeError, SafetensorError, UnpicklingError) as error:
-        raise InputError(f"{path}: not VGG-16 weights: {str(error).splitlines()[0]}") from error

@@ -15,6 +15,7 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.evaluation.perceptual import PerceptualMetrics
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.evaluation.summary import read_summary, write_summary
@@ -78,7 +79,11 @@ class Reconstruction:
 
 
 def reconstruct(
-    recipe: RebuildRecipe, path: LogPath, folder: Path, cache_dir: Path | None = None
+    recipe: RebuildRecipe,
+    path: LogPath,
+    folder: Path,
+    cache_dir: Path | None = None,
+    perceptual: PerceptualMetrics | None = None,
 ) -> Reconstruction:
     """Reconstruct a log, and evaluate the scene on held-out frames.
 
@@ -89,6 +94,7 @@ def reconstruct(
         path: path of the log.
         folder: folder of the run.
         cache_dir: folder for shrunk images; by default in `folder`.
+        perceptual: further metrics of held-out images; they are added to a finished run too.
 
     Raises:
         InputError: `folder` holds a run of another recipe or log, or another process writes to it; the log
@@ -99,10 +105,16 @@ def reconstruct(
     check_memory(recipe, path)
     data = read_reconstruction_data(recipe, path, (cache_dir or folder / "cache").absolute())
     with claim.claimed():
-        return _rebuild(recipe, path, folder, data)
+        return _rebuild(recipe, path, folder, data, perceptual)
 
 
-def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, data: ReconstructionData) -> Reconstruction:
+def _rebuild(
+    recipe: RebuildRecipe,
+    path: LogPath,
+    folder: Path,
+    data: ReconstructionData,
+    perceptual: PerceptualMetrics | None,
+) -> Reconstruction:
     """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(data.vehicle, folder / VEHICLE)
     scene = initial_model(recipe, data)
@@ -120,6 +132,9 @@ def _rebuild(recipe: RebuildRecipe, path: LogPath, folder: Path, data: Reconstru
     load_weights(scene, weights)
     if not (folder / SUMMARY).is_file():
         write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, data))
+    if perceptual is not None:
+        more = perceptual.evaluate(scene, data.held_out.cameras)
+        write_summary(folder / SUMMARY, read_summary(folder / SUMMARY) | more)
     if not (folder / GAUSSIANS).is_file():
         write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
     return Reconstruction(folder, recipe, read_summary(folder / SUMMARY), scene, data.train, data.held_out)
