@@ -97,7 +97,7 @@ def _in_a_row(name: str, *layers: tuple[int, Kernel, int]) -> list[Step]:
 
 
 def _block_a(channels: int, pooled: int) -> _Block:
-    branches = [
+    branches: list[list[Step]] = [
         [(("branch1x1", 64, 1, 1),)],
         _in_a_row("branch5x5", (48, 1, 1), (64, 5, 1)),
         _in_a_row("branch3x3dbl", (64, 1, 1), (96, 3, 1), (96, 3, 1)),
@@ -106,7 +106,7 @@ def _block_a(channels: int, pooled: int) -> _Block:
 
 
 def _block_b(channels: int) -> _Block:
-    branches = [
+    branches: list[list[Step]] = [
         [(("branch3x3", 384, 3, 2),)],
         _in_a_row("branch3x3dbl", (64, 1, 1), (96, 3, 1), (96, 3, 2)),
     ]
@@ -115,7 +115,7 @@ def _block_b(channels: int) -> _Block:
 
 def _block_c(channels: int, width: int) -> _Block:
     wide, tall = (1, 7), (7, 1)
-    branches = [
+    branches: list[list[Step]] = [
         [(("branch1x1", 192, 1, 1),)],
         _in_a_row("branch7x7", (width, 1, 1), (width, wide, 1), (192, tall, 1)),
         _in_a_row(
@@ -131,7 +131,7 @@ def _block_c(channels: int, width: int) -> _Block:
 
 
 def _block_d(channels: int) -> _Block:
-    branches = [
+    branches: list[list[Step]] = [
         _in_a_row("branch3x3", (192, 1, 1), (320, 3, 2)),
         _in_a_row("branch7x7x3", (192, 1, 1), (192, (1, 7), 1), (192, (7, 1), 1), (192, 3, 2)),
     ]
@@ -142,7 +142,7 @@ def _block_e(channels: int, pool: str) -> _Block:
     def forked(name: str) -> Step:
         return ((f"{name}a", 384, (1, 3), 1), (f"{name}b", 384, (3, 1), 1))
 
-    branches = [
+    branches: list[list[Step]] = [
         [(("branch1x1", 320, 1, 1),)],
         [*_in_a_row("branch3x3", (384, 1, 1)), forked("branch3x3_2")],
         [*_in_a_row("branch3x3dbl", (448, 1, 1), (384, 3, 1)), forked("branch3x3dbl_3")],
