@@ -49,11 +49,11 @@ class PerceptualMetrics:
         for view in views:
             assert view.image is not None
             real = view.image[None].cpu()
-            rgb = scene(scene.graph, view.to(scene.actor.device)).rgb.clamp(0, 1)[None].cpu()
+            rendered = scene(scene.graph, view.to(scene.actor.device))
             if self.lpips is not None:
-                distances.append(float(self.lpips(rgb, real.float() / 255)))
+                distances.append(float(self.lpips(rendered.rgb.clamp(0, 1)[None].cpu(), real.float() / 255)))
             if fid is not None:
                 fid.update(real, real=True)
-                fid.update((255 * rgb).round().to(torch.uint8), real=False)
+                fid.update(rendered.rgb_8bit[None], real=False)
         found = {"lpips": fmean(distances)} if distances else {}
         return found if fid is None else found | {"fid": float(fid.compute())}

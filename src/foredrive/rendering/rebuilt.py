@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
@@ -50,6 +50,11 @@ class RenderedImage:
     range_m: Float[Tensor, "H W"]
     """Expected depth along the camera's axis of the stopped light, m."""
     alpha: Float[Tensor, "H W"]
+
+    @property
+    def rgb_8bit(self) -> UInt8[Tensor, "3 H W"]:
+        """Return RGB from 0 to 255, on the CPU."""
+        return (255 * self.rgb.clamp(0, 1)).round().to(torch.uint8).cpu()
 
 
 @dataclass(frozen=True)

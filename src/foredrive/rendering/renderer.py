@@ -12,7 +12,8 @@ from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view,
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.vehicle import EgoState, LoggedVehicle
-from foredrive.scene import CameraRig, Rendered
+from foredrive.scene import CameraRig, LidarSweep, Rendered
+from foredrive.sensors import SpinningLidar
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +40,13 @@ class RebuiltRenderer:
         device, rig = self.scene.actor.device, self.rig
         images = torch.zeros(len(rig.names), 3, *rig.size_hw, dtype=torch.uint8)
         for camera in range(len(rig.names)):
-            rgb = self.scene(self.graph, novel_camera_view(rig, camera, ego).to(device)).rgb
-            images[camera] = (255 * rgb.clamp(0, 1)).round().to(torch.uint8).cpu()
-        if self.vehicle.lidar is None:
-            return Rendered(images, None)
-        view = novel_sweep_view(self.vehicle.lidar, ego)
-        picture = self.scene.sweep(self.graph, self.scene.prepare_sweep(view), t_s)
-        return Rendered(images, rendered_sweep(view, picture))
+            images[camera] = self.scene(self.graph, novel_camera_view(rig, camera, ego).to(device)).rgb_8bit
+        lidar = self.vehicle.lidar
+        return Rendered(images, None if lidar is None else render_sweep(self.scene, self.graph, lidar, ego))
+
+
+@torch.no_grad()
+def render_sweep(scene: RebuiltScene, graph: SceneGraph, lidar: SpinningLidar, ego: EgoState) -> LidarSweep:
+    """Render the revolution of a lidar that ends at a pose and time of the vehicle."""
+    view = novel_sweep_view(lidar, ego)
+    return rendered_sweep(view, scene.sweep(graph, scene.prepare_sweep(view), ego.t_s))

@@ -110,8 +110,7 @@ def rendered_images(
             view = min((v for v in views if v.sensor == camera), key=lambda v: abs(v.t_s - at_s))
             if abs(view.t_s - at_s) > _SAME_S:
                 raise InputError(f"no view of {clip.rig.names[place]} at {at_s:.3f} s of the log")
-            rgb = scene(graph, view.to(scene.actor.device)).rgb.clamp(0, 1).cpu()
-            images[frame, place] = (255 * rgb).round().to(torch.uint8)
+            images[frame, place] = scene(graph, view.to(scene.actor.device)).rgb_8bit
     return dataclasses.replace(clip, images=images)
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, EditedScene, Insert, Remove, ShiftEgo
-from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
+from foredrive.rendering.novel_views import novel_camera_view
 from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.renderer import render_sweep
 from foredrive.rendering.tracks import ActorTracks, boxes_at
 from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import Boxes, LidarSweep
@@ -114,12 +115,10 @@ def render_frame(
     for place, camera in enumerate(plan.cameras):
         ego = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
         view = novel_camera_view(rig, camera, ego).to(scene.actor.device)
-        rgb = scene(edited.graph, view).rgb
-        images[place] = (255 * rgb.clamp(0, 1)).round().to(torch.uint8).cpu()
+        images[place] = scene(edited.graph, view).rgb_8bit
     ego, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
     if plan.lidar is not None:
-        beams = novel_sweep_view(plan.lidar, ego)
-        sweep = rendered_sweep(beams, scene.sweep(edited.graph, scene.prepare_sweep(beams), t_s))
+        sweep = render_sweep(scene, edited.graph, plan.lidar, ego)
     return RenderedFrame(t_s, images, sweep, boxes_at(edited.graph.tracks, ego.T_scene_ego, t_s))
 
 
