@@ -1,5 +1,6 @@
 """`foredrive search` from logs to lists of clips, and what it says where it cannot go on."""
 
+import json
 import os
 import shlex
 import shutil
@@ -43,6 +44,17 @@ def test_a_text_finds_pictures_and_clips(
     assert main(["search", "--untag", "few", *index]) == 0
     assert main(["search", "--tagged", "few", *index]) == 0
     assert "nothing found among 9 rows" in capsys.readouterr().out
+
+
+def test_lidar_and_images_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, index, out = write_log(tmp_path, frames=11), tmp_path / "index", tmp_path / "shares.json"
+    assert main(shlex.split(f"search index {log.folder} --index {index} --workers 1")) == 0
+    assert main(shlex.split(f"search evaluate --index {index} --moments 2 --out {out}")) == 0
+    shares = json.loads(out.read_text())
+    assert shares["frames.recall_at_5.lidar_to_image"] == {"value": 1.0, "low": None, "high": None}
+    assert 0 <= shares["views.recall_at_1.image_to_lidar"]["value"] <= 1
+    assert "frames: recall at 5" in capsys.readouterr().out
+    assert main(shlex.split(f"search evaluate --index {index} --moments -1")) == 2
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from foredrive.cli.render import render
 from foredrive.cli.score import score
 from foredrive.cli.search import search, search_page
 from foredrive.cli.search_caption import search_caption, search_train_captions
+from foredrive.cli.search_evaluate import search_evaluate
 from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.train import train
 from foredrive.cli.view import view
@@ -46,6 +47,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search train": search_train,
     "search caption": search_caption,
     "search train-captions": search_train_captions,
+    "search evaluate": search_evaluate,
     "reconstruct": reconstruct,
     "render": render,
     "imagine": imagine,

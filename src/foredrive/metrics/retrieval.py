@@ -1,10 +1,14 @@
-"""Precision of retrieval with neighbours counted once, and its interval."""
+"""Precision and recall of retrieval, and their intervals over sequences."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+ROWS_AT_ONCE = 1024
+_TIE = 1e-6
+"""Difference of cosines up to which two items are equally similar; it is above the error of a product."""
 
 
 class Ranking(NamedTuple):
@@ -33,6 +37,39 @@ def precision_at(
     could = ranking.could[drawn].sum(axis=1)
     found = [hits[:, min(rank, hits.shape[1]) - 1] / np.minimum(rank, could).clip(min=1) for rank in ranks]
     return np.where((could > 0)[:, None], np.stack(found, axis=1), np.nan)
+
+
+def match_rank(queries: Float[np.ndarray, "n D"], gallery: Float[np.ndarray, "n D"]) -> Int[np.ndarray, "n"]:
+    """Return for each query the rank, from 1, of its own item: item i of the gallery belongs to query i.
+
+    Both are unit vectors. Items that are as similar as the own one rank before it.
+    """
+    own = (queries * gallery).sum(axis=1)
+    found = [
+        (queries[start : start + ROWS_AT_ONCE] @ gallery.T >= own[start : start + ROWS_AT_ONCE, None] - _TIE)
+        for start in range(0, len(queries), ROWS_AT_ONCE)
+    ]
+    return np.concatenate([rows.sum(axis=1) for rows in found])
+
+
+def mean_of_groups(
+    values: Float[np.ndarray, "n"],
+    group: Int[np.ndarray, "n"],
+    sequence: Int[np.ndarray, "n"],
+    drawn: Int[np.ndarray, "B S"],
+) -> Float[np.ndarray, "B"]:
+    """Return the mean over groups of the mean of a group, of each draw of sequences.
+
+    A group without a value in a draw is left out of it.
+    """
+    shape = (drawn.max() + 1, group.max() + 1)
+    total, count = np.zeros(shape), np.zeros(shape)
+    np.add.at(total, (sequence, group), values)
+    np.add.at(count, (sequence, group), 1)
+    sums, counts = total[drawn].sum(axis=1), count[drawn].sum(axis=1)
+    there = counts > 0
+    means = np.where(there, sums / counts.clip(min=1), 0).sum(axis=1)
+    return np.where(there.any(axis=1), means / there.sum(axis=1).clip(min=1), np.nan)
 
 
 def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:

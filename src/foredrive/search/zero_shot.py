@@ -6,21 +6,24 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from foredrive.search.towers import Towers, embed_prompt, unit
+from foredrive.search.towers import PROMPTS, Towers, embed_prompt, unit
 
 
-def class_vectors(towers: Towers, classes: Mapping[str, Sequence[str]]) -> Float[Tensor, "C D"]:
+def class_vectors(
+    towers: Towers, classes: Mapping[str, Sequence[str]], templates: Sequence[str] = PROMPTS
+) -> Float[Tensor, "C D"]:
     """Return a unit vector per class: the mean direction of its texts, each in several wordings.
 
     Args:
         classes: texts by name, such as {"night": ("at night", "in the dark"), "day": ("by day",)}.
+        templates: wordings with one {} for the text.
 
     Raises:
         InputError: a text is empty.
     """
     return torch.stack(
         [
-            unit(torch.stack([embed_prompt(towers, text) for text in texts]).mean(0))
+            unit(torch.stack([embed_prompt(towers, text, templates) for text in texts]).mean(0))
             for texts in classes.values()
         ]
     )
