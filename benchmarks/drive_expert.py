@@ -32,7 +32,7 @@ def scores(seed: int, name: str) -> Mapping[str, float]:
     driven = drive_suite(suite, WORK / f"{name}_seed{seed}", workers=len(os.sched_getaffinity(0)))
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
-        raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
+        raise InputError(f"{len(driven.broken)} drives failed, {job.name}: {why}")
     summary = summarise(list(driven.drives.values()))
     kept = [key for key in summary if key in FIGURES or key.startswith(("infractions.", "endings."))]
     short = {"driving_score_1_0": "ds", "driving_score_2_1": "ds_2_1", "completion": "rc"}

@@ -37,7 +37,7 @@ def _driven(suite: DriveSuite, out: Path) -> SuiteResult:
     driven = drive_suite(suite, out, CORES)
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
-        raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
+        raise InputError(f"{len(driven.broken)} drives failed, {job.name}: {why}")
     return driven
 
 

@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 def test_without_a_name_benchmarks_are_listed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "script.py").write_text("")
     assert main(["bench", "--folder", str(folder)]) == 0
-    script = f"script: a script of its own; run it with python {folder / 'script.py'}\n"
+    script = f"script: a separate script; run it with python {folder / 'script.py'}\n"
     assert capsys.readouterr().out == script + "speed: How fast is it?\n    arms: plain\n"
     assert not (folder / "ran.txt").exists()
 

@@ -186,7 +186,7 @@ def test_logs_that_are_gone_are_named(log: LogPath, foredrive: Program, tmp_path
 def test_a_batch_of_nothing_is_refused(size: str, trained: Run, foredrive: Program, tmp_path: Path) -> None:
     code, err = foredrive("evaluate", trained.folder, "--out", tmp_path / "out", "--batch-size", size)
     assert code == 2
-    assert err == f"foredrive: a batch has at least one clip, got a batch size of {size}\n"
+    assert err == f"foredrive: the batch size must be at least 1, got {size}\n"
 
 
 def test_the_report_says_where_its_figures_come_from(

@@ -183,7 +183,7 @@ def test_a_folder_that_is_a_file_is_named(
     }
     code, err = foredrive(*arguments[verb], "--out", out)
     assert code == 2
-    assert err == f"foredrive: --out {out}: there is a file of that name; a folder is needed\n"
+    assert err == f"foredrive: --out {out}: this is a file; a folder is needed\n"
     assert out.read_text() == "something else"
 
 

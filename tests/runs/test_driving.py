@@ -186,10 +186,10 @@ def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: P
         drive_suite(changed(suite, seed=1), out, workers=1)
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
-    with pytest.raises(InputError, match="nobody knows"):
+    with pytest.raises(InputError, match="no readable suite"):
         drive_suite(suite, tmp_path, workers=1)
     (out / "drives" / "routea_rep0.json").write_text("{}")
-    with pytest.raises(InputError, match="not what is kept of a drive"):
+    with pytest.raises(InputError, match="not the record of a drive"):
         drive_suite(suite, out, workers=1)
 
 
@@ -223,7 +223,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("driver", ["nobody", "ego-mlp:nowhere"])
 def test_an_unknown_driver_is_named(driver: str) -> None:
-    with pytest.raises(InputError, match=f"{driver}: no such driver; there are expert"):
+    with pytest.raises(InputError, match=f"unknown agent '{driver}'; the agents are expert"):
         inputs_of(driver)
 
 

@@ -97,5 +97,5 @@ def test_the_verb_shows_a_table(
 
 def test_a_camera_that_was_not_rebuilt_is_named() -> None:
     assert camera_indices(("a", "b"), ("b", "a")) == [1, 0]
-    with pytest.raises(InputError, match="not rebuilt: c; there are: a, b"):
+    with pytest.raises(InputError, match="not reconstructed: c; available: a, b"):
         camera_indices(("a", "b"), ("a", "c"))

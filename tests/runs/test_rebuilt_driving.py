@@ -111,7 +111,7 @@ def test_the_verb_drives_against_a_threat(
     """From 3 s on the log is too short to meet anybody."""
     command = ["drive", "--agent", "stop", "--out", str(tmp_path / "suite"), "--in", str(run), "--no-sensors"]
     assert main([*command, "--start", "3", "--threat", "side"]) == 2
-    assert "the log ends at 6.6 s, too early to meet anybody at 7.0 s" in capsys.readouterr().err
+    assert "the log ends at 6.6 s, too early for an impact at 7.0 s" in capsys.readouterr().err
     assert main([*command, "--start", "0.7"]) == 0
     assert (tmp_path / "suite" / "report.html").is_file()
     assert main(["drive", "--agent", "stop", "--out", str(tmp_path / "other"), "--start", "1"]) == 2

@@ -107,7 +107,7 @@ def test_what_is_no_finished_run_is_told(run: Reconstruction, tmp_path: Path) ->
     with pytest.raises(InputError, match="not finished"):
         open_rebuilt(tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"")
-    with pytest.raises(InputError, match=r"no vehicle\.json\): rebuild the log anew"):
+    with pytest.raises(InputError, match=r"no vehicle\.json\); reconstruct the log again"):
         open_rebuilt(tmp_path)
     (tmp_path / "vehicle.json").write_text("{}")
     with pytest.raises(InputError, match="does not describe a vehicle"):

@@ -80,7 +80,7 @@ def test_the_share_counts_the_time_out_of_bounds() -> None:
 
 
 def test_a_drive_of_a_moment_has_no_comfort() -> None:
-    with pytest.raises(InputError, match="31 states or more, got 30"):
+    with pytest.raises(InputError, match="31 states, got 30"):
         comfort_of(driven(np.full(30, 1.0)))
 
 

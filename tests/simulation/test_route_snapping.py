@@ -50,7 +50,7 @@ def test_carla_s_left_handed_waypoints_are_mirrored(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         (XML, XML[:120], "no XML"),
-        ("<route ", "<path ", "no route in|no XML"),
+        ("<route ", "<path ", "no route in|not valid XML"),
         ('town="Town05"', "", "route 7 of .* has no town"),
         ('id="7" ', "", "route number 1 of .* has no id"),
         ('y="-2.5"', 'y="north"', "route 7 of .* without numbers"),
@@ -61,7 +61,7 @@ def test_carla_s_left_handed_waypoints_are_mirrored(tmp_path: Path) -> None:
             "",
             "route 7 of .* has 1 waypoints",
         ),
-        ("</routes>", XML[XML.index("<route ") :], "more than one route '7'"),
+        ("</routes>", XML[XML.index("<route ") :], "several routes with the id '7'"),
     ],
 )
 def test_mistakes_in_a_route_file_are_one_line_that_names_it(
@@ -246,7 +246,7 @@ def test_a_waypoint_on_a_lane_means_that_lane(graph: LaneGraph) -> None:
 
 def test_a_route_that_cannot_be_driven_is_named() -> None:
     here = np.zeros((1, 3))
-    with pytest.raises(InputError, match="route 4 in Town05: a route has two waypoints or more, got 1"):
+    with pytest.raises(InputError, match="route 4 in Town05: a route needs at least two waypoints, got 1"):
         snap_route(RouteWaypoints("4", "Town05", here))
     with pytest.raises(InputError, match="route 4 in Town99: unknown town"):
         snap_route(RouteWaypoints("4", "Town99", np.zeros((2, 3))))

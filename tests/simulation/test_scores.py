@@ -120,7 +120,7 @@ def test_missing_and_double_drives_are_named() -> None:
     other = dataclasses.replace(FLAWLESS, route="1", repetition=1)
     with pytest.raises(InputError, match=r"missing.*\('0', 1\).*\('1', 0\)"):
         score_suite([FLAWLESS, other])
-    with pytest.raises(InputError, match=r"twice: \[\('0', 0\)\]"):
+    with pytest.raises(InputError, match=r"duplicate drives, .*: \[\('0', 0\)\]"):
         score_suite([FLAWLESS, FLAWLESS])
     with pytest.raises(InputError, match="no drive"):
         score_suite([])

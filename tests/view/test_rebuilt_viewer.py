@@ -247,4 +247,4 @@ def test_an_unfinished_run_is_told(
 ) -> None:
     (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
     assert main(["view", str(tmp_path)]) == 2
-    assert "not finished; go on with `foredrive reconstruct`" in capsys.readouterr().err
+    assert "not finished; continue it with `foredrive reconstruct`" in capsys.readouterr().err

@@ -51,19 +51,19 @@ def check_number(
         wanted = f"a number of {low:g} or more"
     fits = (above is None or value > above) and (low is None or value >= low) and value <= high
     if not (math.isfinite(value) and fits):
-        raise InputError(f"{flag} is {value:g}: {wanted} is needed")
+        raise InputError(f"{flag} must be {wanted}, got {value:g}")
 
 
 def check_image_size(size: tuple[int, int] | None) -> None:
     """Check --image-size. Raise `InputError` if the size is impossible."""
     if size is not None and not all(0 < side <= MAX_IMAGE_PX for side in size):
-        raise InputError(f"--image-size is {size[0]} {size[1]}: sides are 1 to {MAX_IMAGE_PX} px")
+        raise InputError(f"--image-size must be 1 to {MAX_IMAGE_PX} px, got {size[0]} {size[1]}")
 
 
 def check_out_folder(folder: Path | None) -> None:
     """Check that --out can be a folder. Raise `InputError` if it is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: there is a file of that name; a folder is needed")
+        raise InputError(f"--out {folder}: this is a file; a folder is needed")
 
 
 def check_run(folder: Path) -> None:
@@ -75,7 +75,7 @@ def check_run(folder: Path) -> None:
 def check_rebuilt(folder: Path) -> None:
     """Check that a folder holds a reconstruction. Raise `InputError` if it does not."""
     if not (folder / RUN_CONFIG).is_file():
-        raise InputError(f"{folder}: not the folder of a reconstruction (no {RUN_CONFIG})")
+        raise InputError(f"{folder}: not a reconstruction folder (no {RUN_CONFIG})")
 
 
 def check_file(path: Path | None) -> None:

@@ -34,13 +34,13 @@ def bench(
     files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:
         raise InputError(
-            f"{folder}: no benchmarks here; run this in Foredrive's checkout or name their --folder"
+            f"{folder}: no benchmarks here; run this in a checkout of Foredrive, or set --folder"
         )
     if name is None:
         for found, path in files.items():
             benchmark = _load(path)
             if benchmark is None:
-                print(f"{found}: a script of its own; run it with python {path}")
+                print(f"{found}: a separate script; run it with python {path}")
             else:
                 print(f"{found}: {benchmark.question}\n    arms: {', '.join(benchmark.arms)}")
         return

@@ -55,7 +55,7 @@ def drive(
 
     from foredrive.view.drive_report import write_drive_report
 
-    print(f"look: {write_drive_report(out)}")
+    print(f"report: {write_drive_report(out)}")
 
 
 def _tell(driven: "SuiteResult") -> None:
@@ -75,11 +75,11 @@ def _tell(driven: "SuiteResult") -> None:
         more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
         whole = len(driven.drives) + len(told)
         raise InputError(
-            f"{len(told)} of {whole} drives broke off: {', '.join(told[:FAILURES_SHOWN])}{more}; "
-            "the others are kept, and there is no score without them"
+            f"{len(told)} of {whole} drives failed: {', '.join(told[:FAILURES_SHOWN])}{more}; "
+            "the other drives are kept, and scores need all drives"
         )
     if driven.skipped:
-        print(f"{driven.skipped} of {len(driven.drives)} drives were there already")
+        print(f"{driven.skipped} of {len(driven.drives)} drives had been driven before")
     print_table(score_table(summarise(list(driven.drives.values()))), Console())
     for met in (drive.threat for drive in driven.drives.values() if drive.threat):
         print(f"{met.kind} threat: {met.score:.1f} of 5")

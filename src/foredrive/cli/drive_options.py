@@ -138,7 +138,7 @@ class InRebuilt:
         """
         if self.rebuilt is None:
             if self.start or self.threat or self.edits is not None:
-                raise InputError("--start, --threat and --edits are for drives in rebuilt logs (--in RUN)")
+                raise InputError("--start, --threat and --edits need a reconstructed log (--in RUN)")
             return None
         from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
         from foredrive.simulation.threats import Threat

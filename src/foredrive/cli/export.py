@@ -40,5 +40,5 @@ def export(
     for name, latency in facts["latency_ms"].items():
         print(f"{name}: {latency['median']:.1f} ms a clip (90 % below {latency['p90']:.1f} ms)")
         for output, difference in facts["largest_difference"].get(name, {}).items():
-            print(f"    {output}: at most {difference:.2g} off")
+            print(f"    {output}: maximum difference {difference:.2g}")
     print(f"wrote {folder / 'model.onnx'}, {folder / 'model.pt2'} and {folder / 'export.json'}")

@@ -90,7 +90,7 @@ def record(
     if len(plans) == 1 and not ray:
         log = record_plan(plans[0], out, image_size)
         print(f"wrote {log.folder}")
-        print(f"look: foredrive view {log.folder} --save {log.folder.name}.png")
+        print(f"next: foredrive view {log.folder} --save {log.folder.name}.png")
         return
     with _progress(len(plans)) as tick:
         cores = len(os.sched_getaffinity(0))
@@ -106,10 +106,10 @@ def _tell(done: "RecordingResult", plans: "list[DrivePlan]", out: Path) -> None:
     """
     from foredrive.view.contact_sheet import write_contact_sheet
 
-    print(f"recorded {len(done.logs) - done.skipped} drives, {done.skipped} were there already")
+    print(f"recorded {len(done.logs) - done.skipped} drives, {done.skipped} had been recorded before")
     if done.logs:
         write_contact_sheet(out / SHEET, [(log, _caption(plan)) for plan, log in done.logs.items()])
-        print(f"look: {out / SHEET}")
+        print(f"contact sheet: {out / SHEET}")
     if done.failed:
         told = [f"{plan.log_name} ({reason})" for plan, reason in done.failed.items()]
         more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
@@ -146,7 +146,9 @@ def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
         return () if names == (NO_CONDITIONS,) else names
     for name in names:
         if name in (NO_CONDITIONS, ANY_CONDITIONS):
-            raise InputError(f"--conditions {name} stands alone, got {' '.join(names)}")
+            raise InputError(
+                f"--conditions {name} cannot be combined with other names, got {' '.join(names)}"
+            )
         find_conditions(name)
     return names
 
@@ -154,5 +156,5 @@ def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
 def _range(what: str, text: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", text)
     if found is None or (found[2] is not None and int(found[2]) < int(found[1])):
-        raise InputError(f"{what}: a number or a range such as 1..8, got {text!r}")
+        raise InputError(f"--{what} must be a number or a range such as 1..8, got {text!r}")
     return int(found[1]), int(found[2] or found[1])

@@ -44,8 +44,8 @@ def render(
         lidar: Mount this lidar in place of the log's lidar; by default the log's own, if its beam pattern is
             known.
         colour: Quantity that colours the lidar's points.
-        start: Start of the film, s since the start of the log.
-        seconds: Length of the film, s; by default until the end of the log.
+        start: Start of the video, s since the start of the log.
+        seconds: Length of the video, s; by default until the end of the log.
         rate_hz: Frames per second, shown in real time; by default the rate of the log.
     """
     from foredrive.view.video import check_video

@@ -50,14 +50,16 @@ def view(
     check_file(edits)
     if (log / RUN_CONFIG).is_file():
         if run is not None or save is not None:
-            raise InputError(f"{log}: --run and --save are for logs; `foredrive render` films rebuilt ones")
+            raise InputError(
+                f"{log}: --run and --save need a log; `foredrive render` makes videos of reconstructions"
+            )
         _serve_rebuilt(log, edits, t, host, port)
         return
     if edits is not None:
-        raise InputError(f"{log}: --edits are for the folder of a reconstruction")
+        raise InputError(f"{log}: --edits needs the folder of a reconstruction")
     found = find_one_log(log)
     if save is not None and run is not None:
-        raise InputError("--save draws the log alone; leave out --run, or --save for the page")
+        raise InputError("--save draws only the log and cannot be combined with --run")
     if run is not None:
         check_run(run)
 

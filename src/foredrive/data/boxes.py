@@ -125,7 +125,7 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     table = get_modality_table(log.path.folder, _KEY)
     metadata = log.scene.get_modality_metadata(ModalityType.BOX_DETECTIONS_SE3)
     if table is None or not isinstance(metadata, BoxDetectionsSE3Metadata):
-        raise ValueError("its label set is not known here")
+        raise ValueError("the table is missing, or its label set is unknown")
     column = {name.split(".")[-1]: column_array(table, name) for name in table.column_names}
     lists = column["bounding_box_se3"]
     first_row = lists.offsets.to_numpy().astype(np.int64) - lists.offsets[0].as_py()

@@ -108,7 +108,7 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
     for camera in left_over:
         free = [id_ for id_ in spare if id_ not in taken]
         if not free:
-            raise InputError(f"123D names at most 11 cameras, got {len(cameras)}")
+            raise InputError(f"123D supports at most 11 cameras, got {len(cameras)}")
         taken[free[0]] = camera
     return [(camera, id_) for id_, camera in taken.items()]
 

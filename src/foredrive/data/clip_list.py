@@ -72,7 +72,7 @@ def read_clip_list(path: Path) -> list[ListedClip]:
     except (ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path}: not a list of clips ({FORMAT}): {error}") from error
     if not clips:
-        raise InputError(f"{path}: a list of no clips")
+        raise InputError(f"{path}: the list has no clips")
     for clip in clips:
         if not clip.start_s < clip.end_s:
             raise InputError(f"{path}: a clip of {clip.folder} ends at {clip.end_s:g} s, before it starts")

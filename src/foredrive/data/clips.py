@@ -97,7 +97,7 @@ class ClipDataset(Dataset[Example]):
                 self._clips.append((number, frames))
                 self.command_source[self._command(log, frames[config.past_frames])[1]] += 1
         if not self._clips:
-            raise InputError(f"{logs[0].folder}: none of the parts asked for is long enough for a clip")
+            raise InputError(f"{logs[0].folder}: none of the selected parts is long enough for a clip")
 
     def __len__(self) -> int:
         return len(self._clips)

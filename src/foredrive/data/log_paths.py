@@ -68,7 +68,7 @@ def _listed_logs(path: Path) -> list[LogPath]:
         parts.setdefault((clip.folder, clip.maps_dir), []).append((clip.start_s, clip.end_s))
     for folder, _ in parts:
         if not (folder / "sync.arrow").is_file():
-            raise InputError(f"{path}: the log {folder} is not there")
+            raise InputError(f"{path}: the log {folder} does not exist")
     return [LogPath(folder, maps_dir, _united(spans)) for (folder, maps_dir), spans in parts.items()]
 
 

@@ -293,7 +293,7 @@ class LogWriter:
         t_us, kept = frame.t_us, sweep.valid & sweep.returned
         returns = sweep[kept]
         if (returns.beam > 255).any():
-            raise InputError(f"{self.folder}: 123D holds lidar channels 0 to 255")
+            raise InputError(f"{self.folder}: 123D stores only the lidar channels 0 to 255")
         if self._lidar is None:  # static extrinsics, from the beam nearest the frame's time
             position = sweep.origin_ego[sweep.dt_s.abs().argmin()].tolist() if len(sweep.dt_s) else [0, 0, 0]
             classes = None if frame.beam_semantic is None else DefaultLidarSegmentationLabel

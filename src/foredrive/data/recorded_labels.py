@@ -23,7 +23,9 @@ def check_recorded_occupancy(log: Log) -> None:
         InputError: it has none.
     """
     if not log.file(f"custom.{FULL_OCCUPANCY}").is_file():
-        raise InputError(f"{log.path.folder}: no recorded occupancy; take its labels from lidar")
+        raise InputError(
+            f"{log.path.folder}: no recorded occupancy; use the labels from lidar (--occupancy lidar)"
+        )
 
 
 def recorded_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:

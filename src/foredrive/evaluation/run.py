@@ -116,10 +116,10 @@ class _EvaluatedMethod:
         self._metrics = [metric for metric in started if only is None or metric.needs <= only]
         self._asked: frozenset[Part] = frozenset().union(*(metric.needs for metric in self._metrics))
         self._has_figures = [only is not None for _ in self._metrics]
-        """Which metrics give figures: those that were updated, and all of them where `only` is given."""
+        """Metrics that give figures: those that were updated, and all of them where `only` is given."""
         self.failures: list[Failure] = []
         self.items = 0
-        """That were predicted."""
+        """Number of clips that were predicted."""
 
     def add(self, example: Example) -> None:
         """Predict and judge one batch."""

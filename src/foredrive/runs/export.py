@@ -58,7 +58,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
             compare.
     """
     if clips < 1:
-        raise InputError(f"the comparison needs at least one clip, not {clips}")
+        raise InputError(f"the number of clips to compare must be at least 1, got {clips}")
     _check_packages()
     from foredrive.export.onnx import OPSET, write_onnx
 

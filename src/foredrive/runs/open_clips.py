@@ -16,5 +16,5 @@ def open_clips(logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path) -> 
     dataset = ClipDataset(logs, config, cache_dir)
     if not dataset.camera_names:
         others = f" and {len(logs) - 1} more logs" if len(logs) > 1 else ""
-        raise InputError(f"{logs[0].folder}{others}: no pinhole camera, and agents see by cameras alone")
+        raise InputError(f"{logs[0].folder}{others}: no pinhole camera, which agents need")
     return dataset

@@ -76,7 +76,7 @@ def find_conditions(name: str) -> Conditions:
         InputError: there are no conditions of this name.
     """
     if name not in CONDITIONS:
-        raise InputError(f"no conditions are named {name}; there are {', '.join(CONDITIONS)}")
+        raise InputError(f"unknown conditions {name}; the conditions are {', '.join(CONDITIONS)}")
     return CONDITIONS[name]
 
 

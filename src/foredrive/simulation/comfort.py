@@ -68,7 +68,7 @@ def comfort_of(
 
     window = {seconds: 2 * round(0.5 * seconds / dt_s) + 1 for seconds in (ACCELERATION_S, JERK_S)}
     if len(states) < window[JERK_S]:
-        raise InputError(f"comfort takes {window[JERK_S]} states or more, got {len(states)}")
+        raise InputError(f"the comfort metrics need at least {window[JERK_S]} states, got {len(states)}")
 
     def smoothed(values: Float64[np.ndarray, "T"], seconds: float, derivative: int) -> np.ndarray:
         return savgol_filter(values, window[seconds], 2, deriv=derivative, delta=dt_s)

@@ -33,9 +33,11 @@ class PlanningTiming:
     def __post_init__(self) -> None:
         frames = self.period_s / FRAME_DT_S
         if not (frames > 0.5 and abs(frames - round(frames)) < 1e-6):
-            raise InputError(f"agents plan every {FRAME_DT_S} s or a multiple of it, got {self.period_s} s")
+            raise InputError(
+                f"the planning period must be a multiple of {FRAME_DT_S} s, got {self.period_s} s"
+            )
         if not 0 <= self.latency_s < math.inf:
-            raise InputError(f"a latency is 0 s or more, got {self.latency_s}")
+            raise InputError(f"the latency must be at least 0 s, got {self.latency_s}")
 
     @property
     def steps(self) -> int:

@@ -33,7 +33,7 @@ class Vehicle:
     max_braking_mps2: float = 8.0
     """On a dry road, m/s²."""
     max_jerk_mps3: float = 30.0
-    """How fast engine and brakes build up their force, m/s³: from coasting to full braking in 0.27 s."""
+    """Rate at which engine and brakes build up their force, m/s³: full braking after 0.27 s of coasting."""
 
 
 EGO = Vehicle()

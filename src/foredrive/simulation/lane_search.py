@@ -48,7 +48,7 @@ class Leg:
     from_m: float
     to_m: float
     changes: int = 0
-    """How the leg begins: 0 continues from the lane before, 1 is a change to the left (from the lane to
+    """Start of the leg: 0 continues from the lane before, 1 is a change to the left (from the lane to
     the right), -1 is a change to the right (from the lane to the left)."""
 
 
@@ -101,7 +101,7 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
         InputError: there are fewer than two waypoints, or a waypoint cannot be reached from those before it.
     """
     if len(waypoints) < 2:
-        raise InputError(f"a route has two waypoints or more, got {len(waypoints)}")
+        raise InputError(f"a route needs at least two waypoints, got {len(waypoints)}")
     choices = [places_near(graph, xyz) for xyz in waypoints]
     ways: list[list[Leg]] = [[] for _ in choices[0]]
     places = [[place] for place in choices[0]]
@@ -113,7 +113,7 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
             max_cost = min((total for total, *_ in found), default=np.inf) if is_last else np.inf
             found.append(_best_onto(graph, before, costs, end, max_cost))
         if not any(np.isfinite(total) for total, *_ in found):
-            raise InputError(f"no way leads from waypoint {number} to waypoint {number + 1}")
+            raise InputError(f"no lanes lead from waypoint {number} to waypoint {number + 1}")
         ways = [joined(ways[b], legs) for _, b, legs in found]
         places = [[*places[b], end] for (_, b, _), end in zip(found, here, strict=True)]
         costs = [total for total, *_ in found]

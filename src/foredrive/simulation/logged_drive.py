@@ -34,7 +34,7 @@ class LoggedDrive:
 
     def __post_init__(self) -> None:
         if len(self.vehicle.t_s) < 2:
-            raise InputError("a log to drive in needs two ego poses or more")
+            raise InputError("a drive in a log needs at least two ego poses")
 
     @property
     def first_s(self) -> float:
@@ -70,7 +70,7 @@ class LoggedDrive:
             InputError: the route is shorter than the vehicle.
         """
         if (left_m := self.way_left_m(t_s)) < EGO.length_m:
-            raise InputError(f"from {t_s:.1f} s on the log drives {left_m:.1f} m: nothing to follow")
+            raise InputError(f"from {t_s:.1f} s on, the path of the log is only {left_m:.1f} m long")
         return self._way(t_s)
 
     def way_left_m(self, t_s: float) -> float:

@@ -69,7 +69,7 @@ def fixed_in_world(
 def _waypoints(trajectory: Trajectory) -> Float64[np.ndarray, "T 2"]:
     """Return the points of the most probable alternative, up to its first invalid step, m, ego frame."""
     if trajectory.log_prob.shape[:-1].numel() != 1:
-        raise InputError(f"one plan at a time, got a batch of {tuple(trajectory.log_prob.shape[:-1])}")
+        raise InputError(f"expected one plan, got a batch of {tuple(trajectory.log_prob.shape[:-1])}")
     best, steps = int(trajectory.log_prob.reshape(-1).argmax()), trajectory.xy.shape[-2]
     valid = trajectory.valid.reshape(-1, steps)[best].cpu().numpy()
     count = steps if valid.all() else int(np.argmin(valid))

@@ -24,8 +24,8 @@ REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
 the drive ends."""
 STRUCK = "struck"
-"""Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor cannot brake, so
-nobody is to blame."""
+"""Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor replays
+its track and cannot brake, so this is no collision of the ego vehicle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class RebuiltState:
 class RebuiltSimulator:
     """A `Simulator` over a rebuilt log: equal scenarios and controls give equal drives.
 
-    Actors replay their tracks and react to nobody. Static objects without a box are no obstacles.
+    Actors replay their tracks and do not react. Static objects without a box are no obstacles.
 
     Args:
         renderer: renderer of the scene.

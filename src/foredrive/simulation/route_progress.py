@@ -45,7 +45,7 @@ def first_step(xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "3"]:
     away_m = np.hypot(*(xyz[:, :2] - xyz[0, :2]).T)
     ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
     if not len(ahead):
-        raise InputError("a route is longer than a vehicle")
+        raise InputError("the route must be longer than the vehicle")
     return np.asarray(xyz[ahead[0]] - xyz[0])
 
 

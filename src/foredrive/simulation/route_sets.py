@@ -86,13 +86,13 @@ def read_carla_routes(path: Path) -> list[RouteWaypoints]:
     except OSError as error:
         raise InputError(f"cannot read the routes {path}: {error.strerror}") from None
     except ElementTree.ParseError as error:
-        raise InputError(f"the routes {path} are no XML: {error}") from None
+        raise InputError(f"the routes {path} are not valid XML: {error}") from None
     routes = [_route(path, number, element) for number, element in enumerate(root.iter("route"))]
     if not routes:
         raise InputError(f"there is no route in {path}")
     twice = [name for name, count in Counter(route.id for route in routes).items() if count > 1]
     if twice:
-        raise InputError(f"{path} has more than one route {twice[0]!r}; results are stored by id")
+        raise InputError(f"{path} has several routes with the id {twice[0]!r}; ids must be unique")
     return routes
 
 
@@ -117,7 +117,7 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
         raise InputError(f"{where} has no {'id' if name is None else 'town'}")
     waypoints = element.findall("waypoint")
     if len(waypoints) < 2:
-        raise InputError(f"{where} has {len(waypoints)} waypoints, a route has two or more")
+        raise InputError(f"{where} has {len(waypoints)} waypoints; a route needs at least two")
     try:
         xyz = [[float(point.attrib[axis]) for axis in ("x", "y", "z")] for point in waypoints]
     except (KeyError, ValueError) as error:

@@ -114,7 +114,7 @@ class RouteScore:
         shares = (self.completion, self.outside_lanes)
         if not all(0 <= share <= 1 for share in shares):
             raise InputError(
-                f"route {self.route}: completion and outside_lanes are shares of 1, got {shares}"
+                f"route {self.route}: completion and outside_lanes must be between 0 and 1, got {shares}"
             )
 
     @property
@@ -181,11 +181,13 @@ def score_suite(drives: Sequence[RouteScore]) -> SuiteScore:
     keys = [(drive.route, drive.repetition) for drive in drives]
     routes, repetitions = ({key[k] for key in keys} for k in (0, 1))
     if not keys:
-        raise InputError("there is no drive to score")
+        raise InputError("there are no drives to score")
     if len(set(keys)) != len(keys):
-        raise InputError(f"drives are there twice: {sorted({key for key in keys if keys.count(key) > 1})}")
+        raise InputError(
+            f"duplicate drives, (route, repetition): {sorted({key for key in keys if keys.count(key) > 1})}"
+        )
     if missing := sorted({(r, n) for r in routes for n in repetitions} - set(keys)):
-        raise InputError(f"drives are missing, as failed ones must not: (route, repetition) {missing}")
+        raise InputError(f"missing drives, (route, repetition): {missing}; failed drives count too")
     kinds = [infraction.kind for drive in drives for infraction in drive.infractions]
     driven_km = sum(drive.driven_m for drive in drives) / 1000
     counts = {kind: kinds.count(kind) for kind in InfractionKind}

@@ -48,9 +48,9 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     """
     at_s = start_s + AFTER_S
     if at_s > drive.end_s or drive.way_left_m(at_s) < ARRIVED_M:
-        raise InputError(f"the log ends at {drive.end_s:.1f} s, too early to meet anybody at {at_s:.1f} s")
+        raise InputError(f"the log ends at {drive.end_s:.1f} s, too early for an impact at {at_s:.1f} s")
     if drive.state_at(at_s).speed_mps < MIN_MPS:
-        raise InputError(f"the log hardly moves at {at_s:.1f} s: nobody would be met")
+        raise InputError(f"the vehicle of the log hardly moves at {at_s:.1f} s, so no impact would follow")
     row, tracks = _car_with_most_points(graph), graph.tracks
     length_m, _, height_m = tracks.size_lwh[row].tolist()
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
@@ -96,7 +96,7 @@ def _car_with_most_points(graph: SceneGraph) -> int:
     """Return the row of the car with the most Gaussians."""
     rows = (graph.tracks.category == Category.CAR).nonzero()[:, 0].tolist()
     if not rows:
-        raise InputError("there is no car in the scene that could be put in the way")
+        raise InputError("the scene has no car that could serve as the threat")
     return max(rows, key=lambda row: int((graph.actor == row).sum()))
 
 

@@ -75,19 +75,21 @@ class Campaign:
 
     def __post_init__(self) -> None:
         if not self.towns or not self.seeds or (isinstance(self.seeds, int) and self.seeds < 0):
-            raise InputError("there is nothing to record without a town and a seed")
+            raise InputError("a recording needs at least one town and one seed")
         if not self.seconds > 0:
-            raise InputError(f"a recording takes more than 0 s, got {self.seconds:g}")
+            raise InputError(f"the length of a recording must be more than 0 s, got {self.seconds:g}")
         if not 0 < self.rate_hz <= MAX_RATE_HZ:
             raise InputError(
-                f"the frame rate lies above 0 and up to {MAX_RATE_HZ:g} Hz, got {self.rate_hz:g}"
+                f"the frame rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {self.rate_hz:g}"
             )
         if self.conditions != (ANY_CONDITIONS,):
             for name in self.conditions:
                 find_conditions(name)
         for what, (minimum, maximum) in (("vehicles", self.vehicles), ("people", self.people)):
             if not 0 <= minimum <= maximum:
-                raise InputError(f"{what} range from 0 or more upwards, got {minimum}..{maximum}")
+                raise InputError(
+                    f"the range of {what} must be 0 or more and in order, got {minimum}..{maximum}"
+                )
 
 
 def plan_drives(campaign: Campaign) -> list[DrivePlan]:

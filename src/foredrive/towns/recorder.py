@@ -110,11 +110,11 @@ def record(
         OSError: the disk is full. The incomplete log is removed.
     """
     if not seconds > 0:
-        raise InputError(f"a recording takes more than 0 s, got {seconds:g}")
+        raise InputError(f"the length of a recording must be more than 0 s, got {seconds:g}")
     if not 0 < rate_hz <= MAX_RATE_HZ:
-        raise InputError(f"the frame rate lies above 0 and up to {MAX_RATE_HZ:g} Hz, got {rate_hz:g}")
+        raise InputError(f"the frame rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate_hz:g}")
     if seed < 0:
-        raise InputError(f"a seed is 0 or more, got {seed}")
+        raise InputError(f"the seed must be at least 0, got {seed}")
     town_map = load_town_map(town)
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
     background_traffic = background_traffic or BackgroundTraffic()

@@ -149,7 +149,7 @@ def test_two_half_turns_of_the_lidar_are_a_sweep() -> None:
     sweep = clip.sweeps[0, 0]
     xyz = sweep.points_ego[sweep.valid] - lidar.T_ego_lidar[:3, 3]
     assert sorted(xyz.tolist()) == [pytest.approx([-9.0, 0.0, 0.5]), pytest.approx([8.0, -3.0, -1.0])]
-    with pytest.raises(InputError, match="sent nothing: LIDAR"):
+    with pytest.raises(InputError, match="without data: LIDAR"):
         driver.step(data, 0.6)
 
 
@@ -189,7 +189,7 @@ def test_what_is_missing_is_named() -> None:
     data = sensed(driver, BicycleState(0.0, 0.0, 0.0, 0.0), 0)
     with pytest.raises(InputError, match="no route"):
         driver.step(data, 0.0)
-    with pytest.raises(InputError, match="5 by satellite"):
+    with pytest.raises(InputError, match="5 in degrees"):
         driver.set_route(BY_SATELLITE[1:], PLAN)
     with pytest.raises(InputError, match="two points"):
         driver.set_route(BY_SATELLITE[:1], PLAN[:1])

@@ -253,7 +253,7 @@ def test_whatever_goes_wrong_the_server_is_left_as_it_was(world: World, scenario
     world.dead_at = float("inf")
     with pytest.raises(InputError, match="no Town99; it has Town01, Town02"):
         simulator.reset(dataclasses.replace(quick, town="Town99"))
-    with pytest.raises(InputError, match="longer than a vehicle"):
+    with pytest.raises(InputError, match="longer than the vehicle"):
         simulator.reset(dataclasses.replace(quick, route_xyz=quick.route_xyz[:2]))
     simulator.reset(quick)
     with pytest.raises(InputError, match="finite"):

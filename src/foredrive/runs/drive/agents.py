@@ -104,7 +104,7 @@ def make_driver(
 
 def _expert(town: TownSimulator | None) -> TownExpert:
     if town is None:
-        raise InputError("the expert knows a town's traffic from inside: it cannot drive anywhere else")
+        raise InputError("the expert reads the state of an embedded town and can drive only there")
     return TownExpert(town)
 
 
@@ -115,7 +115,7 @@ def _run_folder(driver: str) -> Path:
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {STUDENT}RUN"
         )
-        raise InputError(f"{driver}: no such driver; there are {known}")
+        raise InputError(f"unknown agent {driver!r}; the agents are {known}")
     return folder
 
 

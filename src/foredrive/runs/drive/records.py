@@ -43,7 +43,7 @@ def read_drive(path: Path) -> DriveRecord:
         why = ": ".join([".".join(map(str, first["loc"])), first["msg"]])
     except OSError as error:
         why = str(error)
-    raise InputError(f"{path}: not what is kept of a drive ({why}); delete it to drive again")
+    raise InputError(f"{path}: not the record of a drive ({why}); delete it to repeat the drive")
 
 
 def suite_title(folder: Path) -> str:
@@ -56,7 +56,7 @@ def suite_title(folder: Path) -> str:
         suite = json.loads((folder / SUITE).read_text())
         return f"{Path(suite['driver']).name} on {Path(suite['routes']).stem}"
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{folder / SUITE}: does not say who drove what ({error})") from error
+        raise InputError(f"{folder / SUITE}: not the description of a suite ({error})") from error
 
 
 def summarise(drives: Sequence[DriveRecord]) -> Figures:

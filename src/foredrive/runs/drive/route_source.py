@@ -38,10 +38,10 @@ class RouteSource:
 
     def __post_init__(self) -> None:
         if self.repetitions < 1:
-            raise InputError(f"routes are driven once or more, got {self.repetitions} repetitions")
+            raise InputError(f"the number of repetitions must be at least 1, got {self.repetitions}")
         if self.conditions not in (None, ANY_CONDITIONS, *CONDITIONS):
             there_are = ", ".join((ANY_CONDITIONS, *CONDITIONS))
-            raise InputError(f"no conditions are named {self.conditions}; there are {there_are}")
+            raise InputError(f"unknown conditions {self.conditions}; the conditions are {there_are}")
 
     def noted(self) -> Mapping[str, object]:
         """Return the fields."""

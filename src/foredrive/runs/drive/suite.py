@@ -233,7 +233,9 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
         except (OSError, ValueError):
             there = None
         if not isinstance(there, dict) or not there.keys() >= set(grows):
-            raise InputError(f"{out}: holds drives that nobody knows the suite of; choose another folder")
+            raise InputError(
+                f"{out}: has drives, but no readable {SUITE} that describes them; choose another folder"
+            )
         return there
 
     def read() -> dict[str, object] | None:

@@ -50,11 +50,11 @@ def imagine_run(
     clips = run.recipe.clips
     steps = round(seconds / clips.frame_dt_s)
     if min(steps, samples, moments) < 1:
-        raise InputError(f"at least one future of {clips.frame_dt_s:g} s from one moment can be imagined")
+        raise InputError(f"at least one moment, one sample and one step of {clips.frame_dt_s:g} s are needed")
     world = load_agent(run).world_model
     if world.max_steps is not None and steps > world.max_steps:
         max_s = world.max_steps * clips.frame_dt_s
-        raise InputError(f"{run.folder}: this model imagines {max_s:g} s at most, not {seconds:g} s")
+        raise InputError(f"{run.folder}: the model imagines at most {max_s:g} s, not {seconds:g} s")
     config = dataclasses.replace(clips, future_frames=steps, future_images=True)
     dataset = open_clips([log], config, run.cache_dir)
     generator = torch.Generator().manual_seed(SEED)

@@ -70,7 +70,7 @@ def measure_gap(
     held_us = set(t_us[every - 1 :: every].tolist()) if every else set()
     moments = [k for k in range(len(dataset)) if dataset.now_us(k) in held_us]
     if not moments:
-        raise InputError(f"{rebuilt}: no clip of the run's length lies at a moment that was held out")
+        raise InputError(f"{rebuilt}: no clip as long as the run's clips has its present at a held-out frame")
     predictor = AgentPredictor(load_agent(run), clips.future_frames, 0)
     seen = RealToSimComparison(predictor, clips.image_hw)
     for done, index in enumerate(moments):

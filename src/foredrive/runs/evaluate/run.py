@@ -93,7 +93,7 @@ def evaluate_run(
         InputError: the run has not finished a stage, or no clip can be read.
     """
     if batch_size < 1:
-        raise InputError(f"a batch has at least one clip, got a batch size of {batch_size}")
+        raise InputError(f"the batch size must be at least 1, got {batch_size}")
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)

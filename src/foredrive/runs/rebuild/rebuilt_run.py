@@ -38,12 +38,12 @@ def open_rebuilt(folder: Path) -> OpenedReconstruction:
         InputError: the folder holds no finished reconstruction.
     """
     if not (folder / CONFIG).is_file():
-        raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
+        raise InputError(f"{folder}: not a reconstruction folder (no {CONFIG})")
     recipe = load_rebuild_recipe(folder / CONFIG)
     if not (folder / WEIGHTS).is_file():
-        raise InputError(f"{folder}: not finished; go on with `foredrive reconstruct`")
+        raise InputError(f"{folder}: not finished; continue it with `foredrive reconstruct`")
     if not (folder / VEHICLE).is_file():
-        raise InputError(f"{folder}: of before runs kept their sensors (no {VEHICLE}): rebuild the log anew")
+        raise InputError(f"{folder}: made by an earlier version (no {VEHICLE}); reconstruct the log again")
     vehicle = load_vehicle(folder / VEHICLE)
     try:
         graph, cameras, frames = _read_graph(folder / WEIGHTS)
@@ -89,14 +89,14 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
         InputError: the folder holds no reconstruction, or its log no longer exists.
     """
     if not (folder / CONFIG).is_file():
-        raise InputError(f"{folder}: not the folder of a reconstruction (no {CONFIG})")
+        raise InputError(f"{folder}: not a reconstruction folder (no {CONFIG})")
     try:
         named = json.loads((folder / LOG).read_text())
         path = LogPath(Path(named["folder"]), Path(named["maps_dir"]))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+        raise InputError(f"{folder / LOG}: cannot be read as the path of a log: {error}") from error
     if not path.folder.is_dir():
-        raise InputError(f"{folder}: the log it was made of is gone: {path.folder}")
+        raise InputError(f"{folder}: its log no longer exists: {path.folder}")
     return load_rebuild_recipe(folder / CONFIG), path
 
 
@@ -107,5 +107,7 @@ def camera_indices(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
         InputError: some cameras were not reconstructed; the error names them.
     """
     if missing := [name for name in wanted if name not in there]:
-        raise InputError(f"not rebuilt: {', '.join(missing)}; there are: {', '.join(there) or 'no cameras'}")
+        raise InputError(
+            f"cameras not reconstructed: {', '.join(missing)}; available: {', '.join(there) or 'none'}"
+        )
     return [there.index(name) for name in wanted]

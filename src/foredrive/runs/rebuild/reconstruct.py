@@ -144,7 +144,9 @@ def read_reconstruction_data(recipe: RebuildRecipe, path: LogPath, cache_dir: Pa
     """Read a log's frames and split them into training and held-out frames; warn if sensors are missing."""
     drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
     if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
-        raise InputError(f"{path.folder}: neither images nor lidar sweeps, nothing to rebuild from")
+        raise InputError(
+            f"{path.folder}: a reconstruction needs images or lidar sweeps, and the log has neither"
+        )
     every, frames = recipe.hold_out_every, torch.arange(len(drive.t_s))
     held = (frames % every == every - 1) if every else torch.zeros_like(frames, dtype=torch.bool)
     T_world_scene = drive.T_world_ego[0]
@@ -290,7 +292,7 @@ def _folder_of(recipe: RebuildRecipe, path: LogPath, folder: Path) -> RunFolder:
         try:
             return {other_recipe: there, other_log: json.loads((folder / LOG).read_text())["folder"]}
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{folder / LOG}: does not name the log of a run: {error}") from error
+            raise InputError(f"{folder / LOG}: cannot be read as the path of a log: {error}") from error
 
     def write() -> None:
         with atomic_path(folder / LOG) as temporary:

@@ -81,7 +81,7 @@ def plan_frames(
             raise InputError("the log had no lidar, so this scene has no learned lidar")
         beams = LIDARS[lidar](vehicle.T_ego_lidar)
     if not chosen and beams is None:
-        raise InputError("neither cameras nor a lidar to render; name a lidar with --lidar")
+        raise InputError("there are no cameras to render; choose a lidar with --lidar")
     vehicle.check_time(start_s)
     last_s = float(vehicle.t_s[-1])
     end_s = last_s if seconds is None else start_s + seconds
@@ -89,7 +89,9 @@ def plan_frames(
     steps_s = vehicle.t_s.diff()
     step_s = 1 / rate_hz if rate_hz else float(steps_s.median()) if len(steps_s) else 1.0
     if not (step_s >= _MIN_STEP_S and end_s >= start_s):
-        raise InputError(f"{rate_hz or 0:g} times a second over {end_s - start_s:g} s cannot be filmed")
+        raise InputError(
+            f"a video of {end_s - start_s:g} s with {rate_hz or 0:g} frames per second is not possible"
+        )
     count = int((end_s - start_s) / step_s + _MIN_STEP_S) + 1
     return RenderPlan(tuple(min(start_s + k * step_s, last_s) for k in range(count)), step_s, chosen, beams)
 

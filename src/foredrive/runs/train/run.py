@@ -49,7 +49,9 @@ class Run:
         for stage in (PATH, *reversed(STAGES)):
             if (self.folder / stage / WEIGHTS).is_file():
                 return self.folder / stage / WEIGHTS
-        raise InputError(f"{self.folder}: no stage of this run has finished; go on with `foredrive train`")
+        raise InputError(
+            f"{self.folder}: no stage of this run has finished; continue it with `foredrive train`"
+        )
 
     @property
     def conditions(self) -> dict[str, str | int]:
@@ -77,7 +79,7 @@ def open_run(folder: Path) -> Run:
         start = written.get("start")
         return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{folder / LOGS}: does not name the logs of a run: {error}") from error
+        raise InputError(f"{folder / LOGS}: cannot be read as paths of logs: {error}") from error
 
 
 def train_run(
@@ -155,7 +157,7 @@ def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric
 def _pretrained(start: Path) -> Path:
     weights = start / "pretrain" / WEIGHTS
     if not weights.is_file():
-        raise InputError(f"{start}: no pre-trained weights here (no pretrain/{WEIGHTS})")
+        raise InputError(f"{start}: no pre-trained weights (no pretrain/{WEIGHTS})")
     return weights
 
 

@@ -49,7 +49,7 @@ def require_same_version(client: str, server: str, where: str) -> None:
     """
     if server != client:
         raise InputError(
-            f"the CARLA server at {where} is version {server}, the client {client}: they have to be the same"
+            f"the CARLA server at {where} is version {server}, the client {client}: install the same version"
         )
 
 

@@ -38,7 +38,7 @@ class GlobalPlan:
         ).reshape(-1, 2)
         self._arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.xy, axis=0).T)))
         if len(plan) < 2 or not self._arc_m[-1] > 0:
-            raise InputError(f"a route has two points or more at different places, got {len(plan)}")
+            raise InputError(f"a route needs at least two different points, got {len(plan)} points")
         self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]
         self._line = RouteLine(np.column_stack([self.xy, np.zeros(len(plan))]))
 

@@ -94,7 +94,9 @@ class LeaderboardDriver:
             InputError: the route has no length, or the two plans do not match.
         """
         if len(plan_gps) != len(plan_world):
-            raise InputError(f"a route of {len(plan_world)} points, but {len(plan_gps)} by satellite")
+            raise InputError(
+                f"the route has {len(plan_world)} points in metres, but {len(plan_gps)} in degrees"
+            )
         self._plan = GlobalPlan(plan_world)
         self._geo: GeoFrame = fit_geo_frame(lat_lon_of(plan_gps), self._plan.xy)
 
@@ -108,9 +110,9 @@ class LeaderboardDriver:
             InputError: there is no route, or a sensor has sent nothing.
         """
         if self._plan is None:
-            raise InputError("the leaderboard has given no route")
+            raise InputError("the leaderboard has not set a route")
         if missing := sorted({sensor["id"] for sensor in self._sensors} - set(input_data)):
-            raise InputError(f"sensors that sent nothing: {', '.join(missing)}")
+            raise InputError(f"sensors without data: {', '.join(missing)}")
         lat, lon, _ = (float(value) for value in input_data[GPS][1])
         speed_mps = max(float(input_data[SPEED][1]["speed"]), 0.0)
         yaw_rad = yaw_of_compass(float(input_data[IMU][1][COMPASS_AT]))

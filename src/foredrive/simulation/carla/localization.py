@@ -55,7 +55,9 @@ def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarra
     unit = np.array([_mercator(lat, lon) for lat, lon in lat_lon_deg.tolist()]).reshape(-1, 2)
     about = unit - unit.mean(axis=0), xy - xy.mean(axis=0)
     if np.linalg.norm(np.ptp(xy, axis=0)) < SPREAD_M:
-        raise InputError("the route's points lie at one place: they do not tell how to read the satellites")
+        raise InputError(
+            "the route's points coincide, so they cannot relate latitude and longitude to metres"
+        )
     scale_m = float((about[0] * about[1]).sum() / (about[0] ** 2).sum())
     origin = xy.mean(axis=0) - scale_m * unit.mean(axis=0)
     return GeoFrame(scale_m, float(origin[0]), float(origin[1]))

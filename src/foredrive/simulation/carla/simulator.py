@@ -120,7 +120,7 @@ class CarlaSimulator:
             InputError: the drive is over, the control is not finite, or the server does not answer.
         """
         if self._session is None or self.state.ended is not None:
-            raise InputError("there is no drive under way: reset the simulator")
+            raise InputError("no drive has begun, or it is over: reset the simulator")
         if not math.isfinite(control.acceleration_mps2 + control.steering_rad):
             raise InputError(f"a step needs finite controls, got {control}")
         try:

@@ -221,7 +221,7 @@ def _crosses(actor: CaptionActor) -> bool:
 
 
 def _crossing(visible: Sequence[CaptionActor], words: _Words) -> list[str]:
-    """Describe the people who walk across the road in front, and the side from which they come."""
+    """Describe the pedestrians that walk across the road in front, and the side from which they come."""
     sentences = []
     for sign, side in ((1.0, "right"), (-1.0, "left")):
         group = [t for t in visible if _crosses(t) and np.sign(t.velocity_mps[1]) == sign]
@@ -234,7 +234,7 @@ def _crossing(visible: Sequence[CaptionActor], words: _Words) -> list[str]:
 
 
 def _on_foot(visible: Sequence[CaptionActor], words: _Words) -> str:
-    """Describe the people who do not cross."""
+    """Describe the pedestrians that do not cross."""
     people = [t for t in visible if t.kind is ObjectKind.PEDESTRIAN and not _crosses(t)]
     if not people:
         return ""

@@ -50,9 +50,7 @@ def full_occupancy(
         InputError: the voxels are finer than the sampling of the town.
     """
     if spec.voxel_m < FINEST_VOXEL_M:
-        raise InputError(
-            f"towns are sampled for voxels of {FINEST_VOXEL_M:.2f} m or more, got {spec.voxel_m}"
-        )
+        raise InputError(f"the voxels of a town must be at least {FINEST_VOXEL_M:.2f} m, got {spec.voxel_m}")
     T_index_ego = np.diag([1 / spec.voxel_m] * 3 + [1.0])
     T_index_ego[:3, 3] = -np.array(spec.lower_m) / spec.voxel_m
     T_index_world = T_index_ego @ np.linalg.inv(T_world_ego)

@@ -23,7 +23,7 @@ def _ball(centre: tuple[float, float, float], radius: float, material: int) -> M
 
 
 def pedestrian(mats: MeshMaterials, phase: float | None, dress: str) -> Mesh:
-    """Build a pedestrian who is 1.75 m tall.
+    """Build a pedestrian, 1.75 m tall.
 
     Args:
         phase: phase of the double step, 0 to 1, which begins with the left foot moving forward. None:

@@ -118,7 +118,7 @@ def check_release(version: int) -> None:
     if version // 100 != EMBREE:
         found = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
         raise InputError(
-            f"towns need the Embree of embreex {EMBREEX}, and the one installed is {found}: "
+            f"towns need the Embree of embreex {EMBREEX}, but {found} is installed: "
             f"pip install 'embreex=={EMBREEX}.*'"
         )
 

@@ -76,7 +76,7 @@ class ExpertDrive:
 
     def __init__(self, traffic: Traffic, seconds: float, steering_noise: float = 0.0) -> None:
         if not steering_noise >= 0:
-            raise InputError(f"the steering noise is 0 rad or more, got {steering_noise:g}")
+            raise InputError(f"the steering noise must be at least 0 rad, got {steering_noise:g}")
         self._traffic = traffic
         self._planned = plan_route(traffic.lanes, traffic.starts, traffic.seed, seconds)
         first, start_m = self._planned.lanes[:1], np.array([self._planned.start_m])
