@@ -194,9 +194,9 @@ def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
         (["convert", "pandaset", "{tmp}/none", "--out", "{tmp}/out"], "{tmp}/none: no such folder"),
         (
             ["convert", "kitti-object", "{tmp}", "--out", "{file}"],
-            "--out {file}: there is a file of that name",
+            "--out {file}: this is a file",
         ),
-        (["reconstruct", "{tmp}", "--out", "{file}"], "--out {file}: there is a file of that name"),
+        (["reconstruct", "{tmp}", "--out", "{file}"], "--out {file}: this is a file"),
         (["convert", "lyft", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
     ],
 )
@@ -232,8 +232,8 @@ RECORD, RENDER = "record --town Town01 --out {tmp}/out", "render {tmp} --out {tm
         ("view {tmp} --reach inf", "--reach must be a number above 0, got inf"),
         ("view {tmp} --reach -5", "--reach must be a number above 0, got -5"),
         ("view {tmp} --t nan", "--t must be a finite number, got nan"),
-        (f"{RENDER} --shift-left nan", "--shift-left is nan: a number from -100 to 100 is needed"),
-        (f"{RENDER} --shift-left 1e30", "--shift-left is 1e+30: a number from -100 to 100 is needed"),
+        (f"{RENDER} --shift-left nan", "--shift-left must be a number from -100 to 100, got nan"),
+        (f"{RENDER} --shift-left 1e30", "--shift-left must be a number from -100 to 100, got 1e+30"),
         (f"{RENDER} --rate-hz 0", "--rate-hz must be a number above 0, got 0"),
         ("search rain --before -5 --after -9", "--before must be a number of 0 or more, got -5"),
         ("search rain --before 0 --after 0", "--before and --after are 0: such a clip is empty"),

@@ -213,7 +213,7 @@ def test_threats_need_a_car_and_a_moving_log() -> None:
     drive = LoggedDrive(vehicle(), torch.eye(4))
     with pytest.raises(InputError, match="no car"):
         send_threat(Threat.SIDE, scene_with(actor(9.0, 0.0, Category.PEDESTRIAN)), drive, 1.0)
-    with pytest.raises(InputError, match="too early to meet anybody"):
+    with pytest.raises(InputError, match="too early for an impact"):
         send_threat(Threat.SIDE, scene_with(FAR), drive, END_S - 2.0)
 
 

@@ -49,7 +49,7 @@ def test_carla_s_left_handed_waypoints_are_mirrored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (XML, XML[:120], "no XML"),
+        (XML, XML[:120], "not valid XML"),
         ("<route ", "<path ", "no route in|not valid XML"),
         ('town="Town05"', "", "route 7 of .* has no town"),
         ('id="7" ', "", "route number 1 of .* has no id"),

@@ -148,11 +148,11 @@ def test_no_route_is_chosen_twice(routes: list[Counter[Command]]) -> None:
         ({"towns": ("Town99",)}, "one of Town01"),
         ({"conditions": ("hail",)}, "unknown conditions hail"),
         ({"conditions": (ANY_CONDITIONS, "night")}, "unknown conditions any"),
-        ({"seeds": ()}, "nothing to record"),
-        ({"seeds": 0}, "nothing to record"),
+        ({"seeds": ()}, "at least one town and one seed"),
+        ({"seeds": 0}, "at least one town and one seed"),
         ({"seconds": 0.0}, "more than 0 s"),
         ({"rate_hz": 1000.0}, "frame rate"),
-        ({"vehicles": (5, 3)}, "vehicles range"),
+        ({"vehicles": (5, 3)}, "range of vehicles"),
     ],
 )
 def test_impossible_ranges_are_named(ranges: dict[str, object], says: str) -> None:

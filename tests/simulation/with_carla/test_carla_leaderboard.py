@@ -187,11 +187,11 @@ def test_the_sensors_are_what_the_leaderboards_allow() -> None:
 def test_what_is_missing_is_named() -> None:
     driver = LeaderboardDriver(Straight(1.0), camera_rig(SIZE), None, 1)
     data = sensed(driver, BicycleState(0.0, 0.0, 0.0, 0.0), 0)
-    with pytest.raises(InputError, match="no route"):
+    with pytest.raises(InputError, match="not set a route"):
         driver.step(data, 0.0)
     with pytest.raises(InputError, match="5 in degrees"):
         driver.set_route(BY_SATELLITE[1:], PLAN)
-    with pytest.raises(InputError, match="two points"):
+    with pytest.raises(InputError, match="two different points"):
         driver.set_route(BY_SATELLITE[:1], PLAN[:1])
     driver.set_route(BY_SATELLITE, PLAN)
     with pytest.raises(InputError, match="PCAM_B0"):

@@ -74,7 +74,7 @@ class Traffic:
         seed: the seed of everything random.
         vehicle_count: vehicles on the road at one time, vehicle 0 included.
         people_count: people on foot at one time, where the town has walkways.
-        guest_count: additional slots, after those of the vehicles, for vehicles that the caller adds.
+        scenario_slot_count: additional slots, after those of the vehicles, for vehicles that the caller adds.
     """
 
     def __init__(
