@@ -200,7 +200,7 @@ def claim(suite: DriveSuite, out: Path) -> None:
 
 def test_a_folder_is_claimed_by_what_can_be_driven(suite: DriveSuite, tmp_path: Path) -> None:
     unknown = changed(suite, routes="nothing.xml"), dataclasses.replace(suite, driver="nobody")
-    for wrong, named in zip(unknown, (r"nothing\.xml", "no such driver"), strict=True):
+    for wrong, named in zip(unknown, (r"nothing\.xml", "unknown agent"), strict=True):
         with pytest.raises(InputError, match=named):
             drive_suite(wrong, tmp_path / "new")
     assert not (tmp_path / "new").exists()

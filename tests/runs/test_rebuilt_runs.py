@@ -101,7 +101,7 @@ def test_an_actor_of_another_run_is_where_one_of_this_was(run: Reconstruction) -
 
 
 def test_what_is_no_finished_run_is_told(run: Reconstruction, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not the folder of a reconstruction"):
+    with pytest.raises(InputError, match="not a reconstruction folder"):
         open_rebuilt(tmp_path)
     (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
     with pytest.raises(InputError, match="not finished"):
