@@ -5,7 +5,7 @@ import dataclasses
 import torch
 
 from foredrive.geometry.se3 import sensor_twist
-from foredrive.rendering.rebuilt import RenderedSweep
+from foredrive.rendering.rendered import RenderedSweep
 from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import CameraRig, LidarSweep

@@ -21,8 +21,9 @@ from foredrive.losses.rendering import (
     published_lidar_losses,
     range_loss,
 )
-from foredrive.rendering.rebuilt import PreparedSweep, RebuiltScene, RenderedSweep
+from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.relocation import random_walk_m
+from foredrive.rendering.rendered import PreparedSweep, RenderedSweep
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint
