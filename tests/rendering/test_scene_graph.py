@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
-from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.geometry.se3 import exp_se3, matrix_from_yaw
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.scene_graph import STATIC, SceneGraph, mirrored, place_gaussians
 from foredrive.rendering.tracks import ActorTracks, states_at
@@ -55,6 +55,16 @@ def test_halfway_an_actor_has_gone_and_turned_half() -> None:
     assert torch.allclose(states.velocity_mps[0], torch.tensor([2.0, 0, 0]))
     assert torch.allclose(states.turn_radps[0], torch.tensor([0, 0, math.pi / 4]), atol=1e-6)
     assert states.present.tolist() == [True, False]
+
+
+def test_an_actor_on_its_side_turns_about_the_axis_of_the_scene() -> None:
+    """Rolled by 90° to the right, it turns left in its own axes by 90° over 2 s: about the scene's y."""
+    rolled = exp_se3(torch.tensor([0.0, 0, 0, -math.pi / 2, 0, 0]))
+    turned = rolled @ matrix_from_yaw(torch.tensor(math.pi / 2), torch.zeros(3))
+    poses = torch.stack([torch.stack([rolled, turned]), two_actors().T_scene_actor[1]])
+    tracks = dataclasses.replace(two_actors(), T_scene_actor=poses)
+    turn_radps = states_at(tracks, 1.0).turn_radps[0]
+    assert torch.allclose(turn_radps, torch.tensor([0, math.pi / 4, 0]), atol=1e-6)
 
 
 def test_an_actor_goes_on_for_one_step_and_no_longer() -> None:

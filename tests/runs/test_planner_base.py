@@ -93,6 +93,9 @@ def test_what_the_decoder_says_is_not_said_twice(log: LogPath, tmp_path: Path) -
     dataset = open_clips([log], dataclasses.replace(fitted.clips, now_stride_s=0.5), tmp_path / "other")
     planned = agent.act(collate([dataset[0]]).clip.observed()).xy[0, 0]
     torch.testing.assert_close(again.planned_xy[0], planned, atol=1e-4, rtol=0)
+    next(agent.world_model.parameters()).data += 0.1
+    other = sample_paths(agent, [log], fitted.clips, tmp_path / "other", stride_s=0.5)
+    assert not torch.equal(other.values, again.values)  # of other weights
 
 
 def test_it_can_be_exported(run: Run, log: LogPath, tmp_path: Path) -> None:

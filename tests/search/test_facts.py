@@ -45,6 +45,7 @@ def test_where_things_are_and_how_they_move() -> None:
             (Category.PEDESTRIAN, (14.0, -3.0), (0.1, 1.2), 0.0),
             (Category.PEDESTRIAN, (14.0, -12.0), (0.1, 1.2), 0.0),
             (Category.BICYCLE, (-20.0, 1.0), (5.0, 0.0), 0.0),
+            (Category.CAR, (-20.0, 1.0), (-8.0, 0.0), 3.1),
             (Category.CAR, (20.0, 1.0), (torch.nan, torch.nan), 0.0),
             (Category.OTHER, (20.0, 1.0), (0.0, 0.0), 0.0),
         )
@@ -56,6 +57,7 @@ def test_where_things_are_and_how_they_move() -> None:
         Thing("pedestrian", ("moving", "crossing")),
         Thing("pedestrian", ("moving",)),
         Thing("cyclist", ("moving",)),
+        Thing("car", ("moving",)),  # away from us, behind
         Thing("car", ()),
     ]
 

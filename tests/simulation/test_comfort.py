@@ -61,6 +61,13 @@ def test_lateral_acceleration_is_v_squared_by_radius(speed_mps: float, comfortab
     assert comfort.comfortable is comfortable
 
 
+def test_speeding_up_in_a_bend_adds_to_the_jerk_aside() -> None:
+    # v' = 1 m/s², curvature k = 1 / 40: in the vehicle's axes the jerk is (-v³ k², 2 v v' k + v v' k)
+    speed = 5.0 + T_S
+    comfort = comfort_of(driven(speed, 1 / 40))
+    assert comfort.jerk_mps3 == pytest.approx(math.hypot(speed[-1] ** 3 / 1600, 3 * speed[-1] / 40))
+
+
 def test_turning_on_the_spot_is_uncomfortable() -> None:
     comfort = comfort_of(driven(np.full(100, 5.0), 1 / 5))
     assert comfort.yaw_rate_radps == pytest.approx(1.0)

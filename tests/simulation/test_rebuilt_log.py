@@ -109,6 +109,9 @@ def test_the_vehicle_stands_on_the_slope_and_sees_boxes_from_there() -> None:
     aside = BicycleState(float(x_m), float(y_m), WORLD_YAW, 0.0)
     beside = np.linalg.inv(begin) @ simulator.drive.on_ground(aside)
     assert np.allclose(beside[:3, 3], [0, 2, 0], atol=1e-5)
+    ahead_m = 0.3 * np.array([math.cos(WORLD_YAW), math.sin(WORLD_YAW)])  # of the nearest pose, uphill
+    further = BicycleState(*(begin[:2, 3] + ahead_m).tolist(), WORLD_YAW, 0.0)
+    assert simulator.drive.on_ground(further)[2, 3] == pytest.approx(begin[2, 3] + 0.3 * SLOPE, abs=1e-5)
     near = begun(scene_with(actor(30.0, 0.0)))
     boxes = near.state.frames[-1].boxes
     assert torch.allclose(boxes.centre, torch.tensor([[30.0 - SPEED_MPS, 0.0, 0.8]]), atol=1e-4)

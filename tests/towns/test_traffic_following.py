@@ -42,6 +42,11 @@ def test_closing_in_needs_a_larger_gap() -> None:
     assert at_20_m == pytest.approx(1 - (desired / 20) ** 2)
 
 
+def test_who_is_too_fast_and_too_near_brakes_for_both() -> None:
+    # 1 m/s above the wanted speed: -2 m/s². At half the desired gap of 2 + 11 * 1.5 m: a (1 - 2²) more.
+    assert follow(free(11.0, 10.0), speed=11.0, closing=0.0, gap=18.5 / 2) == pytest.approx(-2.0 - 3.0)
+
+
 def test_an_open_road_is_no_obstacle() -> None:
     assert follow(free(5.0, 10.0), speed=5.0, closing=0.0, gap=np.inf) == pytest.approx(free(5.0, 10.0))
 
