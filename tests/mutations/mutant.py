@@ -9,12 +9,14 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).parent
 REPOSITORY = HERE.parents[1]
 PACKAGE = REPOSITORY / "src" / "foredrive"
+NUMBA_CACHES = "*.nb[ic]"
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Fault:
     """Files or tests below `tests`, as pytest takes them."""
 
 
-def faults() -> list[Fault]:
+def read_faults() -> list[Fault]:
     """Return the listed faults."""
     listed = tomllib.loads((HERE / "faults.toml").read_text())["fault"]
     return [Fault(**{**row, "tests": tuple(row["tests"])}) for row in listed]
@@ -43,19 +45,29 @@ def occurrences(fault: Fault) -> int:
     return path.read_text().count(fault.original) if path.is_file() else 0
 
 
-def run_tests_with(fault: Fault, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run the fault's tests up to the first failure, on a copy of the package in `folder` that has the fault.
+def copy_package(folder: Path) -> Path:
+    """Copy the package into a folder, without compiled kernels, which may be of other sources."""
+    shutil.copytree(PACKAGE, folder / "foredrive", ignore=shutil.ignore_patterns(NUMBA_CACHES))
+    return folder
 
-    Numba's caches are not copied for a fault in a file with kernels: others contain them, as they were.
+
+def copy_with_fault(fault: Fault, sound: Path, folder: Path) -> Path:
+    """Copy a sound package into a folder and put a fault into it.
+
+    Its kernels are compiled again if the fault's file has any: other kernels contain them.
     """
-    copy = folder / "foredrive"
-    source = (PACKAGE / fault.file).read_text()
-    stale = ("*.nb[ic]",) if "numba" in source else ()
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns(*stale))
-    (copy / fault.file).write_text(source.replace(fault.original, fault.faulty))
-    tests = [str(REPOSITORY / "tests" / test) for test in fault.tests]
+    source = (sound / "foredrive" / fault.file).read_text()
+    left_out = [NUMBA_CACHES] if "numba" in source else []
+    shutil.copytree(sound / "foredrive", folder / "foredrive", ignore=shutil.ignore_patterns(*left_out))
+    (folder / "foredrive" / fault.file).write_text(source.replace(fault.original, fault.faulty))
+    return folder
+
+
+def run_tests(tests: Iterable[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run tests of the repository, up to the first failure, with the package in a folder."""
     return subprocess.run(
-        [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests],
+        [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
+        + [str(REPOSITORY / "tests" / test) for test in tests],
         cwd=REPOSITORY,
         env={**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"},
         capture_output=True,

@@ -18,7 +18,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.agents import _run_folder, inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.records import read_drive
+from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
@@ -125,6 +125,8 @@ def test_every_drive_is_kept_scored_and_logged(driven: SuiteResult, out: Path) -
     assert summary["scenarios.cut_in"] == 0  # routes are too short for any
     mean = np.mean([kept.score.driving_score_1_0 for kept in driven.drives.values()])
     assert summary["driving_score_1_0"] == pytest.approx(mean)
+    met = dataclasses.replace(driven.drives[job_of("a", 0)], nearest_s=(0.5, None, 2.0, None))
+    assert summarise([met])["near_collision_share"] == 1 / 4
 
 
 def test_scenarios_are_those_of_the_drives_seed(suite: DriveSuite) -> None:
@@ -149,6 +151,24 @@ def test_what_lies_there_is_not_driven_again(driven: SuiteResult, suite: DriveSu
     for job, kept in driven.drives.items():
         taken = {"wall_s": kept.wall_s, "act_s": kept.act_s}  # by the computer
         assert dataclasses.replace(again.drives[job], **taken) == kept
+
+
+def test_while_a_drive_is_broken_there_is_no_summary(
+    driven: SuiteResult, suite: DriveSuite, routes: Path, out: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "suite"
+    shutil.copytree(out, folder)
+    for name in ("drives/routeb_rep0.json", "summary.json"):
+        (folder / name).unlink()
+    text = routes.read_text()
+    routes.write_text(text.replace('id="b" town="Town02"', 'id="b" town="Nowhere"'))
+    try:
+        again = drive_suite(suite, folder, workers=1)
+    finally:
+        routes.write_text(text)
+    assert list(again.drives) == [job_of("a", 0)]
+    assert "Nowhere" in again.broken[job_of("b", 0)]
+    assert not (folder / "summary.json").exists()
 
 
 def test_files_of_suites_and_drives_stay_what_they_were(driven: SuiteResult, out: Path) -> None:
