@@ -5,14 +5,16 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from foredrive.data.setting import Doing, LightColour, Place, Setting, TimeOfDay, Weather
 from foredrive.data.setting import ObjectKind as Kind
-from foredrive.scene import Category
+from foredrive.scene import CameraRig, Category
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import CONDITIONS, Conditions
 from foredrive.towns.labels.captions import CaptionActor, FrameFacts, caption
 from foredrive.towns.labels.frame_facts import object_kind
+from foredrive.towns.labels.visibility import is_point_visible
 
 SEEDS = range(24)
 
@@ -174,3 +176,16 @@ def test_vans_and_riders_go_by_their_own_names() -> None:
 )
 def test_conditions_in_words(name: str, facts: tuple[str, str]) -> None:
     assert (TimeOfDay.at_hour(CONDITIONS[name].hour), Weather.under(CONDITIONS[name])) == facts
+
+
+def test_a_small_object_is_seen_beside_a_post_but_not_behind_a_wall() -> None:
+    """It is 10 m ahead; the pixel that it falls on shows a surface 3 m ahead."""
+    T_ego_cam = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+    K = torch.tensor([[20.0, 0, 8], [0, 20, 5], [0, 0, 1]])
+    rig = CameraRig(K[None], T_ego_cam[None], torch.zeros(1, 5), torch.zeros(1), ("ahead",), (10, 16))
+    point, post = np.array([10.0, 0.0, 1.5]), np.full((1, 10, 16), 50.0, np.float32)
+    post[0, :, 8] = 3.0
+    assert is_point_visible(point, rig, post)
+    assert not is_point_visible(point, rig, np.full_like(post, 3.0))
+    assert is_point_visible(point, rig, np.full_like(post, 9.6))  # its own surface
+    assert not is_point_visible(-point, rig, post)
