@@ -1,8 +1,7 @@
 """Query time and recall over a million embeddings, and memory for building the index.
 
 LanceDB as `foredrive.search` uses it is compared with exhaustive search in NumPy and FAISS, and with FAISS'
-partitions of 8-bit vectors, as LanceDB has them. The benchmark also measures how many sweeps of a recorded
-town the lidar tower embeds per second, by wall time and by CPU time.
+partitions of 8-bit vectors, as LanceDB has them.
 
 The embeddings are synthetic. Like those of image towers, they are directions of falling variance about a
 common mean. They are grouped in kinds of scenes, drives of a kind, and consecutive moments of a drive. Half
@@ -16,31 +15,21 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
-from pathlib import Path
 from statistics import median
 
 import numpy as np
 import pyarrow as pa
-import torch
 
-from benchmarks.common.measuring import held_mib, measure
-from foredrive.data.batches import stack_records
-from foredrive.data.logs import Log
+from benchmarks.common.measuring import held_mib
 from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
-from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.indexing import IndexWriter
-from foredrive.search.crops import Crop
-from foredrive.search.embedding import read_views
 from foredrive.search.find import find
 from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, Making, Part
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.target import Target
-from foredrive.towns.campaign import DrivePlan
 
 ROWS = int(os.environ.get("SEARCH_SPEED_ROWS", "1000000"))
 DIM, KINDS, DRIVE = 384, 300, 400
@@ -49,9 +38,6 @@ MEAN, KIND, ALONG, NOISE = 0.6, 0.55, 0.3, 0.25
 """Lengths of the components of an embedding: two random moments have a cosine of about 0.4."""
 ASIDE = 0.8
 QUERIES, TOP = 60, 20
-SWEEPS = 8
-"""Number of sweeps embedded together, sector by sector, as in an index."""
-REPEATS = 9
 
 
 def spectrum(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -210,38 +196,6 @@ def with_lancedb(seed: int) -> dict[str, float]:
         }
 
 
-def lidar_tower(seed: int) -> dict[str, float]:
-    """Measure an untrained tower on whole sweeps, cut into six sectors; weights do not change the speed.
-
-    It runs as in an index: in parallel on every core, with one thread each.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        plan = DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0)
-        log = Log(record_drives([plan], Path(folder), (144, 256), workers=1).logs[plan])
-        frames = range(len(log.t_us))
-        read = [read_views(log, frame, 128, Crop.WHOLE, with_lidar=True) for frame in frames]
-    sectors = [[views[name].sweep for views in read] for name in read[0]]
-    clouds = [PointCloud.from_sweeps(stack_records(those)) for those in sectors]
-    cores = os.cpu_count() or 1
-    torch.manual_seed(seed)
-    tower = LidarEncoder(LidarEncoderConfig(), dim=DIM).eval()
-
-    @torch.inference_mode()
-    def embed(_: int) -> None:
-        for cloud in clouds:
-            tower(cloud, len(read))
-
-    with ThreadPoolExecutor(cores, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        took = measure(lambda: list(pool.map(embed, range(cores))), REPEATS, "cpu")
-    return {
-        "sweeps_per_s": cores * len(read) / took.wall_s,
-        "sweeps_per_core_s": cores * len(read) / took.cpu_s,
-        "threads": float(cores),
-        "sectors": float(len(sectors)),
-        "points_per_sector": float(np.mean([len(cloud.points) for cloud in clouds])) / len(read),
-    }
-
-
 BENCHMARK = Benchmark(
     question=f"How long does a query over {ROWS} embeddings take, and what does it miss?",
     arms={
@@ -249,7 +203,6 @@ BENCHMARK = Benchmark(
         "numpy": with_numpy,
         "faiss_flat": lambda seed: with_faiss(seed, partitions=False),
         "faiss_partitions": lambda seed: with_faiss(seed, partitions=True),
-        "lidar_tower": lidar_tower,
     },
     seeds=(0,),
     config={"rows": ROWS, "dim": DIM, "drive": DRIVE, "kinds": KINDS, "queries": QUERIES, "top": TOP},
