@@ -20,6 +20,8 @@ from foredrive.search.towers import Towers, embed_prompt
 from foredrive.search.zero_shot import class_vectors, classify
 
 RANKS = (1, 10, 100)
+KIND_RANK = 10
+"""The rank that is reported for each kind of query."""
 GAP_S = 5.0
 """Moments of one drive that are closer than this count as one hit, s."""
 DRAWS = 1000
@@ -85,9 +87,9 @@ def questions() -> list[Question]:
 def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
     """Return P@K by modality under "pool.kind.p_at_K", and its 95 % interval under "..._low" and "..._high".
 
-    Pools are the drives of one weather, and all drives. Kinds are those of `Question`, and all queries. The
-    interval resamples drives. "_above_image" is the difference to the image tower, over the same resampled
-    drives.
+    Pools are the drives of one weather, and all drives. Of all drives, the kinds of `Question` have P@10 too,
+    beside all queries with P@1, P@10 and P@100. The interval resamples drives. "_above_image" is the
+    difference to the image tower, over the same resampled drives.
     """
     logs = [row.log for row in judged.rows]
     drives = sorted(set(logs))
@@ -102,7 +104,7 @@ def judge_retrieval(judged: Judged, towers: Towers) -> dict[str, dict[str, float
         kept = [each for each in asked if _fits(*each, pool, judged, np.isin(drive, chosen), chosen)]
         if kept:
             drawn = chosen[draw_sequences(len(chosen), DRAWS, seed=0)]
-            for modality, figures in _pooled(kept, drawn).items():
+            for modality, figures in _pooled(kept, drawn, by_kind=pool == ALL).items():
                 out[modality] |= {f"{pool}.{name}": value for name, value in figures.items()}
     return out
 
@@ -203,7 +205,7 @@ def _fits(
 
 
 def _pooled(
-    kept: Sequence[tuple[Question, Mapping[str, Ranking]]], drawn: Int[np.ndarray, "B s"]
+    kept: Sequence[tuple[Question, Mapping[str, Ranking]]], drawn: Int[np.ndarray, "B s"], *, by_kind: bool
 ) -> dict[str, dict[str, float]]:
     """Return the metrics of one pool by modality."""
     kinds = np.array([question.kind for question, _ in kept])
@@ -214,11 +216,13 @@ def _pooled(
     out = {}
     for modality, values in found.items():
         figures: dict[str, float] = {}
-        for kind in (EVERY, *sorted(set(kinds))):
+        for kind in (EVERY, *(sorted(set(kinds)) if by_kind else ())):
             mine = (kinds == kind) | (kind == EVERY)
             figures[f"{kind}.questions"] = float(mine.sum())
             means, by_image = _mean(values[mine]), _mean(found["image"][mine])
             for n, rank in enumerate(RANKS):
+                if kind != EVERY and rank != KIND_RANK:
+                    continue
                 figures |= _with_bounds(f"{kind}.p_at_{rank}", means[:, n])
                 if kind == EVERY and modality != "image":
                     figures |= _with_bounds(f"{kind}.p_at_{rank}_above_image", means[:, n] - by_image[:, n])
