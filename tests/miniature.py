@@ -2,11 +2,13 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import synthetic_log
 
 from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.models.backbone import BackboneConfig
+from foredrive.models.bev import BevConfig
 from foredrive.models.driveworld import DriveWorldConfig
 from foredrive.models.driveworld.planes import (
     PlanesToVolumeConfig,
@@ -19,6 +21,7 @@ from foredrive.models.lift_splat import LiftSplatConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
 from foredrive.models.planner import PlannerConfig
+from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.driveworld import DriveWorldRecipe
 from foredrive.recipes.nemo import NemoRecipe
@@ -114,3 +117,61 @@ def write_log(root: Path, name: str = "flat", frames: int = 51) -> LogPath:
     """Write a log at 10 Hz, 5 s long by default, with two cameras, lidar and boxes."""
     (log,) = find_logs(synthetic_log.write(root, frames=frames, name=name))
     return log
+
+
+def shrunk(recipe: Recipe) -> Recipe:
+    """Any recipe with all its parts and stages in the sizes of the miniature, and without named weights."""
+    clips = dataclasses.replace(
+        recipe.clips, image_hw=(32, 64), voxels=miniature().clips.voxels, cameras=None, part_s=None
+    )
+    first = recipe.pretrained_model
+    stages = {
+        name: dataclasses.replace(stage, perceptual=None, ray_stride=8) if stage.kind == "nemo" else stage
+        for name in ("pretrain", "finetune")
+        if (stage := getattr(recipe, name)) is not None
+    }
+    return dataclasses.replace(
+        recipe,
+        clips=clips,
+        model=_shrunk_model(recipe.model),
+        pretrained_model=None if first is None else _shrunk_model(first),
+        planner=dataclasses.replace(recipe.planner, width=16, layers=2, heads=2, pool=(1, 4, 4)),
+        **stages,
+    )
+
+
+def _shrunk_model(model: NemoConfig | DriveWorldConfig) -> NemoConfig | DriveWorldConfig:
+    depth = len(model.backbone.depths)
+    backbone = dataclasses.replace(
+        miniature().model.backbone,
+        hidden_sizes=(8, 16, 16, 16)[:depth],
+        depths=(1,) * depth,
+        stages=model.backbone.stages,
+        checkpoint=model.backbone.checkpoint,
+    )
+    if isinstance(model, NemoConfig):
+        return dataclasses.replace(
+            miniature().model, backbone=backbone, encoder=_shrunk_encoder(model.encoder), unseen=model.unseen
+        )
+    small = miniature_driveworld().model
+    parts = {"memory_bank": model.states.memory_bank, "motion_norm": model.states.motion_norm}
+    prompt = model.prompt and dataclasses.replace(model.prompt, expand=VectorToPlaneConfig(widths=(8, 4)))
+    return dataclasses.replace(
+        small,
+        backbone=backbone,
+        encoder=_shrunk_encoder(model.encoder),
+        states=dataclasses.replace(small.states, **parts),
+        statics=model.statics and small.statics,
+        prompt=prompt,
+        warp_statics=model.warp_statics,
+    )
+
+
+def _shrunk_encoder(encoder: Any) -> Any:
+    if isinstance(encoder, PooledLiftingConfig):
+        return dataclasses.replace(encoder, lifting=_shrunk_encoder(encoder.lifting))
+    if isinstance(encoder, BevConfig):
+        return dataclasses.replace(encoder, width=8, heads=2, points=2, pillars=2)
+    if isinstance(encoder, LiftingConfig):
+        return dataclasses.replace(encoder, heads=2, points=2)
+    return encoder

@@ -45,6 +45,47 @@ def test_missing_weights_are_said_loudly(tmp_path: Path) -> None:
     assert not backbone.pretrained
 
 
+def step(backbone: ImageBackbone) -> dict[str, torch.Tensor]:
+    """The state after one step of training on random images."""
+    backbone.train()
+    images = torch.randint(0, 256, (2, 3, 32, 64), generator=torch.Generator().manual_seed(0)).byte()
+    optimizer = torch.optim.SGD([p for p in backbone.parameters() if p.requires_grad], lr=0.1)
+    torch.cat([level.square().flatten() for level in backbone(images)]).mean().backward()
+    optimizer.step()
+    return {name: value.clone() for name, value in backbone.state_dict().items()}
+
+
+@pytest.mark.parametrize("pretrained", [True, False])
+def test_norms_are_frozen_where_weights_were_loaded_and_live_from_scratch(
+    pretrained: bool, tmp_path: Path
+) -> None:
+    original = ImageBackbone(CONFIG, channels=12)
+    original.resnet.save_pretrained(tmp_path)
+    weights = str(tmp_path) if pretrained else None
+    backbone = ImageBackbone(dataclasses.replace(CONFIG, weights=weights), channels=12)
+    before = {name: value.clone() for name, value in backbone.state_dict().items()}
+    after = step(backbone)
+    changed = {name for name in after if not torch.equal(before[name], after[name])}
+    norms = {name for name in after if "normalization" in name and ".stages.3." not in name}
+    assert norms
+    assert norms & changed == (set() if pretrained else norms)
+    filters = {name for name in after if name.endswith("convolution.weight") and ".stages.3." not in name}
+    assert filters <= changed
+
+
+def test_only_the_levels_that_are_read_are_returned_and_trained() -> None:
+    torch.manual_seed(0)
+    whole = ImageBackbone(CONFIG, channels=12).eval()
+    torch.manual_seed(0)
+    finest = ImageBackbone(CONFIG, channels=12, levels=1).eval()
+    images = torch.randint(0, 256, (2, 3, 32, 64), generator=torch.Generator().manual_seed(0)).byte()
+    (level,) = finest(images)
+    torch.testing.assert_close(level, whole(images)[0], atol=0, rtol=0)
+    assert finest.state_dict().keys() == whole.state_dict().keys()
+    still = {name for name, p in finest.named_parameters() if not p.requires_grad}
+    assert still == {"smooth.1.weight", "smooth.1.bias"}
+
+
 def vgg_state() -> dict[str, torch.Tensor]:
     widths = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512]
     index = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21]

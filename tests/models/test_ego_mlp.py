@@ -7,7 +7,7 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.models.ego_mlp import ego_status
+from foredrive.models.ego_mlp import ego_speeds, ego_status
 from foredrive.scene import Command
 
 
@@ -21,7 +21,10 @@ def test_the_ego_status_by_hand() -> None:
     assert status.shape == (2 * 3 + 3 + 3,)
     # Two poses before now, in the ego frame at now: behind it.
     assert status[0] < status[3] < 0
-    assert status[6:9].tolist() == [0.0, 0.0, 2.0]  # speeds, the unknown one 0
+    way_m = clip.T_world_ego[0, clip.now - 1, :3, 3] - clip.T_world_ego[0, clip.now - 2, :3, 3]
+    estimate = way_m.norm().item() / (clip.t_s[0, clip.now - 1] - clip.t_s[0, clip.now - 2]).item()
+    assert estimate > 1.0
+    assert status[6:9].tolist() == pytest.approx([0.0, estimate, 2.0])  # the unknown one follows from poses
     assert status[9:].tolist() == [0.0, 0.0, 1.0]  # left, right, straight
     clip.command_valid[:] = False
     assert ego_status(clip, past_frames=2)[0, 9:].tolist() == [0.0, 0.0, 0.0]
@@ -40,3 +43,17 @@ def test_the_status_does_not_depend_on_where_in_the_world_one_is() -> None:
         clip, T_world_ego=clip.T_world_ego[:, 0].inverse()[:, None] @ clip.T_world_ego
     )
     torch.testing.assert_close(ego_status(clip, 2), ego_status(moved, 2), atol=1e-4, rtol=0)
+
+
+def test_unknown_speeds_follow_from_poses_that_may_be_seen() -> None:
+    clip = drives(1).clip
+    clip.T_world_ego[:, :, :3, 3] = 0.0
+    clip.T_world_ego[:, :, 0, 3] = torch.arange(clip.t_s.shape[1]).cumsum(0)
+    clip.ego_speed_valid[:] = False
+    clip.ego_speed_mps[:] = torch.nan
+    assert ego_speeds(clip)[0, :4].tolist() == pytest.approx(
+        [2.0, 2.0, 4.0, 6.0]
+    )  # 0, 1, 3, 6 m, 0.5 s apart
+    clip.ego_speed_valid[:, 2], clip.ego_speed_mps[:, 2] = True, 4.5
+    assert ego_speeds(clip)[0, :4].tolist() == pytest.approx([2.0, 2.0, 4.5, 6.0])
+    assert ego_speeds(clip.frames(slice(0, 1)))[0].tolist() == [0.0]

@@ -28,6 +28,7 @@ def small_planner(
     ego_mlp: EgoMLPConfig | None = None,
     path: PathCorrectionConfig | None = None,
     target: bool = False,
+    final_norm: bool = False,
 ) -> VolumePlanner:
     config = PlannerConfig(
         width=16,
@@ -39,6 +40,7 @@ def small_planner(
         ego_mlp=ego_mlp,
         path=path,
         target=target,
+        final_norm=final_norm,
     )
     return VolumePlanner(config, SPEC, channels=4, horizon_steps=steps, dt_s=0.5).eval()
 
@@ -83,16 +85,46 @@ def test_the_next_volume_matters_where_it_is_looked_at(
 
 
 def test_where_nothing_is_learned_it_goes_straight_on() -> None:
-    """With a last layer of zeros it is constant velocity, and standing still where the speed is unknown."""
+    """With a last layer of zeros it is constant velocity, at the estimate where no speed was measured."""
     planner = small_planner("none", history=1, steps=3)
     torch.nn.init.zeros_(planner.waypoints[-1].weight)
     torch.nn.init.zeros_(planner.waypoints[-1].bias)
     volume, past = torch.randn(2, 4, 2, 8, 8), torch.randn(2, 1, 4)
-    speed, known = torch.tensor([6.0, 6.0]), torch.tensor([True, False])
+    speed, known = torch.tensor([6.0, 2.0]), torch.tensor([True, False])
     plan = planner(volume, None, torch.zeros(2, dtype=torch.int64), known, speed, known, past)
     assert plan.xy[0, 0].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
-    assert not plan.xy[1].any()
+    assert plan.xy[1, 0].tolist() == [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     assert not plan.yaw.any()
+
+
+def test_the_output_of_a_pre_norm_decoder_is_normalised_if_the_config_says_so() -> None:
+    """Without the norm, what the layers add up to reaches the waypoints; with it, only its direction."""
+    volume, past = torch.randn(1, 4, 2, 8, 8), torch.zeros(1, 0, 4)
+    status = torch.tensor([1]), torch.tensor([True]), torch.tensor([5.0]), torch.tensor([True]), past
+    found = {}
+    for final_norm in (False, True):
+        torch.manual_seed(0)
+        planner = small_planner("none", history=0, steps=3, final_norm=final_norm)
+        read: list[torch.Tensor] = []
+        planner.waypoints.register_forward_pre_hook(lambda _, inputs, read=read: read.append(inputs[0]))
+        planner(volume, None, *status)
+        with torch.no_grad():
+            for layer in planner.decoder:
+                for last in (layer.self_attn.out_proj, layer.multihead_attn.out_proj, layer.linear2):
+                    last.weight *= 100
+                    last.bias *= 100
+        planner(volume, None, *status)
+        found[final_norm] = [values.norm().item() for values in read]
+    before, after = found[False]
+    assert after > 10 * before
+    before, after = found[True]
+    assert before == pytest.approx(4.0, rel=1e-2)  # 16 channels of mean 0 and variance 1
+    assert after == pytest.approx(4.0, rel=1e-2)
+
+
+def test_old_weights_of_a_planner_fit_without_the_norm() -> None:
+    plain, normed = (small_planner("none", history=0, steps=3, final_norm=norm) for norm in (False, True))
+    assert set(normed.state_dict()) - set(plain.state_dict()) == {"final_norm.weight", "final_norm.bias"}
 
 
 def test_an_untrained_planner_drives_as_the_ego_mlp_it_starts_from() -> None:

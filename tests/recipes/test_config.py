@@ -107,9 +107,17 @@ def as_it_was(recipe: Any) -> Any:
     stages = {}
     for name in ("pretrain", "finetune"):
         stage = getattr(recipe, name)
-        if hasattr(stage, "pixels"):
-            stages[name] = dataclasses.replace(stage, pixels="thinned")
-    return dataclasses.replace(recipe, **stages)
+        weights = dataclasses.replace(stage.weights, over_frames="mean")
+        if stage.kind == "driveworld":
+            weights = dataclasses.replace(weights, scal=1.0, bce=10.0, occupied=3.0)
+        stages[name] = dataclasses.replace(stage, weights=weights)
+        if stage.kind == "nemo":
+            stages[name] = dataclasses.replace(stages[name], pixels="thinned")
+    planner = dataclasses.replace(recipe.planner, final_norm=False)
+    model, whole = recipe.of_pretraining.model, "world_model"
+    return dataclasses.replace(
+        recipe, **stages, planner=planner, model=model, pretrained_model=None, transfer=whole
+    )
 
 
 def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> None:

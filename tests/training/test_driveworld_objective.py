@@ -9,6 +9,7 @@ from miniature import miniature_driveworld
 
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import motion_of
+from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent
 from foredrive.scene import Example
 from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_velocities
@@ -124,3 +125,28 @@ def test_a_seed_decides_what_is_drawn(example: Example) -> None:
     first, again, other = (objective(example, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
     assert torch.equal(first["loss"], again["loss"])
     assert not torch.equal(first["occ"], other["occ"])
+
+
+def test_the_terms_of_equation_3_are_sums_over_frames_if_the_weights_say_so(example: Example) -> None:
+    """T observed and L imagined frames; the last action of a clip is unknown."""
+    observed, every = PAST + 1, PAST + 1 + STEPS
+    frames = {"kl": observed, "velocity": observed, "occ": every, "flow": every, "action": every - 1}
+    found = {}
+    for over_frames in ("mean", "sum"):
+        weights = dataclasses.replace(PLANNING.weights, over_frames=over_frames)
+        stage = dataclasses.replace(PLANNING, weights=weights)
+        objective = DriveWorldObjective(agent(), stage, steps=STEPS).eval()
+        found[over_frames] = objective(example, torch.Generator().manual_seed(0))
+    mean, total = found["mean"], found["sum"]
+    for name, count in frames.items():
+        torch.testing.assert_close(total[name], count * mean[name], msg=name)
+    torch.testing.assert_close(total["wpts"], mean["wpts"])
+    weighted = sum(getattr(PLANNING.weights, name) * total[name] for name in (*frames, "wpts"))
+    torch.testing.assert_close(total["loss"], weighted)
+
+
+def test_base_learns_occupancy_by_cross_entropy_alone() -> None:
+    """Eq. 3 has no affinity loss and no weight of occupied voxels."""
+    recipe = find_recipe("driveworld_base")
+    for stage in (recipe.pretrain, recipe.finetune):
+        assert (stage.weights.scal, stage.weights.bce, stage.weights.occupied) == (0.0, 1.0, 1.0)

@@ -87,6 +87,54 @@ def test_a_network_finds_equal_images_equal_and_blurred_ones_not(tmp_path: Path)
     assert all((a - b).abs().mean() > 0.01 for a, b in zip(levels, features(blurred), strict=True))
 
 
+@pytest.mark.parametrize(
+    ("over_frames", "future", "l1", "occ"),
+    [
+        ("mean", 1.0, 0.9 / 3, 1.3133 + 0.3133 + 1.3133),
+        ("mean", 0.25, (0.5 + 0.4 / 4) / 1.5, 2 * (1.3133 + 1.6266 / 4)),
+        ("sum", 1.0, 0.9, 3 * (1.3133 + 0.3133 + 1.3133)),
+        ("sum", 0.25, 0.5 + 0.4 / 4, 3 * (1.3133 + 1.6266 / 4)),
+    ],
+)
+def test_frames_are_summed_or_averaged_as_the_weights_say(
+    over_frames: str, future: float, l1: float, occ: float, example: Example
+) -> None:
+    """A model that renders grey everywhere and predicts the logit 1 in every voxel.
+
+    The true images have 0, 0.2 and 0.4 at now and later, so L1 is 0.5, 0.3 and 0.1. All voxels are free, then
+    occupied, then free: the cross entropies are ln(1 + e), ln(1 + 1/e) and ln(1 + e), here times 3.
+    """
+    now = example.clip.now
+    images, occupied = example.clip.images.clone(), example.occupancy.values.clone()
+    for k in range(3):
+        images[:, now + k] = (0, 51, 102)[k]
+        occupied[:, now + k] = (0.0, 1.0, 0.0)[k]
+    example = dataclasses.replace(
+        example,
+        clip=dataclasses.replace(example.clip, images=images),
+        occupancy=dataclasses.replace(example.occupancy, values=occupied),
+    )
+    weights = dataclasses.replace(
+        RECIPE.pretrain.weights, recon=2.0, occ=5.0, scal=0.0, bce=3.0, over_frames=over_frames, future=future
+    )
+    agent = build_agent(RECIPE)
+    for last, bias in ((agent.world_model.occupancy[-1], 1.0), (agent.world_model.renderer.recon[-1], 0.0)):
+        torch.nn.init.zeros_(last.weight)
+        torch.nn.init.constant_(last.bias, bias)
+    stage = dataclasses.replace(RECIPE.pretrain, weights=weights)
+    losses = build_objective(RECIPE, stage, agent)(example, torch.Generator().manual_seed(0))
+    found = {name: value.item() for name, value in losses.items()}
+    assert found["l1"] == pytest.approx(l1)
+    assert found["occ"] == pytest.approx(occ, rel=1e-4)
+    assert found["loss"] == pytest.approx(2 * l1 + 5 * occ, rel=1e-4)
+
+
+def test_recipes_of_towns_take_the_mean_and_base_recipes_the_sum() -> None:
+    for name in ("nemo_town", "nemo_base", "driveworld_town", "driveworld_base"):
+        for stage in (find_recipe(name).pretrain, find_recipe(name).finetune):
+            assert stage.weights.over_frames == ("sum" if name.endswith("base") else "mean")
+
+
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
 def test_a_file_of_vgg_weights_fits_the_recipes_of_towns(stage: str, tmp_path: Path) -> None:
     """Fine-tuning renders 6 × 10 pixels: too few to be pooled three times."""

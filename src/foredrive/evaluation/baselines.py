@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.errors import InputError
+from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene import Clip, Trajectory
 
 
@@ -36,15 +37,9 @@ class ConstantVelocity:
             InputError: if there is no earlier pose either.
         """
         now = observation.now
-        speed_mps, known = observation.ego_speed_mps[:, now], observation.ego_speed_valid[:, now]
-        if not bool(known.all()):
-            if now == 0:
-                raise InputError("constant velocity needs a speed at now or an earlier pose")
-            position = observation.T_world_ego[:, now - 1 : now + 1, :3, 3]
-            step_m = (position[:, 1] - position[:, 0]).norm(dim=-1)
-            travelled = (step_m / (observation.t_s[:, now] - observation.t_s[:, now - 1])).to(speed_mps)
-            speed_mps = torch.where(known, speed_mps, travelled)
-        return _straight(speed_mps, self.steps, self.dt_s)
+        if now == 0 and not bool(observation.ego_speed_valid[:, 0].all()):
+            raise InputError("constant velocity needs a speed at now or an earlier pose")
+        return _straight(ego_speeds(observation)[:, now], self.steps, self.dt_s)
 
 
 def _straight(speed_mps: Float[Tensor, "b"], steps: int, dt_s: float) -> Trajectory:

@@ -41,7 +41,7 @@ class GraphInputs(NamedTuple):
             K=frames.rig.K.contiguous(),
             T_ego_cam=frames.rig.T_ego_cam.contiguous(),
             dist=frames.rig.dist.contiguous(),
-            speed_mps=observed.ego_speed_mps[:, -1],
+            speed_mps=speeds[:, -1],
             speed_valid=observed.ego_speed_valid[:, -1],
             command=observed.command.long(),
             command_valid=observed.command_valid,

@@ -51,7 +51,7 @@ class PlanningAgent(nn.Module, Generic[W]):
             self.planner_volume(beliefs[1]) if self.planner.imagined_frames else None,
             clip.command,
             clip.command_valid,
-            clip.ego_speed_mps[:, now],
+            speeds[:, -1],
             clip.ego_speed_valid[:, now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
             route_target(clip) if self.planner.target else None,

@@ -45,20 +45,26 @@ class BackboneConfig:
     """Hub name or local folder of a `transformers` ResNet. Its sizes then replace the ones given here. None
     starts from random weights."""
     checkpoint: bool = False
-    """Keep only the images for the backward pass and recompute the rest. The running statistics of batch
-    normalisation then count every batch twice."""
+    """Keep only the images for the backward pass and recompute the rest. From random weights, the running
+    statistics of batch normalisation then count every batch twice."""
 
 
 class ImageBackbone(nn.Module):
     """A ResNet (He et al. 2016) with a feature pyramid (Lin et al. 2017). All levels have D channels.
 
+    Where weights were loaded, batch normalisation is frozen, as in DETR and BEVFormer: neither its statistics
+    nor its scales change in training.
+
     Args:
         config: sizes.
         channels: D of every pyramid level.
+        levels: number of levels to return, finest first; None returns all.
         fetch: load `config.weights`. Not needed when trained weights replace them later.
     """
 
-    def __init__(self, config: BackboneConfig, *, channels: int, fetch: bool = True) -> None:
+    def __init__(
+        self, config: BackboneConfig, *, channels: int, levels: int | None = None, fetch: bool = True
+    ) -> None:
         from transformers import ResNetBackbone, ResNetConfig  # slow to import, and recipes do not need it
 
         super().__init__()
@@ -78,6 +84,21 @@ class ImageBackbone(nn.Module):
         widths = self.resnet.channels
         self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])
+        self.levels = len(widths) if levels is None else levels
+        self.smooth[self.levels :].requires_grad_(False)  # they stay so that stored weights fit
+        for norm in self._frozen_norms():
+            norm.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> "ImageBackbone":
+        """Set the mode of all parts but frozen norms."""
+        super().train(mode)
+        for norm in self._frozen_norms():
+            norm.eval()
+        return self
+
+    def _frozen_norms(self) -> list[nn.BatchNorm2d]:
+        norms = [part for part in self.resnet.modules() if isinstance(part, nn.BatchNorm2d)]
+        return norms if self.pretrained else []
 
     def _load(self, weights: str, stages: Sequence[str]) -> None:
         from transformers import ResNetBackbone
@@ -93,7 +114,7 @@ class ImageBackbone(nn.Module):
             )
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
-        """Return the pyramid levels from fine to coarse, channels last."""
+        """Return the finest pyramid levels from fine to coarse, channels last."""
         if self.checkpoint and torch.is_grad_enabled():
             return checkpoint(self._pyramid, images, use_reentrant=False)
         return self._pyramid(images)
@@ -106,5 +127,6 @@ class ImageBackbone(nn.Module):
         for lateral, feature in zip(list(self.lateral)[-2::-1], maps[-2::-1], strict=True):
             merged = lateral(feature) + F.interpolate(merged, size=feature.shape[-2:], mode="nearest")
             levels.append(merged)
-        out = [smooth(level) for smooth, level in zip(self.smooth, levels[::-1], strict=True)]
+        finest = zip(self.smooth[: self.levels], levels[: -self.levels - 1 : -1], strict=True)
+        out = [smooth(level) for smooth, level in finest]
         return tuple(level.float().permute(0, 2, 3, 1) for level in out)

@@ -11,12 +11,24 @@ from foredrive.geometry.se3 import compose_se3, inverse_se3, yaw_from_matrix
 from foredrive.scene import Clip, Command, Trajectory
 
 
+def ego_speeds(clip: Clip) -> Float[Tensor, "b T"]:
+    """Return the speeds at all key frames, m/s. Unknown ones follow from the pose before (at first, after).
+
+    A clip of one key frame has no other pose: there an unknown speed is 0.
+    """
+    if clip.t_s.shape[1] == 1:
+        return torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)
+    travelled_m = clip.T_world_ego[..., :3, 3].diff(dim=1).norm(dim=-1)
+    between = (travelled_m / clip.t_s.diff(dim=1)).to(clip.ego_speed_mps)
+    return torch.where(clip.ego_speed_valid, clip.ego_speed_mps, torch.cat([between[:, :1], between], dim=1))
+
+
 def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Float[Tensor, "b P+1"]]:
     """Return past poses and speeds of the ego vehicle.
 
     Returns:
         x, y (m) and yaw (rad) of the last P = `past_frames` key frames in the ego frame at now; speed at
-        these frames and at now (m/s, 0 where unknown).
+        these frames and at now (see `ego_speeds`).
 
     Raises:
         InputError: the clip has fewer frames.
@@ -27,7 +39,7 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
     frames = slice(now - past_frames, now + 1)
     T_now_ego = compose_se3(inverse_se3(clip.T_world_ego[:, now : now + 1]), clip.T_world_ego[:, frames])
     poses = torch.cat([T_now_ego[..., :2, 3], yaw_from_matrix(T_now_ego)[..., None]], dim=-1)[:, :-1]
-    return poses.float(), torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)[:, frames]
+    return poses.float(), ego_speeds(clip.observed())[:, frames]
 
 
 def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[Tensor, "b S"]:

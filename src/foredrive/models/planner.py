@@ -63,6 +63,9 @@ class PlannerConfig:
     """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
     dropout: float = 0.1
     """Dropout of the decoder."""
+    final_norm: bool = False
+    """Normalise the output of the decoder, as pre-norm decoders do. False in runs from before there was a
+    choice."""
     speed_scale_mps: float = 10.0
     past_scale_m: float = 5.0
     target_scale_m: float = 20.0
@@ -255,6 +258,7 @@ class VolumePlanner(nn.Module):
             width, config.heads, round(config.feed_forward * width), config.dropout
         )
         self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(config.layers)])  # as in torch
+        self.final_norm = nn.LayerNorm(width) if config.final_norm else nn.Identity()
         self.waypoints = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
@@ -288,18 +292,20 @@ class VolumePlanner(nn.Module):
 
         Args:
             now, future: volumes at now and, if it is used, at the next key frame.
-            command, command_valid, speed_mps, speed_valid: values at now.
+            command, command_valid: at now.
+            speed_mps, speed_valid: speed at now, and whether it was measured and not estimated from poses. An
+                estimate is enough to begin with; the query is told that the speed is unknown.
             past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
             target: see `route_target`; required if the config's `target` is set.
         """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
-        speed_mps = torch.where(speed_valid, speed_mps, 0.0)
         initial_xy, ego_status = self.initial_plan(command, command_valid, speed_mps, past, target)
         command = torch.where(command_valid, command, len(Command))
         sizes = self.config
-        status = torch.stack([speed_mps / sizes.speed_scale_mps, speed_valid.to(speed_mps)], dim=-1)
+        measured_mps = torch.where(speed_valid, speed_mps, 0.0)
+        status = torch.stack([measured_mps / sizes.speed_scale_mps, speed_valid.to(speed_mps)], dim=-1)
         past_scale = past.new_tensor((sizes.past_scale_m, sizes.past_scale_m, 1.0, sizes.speed_scale_mps))
         status = torch.cat([status, (past / past_scale).flatten(1)], dim=-1)
         if self.target and target is not None:
@@ -311,7 +317,7 @@ class VolumePlanner(nn.Module):
         query = self.fuse_query(query)[:, None]
         for layer in self.decoder:
             query = layer(query, memory)
-        change = self.waypoints(query[:, 0]).float().unflatten(1, (self.horizon_steps, 2))
+        change = self.waypoints(self.final_norm(query[:, 0])).float().unflatten(1, (self.horizon_steps, 2))
         change = sizes.step_scale_m * change
         if self.path is not None:
             change = change + self.path(self.path.sample(now, initial_xy), ego_status)

@@ -36,6 +36,11 @@ class Recipe(Generic[M, S]):
     pretrain: S | None
     """None: fine-tuning starts from scratch or from given weights."""
     finetune: S
+    pretrained_model: M | None = None
+    """World model of pre-training if it is another than `model`. Both have the same encoder."""
+    transfer: Literal["world_model", "encoder"] = "world_model"
+    """Part of the pre-trained weights that fine-tuning starts from: the whole world model, or its backbone
+    and encoder from images to a volume or plane. All other parts then start fresh, by the seed alone."""
     path: PathFit | None = None
     """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
     trains it in fine-tuning."""
@@ -44,6 +49,11 @@ class Recipe(Generic[M, S]):
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
+
+    @property
+    def of_pretraining(self) -> "Recipe[M, S]":
+        """Return the recipe with the world model of pre-training."""
+        return self if self.pretrained_model is None else replace(self, model=self.pretrained_model)
 
 
 def rescheduled(stage: S, **changes: Any) -> S:

@@ -29,9 +29,11 @@ OBSERVED, IMAGINED = 4, 4
 def driveworld_tiny() -> DriveWorldRecipe:
     """Return a small DriveWorld for two CPU cores. It has all parts, and T and L of the paper.
 
-    Images, voxels and the planner are those of `nemo_tiny`.
+    Images, voxels and the planner are those of `nemo_tiny`. The occupancy loss is its too, not eq. 3's
+    cross-entropy: after so few steps, that alone calls no voxel occupied.
     """
     nemo = nemo_tiny()
+    few_steps = DriveWorldWeights(scal=1.0, bce=10.0, occupied=3.0)
     return Recipe(
         name="driveworld_tiny",
         about="DriveWorld small enough for two CPU cores",
@@ -55,11 +57,11 @@ def driveworld_tiny() -> DriveWorldRecipe:
         planner=nemo.planner,
         pretrain=DriveWorldStage(
             schedule=Schedule(batch_size=4, lr=2e-3, steps=400, warmup_steps=20, workers=1),
-            weights=DriveWorldWeights(),
+            weights=few_steps,
         ),
         finetune=DriveWorldStage(
             schedule=Schedule(batch_size=4, lr=1e-3, steps=160, warmup_steps=10, workers=1),
-            weights=DriveWorldWeights(occ=0.5, wpts=1.0),
+            weights=replace(few_steps, occ=0.5, wpts=1.0),
             statics_of="now",
         ),
     )
@@ -90,13 +92,15 @@ def driveworld_town() -> DriveWorldRecipe:
 def driveworld_base() -> DriveWorldRecipe:
     """Return the paper's size: ResNet-101, 200×200×16 voxels, 24 epochs at 2e-4, then 20.
 
-    The 20 epochs are UniAD's second stage.
+    The paper's ResNet-101 has deformable convolutions (DCN), this one has none. The 20 epochs are UniAD's
+    second stage. The occupancy loss is eq. 3's cross-entropy, summed over frames.
 
     Constants are from §4.1 and from MILE (state and history). Values not given there: D = 64, a plane of 256
     channels, a memory of 16, K = 32, images of 448×800, voxels of 0.5 m.
     """
     nemo = nemo_base()
     schedule = replace(nemo.finetune.schedule, epochs=24)
+    as_published = DriveWorldWeights(over_frames="sum")
     return Recipe(
         name="driveworld_base",
         about="DriveWorld at the paper's size, for a GPU",
@@ -125,10 +129,10 @@ def driveworld_base() -> DriveWorldRecipe:
             ),
         ),
         planner=nemo.planner,
-        pretrain=DriveWorldStage(schedule=schedule, weights=DriveWorldWeights()),
+        pretrain=DriveWorldStage(schedule=schedule, weights=as_published),
         finetune=DriveWorldStage(
             schedule=replace(schedule, epochs=20),
-            weights=DriveWorldWeights(occ=0.5, wpts=1.0),
+            weights=replace(as_published, occ=0.5, wpts=1.0),
             statics_of="now",
         ),
         precision=nemo.precision,

@@ -9,29 +9,35 @@ from foredrive.recipes.driveworld import DriveWorldRecipe
 def driveworld_ablations(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
     """Return all rows by name: the full DriveWorld first, under its own name, the others as FULL_ROW.
 
-    The full DriveWorld is `mln` with task prompts. All rows are fine-tuned in the same way.
+    The rows of Table 1 differ in pre-training alone. As in §3.5, backbone and encoder are carried over to
+    fine-tuning; all other parts are those of the full DriveWorld and start fresh, the same in every row.
 
     Args:
         full: a recipe with pre-training.
     """
     size, stage = full.model, full.pretrain
     assert stage is not None
+    alone = replace(full, transfer="encoder")
     mln = replace(size, prompt=None)
     dmb = replace(mln, states=replace(mln.states, motion_norm=False))
     ssp = replace(dmb, states=replace(dmb.states, memory_bank=False))
     rows = {
         "scratch": (replace(full, pretrain=None), "without pre-training (Table 1)"),
         "occupancy": (
-            replace(full, pretrain=replace(stage, temporal=False)),
-            "pre-trained by the occupancy of single frames, as OccNet and UniScene are",
+            replace(alone, pretrain=replace(stage, temporal=False)),
+            "encoder pre-trained by the occupancy of single frames, as OccNet and UniScene are",
         ),
         "rssm": (
-            replace(full, model=replace(ssp, statics=None)),
-            "plain latent dynamics in one vector (Table 1)",
+            replace(alone, pretrained_model=replace(ssp, statics=None)),
+            "encoder pre-trained by plain latent dynamics in one vector (Table 1)",
         ),
-        "ssp": (replace(full, model=ssp), "rssm with Static Scene Propagation (Table 1)"),
-        "dmb": (replace(full, model=dmb), "ssp with the Dynamic Memory Bank (Table 1)"),
-        "mln": (replace(full, model=mln), "dmb with motion-aware layer normalisation (Table 1)"),
+        "ssp": (replace(alone, pretrained_model=ssp), "rssm with Static Scene Propagation (Table 1)"),
+        "dmb": (replace(alone, pretrained_model=dmb), "ssp with the Dynamic Memory Bank (Table 1)"),
+        "mln": (
+            replace(alone, pretrained_model=mln),
+            "dmb with motion-aware layer normalisation (Table 1)",
+        ),
+        "prompts": (alone, "mln with task prompts (Table 1)"),
         "carried": (
             replace(full, model=replace(size, warp_statics=True)),
             "latent statics warped by the ego motion; not in the paper",

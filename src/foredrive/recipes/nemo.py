@@ -49,7 +49,7 @@ def nemo_tiny() -> NemoRecipe:
             channels=32,
             occupancy_hidden=32,
         ),
-        planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4)),
+        planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4), final_norm=True),
         pretrain=NemoStage(
             schedule=Schedule(batch_size=4, lr=2e-3, steps=200, warmup_steps=20, workers=1),
             weights=dataclasses.replace(few_steps, wpts=0.0, recon=2.0, occ=1.0),
@@ -120,6 +120,10 @@ def nemo_base() -> NemoRecipe:
 
     Constants are from §4.1. Values not given there: D = 64, three rounds of lifting with 8 heads and 8
     points, four pyramid levels, T_f = 3 at 0.5 s, images of 448×800, λ_perc = 0.1 (Video Autoencoder).
+    The images are half of nuScenes' 900×1600, with the height rounded to whole strides (32) of the backbone.
+
+    The planner departs from the paper: its decoder is normalised first, and its output is the difference from
+    driving on at constant velocity.
     """
     schedule = Schedule(
         batch_size=1,
@@ -154,17 +158,17 @@ def nemo_base() -> NemoRecipe:
             channels=64,
             occupancy_hidden=64,
         ),
-        planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8)),
+        planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8), final_norm=True),
         pretrain=NemoStage(
             schedule=schedule,
-            weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0),
+            weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0, over_frames="sum"),
             ray_stride=8,
             pixels="averaged",
             perceptual="vgg16",
         ),
         finetune=NemoStage(
             schedule=schedule,
-            weights=NemoWeights(wpts=1.0, recon=0.5, occ=0.5),
+            weights=NemoWeights(wpts=1.0, recon=0.5, occ=0.5, over_frames="sum"),
             ray_stride=8,
             pixels="averaged",
             perceptual="vgg16",

@@ -44,7 +44,8 @@ def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
     """Restore model and optimizer. Return the number of finished steps.
 
     Raises:
-        InputError: the checkpoint cannot be read or is of another architecture.
+        InputError: the checkpoint cannot be read, is of another architecture, or has other groups of
+            parameters.
     """
     load_weights(model, path / MODEL)
     try:
@@ -52,7 +53,12 @@ def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
         tensors = load_file(path / OPTIMIZER)
     except (OSError, ValueError, SafetensorError) as error:
         raise InputError(f"{path}: checkpoint cannot be read: {error}") from error
-    _restore_optimizer(optimizer, tensors, progress["optimizer"])
+    try:
+        _restore_optimizer(optimizer, tensors, progress["optimizer"])
+    except ValueError as error:
+        raise InputError(
+            f"{path}: checkpoint of an earlier version, {error}; train this stage anew"
+        ) from error
     return int(progress["step"])
 
 
@@ -96,6 +102,17 @@ def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[st
 
 
 def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor], scalars: dict[str, Any]) -> None:
+    """Restore an optimizer.
+
+    Raises:
+        ValueError: it had other groups of parameters.
+    """
+    sizes = [
+        [len(group["params"]) for group in groups]
+        for groups in (optimizer.param_groups, scalars["param_groups"])
+    ]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"whose optimizer has groups of {sizes[1]} parameters, not of {sizes[0]}")
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)

@@ -12,6 +12,7 @@ from foredrive.errors import InputError
 from foredrive.models.detection import DetectionHead
 from foredrive.sets import LabelledBoxes, MultiBernoulli
 from foredrive.training.detection_losses import Loss
+from foredrive.training.parameter_groups import parameter_groups
 
 Sample = tuple[Float[Tensor, "D Z Y X"], LabelledBoxes]
 """A volume and its labelled objects."""
@@ -36,7 +37,7 @@ def fit_head(
         raise InputError(f"{len(samples)} samples are fewer than a batch of {batch}")
     head = copy.deepcopy(head).train()
     rng = np.random.default_rng(seed)
-    optimizer = torch.optim.AdamW(head.parameters(), learning_rate)
+    optimizer = torch.optim.AdamW(parameter_groups(head, weight_decay=1e-2), learning_rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, total_steps=steps)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # for losses that draw samples

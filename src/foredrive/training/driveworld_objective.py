@@ -19,7 +19,7 @@ from foredrive.training.objective import set_planner_trainable
 
 @dataclass(frozen=True)
 class DriveWorldWeights:
-    """Weights of the terms of eq. 3, each a mean over frames. The paper gives none; the first two are MILE's.
+    """Weights of the terms of eq. 3. The paper gives none; the first two are MILE's.
 
     If all are 0 except `wpts`, only planning is trained.
     """
@@ -34,12 +34,14 @@ class DriveWorldWeights:
     """L2, where labels have flow."""
     velocity: float = 0.1
     """L1 of the velocities of moving objects, where boxes are known, in units of the scale of speed."""
-    scal: float = 1.0
-    bce: float = 10.0
-    occupied: float = 3.0
-    """Weights within the occupancy loss, as for NeMo."""
+    scal: float = 0.0
+    bce: float = 1.0
+    occupied: float = 1.0
+    """Weights within the occupancy loss, as for NeMo. The defaults are eq. 3's cross-entropy."""
     wpts: float = 0.0
     """Weight of the waypoints. With 0 the planner is not trained."""
+    over_frames: Literal["mean", "sum"] = "mean"
+    """Reduction of every term but the waypoints over its frames. Eq. 3 sums."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +103,18 @@ class DriveWorldObjective(nn.Module):
     def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
         """Return the divergence of prior and posterior and the errors of the policy and the velocities."""
         first = clip.now + 1 - len(unrolled.posteriors)
-        pairs = zip(unrolled.posteriors, unrolled.priors, strict=True)
+        pairs = list(zip(unrolled.posteriors, unrolled.priors, strict=True))
         balance = self.stage.weights.balance
         kl = torch.stack([balanced_kl(q, p, balance).mean() for q, p in pairs]).mean()
         return {
-            "kl": kl,
+            "kl": self._over_frames(kl, len(pairs)),
             "action": self._action_loss(unrolled, clip, slice(first, clip.now + self.steps + 1)),
             "velocity": self._velocity_loss(unrolled, clip, slice(first, clip.now + 1)),
         }
+
+    def _over_frames(self, mean: Float[Tensor, ""], frames: int) -> Float[Tensor, ""]:
+        """Return the mean of a term over its frames, or their sum if the weights say so."""
+        return mean if self.stage.weights.over_frames == "mean" else frames * mean
 
     def _volume_losses(self, beliefs: Sequence[Belief], example: Example) -> dict[str, Float[Tensor, ""]]:
         """Return the losses of occupancy and flow over all frames."""
@@ -128,14 +134,19 @@ class DriveWorldObjective(nn.Module):
             if decoded.flow is not None and weights.flow > 0:
                 squared = (decoded.flow - example.flow.values[:, frame]).square().sum(dim=1)
                 flow.append(masked_mean(squared, example.flow.known[:, frame]))
-        losses = {"occ": torch.stack(occ).mean()}
-        return losses | {"flow": torch.stack(flow).mean()} if flow else losses
+        terms = {"occ": occ, "flow": flow}
+        return {
+            name: self._over_frames(torch.stack(values).mean(), len(values))
+            for name, values in terms.items()
+            if values
+        }
 
     def _action_loss(self, unrolled: Unrolled, clip: Clip, frames: slice) -> Float[Tensor, ""]:
         """Return the L1 error of the policy's actions. The action at the clip's last frame is unknown."""
         driven = actions_of(clip)[:, frames.start : min(frames.stop, clip.t_s.shape[1] - 1)]
         error = (unrolled.actions[:, : driven.shape[1]] - driven).abs()
-        return (error / self.agent.world_model.states.action_scale).mean()
+        mean = (error / self.agent.world_model.states.action_scale).mean()
+        return self._over_frames(mean, error.shape[1])
 
     def _velocity_loss(self, unrolled: Unrolled, clip: Clip, frames: slice) -> Float[Tensor, ""]:
         """Return the L1 error of the velocities of the nearest moving objects, sorted by distance."""
@@ -143,7 +154,8 @@ class DriveWorldObjective(nn.Module):
         boxes = clip.boxes[:, frames]
         truth, exists = nearest_velocities(boxes, estimated.shape[2], self.stage.moving_mps)
         error = (estimated - truth).abs().sum(-1) / self.agent.world_model.states.speed_scale_mps
-        return masked_mean(error, exists & clip.boxes_valid[:, frames, None])
+        mean = masked_mean(error, exists & clip.boxes_valid[:, frames, None])
+        return self._over_frames(mean, error.shape[1])
 
 
 def nearest_velocities(

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from foredrive.training.parameter_groups import parameter_groups
+
 
 @dataclass(frozen=True)
 class FitSchedule:
@@ -34,7 +36,7 @@ def fit_in_memory(
         fit: schedule.
         seed: seed of the draws and of dropout. Torch's own generators are restored afterwards.
     """
-    optimizer = torch.optim.AdamW(module.parameters(), lr=fit.lr, weight_decay=fit.weight_decay)
+    optimizer = torch.optim.AdamW(parameter_groups(module, fit.weight_decay), lr=fit.lr)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)
     draws = torch.Generator().manual_seed(seed)
     module.train()

@@ -20,6 +20,7 @@ from foredrive.files import atomic_path, naming
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.training.one_cycle import OneCycle
+from foredrive.training.parameter_groups import parameter_groups
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
@@ -59,6 +60,7 @@ class Schedule:
     steps: int | None = None
     epochs: int | None = None
     weight_decay: float = 1e-2
+    """Of weight matrices and filters, see `parameter_groups`."""
     warmup_steps: int = 0
     final_lr_fraction: float = 0.0
     clip_grad_norm: float = 35.0
@@ -119,11 +121,7 @@ def train(
     if items == 0:
         raise InputError("there is nothing to train on: the data set is empty")
     total = schedule.total_steps(items, fabric.world_size)
-    optimizer = torch.optim.AdamW(
-        [p for p in objective.parameters() if p.requires_grad],
-        lr=schedule.lr,
-        weight_decay=schedule.weight_decay,
-    )
+    optimizer = torch.optim.AdamW(parameter_groups(objective, schedule.weight_decay), lr=schedule.lr)
     model, fabric_optimizer = fabric.setup(objective, optimizer)
     found = latest_checkpoint(folder / CHECKPOINTS)
     done = load_checkpoint(found, objective, optimizer) if found is not None else 0

@@ -34,6 +34,9 @@ class NemoWeights:
     """Weight of occupied voxels within the BCE. Above the road, only a few percent are occupied."""
     future: float = 1.0
     """Weight of each imagined key frame relative to now. The paper weighs all equally."""
+    over_frames: Literal["mean", "sum"] = "mean"
+    """Reduction of `recon` and `occ` over now and the imagined frames. Eq. 9 and 10 sum, so with T_f = 3 a
+    mean has a quarter of their weight beside `wpts`. Over voxels and pixels both take the mean."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,8 @@ class NemoObjective(nn.Module):
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
-        for k, (belief, share) in enumerate(zip(decoded, shares / shares.sum(), strict=True)):
+        shares = shares / shares.sum() if weights.over_frames == "mean" else shares
+        for k, (belief, share) in enumerate(zip(decoded, shares, strict=True)):
             frame = now + k
             if weights.occ > 0:
                 losses["occ"] = losses["occ"] + share * occupancy_loss(

@@ -128,9 +128,11 @@ class DriveWorld(nn.Module):
         height, size_yx = spec.shape_zyx[0], spec.shape_zyx[1:]
         self.spec, self.channels, self.past_frames, self.dt_s = spec, channels, past_frames, dt_s
         self.warp_statics = config.warp_statics
-        self.backbone = ImageBackbone(config.backbone, channels=channels, fetch=fetch)
+        finest_alone = isinstance(config.encoder, LiftSplatConfig)
+        levels = 1 if finest_alone else len(config.backbone.stages)
+        self.backbone = ImageBackbone(config.backbone, channels=channels, levels=levels, fetch=fetch)
         self.encoder = ENCODERS[type(config.encoder)](
-            config.encoder, spec, channels=channels, plane_channels=plane, levels=len(config.backbone.stages)
+            config.encoder, spec, channels=channels, plane_channels=plane, levels=levels
         )
         self.states = StateSpace(states)
         self.to_vector = PlaneToVector(config.to_vector, channels=plane, vector=states.observation)

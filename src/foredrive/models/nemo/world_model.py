@@ -75,10 +75,12 @@ class Nemo(nn.Module):
         fetch: bool = True,
     ) -> None:
         super().__init__()
-        channels, levels = config.channels, len(config.backbone.stages)
+        channels = config.channels
+        finest_alone = isinstance(config.encoder, AveragingConfig)
+        levels = 1 if finest_alone else len(config.backbone.stages)
         self.spec, self.channels, self.dt_s = spec, channels, dt_s
         self.past_frames, self.max_steps = past_frames, max_steps
-        self.backbone = ImageBackbone(config.backbone, channels=channels, fetch=fetch)
+        self.backbone = ImageBackbone(config.backbone, channels=channels, levels=levels, fetch=fetch)
         self.encoder = ENCODERS[type(config.encoder)](config.encoder, spec, channels=channels, levels=levels)
         self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
         self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)

@@ -98,8 +98,9 @@ def train_run(
         logs: logs for all stages.
         folder: folder of the run.
         cache_dir: folder for labels and shrunk images; by default in `folder`.
-        start: a run folder. Its pre-trained world model is used, and this run skips that stage. It allows
-            pre-training on many logs and fine-tuning on few, or with another planner.
+        start: a run folder. The part of its pre-trained world model that the recipe transfers is used, and
+            this run skips that stage. It allows pre-training on many logs and fine-tuning on few, or with
+            another planner.
 
     Raises:
         InputError: `folder` holds a run of another recipe, other logs or another start; another process
@@ -124,12 +125,15 @@ def train_run(
 def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
     """Train the stages that are not finished yet, in order."""
     recipe, folder = run.recipe, run.folder
-    torch.manual_seed(recipe.finetune.schedule.seed)
-    agent = build_agent(recipe)
+    if pretrained is None and recipe.pretrain is not None:
+        pretrained = folder / "pretrain" / WEIGHTS
+        if not pretrained.is_file():
+            _train_stage(
+                run, "pretrain", recipe.pretrain, fresh_agent(recipe.of_pretraining), dataset, fabric
+            )
+    agent = fresh_agent(recipe)
     if pretrained is not None:
-        load_weights(agent.get_submodule("world_model"), pretrained, "world_model")
-    elif recipe.pretrain is not None:
-        _train_stage(run, "pretrain", recipe.pretrain, agent, dataset, fabric)
+        load_pretrained(agent, recipe, pretrained)
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
@@ -138,6 +142,24 @@ def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabri
     _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
     if recipe.path is not None:
         _fit_path(run, recipe.path, agent, fabric)
+
+
+def fresh_agent(recipe: Recipe) -> PlanningAgent[Any]:
+    """Build an agent whose first weights follow from the seed of the recipe alone."""
+    torch.manual_seed(recipe.finetune.schedule.seed)
+    return build_agent(recipe)
+
+
+def load_pretrained(agent: PlanningAgent[Any], recipe: Recipe, weights: Path) -> None:
+    """Load the part of pre-trained weights that fine-tuning starts from.
+
+    Raises:
+        InputError: the file cannot be read, or this part is of another architecture.
+    """
+    parts = ("backbone", "encoder") if recipe.transfer == "encoder" else ("",)
+    for part in parts:
+        name = f"world_model.{part}".rstrip(".")
+        load_weights(agent.get_submodule(name), weights, name)
 
 
 def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric") -> None:
