@@ -257,7 +257,7 @@ def test_training_trains(stage: str, falls_to: dict[str, float], trained: Run, t
     clip = OneClip(ClipDataset(trained.logs, recipe.clips, trained.cache_dir)[0])
     torch.manual_seed(0)
     agent = build_agent(recipe)
-    schedule = Schedule(batch_size=1, lr=3e-2, steps=50, final_lr_fraction=1.0)
+    schedule = Schedule(batch_size=1, lr=2e-2, steps=50, final_lr_fraction=1.0)
     objective = build_objective(recipe, getattr(recipe, stage), agent)
     train(objective, clip, collate, schedule, tmp_path, Fabric(accelerator="cpu", devices=1))
     lines = losses(tmp_path, ".")

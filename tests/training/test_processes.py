@@ -12,9 +12,9 @@ from foredrive.training import read_metrics
 SCRIPT = """
 import sys
 from pathlib import Path
+from conftest import synthetic_example  # before anything of the package
 from lightning_fabric import Fabric
 from test_loop import Items, Prior, collate
-from conftest import synthetic_example
 from foredrive.training.loop import Schedule, train
 
 fabric = Fabric(accelerator="cpu", devices=2, strategy="ddp")
