@@ -79,55 +79,21 @@ def solve(cost, free):
     has its own such column, so these never conflict.
     """
     rows, columns = cost.shape
-    column_of = np.full(rows, -1)
-    row_of = np.full(columns, -1)
+    column_of, row_of = np.full(rows, -1), np.full(columns, -1)
     u, v = np.zeros(rows), np.zeros(columns)
     distance = np.empty(columns)
     before = np.empty(columns, np.int64)  # the row from which a column is reached
     done = np.empty(columns, np.bool_)
-    # Each round adds row `start` by Dijkstra's algorithm on reduced costs. The path alternates between rows
-    # and the columns that they hold.
     for start in range(rows):
-        distance[:] = np.inf
-        done[:] = False
-        row, reached = start, 0.0
-        none_distance, none_row = np.inf, -1
-        while True:
-            # A path may end at any reached row that takes "no column". Keep the shortest such path.
-            to_none = reached + free[row] - u[row]
-            if to_none < none_distance:
-                none_distance, none_row = to_none, row
-            nearest, end = np.inf, columns
-            # Relax the edges from `row`, and find the nearest column that is not done.
-            for c in range(columns):
-                if done[c]:
-                    continue
-                d = reached + cost[row, c] - u[row] - v[c]
-                if d < distance[c]:
-                    distance[c] = d
-                    before[c] = row
-                if distance[c] < nearest:
-                    nearest, end = distance[c], c
-            # Ending with "no column" is shortest.
-            if none_distance <= nearest:
-                reached, end = none_distance, columns
-                break
-            reached = nearest
-            # The nearest column is unassigned: the path ends there.
-            if row_of[end] < 0:
-                break
-            # The nearest column is assigned: its row needs another column.
-            done[end] = True
-            row = row_of[end]
+        length, end, row = _shortest_path(cost, free, u, v, row_of, start, distance, before, done)
         # Update the prices of the rows and columns on the search tree, so that reduced costs stay ≥ 0 and are
         # 0 for assigned pairs.
-        u[start] += reached
+        u[start] += length
         for c in range(columns):
             if done[c]:
-                u[row_of[c]] += reached - distance[c]
-                v[c] -= reached - distance[c]
+                u[row_of[c]] += length - distance[c]
+                v[c] -= length - distance[c]
         # Augment: follow the path backwards. Each row takes its new column and gives up its old one.
-        row = none_row if end == columns else before[end]
         while True:
             if end < columns:
                 row_of[end] = row
@@ -136,6 +102,48 @@ def solve(cost, free):
                 break
             row = before[end]
     return column_of, u, v
+
+
+@_kernel
+@no_type_check
+def _shortest_path(cost, free, u, v, row_of, start, distance, before, done):
+    """Find the shortest path from the unassigned row `start` to a free end, by Dijkstra on reduced costs.
+
+    The path alternates between rows and the columns that they hold. It ends at an unassigned column, or at a
+    reached row that takes "no column". `distance`, `before` and `done` are overwritten.
+
+    Returns:
+        The length of the path.
+        The column at its end; C for "no column".
+        The row before that end.
+    """
+    columns = len(v)
+    distance[:] = np.inf
+    done[:] = False
+    row, reached = start, 0.0
+    none_distance, none_row = np.inf, start
+    while True:
+        to_none = reached + free[row] - u[row]
+        if to_none < none_distance:
+            none_distance, none_row = to_none, row
+        nearest, end = np.inf, columns
+        # Relax the edges from `row`, and find the nearest column that is not done.
+        for c in range(columns):
+            if done[c]:
+                continue
+            d = reached + cost[row, c] - u[row] - v[c]
+            if d < distance[c]:
+                distance[c] = d
+                before[c] = row
+            if distance[c] < nearest:
+                nearest, end = distance[c], c
+        if none_distance <= nearest:
+            return none_distance, columns, none_row
+        if row_of[end] < 0:
+            return nearest, end, before[end]
+        # The nearest column is assigned: its row needs another column.
+        reached, done[end] = nearest, True
+        row = row_of[end]
 
 
 @_kernel
@@ -210,8 +218,11 @@ def _insert(waiting, parent_of, row_cut, wanted, cost, parent, row):
 @_kernel
 @no_type_check
 def _drop_first(waiting, parent_of, row_cut):
-    waiting[:-1], parent_of[:-1], row_cut[:-1] = waiting[1:].copy(), parent_of[1:].copy(), row_cut[1:].copy()
-    waiting[-1] = np.inf
+    """Remove the cheapest subproblem from the sorted list."""
+    last = len(waiting) - 1
+    for n in range(last):
+        waiting[n], parent_of[n], row_cut[n] = waiting[n + 1], parent_of[n + 1], row_cut[n + 1]
+    waiting[last] = np.inf
 
 
 @_kernel
@@ -230,17 +241,9 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
         The distance of the first unused node on it (inf if it has none).
         That node (-1 if it has none).
     """
-    rows, columns = cost.shape
+    columns = cost.shape[1]
     distance, before, done, row_of = search
-    distance[:] = np.inf
-    done[:] = False
-    row_of[:] = -1
-    for r in range(rows):
-        node = column_of[r] if column_of[r] < columns else columns + r
-        row_of[node] = r
-        # Nodes of fixed rows are not available.
-        if r < start:
-            done[node] = done[columns + r] = True
+    _reset(search, column_of, columns, start)
     target = column_of[start] if column_of[start] < columns else columns + start
     row, reached, reached_unused, unused = start, 0.0, np.inf, -1
     while True:
@@ -257,7 +260,7 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
                 distance[own], before[own] = d, row
         # Continue with the nearest node that is not done.
         nearest, end = room, -1
-        for x in range(columns + rows):
+        for x in range(len(distance)):
             if distance[x] < nearest and not done[x]:
                 nearest, end = distance[x], x
         if end < 0:
@@ -267,17 +270,41 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
             return reached, reached_unused, unused
         done[end] = True
         row = row_of[end]
-        if row < 0:
-            # The first unused node is reached. All unused nodes are equivalent from here on. An idle row has
-            # cost 0, so its reduced cost to node x is -v[x] ≥ 0.
+        if row < 0:  # it happens once: all unused nodes are done afterwards
             reached_unused, unused = reached, end
-            for x in range(columns + rows):
-                if done[x]:
-                    continue
-                if row_of[x] < 0:
-                    done[x] = True
-                elif reached - v[x] < distance[x]:
-                    distance[x], before[x] = reached - v[x], _BY_UNUSED
+            _relax_from_unused(v, reached, search)
+
+
+@_kernel
+@no_type_check
+def _reset(search, column_of, columns, start):
+    """Begin a search: note the row of each used node. The nodes of rows before `start` are not available."""
+    distance, _, done, row_of = search
+    distance[:] = np.inf
+    done[:] = False
+    row_of[:] = -1
+    for r in range(len(column_of)):
+        node = column_of[r] if column_of[r] < columns else columns + r
+        row_of[node] = r
+        if r < start:
+            done[node] = done[columns + r] = True
+
+
+@_kernel
+@no_type_check
+def _relax_from_unused(v, reached, search):
+    """Continue a path from the first unused node that it reaches. All unused nodes are equivalent from here.
+
+    An idle row has cost 0, so its reduced cost to node x is -v[x] ≥ 0.
+    """
+    distance, before, done, row_of = search
+    for x in range(len(v)):
+        if done[x]:
+            continue
+        if row_of[x] < 0:
+            done[x] = True
+        elif reached - v[x] < distance[x]:
+            distance[x], before[x] = reached - v[x], _BY_UNUSED
 
 
 @_kernel
@@ -287,7 +314,9 @@ def _apply(column_of, u, v, start, length, reached_unused, unused, search):
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows
-    # The usual update would lower the price of unused nodes. `rise` shifts all prices so that it stays 0.
+    # Dijkstra's update lowers the price of a node nearer than the end by `length` - distance, and raises that of
+    # its row by as much. It would lower the prices of unused nodes, too, which must stay 0. `rise` is that
+    # amount: it is added back to every node, and taken from every row.
     rise = length - reached_unused if reached_unused < np.inf else 0.0
     for x in range(len(v)):
         r = row_of[x]

@@ -18,10 +18,10 @@ from foredrive.sets.component import Components, find_components, scale, sum_com
 from foredrive.sets.gating import bound_left_out, gate, thin
 from foredrive.sets.interval import bound_choices, bound_component
 
-_THINNER_NATS = (1e-6, 1e-4, 1e-2, 0.1, 1.0, 10.0)
+_THINNING_NATS = (1e-6, 1e-4, 1e-2, 0.1, 1.0, 10.0)
 """Steps of the thinning of a large component: limit of the loss in nats, until the component can be summed.
 """
-_WIDE_NATS = 1.0
+_LOOSE_NATS = 1.0
 """Width in nats of an interval from which a second upper bound is computed."""
 
 
@@ -173,7 +173,7 @@ def _sum_large(
     max_states: int,
 ) -> _Found:
     """Sum a subset of the pairs of a component that is too large, and bound the contribution of the rest."""
-    found = _sum_thinner(log_pair, log_row, log_column, k, max_states, _THINNER_NATS)
+    found = _sum_thinned(log_pair, log_row, log_column, k, max_states, _THINNING_NATS)
     left_out = log_pair > -np.inf
     left_out[found.row, found.column] = False
     row, column = np.nonzero(left_out)
@@ -181,24 +181,24 @@ def _sum_large(
     log_weight = np.full(len(row), np.inf)
     log_weight[alone] = (log_pair[row, column] + found.log_freed[column])[alone] - log_row[row][alone]
     found.log_upper += bound_left_out(log_weight, row, column)
-    if found.log_upper - found.log_lower > _WIDE_NATS:
+    if found.log_upper - found.log_lower > _LOOSE_NATS:
         found.log_upper = min(found.log_upper, bound_choices(scale(log_pair, log_row, log_column)))
     return found
 
 
-def _sum_thinner(
+def _sum_thinned(
     log_pair: Float[ndarray, "R C"],
     log_row: Float[ndarray, "R"],
     log_column: Float[ndarray, "C"],
     k: int,
     max_states: int,
-    thinner_nats: tuple[float, ...],
+    thinning_nats: tuple[float, ...],
 ) -> _Found:
     """Leave out pairs until the rest can be summed. If it never can, sum the k best associations."""
     scaled = scale(log_pair, log_row, log_column)
-    if thinner_nats:
-        row, column = thin(scaled, thinner_nats[0])
-        sum_large = partial(_sum_thinner, k=k, max_states=max_states, thinner_nats=thinner_nats[1:])
+    if thinning_nats:
+        row, column = thin(scaled, thinning_nats[0])
+        sum_large = partial(_sum_thinned, k=k, max_states=max_states, thinning_nats=thinning_nats[1:])
         return _sum_kept(log_pair, log_row, log_column, row, column, max_states, sum_large)
     interval = bound_component(scaled, k)
     row, column = np.nonzero(log_pair > -np.inf)

@@ -21,12 +21,12 @@ from foredrive.sets.processes import MultiBernoulli, PoissonMultiBernoulli, Pois
 class ExistenceMap:
     """An increasing, piecewise linear map from predicted to calibrated probabilities."""
 
-    said: Float[ndarray, "n"]
-    meant: Float[ndarray, "n"]
+    predicted: Float[ndarray, "n"]
+    calibrated: Float[ndarray, "n"]
 
     def __call__(self, probability: Float[ndarray, "m"]) -> Float[ndarray, "m"]:
         """Return the calibrated probabilities."""
-        return np.interp(probability, self.said, self.meant)
+        return np.interp(probability, self.predicted, self.calibrated)
 
 
 def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n"]) -> ExistenceMap:
@@ -38,12 +38,12 @@ def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n
     if len(probability) == 0:
         raise InputError("calibration of existence needs detections")
     order = np.argsort(probability, kind="stable")
-    said, where = np.unique(probability[order], return_inverse=True)
-    count = np.bincount(where)
-    mean = np.bincount(where, np.asarray(happened, dtype=float)[order]) / count
+    predicted, which = np.unique(probability[order], return_inverse=True)
+    count = np.bincount(which)
+    mean = np.bincount(which, np.asarray(happened, dtype=float)[order]) / count
     fitted = isotonic_regression(mean, weights=count.astype(float)).x
-    least = 0.5 / len(probability)
-    return ExistenceMap(said, np.clip(fitted, least, 1 - least))
+    margin = 0.5 / len(probability)
+    return ExistenceMap(predicted, np.clip(fitted, margin, 1 - margin))
 
 
 def whiten(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray, "n D"]:

@@ -71,13 +71,14 @@ class ComponentSums(NamedTuple):
 @no_type_check
 def find_components(row: Int[ndarray, "E"], column: Int[ndarray, "E"], rows: int, columns: int) -> Components:
     """Find the connected components that have an edge. Members are in increasing order."""
-    parent = np.arange(rows + columns)
     # Union-find: the root of a component is its smallest node. Columns are numbered after the rows.
+    parent = np.arange(rows + columns)
     for e in range(len(row)):
         a, b = _root(parent, row[e]), _root(parent, rows + column[e])
         if a != b:
             parent[max(a, b)] = min(a, b)
-    number, count = np.full(rows + columns, -1), 0
+    # Number the components in the order of their first edges. Nodes without an edge have none.
+    number, count = np.full(rows + columns, -1), np.int64(0)
     for e in range(len(row)):
         root = _root(parent, row[e])
         if number[root] < 0:
@@ -111,7 +112,7 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
         i = components.row[components.row_start[n] : components.row_start[n + 1]]
         j = components.column[components.column_start[n] : components.column_start[n + 1]]
         edges = components.edge[components.edge_start[n] : components.edge_start[n + 1]]
-        # Copy the edges of the component into a dense matrix.
+        # Copy the edges of the component into a dense matrix of its own rows and columns.
         for p in range(len(i)):
             place[i[p]] = p
         for p in range(len(j)):
@@ -124,6 +125,7 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
         if not solved:
             too_large[left], left = n, left + 1
             continue
+        # Write its results to the places of its members in the whole scene.
         log_sum += log_part
         for e in edges:
             share[e] = pair[place[row[e]], column_place[column[e]]]
@@ -177,35 +179,29 @@ def scale(
 ) -> Scaled:
     """Rescale the weights by the dual prices of the best assignment."""
     rows, columns = log_pair.shape
-    price = _price_of_the_impossible(log_pair, log_row, log_column)
-    no_row, no_column = log_row == -np.inf, log_column == -np.inf
-    free, column_free = np.where(no_row, price, -log_row), np.where(no_column, price, -log_column)
-    cost = -log_pair - column_free
-    if rows <= columns:
-        column, row_price, column_price = solve(cost, free)
-    else:
-        turned, turned_free = turn_costs(cost, free, column_free)
-        of_column, column_price, row_price = solve(turned, turned_free)
-        column = np.full(rows, columns)
-        for c in range(columns):
-            if of_column[c] < rows:
-                column[of_column[c]] = c
-        column_price -= column_free
-        row_price += free
+    cost, free, column_free = _costs(log_pair, log_row, log_column)
+    column, row_price, column_price = _solve_shorter_side(cost, free, column_free)
     taken = np.zeros(columns + 1, np.bool_)
-    log_best = 0.0
+    row_alone, bad_rows = np.zeros(rows), np.zeros(rows, np.bool_)
+    log_scaled, log_best = np.empty((rows, columns)), 0.0
     for r in range(rows):
         taken[column[r]] = True
         log_best += log_row[r] if column[r] == columns else log_pair[r, column[r]]
-    for c in range(columns):
-        log_best += 0.0 if taken[c] else log_column[c]
-    log_scaled = np.empty((rows, columns))
-    for r in range(rows):
+        if log_row[r] > -np.inf:
+            row_alone[r] = np.exp(row_price[r] - free[r])
+        else:
+            bad_rows[r] = column[r] == columns
         for c in range(columns):  # values above 0 come from rounding
             log_scaled[r, c] = min(row_price[r] + column_price[c] - cost[r, c], 0.0)
-    row_alone = np.where(no_row, 0.0, np.exp(row_price - free))
-    column_alone = np.where(no_column, 0.0, np.exp(column_price))
-    bad_rows, bad_columns = no_row & (column == columns), no_column & ~taken[:-1]
+    column_alone, bad_columns = np.zeros(columns), np.zeros(columns, np.bool_)
+    log_column_scale = np.empty(columns)
+    for c in range(columns):
+        log_best += 0.0 if taken[c] else log_column[c]
+        log_column_scale[c] = column_price[c] + column_free[c]
+        if log_column[c] > -np.inf:
+            column_alone[c] = np.exp(column_price[c])
+        else:
+            bad_columns[c] = not taken[c]
     return Scaled(
         cost,
         free,
@@ -216,22 +212,64 @@ def scale(
         log_scaled,
         row_alone,
         column_alone,
-        column_price + column_free,
+        log_column_scale,
         log_best,
     )
 
 
 @_kernel
 @no_type_check
+def _costs(log_pair, log_row, log_column):
+    """Return the input of `assignment`: pairs less their columns' costs, rows alone, and columns alone.
+
+    A zero weight of a row or column alone costs more than any possible gain from paying it.
+    """
+    rows, columns = log_pair.shape
+    price = _price_of_the_impossible(log_pair, log_row, log_column)
+    cost, free, column_free = np.empty((rows, columns)), np.empty(rows), np.empty(columns)
+    for c in range(columns):
+        column_free[c] = price if log_column[c] == -np.inf else -log_column[c]
+    for r in range(rows):
+        free[r] = price if log_row[r] == -np.inf else -log_row[r]
+        for c in range(columns):
+            cost[r, c] = -log_pair[r, c] - column_free[c]
+    return cost, free, column_free
+
+
+@_kernel
+@no_type_check
+def _solve_shorter_side(cost, free, column_free):
+    """Return the best assignment and its prices. It is solved by columns if there are fewer of them."""
+    rows, columns = cost.shape
+    if rows <= columns:
+        return solve(cost, free)
+    of_column, column_price, row_price = solve(*turn_costs(cost, free, column_free))
+    column = np.full(rows, columns)
+    for c in range(columns):
+        if of_column[c] < rows:
+            column[of_column[c]] = c
+        column_price[c] -= column_free[c]
+    for r in range(rows):
+        row_price[r] += free[r]
+    return column, row_price, column_price
+
+
+@_kernel
+@no_type_check
 def turn_costs(cost, free, column_free):
     """Return `cost` and `free` of the transposed problem. The totals differ by Σ free - Σ column_free."""
-    return np.ascontiguousarray(cost.T) + column_free[:, None] - free, column_free
+    rows, columns = cost.shape
+    turned = np.empty((columns, rows))
+    for c in range(columns):
+        for r in range(rows):
+            turned[c, r] = cost[r, c] + column_free[c] - free[r]
+    return turned, column_free
 
 
 @_kernel
 @no_type_check
 def _price_of_the_impossible(log_pair, log_row, log_column):
-    """Return a finite cost that replaces infinity. It is larger than any possible gain from paying it."""
+    """Return a finite cost in place of infinity. It exceeds any possible gain from paying it."""
     total = 0.0
     for r in range(len(log_row)):
         largest = 0.0 if log_row[r] == -np.inf else abs(log_row[r])

@@ -1,8 +1,9 @@
 """The sum over all partial assignments of rows to columns, by dynamic programming over a moving frontier.
 
 Rows are added one after the other. The frontier is the set of columns that both an added row and a later row
-may take. Only for these columns the state must record whether they are taken. Objects compete only for nearby
-detections, so the frontier stays narrow in large scenes.
+may take. Only for these columns the state must record whether they are taken: each has a bit, and a subset of
+taken columns is an integer. Objects compete only for nearby detections, so the frontier stays narrow in large
+scenes.
 """
 
 from typing import NamedTuple, no_type_check
@@ -71,8 +72,8 @@ def plan_sweep(possible: Bool[ndarray, "R C"], max_states: int) -> Sweep:
     `states` is the number of values. If it exceeds `max_states`, the plan is incomplete and must not be used.
     """
     column, start = list_true(possible)
-    row, row_start = list_true(possible.T)
-    sweep = _plan_from(0, column, start, row, row_start, max_states)
+    row, row_start = list_true(np.ascontiguousarray(possible.T))
+    sweep = _plan_from(np.int64(0), column, start, row, row_start, max_states)
     if sweep.states <= _CHEAP:
         return sweep
     again = _plan_from(sweep.row[-1], column, start, row, row_start, max_states)
@@ -106,8 +107,8 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
     unseen = 0  # all rows before it are added
     for place in range(rows):
         order[place], added[next_row] = next_row, True
-        mine = column[start[next_row] : start[next_row + 1]]
-        for c in mine:
+        choices = column[start[next_row] : start[next_row + 1]]
+        for c in choices:
             # A column that is seen for the first time gets the lowest free bit.
             if first[c] < 0:
                 free = 0
@@ -122,7 +123,7 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
         size[place] = 1 << (top + 1)
         states += size[place]
         # After the last row of a column its bit is free again.
-        for c in mine:
+        for c in choices:
             waiting[c] -= 1
             if waiting[c] == 0:
                 last[c], user[slot[c]] = place, -1
@@ -130,7 +131,7 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
         if states > max_states:
             order[-1] = next_row
             break
-        next_row, least = -1, np.iinfo(np.int64).max
+        next_row, smallest = -1, np.iinfo(np.int64).max
         for bit in range(top + 1):
             if user[bit] < 0:
                 continue
@@ -141,8 +142,8 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
                 wider = 0
                 for c in column[start[r] : start[r + 1]]:
                     wider += 2 * (first[c] < 0) - (waiting[c] == 1)
-                if wider < least or (wider == least and r < next_row):
-                    next_row, least = r, wider
+                if wider < smallest or (wider == smallest and r < next_row):
+                    next_row, smallest = r, wider
         if next_row < 0:  # the frontier is empty: continue with the next component
             while unseen < rows and added[unseen]:
                 unseen += 1
@@ -237,6 +238,7 @@ def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, totals):
         # `left` is the total without this row, `whole` the total with it, both up to the same factor. `state`
         # becomes `after` of the row before.
         whole = left * row_alone[row]
+        # A pair turns a subset without its bit into one with it: before · weight · after, summed over subsets.
         for n in range(count):
             share, bit = 0.0, bit_of[n]
             for s in range(size):

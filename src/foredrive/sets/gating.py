@@ -53,21 +53,21 @@ def _keep_likely(
     Return the kept pairs and the loss in nats. Pairs with odds of at least 1 are always kept. The pairs left
     out are in no best association.
     """
-    log_least = np.log(0.5 * budget_nats / max(log_pair.size, 1))
-    row, column, log_odds, lost_nats = _list_odds(log_pair, log_row, log_column, log_least)
-    few = np.flatnonzero(log_odds < 0.0)
-    few = few[np.argsort(log_odds[few])]
-    total = np.cumsum(np.exp(log_odds[few]))
-    out = total <= 0.5 * budget_nats
+    log_min_odds = np.log(0.5 * budget_nats / max(log_pair.size, 1))
+    row, column, log_odds, lost_nats = _list_odds(log_pair, log_row, log_column, log_min_odds)
+    unlikely = np.flatnonzero(log_odds < 0.0)
+    unlikely = unlikely[np.argsort(log_odds[unlikely])]
+    total = np.cumsum(np.exp(log_odds[unlikely]))
+    left_out = total <= 0.5 * budget_nats
     kept = np.ones(len(row), bool)
-    kept[few[out]] = False
-    return row[kept], column[kept], lost_nats + float(total[out].max(initial=0.0))
+    kept[unlikely[left_out]] = False
+    return row[kept], column[kept], lost_nats + float(total[left_out].max(initial=0.0))
 
 
 @_kernel
 @no_type_check
-def _list_odds(log_pair, log_row, log_column, log_least):
-    """List the pairs with log-odds above `log_least`.
+def _list_odds(log_pair, log_row, log_column, log_min_odds):
+    """List the pairs with log-odds above `log_min_odds`.
 
     Return their rows, columns and log-odds, and a bound on the contribution of the other pairs to the
     logarithm.
@@ -80,11 +80,11 @@ def _list_odds(log_pair, log_row, log_column, log_least):
             if log_pair[r, c] == -np.inf:
                 continue
             log_odds = log_pair[r, c] - log_row[r] - log_column[c]
-            if log_odds > log_least:
+            if log_odds > log_min_odds:
                 row[count], column[count], odds[count], count = r, c, log_odds, count + 1
-            elif log_odds > log_least - _NEGLIGIBLE_NATS:
+            elif log_odds > log_min_odds - _NEGLIGIBLE_NATS:
                 lost[c] += np.exp(log_odds)
-    lost += rows * np.exp(log_least - _NEGLIGIBLE_NATS)
+    lost += rows * np.exp(log_min_odds - _NEGLIGIBLE_NATS)
     return row[:count].copy(), column[:count].copy(), odds[:count].copy(), np.log1p(lost).sum()
 
 
@@ -138,7 +138,9 @@ def _estimate_charges(pair, row_alone, column_alone):
     for e in range(len(row)):
         weight[e] = pair[row[e], column[e]]
 
-    # Messages along each pair: its weight over the sum of all other choices of the sending node.
+    # The message along a pair is its weight over the sum of all other choices of the sending node. `total` is
+    # the sum of all choices of a node, so that of the others is `total` less the message from the other end.
+    # Rounding could make it smaller than the choice of being alone, which is always among them.
     for _ in range(_ROUNDS):
         total = row_alone.copy()
         for e in range(len(row)):
@@ -152,6 +154,7 @@ def _estimate_charges(pair, row_alone, column_alone):
         for e in range(len(row)):
             others = max(total[column[e]] - to_column[e], column_alone[column[e]])
             to_row[e] = weight[e] / max(others, _TINY)
+    # 1 / total of the column estimates (sum without the column) / sum.
     charge = np.empty(len(row))
     for e in range(len(row)):
         charge[e] = weight[e] / max(row_alone[row[e]], _TINY) / max(total[column[e]], _TINY)

@@ -85,19 +85,19 @@ def choice_bound(
     Sinkhorn's iteration converges to these costs.
     """
     column, start = list_true(pair > 0.0)
-    cost, least = np.ones(pair.shape[1]), np.inf
+    cost, log_smallest = np.ones(pair.shape[1]), np.inf
     for _ in range(_ROUNDS):
         log_bound = np.log(cost).sum()
         chosen = np.zeros(pair.shape[1])
         for r in range(len(pair)):
-            mine = column[start[r] : start[r + 1]]
+            choices = column[start[r] : start[r + 1]]
             total = row_alone[r]
-            for c in mine:
+            for c in choices:
                 total += pair[r, c] / cost[c]
             log_bound += np.log(total)
-            for c in mine:
+            for c in choices:
                 chosen[c] += pair[r, c] / cost[c] / total
-        least = min(least, log_bound)
+        log_smallest = min(log_smallest, log_bound)
         # Sinkhorn step: raise the cost of a column that is chosen more than once on average.
         cost = np.maximum(np.maximum(column_alone, cost * chosen), _CHEAPEST)
-    return least
+    return log_smallest

@@ -153,7 +153,7 @@ def test_no_detections_at_all(tmp_path: Path) -> None:
 
 
 def test_the_rate_of_the_uniform_background_is_an_option(tmp_path: Path) -> None:
-    """λ is its rate over the region. Without background and detections an object is impossible: counted."""
+    """λ is its rate over the region. Without it, an undetected object is impossible, and counted."""
     truth = {"a": [box(0.0, 0.0)], "b": [box(5.0, 5.0)], "c": []}
     found = {"b": [box(5.0, 5.0, detection_score=0.9)]}
     read = read_detections(
