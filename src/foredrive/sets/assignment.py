@@ -314,8 +314,8 @@ def _apply(column_of, u, v, start, length, reached_unused, unused, search):
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows
-    # Dijkstra's update lowers the price of a node nearer than the end by `length` - distance, and raises that of
-    # its row by as much. It would lower the prices of unused nodes, too, which must stay 0. `rise` is that
+    # Dijkstra's update lowers the price of a node nearer than the end by `length` - distance, and raises that
+    # of its row by as much. It would lower the prices of unused nodes, too, which must stay 0. `rise` is that
     # amount: it is added back to every node, and taken from every row.
     rise = length - reached_unused if reached_unused < np.inf else 0.0
     for x in range(len(v)):

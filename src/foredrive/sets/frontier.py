@@ -238,7 +238,7 @@ def _sweep_back(pair, row_alone, column_alone, sweep, start, ahead, totals):
         # `left` is the total without this row, `whole` the total with it, both up to the same factor. `state`
         # becomes `after` of the row before.
         whole = left * row_alone[row]
-        # A pair turns a subset without its bit into one with it: before · weight · after, summed over subsets.
+        # A pair sets a bit of a subset: its share is before · weight · after, summed over subsets without it.
         for n in range(count):
             share, bit = 0.0, bit_of[n]
             for s in range(size):
