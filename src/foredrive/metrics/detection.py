@@ -96,6 +96,6 @@ def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n
 
 
 def mean_of_valid(values: Sequence[float]) -> float:
-    """Return the mean over classes that have objects; NaN if none has."""
+    """Return the mean over the values that are not NaN, or NaN."""
     valid = [value for value in values if not np.isnan(value)]
     return float(np.mean(valid)) if valid else float("nan")

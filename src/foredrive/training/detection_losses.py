@@ -119,9 +119,9 @@ def _best_matching(
     with torch.no_grad():
         class_cost = -found.logits.softmax(-1)[:, truth.label.long()]
         scale = found.mean.new_tensor(STATE_SCALE)
-        apart = (found.mean[:, None] - truth.state.to(found.mean)) / scale
-        cost = (class_cost + config.box_weight * apart.abs().sum(-1)).T.double().cpu().numpy()
-    dear = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # match every object while queries last
-    column = torch.as_tensor(best_assignment(cost, dear).column)
+        error = (found.mean[:, None] - truth.state.to(found.mean)) / scale
+        cost = (class_cost + config.box_weight * error.abs().sum(-1)).T.double().cpu().numpy()
+    unmatched = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # dearer than all pairs
+    column = torch.as_tensor(best_assignment(cost, unmatched).column)
     match = (column >= 0).nonzero()[:, 0]
     return column[match].to(found.mean.device), match.to(found.mean.device)

@@ -19,20 +19,23 @@ from foredrive.sets import Family
 def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
     """Read detections and truth: two folders of KITTI's text, or JSON of nuScenes or COCO.
 
-    `family` is that of box densities. Raises `InputError` that names the file which cannot be read.
+    `family` is that of the box densities.
+
+    Raises:
+        InputError: a file cannot be read. The message names it.
     """
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
     else:
         predicted, true = _read_json(results), _read_json(truth)
         if not isinstance(true, dict):
-            raise InputError(f"{truth}: neither an object with `results` (nuScenes) nor with `images` (COCO)")
+            raise InputError(f"{truth}: neither an object of boxes by sample (nuScenes) nor of images (COCO)")
         if isinstance(predicted, dict):
             read = read_nuscenes(predicted, true, results, truth, family)
         elif isinstance(predicted, list):
             read = read_coco(predicted, true, results, truth, family)
         else:
-            raise InputError(f"{results}: neither a list (COCO) nor an object with `results` (nuScenes)")
+            raise InputError(f"{results}: neither a list (COCO) nor an object of boxes by sample (nuScenes)")
     if not read.frames:
         raise InputError(f"{truth}: holds no frames")
     if not read.classes:

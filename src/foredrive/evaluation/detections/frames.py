@@ -1,4 +1,4 @@
-"""Detections and truth by frame: the form that every file of detections is read into."""
+"""Detections and truth by frame, as every file of detections is read."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ class StatedDetections:
 
 @dataclass(frozen=True)
 class DetectionSet:
-    """Frames of one file of detections. Upright boxes have a heading and are in m, others in pixels."""
+    """Frames of one file of detections. 3-D boxes have a heading and are in m, image boxes in pixels."""
 
     frames: Sequence[DetectionFrame]
     classes: Sequence[str]

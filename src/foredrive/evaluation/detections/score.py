@@ -124,7 +124,7 @@ def score_frames(
 def predicted_set(
     frame: DetectionFrame, classes: int, true_classes: int, config: ScoreConfig
 ) -> PoissonMultiBernoulli:
-    """Return a frame's detections as a PMB, with a background of unsure ones and a uniform process.
+    """Return a frame's detections as a PMB. Its background has those of low confidence and a uniform process.
 
     The uniform process has the first `true_classes` alone. Classes that only a detector names do not change
     it.
@@ -146,10 +146,10 @@ def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: Sco
     is_3d = detection_set.is_3d
     pmb = predicted_set(frame, len(detection_set.classes), detection_set.true_classes, config)
     result = set_nll(pmb, frame.objects, k=config.k)
-    sure = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(config.low_confidence))
+    bernoulli = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(config.low_confidence))
     closeness = _closeness(frame, is_3d)
-    detections = _detections(frame, result, sure, closeness, is_3d)
-    brier = _object_brier(frame, sure, closeness, is_3d)
+    detections = _detections(frame, result, bernoulli, closeness, is_3d)
+    brier = _object_brier(frame, bernoulli, closeness, is_3d)
     return FrameScore(
         frame.name,
         frame.sequence,
@@ -159,13 +159,13 @@ def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: Sco
         *_gospas(frame, detections, is_3d),
         detections,
         _precision(frame, detections, closeness, is_3d),
-        _objects(frame, result, sure, brier),
+        _objects(frame, result, bernoulli, brier),
         None if is_3d else _pdq(frame, detections),
     )
 
 
 def _pdq(frame: DetectionFrame, detections: DetectionScores) -> PdqCounts:
-    """Count pairs for PDQ; label quality is existence times class probability."""
+    """Count pairs for PDQ. Label quality is existence times class probability."""
     boxes = frame.detected.boxes
     std = boxes.chol.square().sum(-1).sqrt().numpy()
     share = detections.existence[:, None] * frame.detected.log_class.exp().numpy()
@@ -176,7 +176,7 @@ def _pdq(frame: DetectionFrame, detections: DetectionScores) -> PdqCounts:
 def _objects(
     frame: DetectionFrame,
     result: SetNll,
-    sure: Int[ndarray, "_"],
+    bernoulli: Int[ndarray, "_"],
     brier: Float[ndarray, "N"],
 ) -> ObjectScores:
     found, count = result.associations, len(result.associations.background)
@@ -191,25 +191,25 @@ def _objects(
         np.bincount(found.object, label, count).astype(float),
         missed,
         found.background,
-        np.where(found.best < 0, -1, np.append(sure, -1)[found.best]),
+        np.where(found.best < 0, -1, np.append(bernoulli, -1)[found.best]),
         brier,
     )
 
 
 def _object_brier(
-    frame: DetectionFrame, sure: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], is_3d: bool
+    frame: DetectionFrame, bernoulli: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], is_3d: bool
 ) -> Float[ndarray, "N"]:
     detected, label = frame.detected, frame.objects.label.numpy()
-    probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[sure]
+    probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[bernoulli]
     thresholds = [-distance for distance in NEAR_M] if is_3d else NEAR_OVERLAP
-    each = [object_brier(probability, closeness[sure] >= nearness, label) for nearness in thresholds]
+    each = [object_brier(probability, closeness[bernoulli] >= nearness, label) for nearness in thresholds]
     return np.mean(each, axis=0)
 
 
 def _detections(
     frame: DetectionFrame,
     result: SetNll,
-    sure: Int[ndarray, "_"],
+    bernoulli: Int[ndarray, "_"],
     closeness: Float[ndarray, "M N"],
     is_3d: bool,
 ) -> DetectionScores:
@@ -217,7 +217,7 @@ def _detections(
     label = detected.log_class.argmax(-1).numpy()
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
-    has_object[sure] = 1.0 - result.associations.absent
+    has_object[bernoulli] = 1.0 - result.associations.absent
     true, overlap = objects.label.numpy(), np.full(len(label), np.nan if is_3d else 0.0)
     near = np.where(label[:, None] == true, closeness, -np.inf)
     if not is_3d:
@@ -259,14 +259,14 @@ def _closeness(frame: DetectionFrame, is_3d: bool) -> Float[ndarray, "M N"]:
 
 
 def _gospas(frame: DetectionFrame, detections: DetectionScores, is_3d: bool) -> tuple[Gospa, Gospa]:
-    """Return GOSPA of detections above a half, and P-GOSPA of all; likeliest classes must agree."""
+    """Return GOSPA of detections above a half, and P-GOSPA of all. Likeliest classes must agree."""
     dims, cutoff = (3, GOSPA_CUTOFF_M) if is_3d else (4, GOSPA_CUTOFF_PX)
     boxes, objects = frame.detected.boxes, frame.objects
     same = detections.label[:, None] == objects.label.numpy()
     apart = np.linalg.norm(boxes.mean.numpy()[:, None, :dims] - objects.state.numpy()[:, :dims], axis=-1)
-    sure = detections.score >= GOSPA_CONFIDENCE
+    likely = detections.score >= GOSPA_CONFIDENCE
     spread = wasserstein_distance(boxes, objects, dims)
     return (
-        gospa(np.where(same, apart, np.inf)[sure], cutoff),
+        gospa(np.where(same, apart, np.inf)[likely], cutoff),
         gospa(np.where(same, spread, np.inf), cutoff, existence=detections.existence),
     )
