@@ -25,7 +25,7 @@ from foredrive.recipes.config import load_recipe, save_recipe
 from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
-from foredrive.runs.drive.agents import Needs, needs_of
+from foredrive.runs.drive.agents import AgentInputs, inputs_of
 from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
@@ -146,7 +146,7 @@ def test_nemo_imagines_one_future_as_far_as_it_can_and_renders_it(
 
 
 def test_it_drives_and_is_looked_at(run: Run) -> None:
-    assert needs_of(str(run.folder)) == Needs(cameras=True, lidar=True, past_frames=1)
+    assert inputs_of(str(run.folder)) == AgentInputs(cameras=True, lidar=True, past_frames=1)
     agent = load_agent(run)
     observed = collate([ClipDataset(run.logs, run.recipe.clips, run.cache_dir)[0]]).clip.observed()
     assert agent.act(observed).xy.shape == (1, 1, 6, 2)

@@ -11,7 +11,7 @@ from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.car_following import MAX_BRAKING_MPS2
-from foredrive.towns.traffic.lane_graph import Control
+from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, plan_signals
 from foredrive.towns.traffic.traffic import Traffic, TrafficState
 from foredrive.towns.traffic.vehicles import BEHIND, Vehicles
@@ -208,7 +208,7 @@ def test_lights_show_green_to_one_axis_at_a_time(town02: TownMap) -> None:
 def test_a_junction_of_three_axes_has_three_phases(town02: TownMap) -> None:
     """The lanes of one junction of the town, turned to 0°, 60° and 120°."""
     graph = Traffic(town02, 0, vehicle_count=1, people_count=0).lanes
-    guarded = graph.control == Control.LIGHT
+    guarded = graph.control == LaneControl.LIGHT
     lanes = np.flatnonzero(guarded & (graph.junction == graph.junction[guarded][0]))
     angle = np.pi / 3 * (np.arange(len(lanes)) % 3)
     xyz = graph.xyz.copy()
