@@ -1,5 +1,6 @@
 """Planners that see nothing."""
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -31,6 +32,7 @@ def test_constant_velocity_by_hand(make_example: MakeExample) -> None:
     now = clip.now
     clip.T_world_ego[1, now, :3, 3] = clip.T_world_ego[1, now - 1, :3, 3] + torch.tensor([1.5, 2.0, 0.0])
     torch.testing.assert_close(ConstantVelocity(1, 0.5).act(clip).xy[:, 0, 0, 0], torch.tensor([2.0, 2.5]))
-    torch.testing.assert_close(ConstantVelocity(1, 0.25).act(clip).xy[:, 0, 0, 0], torch.tensor([1.0, 1.25]))
+    quicker = dataclasses.replace(clip, t_s=0.5 * clip.t_s)  # 2.5 m in a quarter of a second
+    torch.testing.assert_close(ConstantVelocity(1, 0.5).act(quicker).xy[:, 0, 0, 0], torch.tensor([2.0, 5.0]))
     with pytest.raises(InputError, match="earlier pose"):
         ConstantVelocity(1, 0.5).act(clip.frames([now]))
