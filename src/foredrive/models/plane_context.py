@@ -1,0 +1,61 @@
+"""A U-Net in the plane that gives each column of a volume its surroundings."""
+
+from dataclasses import dataclass
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class PlaneContextConfig:
+    """Sizes of a `PlaneContext`."""
+
+    widths: tuple[int, int] = (96, 128)
+    """Channels at half and at a quarter of the resolution."""
+    blocks: tuple[int, int] = (2, 3)
+    """Residual blocks at half and at a quarter of the resolution."""
+
+
+class PlaneContext(nn.Module):
+    """A residual U-Net over x and y; the heights of a column are its channels.
+
+    It is not part of NeMo. Lifting reads the images for each voxel apart. The U-Net relates the columns at
+    the cost of 2-D convolutions at half and at a quarter of the resolution.
+
+    Args:
+        config: sizes.
+        channels: D.
+        height: Z.
+    """
+
+    def __init__(self, config: PlaneContextConfig, *, channels: int, height: int) -> None:
+        from transformers.models.resnet.modeling_resnet import ResNetBasicLayer  # slow to import
+
+        super().__init__()
+        half, quarter = config.widths
+        at_half, at_quarter = config.blocks
+        self.down = nn.Sequential(
+            nn.Conv2d(height * channels, half, 3, stride=2, padding=1, bias=False),
+            nn.BatchNorm2d(half),
+            nn.ReLU(),
+        )
+        self.fine = nn.Sequential(*[ResNetBasicLayer(half, half) for _ in range(at_half - 1)])
+        self.coarse = nn.Sequential(
+            ResNetBasicLayer(half, quarter, stride=2),
+            *[ResNetBasicLayer(quarter, quarter) for _ in range(at_quarter - 1)],
+        )
+        self.lateral = nn.Conv2d(quarter, half, 1)
+        self.merged = ResNetBasicLayer(half, half)
+        self.out = nn.Conv2d(half, 4 * height * channels, 1)
+
+    def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> Float[Tensor, "b D Z Y X"]:
+        """Return the volume with context, channels-last in memory."""
+        b, d, z, y, x = volume.shape
+        plane = volume.permute(0, 3, 4, 2, 1).reshape(b, y, x, z * d).permute(0, 3, 1, 2)
+        fine = self.fine(self.down(plane))
+        coarse = self.lateral(self.coarse(fine))
+        merged = self.merged(fine + F.interpolate(coarse, size=fine.shape[-2:], mode="nearest"))
+        change = F.pixel_shuffle(self.out(merged), 2)[..., :y, :x]
+        change = change.permute(0, 2, 3, 1).view(b, y, x, z, d).permute(0, 4, 3, 1, 2)
+        return (volume + change).permute(0, 2, 3, 4, 1).contiguous().permute(0, 4, 1, 2, 3)
