@@ -1,5 +1,6 @@
 """The encoders that NeMo's is compared with: where they look, and what they make of it."""
 
+import dataclasses
 import math
 
 import pytest
@@ -7,7 +8,14 @@ import torch
 
 from foredrive.models.averaging import AveragingConfig, AveragingEncoder
 from foredrive.models.bev import BevConfig, BevEncoder
-from foredrive.models.lifting import CameraCrossAttention, position_code, project_to_cameras
+from foredrive.models.lifting import (
+    CameraCrossAttention,
+    LiftingConfig,
+    LiftingEncoder,
+    position_code,
+    project_to_cameras,
+)
+from foredrive.models.plane_context import PlaneContext, PlaneContextConfig
 from foredrive.scene import CameraRig, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -75,7 +83,7 @@ def test_the_volume_unfolds_from_the_plane() -> None:
 
 def test_averaging_reads_at_the_projection_and_nowhere_else() -> None:
     encoder = AveragingEncoder(AveragingConfig(hidden=2), SPEC, channels=2, levels=2)
-    encoder.convolve = torch.nn.Sequential(torch.nn.Identity())  # type: ignore[assignment]
+    encoder.convolve = torch.nn.Identity()
     rows, columns = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(16) + 0.5, indexing="ij")
     image = torch.stack([columns / 16, rows / 8], dim=-1)[None, None]  # says where in the image it is
     volume = encoder([image, torch.full((1, 1, 2, 4, 2), math.nan)], rig(), SEEN)
@@ -83,6 +91,56 @@ def test_averaging_reads_at_the_projection_and_nowhere_else() -> None:
     expected = torch.tensor([(32 - 40 * 0.5 / 6.5) / 64, (16 + 40 * 0.1 / 6.5) / 32])
     torch.testing.assert_close(place, expected, atol=1e-4, rtol=0)
     assert not volume[0, :, :, :, :8].any()  # behind the camera
+
+
+def test_the_gate_tells_the_voxels_of_one_ray_apart() -> None:
+    torch.manual_seed(0)
+    encoder = AveragingEncoder(AveragingConfig(hidden=None, gate=8), SPEC, channels=3, levels=1)
+    same_everywhere = torch.tensor([0.5, -1.0, 2.0]).expand(1, 1, 8, 16, 3)
+    volume = encoder([same_everywhere], rig(), SEEN)
+    near, far = volume[0, :, 2, 8, 12], volume[0, :, 2, 8, 15]
+    assert not torch.allclose(near, far, atol=1e-3)
+    place = position_code(SPEC.centres_m().flatten(0, 2), 28).unflatten(0, SPEC.shape_zyx)[2, 8, 15]
+    assert encoder.gate is not None
+    scale, shift = encoder.gate(place).chunk(2)
+    torch.testing.assert_close(far, same_everywhere[0, 0, 0, 0] * (1 + scale) + shift)
+
+
+def test_without_self_attention_a_round_is_the_same_but_for_that_attention() -> None:
+    torch.manual_seed(0)
+    config = LiftingConfig(heads=2, points=1, layers=1)
+    whole = LiftingEncoder(config, SPEC, channels=4, levels=1)
+    without = LiftingEncoder(dataclasses.replace(config, self_attention=False), SPEC, channels=4, levels=1)
+    assert without.load_state_dict(whole.state_dict(), strict=False).missing_keys == []
+    whole.layers[0].self_attention = None
+    image = torch.randn(1, 1, 8, 16, 4)
+    torch.testing.assert_close(without([image], rig(), SEEN), whole([image], rig(), SEEN))
+
+
+@pytest.mark.parametrize("size_yx", [(8, 8), (7, 10)])
+def test_context_adds_to_each_voxel_what_was_meant_for_it(size_yx: tuple[int, int]) -> None:
+    """The plane has half the resolution, and Z heights times D channels: c = z·D + d."""
+    context = PlaneContext(PlaneContextConfig(widths=(4, 8), blocks=(1, 1)), channels=3, height=2).eval()
+    with torch.no_grad():
+        context.out.weight.zero_()
+        context.out.bias.copy_(torch.arange(24.0))
+        volume = torch.randn(2, 3, 2, *size_yx)
+        change = context(volume) - volume
+    for z, y, x in ((0, 2, 4), (1, 5, 6), (1, 6, 3)):
+        expected = [4.0 * (z * 3 + d) + 2 * (y % 2) + x % 2 for d in range(3)]
+        torch.testing.assert_close(change[1, :, z, y, x], torch.tensor(expected))
+
+
+def test_context_reads_the_surroundings() -> None:
+    torch.manual_seed(0)
+    context = PlaneContext(PlaneContextConfig(widths=(4, 8), blocks=(1, 1)), channels=2, height=2).eval()
+    volume = torch.randn(1, 2, 2, 32, 32)
+    other = volume.clone()
+    other[..., 16, 16] += 1.0
+    changed = (context(other) - context(volume)).abs().amax(dim=(0, 1, 2)) > 0
+    assert changed[16, 20]
+    assert changed[12, 16]
+    assert not changed[0].any()
 
 
 @pytest.mark.parametrize("kind", ["bev", "averaging"])

@@ -118,9 +118,7 @@ def test_boxes_flow_and_grids_are_mirrored_and_other_items_are_left_alone() -> N
 
 def test_mirroring_twice_changes_nothing() -> None:
     example = with_cameras(drives(0, 1))
-    for before, after in zip(
-        tensors(example), tensors(mirrored(mirrored(example, BOTH), BOTH)), strict=True
-    ):
+    for before, after in zip(tensors(example), tensors(mirrored(mirrored(example, BOTH), BOTH)), strict=True):
         torch.testing.assert_close(after, before)
 
 

@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.models.plane_context import PlaneContextConfig, plane_context
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, Frames, VoxelSpec
@@ -67,6 +68,10 @@ class LiftingConfig:
     """Hidden width of the feed-forward networks, as a multiple of the channels."""
     checkpoint: bool = False
     """Keep only the input of each round for the backward pass and recompute the rest."""
+    self_attention: bool = True
+    """Attend among the voxels in each round. In the first round, voxels have not read images yet."""
+    context: PlaneContextConfig | None = None
+    """U-Net in the plane after the last round. Not part of NeMo."""
     kind: Literal["lifting"] = "lifting"
 
 
@@ -177,19 +182,24 @@ class LiftingLayer(nn.Module):
 
     Args:
         channels: D.
-        self_attention: a `NeighbourhoodAttention` among the queries.
+        self_attention: a `NeighbourhoodAttention` among the queries, or None.
         cross_attention: a `CameraCrossAttention` to the images.
         feed_forward: hidden width as a multiple of D.
     """
 
     def __init__(
-        self, channels: int, self_attention: nn.Module, cross_attention: nn.Module, feed_forward: float
+        self,
+        channels: int,
+        self_attention: nn.Module | None,
+        cross_attention: nn.Module,
+        feed_forward: float,
     ) -> None:
         super().__init__()
         self.self_attention, self.cross_attention = self_attention, cross_attention
         hidden = round(feed_forward * channels)
         self.feed_forward = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
-        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(3)])
+        norms = [nn.LayerNorm(channels) for _ in range(3)]
+        self.norms = nn.ModuleList(norms if self_attention is not None else [nn.Identity(), *norms[1:]])
 
     def forward(
         self,
@@ -205,7 +215,8 @@ class LiftingLayer(nn.Module):
         A query batch of 1 means that the queries are still the same for the whole batch. Until they have read
         images, the work on them is done once.
         """
-        query = self.norms[0](query + self.self_attention(query, shape_zyx, place))
+        if self.self_attention is not None:
+            query = self.norms[0](query + self.self_attention(query, shape_zyx, place))
         query = self.norms[1](query + self.cross_attention(query, features, uv, visible))
         return self.norms[2](query + self.feed_forward(query))
 
@@ -276,7 +287,9 @@ class LiftingEncoder(nn.Module):
             [
                 LiftingLayer(
                     channels,
-                    NeighbourhoodAttention(channels, _directions_3d(config.heads), config.points),
+                    NeighbourhoodAttention(channels, _directions_3d(config.heads), config.points)
+                    if config.self_attention
+                    else None,
                     CameraCrossAttention(
                         channels, channels, heads=config.heads, levels=levels, points=config.points
                     ),
@@ -285,6 +298,7 @@ class LiftingEncoder(nn.Module):
                 for _ in range(config.layers)
             ]
         )
+        self.context = plane_context(config.context, spec, channels)
 
     def forward(
         self,
@@ -304,4 +318,5 @@ class LiftingEncoder(nn.Module):
             visible,
             recompute=self.checkpoint,
         )
-        return query.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3)
+        volume: Tensor = self.context(query.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3))
+        return volume

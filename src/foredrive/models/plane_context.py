@@ -6,6 +6,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.scene import VoxelSpec
+
 
 @dataclass(frozen=True)
 class PlaneContextConfig:
@@ -59,3 +61,10 @@ class PlaneContext(nn.Module):
         change = F.pixel_shuffle(self.out(merged), 2)[..., :y, :x]
         change = change.permute(0, 2, 3, 1).view(b, y, x, z, d).permute(0, 4, 3, 1, 2)
         return (volume + change).permute(0, 2, 3, 4, 1).contiguous().permute(0, 4, 1, 2, 3)
+
+
+def plane_context(config: PlaneContextConfig | None, spec: VoxelSpec, channels: int) -> nn.Module:
+    """Return the context of a volume on `spec`; without a config, it changes nothing."""
+    if config is None:
+        return nn.Identity()
+    return PlaneContext(config, channels=channels, height=spec.shape_zyx[0])
