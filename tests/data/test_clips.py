@@ -1,5 +1,6 @@
 """Clips of the synthetic log: what is in them agrees with its geometry, what is missing is masked."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -261,24 +262,46 @@ def test_workers_read_the_same(flat_root: Path, tmp_path: Path) -> None:
     assert here.key == there.key
 
 
-def test_kept_images_are_the_same_and_made_anew_when_damaged(flat_root: Path, tmp_path: Path) -> None:
+def test_kept_frames_are_the_same_and_made_anew_when_damaged(flat_root: Path, tmp_path: Path) -> None:
     logs = find_logs(flat_root)
     plain = ClipDataset(logs, config(), None)[0].clip
     clips = ClipDataset(logs, config(), tmp_path)
-    assert torch.equal(clips[0].clip.images, plain.images)
-    kept = sorted(tmp_path.rglob("*.npy"))
-    assert len(kept) == 10  # 5 frames of 2 cameras
-    kept[0].write_bytes(b"not an image")
+    for _ in range(2):  # as it is made, and as it is kept
+        kept_clip = clips[0].clip
+        for name in ("images", "image_valid", "boxes_valid"):
+            assert torch.equal(getattr(kept_clip, name), getattr(plain, name))
+        for part in ("rig", "boxes"):
+            for name, value in vars(getattr(plain, part)).items():
+                same = getattr(getattr(kept_clip, part), name)
+                assert torch.equal(same, value) if isinstance(value, torch.Tensor) else same == value
+    kept = sorted(tmp_path.rglob("*.safetensors"))
+    assert len(kept) == 5
+    sizes = [file.stat().st_size for file in kept]
+    kept[0].write_bytes(b"not a frame")
     kept[1].write_bytes(kept[1].read_bytes()[:-10])
-    again = clips[0].clip
+    again = ClipDataset(logs, config(), tmp_path)[0].clip
     assert torch.equal(again.images, plain.images)
     assert torch.equal(again.rig.T_ego_cam, plain.rig.T_ego_cam)
-    assert [file.stat().st_size for file in kept] == [kept[2].stat().st_size] * 10
+    assert [file.stat().st_size for file in kept] == sizes
 
 
-def test_images_that_need_no_shrinking_are_not_kept(flat_root: Path, tmp_path: Path) -> None:
+def test_a_kept_frame_is_of_its_log_its_cameras_and_its_size(flat_log: Path, tmp_path: Path) -> None:
+    path, cache = copy_of(flat_log, tmp_path), tmp_path / "cache"
+    before = ClipDataset([path], config(), cache)[0].clip
+    count = len(list(cache.rglob("*.safetensors")))
+    one = ClipDataset([path], config(cameras=before.rig.names[1:]), cache)[0].clip
+    assert torch.equal(one.images[:, 0], before.images[:, 1])
+    small = ClipDataset([path], config(image_hw=(12, 24)), cache)[0].clip
+    assert small.images.shape[-2:] == (12, 24)
+    assert len(list(cache.rglob("*.safetensors"))) == 3 * count
+    os.utime(path.folder / "camera.pcam_f0.arrow", (1, 1))  # written anew
+    ClipDataset([path], config(), cache)[0]
+    assert len(list(cache.rglob("*.safetensors"))) == 4 * count
+
+
+def test_frames_that_need_no_shrinking_are_not_kept(flat_root: Path, tmp_path: Path) -> None:
     ClipDataset(find_logs(flat_root), config(image_hw=(48, 96)), tmp_path)[0]
-    assert not list(tmp_path.rglob("*.npy"))
+    assert not list(tmp_path.rglob("*.safetensors"))
 
 
 def test_a_corrupt_jpeg_is_named(flat_log: Path, tmp_path: Path) -> None:

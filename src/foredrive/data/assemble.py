@@ -4,21 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
-from torch import Tensor
+from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
-from foredrive.data.boxes import no_boxes, read_boxes
+from foredrive.data.frame_store import FrameData
 from foredrive.data.lidar import empty_sweep
 from foredrive.data.logs import Log
-from foredrive.scene import CameraRig, Clip, LidarSweep, MapPatch, Trajectory
+from foredrive.scene import Clip, LidarSweep, MapPatch, Trajectory
 
 
 def assemble_clip(
     log: Log,
     frames: Sequence[int],
     now: int,
-    seen: tuple[UInt8[Tensor, "T C 3 H W"], Bool[Tensor, "T C"], CameraRig],
+    seen: Sequence[FrameData],
     sweeps: Sequence[tuple[LidarSweep, bool] | None],
     future: Trajectory,
     *,
@@ -26,37 +25,33 @@ def assemble_clip(
     target_xy: Float64[np.ndarray, "2"] | None = None,
     map_patch: MapPatch | None = None,
 ) -> Clip:
-    """Assemble a clip of T frames with their boxes, poses and speeds. Arguments that are None are masked.
+    """Assemble a clip of T frames with their poses and speeds. Arguments that are None are masked.
 
     Args:
         log: the source log.
         frames: T frames of the log.
         now: the frame at t = 0.
-        seen: images, their validity and the rig, see `read_rig`.
+        seen: cameras and boxes of the T frames.
         sweeps: T sweeps, each with whether it includes the beams that did not return.
         future: path of the vehicle from now on.
         command: driving command at now.
         target_xy: target point of the route in the ego frame at now, m.
         map_patch: map around the vehicle at now.
-
-    Raises:
-        InputError: the boxes cannot be read.
     """
     chosen = list(frames)
-    boxes = [read_boxes(log, frame) for frame in chosen]
     speed_mps = torch.from_numpy(log.speed_mps[chosen]).float()
-    images, image_valid, rig = seen
+    whole = stack_records(seen)
     return Clip(
         t_s=torch.from_numpy((log.t_us[chosen] - log.t_us[now]) * 1e-6).float(),
         T_world_ego=torch.from_numpy(log.T_world_ego[chosen]),
-        images=images,
-        image_valid=image_valid,
-        rig=rig,
+        images=whole.images,
+        image_valid=whole.image_valid,
+        rig=whole.rig,
         sweeps=stack_records([empty_sweep() if sweep is None else sweep[0] for sweep in sweeps]),
         sweep_valid=torch.tensor([sweep is not None for sweep in sweeps]),
         misses_known=torch.tensor([sweep is not None and sweep[1] for sweep in sweeps]),
-        boxes=stack_records([no_boxes() if b is None else b for b in boxes]),
-        boxes_valid=torch.tensor([b is not None for b in boxes]),
+        boxes=whole.boxes,
+        boxes_valid=whole.boxes_valid,
         ego_speed_mps=speed_mps.nan_to_num(),
         ego_speed_valid=speed_mps.isfinite(),
         command=torch.tensor(0 if command is None else int(command)),

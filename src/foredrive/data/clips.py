@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.commands import command_at, target_at
-from foredrive.data.image_store import ImageStore
+from foredrive.data.frame_store import FrameStore
 from foredrive.data.labels import LabelStore, VoxelLabels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
@@ -21,7 +21,6 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
-from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
 
@@ -68,7 +67,7 @@ class ClipDataset(Dataset[Example]):
 
     Args:
         logs: at least one log.
-        cache_dir: folder for voxel labels and resized images. None disables the cache.
+        cache_dir: folder for voxel labels and frames with resized images. None disables the cache.
 
     Raises:
         InputError: a log cannot be read, is too short for one clip or lacks the requested occupancy, or no
@@ -86,7 +85,7 @@ class ClipDataset(Dataset[Example]):
         self._logs = [Log(path) for path in logs]
         self._cameras = [pinhole_cameras(log) for log in self._logs]
         self.camera_names = self._choose_cameras()
-        self._images = ImageStore(cache_dir, config.image_hw)
+        self._frames = FrameStore(cache_dir, config.image_hw, self.camera_names)
         self._labels = LabelStore(cache_dir, config.voxels)
         self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}
@@ -166,14 +165,10 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clips[index]
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
-        seen = read_rig(
-            log,
-            frames,
-            [find_camera(self._cameras[number], name) for name in self.camera_names],
-            self.camera_names,
-            self._images,
-            frames if config.future_images else frames[: config.past_frames + 1],
-        )
+        cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
+        seen = [
+            self._frames.read(log, frame, cameras, config.future_images or frame <= now) for frame in frames
+        ]
         return assemble_clip(
             log,
             frames,

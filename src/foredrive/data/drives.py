@@ -10,11 +10,10 @@ from torch import Tensor
 
 from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
-from foredrive.data.image_store import ImageStore
+from foredrive.data.frame_store import FrameStore
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
-from foredrive.data.rigs import read_rig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import log_so3
 from foredrive.scene import Clip, LidarSweep
@@ -59,7 +58,8 @@ def read_drive(
         if camera is None:
             raise InputError(f"{path.folder}: no camera {name!r}; there are: {told_cameras(there.values())}")
     frames = list(range(len(log)))
-    seen = read_rig(log, frames, chosen, names, ImageStore(cache_dir, image_hw), frames)
+    store = FrameStore(cache_dir, image_hw, names)
+    seen = [store.read(log, frame, chosen) for frame in frames]
     sweeps = [_read_beams(log, frame) for frame in frames]
     return assemble_clip(log, frames, 0, seen, sweeps, log.driven_future(0, 0, log.period_s))
 

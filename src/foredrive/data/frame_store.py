@@ -1,0 +1,155 @@
+"""All cameras and boxes of a log at one frame, with a disk cache."""
+
+import dataclasses
+import hashlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from jaxtyping import Bool, UInt8
+from py123d.datatypes import PinholeCameraMetadata
+from safetensors import SafetensorError
+from torch import Tensor
+
+from foredrive.data.boxes import no_boxes, read_boxes
+from foredrive.data.cameras import read_camera
+from foredrive.data.logs import Log
+from foredrive.files import atomic_path
+from foredrive.scene import Boxes, CameraRig
+from foredrive.scene.record import Record
+
+FRAME_VERSION = 1
+"""Version in every cache key. Increase it when the images, rigs or boxes change."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FrameData(Record):
+    """Images, rig and boxes of one frame."""
+
+    images: UInt8[Tensor, "*b C 3 H W"]
+    image_valid: Bool[Tensor, "*b C"]
+    rig: CameraRig
+    """A camera that the log lacks has identity matrices."""
+    boxes: Boxes
+    boxes_valid: Bool[Tensor, "*b"]
+    """Whether the frame is annotated."""
+
+
+class FrameStore:
+    """A reader of frames with a cache of those whose images were downsized.
+
+    The name of an entry is a hash of everything that it depends on: the log's files (name, size, modification
+    time), the cameras, the frame, the image size and `FRAME_VERSION`. Entries are written atomically. Damaged
+    entries are replaced. One file holds a whole frame, and reading it opens no table of the log: a clip that
+    is drawn from hundreds of logs costs no more than one from the same log as before.
+
+    Args:
+        cache_dir: folder of the cache. None disables it.
+        image_hw: height and width of the images.
+        names: C camera names.
+    """
+
+    def __init__(self, cache_dir: Path | None, image_hw: tuple[int, int], names: tuple[str, ...]) -> None:
+        self._folder = None if cache_dir is None else Path(cache_dir) / "frames"
+        self._keys: dict[Path, bytes] = {}
+        self.image_hw, self.names = image_hw, names
+
+    def read(
+        self,
+        log: Log,
+        frame: int,
+        cameras: Sequence[PinholeCameraMetadata | None],
+        with_images: bool = True,
+    ) -> FrameData:
+        """Read one frame. `cameras` are the log's own, in the order of `names`; None for a missing one.
+
+        Raises:
+            InputError: an image, a pose or the boxes cannot be read.
+        """
+        there = [camera for camera in cameras if camera is not None]
+        small = self.image_hw[0] * self.image_hw[1]
+        shrinks = any(camera.width * camera.height > small for camera in there)
+        if self._folder is None or not with_images or not shrinks:
+            return self._read(log, frame, cameras, with_images)
+        file = self._file(self._folder, log, frame, there)
+        kept = self._read_entry(file)
+        if kept is None:
+            kept = self._read(log, frame, cameras, with_images)
+            with atomic_path(file) as temporary:
+                safetensors.torch.save_file(_flat(kept), temporary)
+        return kept
+
+    def _read(
+        self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata | None], with_images: bool
+    ) -> FrameData:
+        count = len(self.names)
+        images = torch.zeros(count, 3, *self.image_hw, dtype=torch.uint8)
+        image_valid = torch.zeros(count, dtype=torch.bool)
+        K, T_ego_cam = torch.eye(3).repeat(count, 1, 1), torch.eye(4).repeat(count, 1, 1)
+        dist, readout_s, exposed_dt_s = torch.zeros(count, 5), torch.zeros(count), torch.zeros(count)
+        for c, metadata in enumerate(cameras):
+            if metadata is None:
+                continue
+            camera = read_camera(log, frame, metadata, self.image_hw, with_images)
+            K[c], T_ego_cam[c], dist[c] = camera.K, camera.T_ego_cam, camera.dist
+            readout_s[c], exposed_dt_s[c] = camera.readout_s, camera.exposed_dt_s
+            if camera.image is not None:
+                images[c], image_valid[c] = camera.image, True
+        rig = CameraRig(K, T_ego_cam, dist, readout_s, self.names, self.image_hw, exposed_dt_s)
+        boxes = read_boxes(log, frame)
+        annotated = torch.tensor(boxes is not None)
+        return FrameData(images, image_valid, rig, no_boxes() if boxes is None else boxes, annotated)
+
+    def _file(self, folder: Path, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> Path:
+        key = self._keys.get(log.path.folder)
+        if key is None:
+            files = [log.file(camera.modality_key) for camera in cameras]
+            sources = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+            parts = (FRAME_VERSION, log.fingerprint, sources, self.names, self.image_hw)
+            key = hashlib.blake2b(repr(parts).encode(), digest_size=16).digest()
+            self._keys[log.path.folder] = key
+        name = hashlib.blake2b(key + frame.to_bytes(8, "little"), digest_size=16).hexdigest()
+        return folder / name[:2] / f"{name}.safetensors"
+
+    def _read_entry(self, file: Path) -> FrameData | None:
+        try:
+            tensors = safetensors.torch.load(file.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, SafetensorError) as error:  # it can be made again
+            _log.warning("%s is damaged (%s) and is made anew", file, error)
+            return None
+
+        def fields(part: str) -> dict[str, Tensor]:
+            return {name.removeprefix(part): t for name, t in tensors.items() if name.startswith(part)}
+
+        return FrameData(
+            images=tensors["images"],
+            image_valid=tensors["image_valid"],
+            rig=CameraRig(names=self.names, size_hw=self.image_hw, **fields("rig.")),
+            boxes=Boxes(**fields("boxes.")),
+            boxes_valid=tensors["boxes_valid"],
+        )
+
+
+def _flat(data: FrameData) -> dict[str, Tensor]:
+    """Return the tensors of a frame by name; those of nested records have a dotted one."""
+    flat = {}
+    for field in dataclasses.fields(data):
+        value = getattr(data, field.name)
+        entries = (
+            {field.name: value}
+            if isinstance(value, Tensor)
+            else {
+                f"{field.name}.{name}": entry
+                for name, entry in vars(value).items()
+                if isinstance(entry, Tensor)
+            }
+        )
+        flat |= {name: entry.contiguous() for name, entry in entries.items()}
+    return flat
