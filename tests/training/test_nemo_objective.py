@@ -16,6 +16,8 @@ from foredrive.models.vgg import Vgg16Features
 from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Example
+from foredrive.training import NemoObjective, NemoStage
+from foredrive.training.augmentation import AugmentConfig, mirrored
 from foredrive.training.rays import averaged_rays
 
 RECIPE = miniature()
@@ -154,3 +156,63 @@ def test_a_file_that_is_named_and_wrong_is_one_line(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=said) as caught:
             build_objective(RECIPE, dataclasses.replace(RECIPE.pretrain, perceptual=str(file)), agent)
         assert "\n" not in str(caught.value)
+
+
+def objective_of(stage: NemoStage) -> NemoObjective:
+    """The same weights for every stage; batch normalisation at rest, so that items do not mix."""
+    torch.manual_seed(0)
+    objective = build_objective(RECIPE, stage, build_agent(RECIPE)).eval()
+    for parameter in objective.agent.world_model.motion.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    return objective
+
+
+def losses_of(objective: NemoObjective, example: Example) -> dict[str, torch.Tensor]:
+    return objective(example, torch.Generator().manual_seed(0))
+
+
+def test_some_items_of_a_batch_are_imagined_and_all_train_the_present(example: Example) -> None:
+    stage = dataclasses.replace(
+        RECIPE.pretrain, weights=dataclasses.replace(RECIPE.pretrain.weights, recon=0.0, future=0.5)
+    )
+    some = objective_of(dataclasses.replace(stage, imagined_items=1))
+    found = losses_of(some, example)["occ"]
+    both = objective_of(dataclasses.replace(stage, imagine=False))
+    first = objective_of(stage)
+    present = losses_of(both, example)["occ"]
+    of_first = dataclasses.replace(example[:1], key=example.key[:1])
+    present_of_first = losses_of(both, of_first)["occ"]
+    # The present counts 1, each of two imagined frames 0.5.
+    futures = 2 * losses_of(first, of_first)["occ"] - present_of_first
+    torch.testing.assert_close(found, 0.5 * present + 0.5 * futures)
+
+
+def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
+    stage = RECIPE.pretrain
+    whole, without = objective_of(stage), objective_of(dataclasses.replace(stage, past_gradient=False))
+    losses = losses_of(whole, example), losses_of(without, example)
+    torch.testing.assert_close(losses[0], losses[1])
+    for each in losses:
+        each["loss"].backward()
+    lifted = [next(o.agent.world_model.backbone.parameters()).grad for o in (whole, without)]
+    assert not torch.allclose(*lifted)
+    past = dataclasses.replace(example.clip, images=example.clip.images.clone())
+    past.images[:, 0] = 0
+    changed = losses_of(without, dataclasses.replace(example, clip=past))["loss"]
+    assert not torch.isclose(changed, losses[1]["loss"], rtol=1e-6)  # the past is read
+
+
+def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None:
+    stage = dataclasses.replace(RECIPE.finetune, imagined_items=1)
+    with pytest.raises(InputError, match="imagined frames of every item"):
+        build_objective(RECIPE, stage, build_agent(RECIPE))
+
+
+def test_examples_are_augmented_before_anything_is_read(example: Example) -> None:
+    stage = dataclasses.replace(RECIPE.pretrain, augment=AugmentConfig(mirror=1.0))
+    found = losses_of(objective_of(stage), example)
+    across = mirrored(example, torch.ones(2, dtype=torch.bool))
+    plain = objective_of(RECIPE.pretrain)
+    generator = torch.Generator().manual_seed(0)
+    torch.rand(2, generator=generator)  # which items are mirrored
+    torch.testing.assert_close(found, plain(across, generator))

@@ -1,18 +1,21 @@
 """NeMo's two training objectives (eq. 9–11 and 15)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.errors import InputError
 from foredrive.losses import l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
 from foredrive.losses.reconstruction import ImageFeatures
 from foredrive.models.agent import PlanningAgent
+from foredrive.models.lifting import lift_frames
 from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
-from foredrive.scene import Example, Trajectory
+from foredrive.scene import Belief, Clip, Example, last_frames
+from foredrive.training.augmentation import AugmentConfig, augmented
 from foredrive.training.loop import Schedule
 from foredrive.training.rays import averaged_rays, thinned_rays
 
@@ -54,6 +57,13 @@ class NemoStage:
     "tower", the image tower that comes with the package. None disables that loss (weight 0)."""
     imagine: bool = True
     """Imagine the future key frames and supervise them. If False, only the present is trained."""
+    imagined_items: int | None = None
+    """Number of items of each batch that are imagined, with their pasts and futures. The other items train
+    the present alone, at a fraction of the cost. None: all items, as in the paper."""
+    past_gradient: bool = True
+    """Train the encoder by past frames too. Only the motion reads them."""
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    """Augmentation of the examples. The paper has none."""
     kind: Literal["nemo"] = "nemo"
 
 
@@ -65,6 +75,9 @@ class NemoObjective(nn.Module):
         stage: λ, and what is trained.
         steps: T_f, number of future key frames that are imagined and supervised, if the stage imagines.
         image_features: trained features for the perceptual loss, or None to disable it.
+
+    Raises:
+        InputError: some items are not to be imagined, but the planner reads their imagined frames.
     """
 
     def __init__(
@@ -76,13 +89,15 @@ class NemoObjective(nn.Module):
         image_features: ImageFeatures | None = None,
     ) -> None:
         super().__init__()
-        self.agent, self.weights, self.ray_stride = agent, stage.weights, stage.ray_stride
+        self.agent, self.stage, self.weights = agent, stage, stage.weights
         self.rays = averaged_rays if stage.pixels == "averaged" else thinned_rays
         self.steps = steps if stage.imagine else 0
         self.image_features = image_features
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
         set_planner_trainable(agent.planner, plans)
+        if plans and agent.planner.imagined_frames > 0 and stage.imagined_items is not None:
+            raise InputError("the planner reads imagined frames of every item: leave out imagined_items")
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
         world.motion.requires_grad_(imagines)
         if world.unseen is not None:
@@ -91,33 +106,32 @@ class NemoObjective(nn.Module):
         world.renderer.requires_grad_(weights.recon > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
-        """Return losses by name; "loss" is minimised. The generator picks rays and samples."""
+        """Return losses by name; "loss" is minimised. The generator augments and picks rays and samples."""
+        example = augmented(example, self.stage.augment, generator)
         clip, world = example.clip, self.agent.world_model
         now, weights = clip.now, self.weights
         observed = clip.observed()
-        plan: Trajectory | None = None
-        if weights.wpts > 0:
-            output = self.agent(observed, self.steps)
-            decoded, plan = output.decoded, output.plan
-        else:
-            decoded = [world.decode(belief) for belief in self.agent.rollout(observed, self.steps)]
+        needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
+        beliefs = self._rollout(observed, max(self.steps, needed))
+        plan = self.agent.plan(observed, beliefs) if weights.wpts > 0 else None
+        decoded = [world.decode(belief) for belief in beliefs[: self.steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
         shares = shares / shares.sum() if weights.over_frames == "mean" else shares
         for k, (belief, share) in enumerate(zip(decoded, shares, strict=True)):
-            frame = now + k
+            frame, items = now + k, slice(len(belief.occupancy_logit))
             if weights.occ > 0:
                 losses["occ"] = losses["occ"] + share * occupancy_loss(
                     belief.occupancy_logit,
-                    example.occupancy.values[:, frame, 0],
-                    example.occupancy.known[:, frame],
+                    example.occupancy.values[items, frame, 0],
+                    example.occupancy.known[items, frame],
                     scal_weight=weights.scal,
                     bce_weight=weights.bce,
                     occupied_weight=weights.occupied,
                 )
             if weights.recon > 0:
-                rays = self.rays(clip, frame, self.ray_stride, generator)
+                rays = self.rays(clip[items], frame, self.stage.ray_stride, generator)
                 rendered = world.renderer(
                     belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
                 )
@@ -137,6 +151,22 @@ class NemoObjective(nn.Module):
             losses["wpts"] = waypoint_loss(plan, clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
         return losses
+
+    def _rollout(self, observed: Clip, steps: int) -> list[Belief]:
+        """Return the beliefs about now, and about the next `steps` key frames for the imagined items."""
+        stage, world = self.stage, self.agent.world_model
+        if stage.imagined_items is None and stage.past_gradient:
+            return self.agent.rollout(observed, steps)
+        items = slice(stage.imagined_items)
+        frames = last_frames(observed, world.past_frames if steps else 0)
+        present = lift_frames(frames[:, -1:], world.backbone, world.encoder)
+        now = Belief(volume=present[:, -1])
+        if steps == 0:
+            return [now]
+        with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
+            past = lift_frames(frames[items, :-1], world.backbone, world.encoder)
+        history = torch.cat([past, present[items]], dim=1)
+        return [now, *world.imagine(Belief(volume=now.volume[items], history=history), steps)]
 
 
 def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:
