@@ -1,11 +1,13 @@
-"""Loading speed of clips from disk at nemo_tiny's sizes, and growth of memory: `foredrive bench loading`.
+"""Loading of clips from disk, and growth of memory: `foredrive bench loading`.
 
-A town is recorded first, at 10 Hz as by `foredrive record`. A first pass, which is not measured, makes labels
-and shrunk images, as training does in its first epoch.
+A town is recorded first. `nemo_tiny` loads from one log at 10 Hz, as `foredrive record` makes it by default.
+`nemo_town` draws from forty logs at 2 Hz, copies of one, as a large training set does. A first pass, which is
+not measured, makes labels and shrunk images, as training does in its first epoch.
 """
 
 import itertools
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -13,7 +15,7 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
-from foredrive.data import ClipDataset, collate
+from foredrive.data import ClipDataset, collate, find_logs
 from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
 from foredrive.scene import Example
@@ -21,26 +23,41 @@ from foredrive.towns.recorder import record
 from foredrive.training.interrupts import start_fork_server
 
 TOWN, SECONDS = "Town02", 30.0
-WORKERS, BATCH_SIZE, CLIPS = 2, 4, 5000
+WORKERS, BATCH_SIZE, CLIPS, LOGS = 2, 4, 5000, 40
 COUNTED_FROM = 0.2
 """Share of the clips after which memory is compared; before it, caches of the libraries fill."""
 
 
-def measure(seed: int) -> dict[str, float]:
-    """Return clips per second, and the growth of memory of this process and its workers, MiB."""
+def one_log(seed: int) -> dict[str, float]:
+    """Return the figures of clips of one log."""
     with tempfile.TemporaryDirectory() as folder:
         log = record(TOWN, SECONDS, seed, Path(folder))
-        dataset = ClipDataset([log], find_recipe("nemo_tiny").clips, Path(folder, "cache"))
-        for index in range(len(dataset)):
-            dataset[index]
-        loaded, memory_mib = 0, []
-        started = time.perf_counter()
-        for batch in _batches(dataset):
-            loaded += len(batch.key)
-            memory_mib.append((loaded, _memory_mib()))
-            if loaded >= CLIPS:
-                break
-        took_s = time.perf_counter() - started
+        return _measure(ClipDataset([log], find_recipe("nemo_tiny").clips, Path(folder, "cache")))
+
+
+def forty_logs(seed: int) -> dict[str, float]:
+    """Return the figures of clips of many logs in random order."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = record(TOWN, SECONDS, seed, Path(folder), rate_hz=2.0)
+        for copy in range(1, LOGS):
+            there = log.folder.with_name(f"{log.folder.name}_{copy}")
+            shutil.copytree(log.folder, there, copy_function=os.link)
+        logs = find_logs(Path(folder))
+        return _measure(ClipDataset(logs, find_recipe("nemo_town").clips, Path(folder, "cache")))
+
+
+def _measure(dataset: ClipDataset) -> dict[str, float]:
+    """Return clips per second, and the growth of memory of this process and its workers, MiB."""
+    for index in range(len(dataset)):
+        dataset[index]
+    loaded, memory_mib = 0, []
+    started = time.perf_counter()
+    for batch in _batches(dataset):
+        loaded += len(batch.key)
+        memory_mib.append((loaded, _memory_mib()))
+        if loaded >= CLIPS:
+            break
+    took_s = time.perf_counter() - started
     settled_mib = next(mib for count, mib in memory_mib if count >= COUNTED_FROM * CLIPS)
     return {
         "clips_per_s": loaded / took_s,
@@ -96,8 +113,15 @@ def _resident_mib(pid: int) -> float:
 
 
 BENCHMARK = Benchmark(
-    question="How many clips per second do two workers load at nemo_tiny's sizes, and is their memory flat?",
-    arms={"nemo_tiny": measure},
+    question="How many clips per second do two workers load, and is their memory flat?",
+    arms={"nemo_tiny": one_log, "nemo_town": forty_logs},
     seeds=(0,),
-    config={"town": TOWN, "seconds": SECONDS, "workers": WORKERS, "batch_size": BATCH_SIZE, "clips": CLIPS},
+    config={
+        "town": TOWN,
+        "seconds": SECONDS,
+        "logs": LOGS,
+        "workers": WORKERS,
+        "batch_size": BATCH_SIZE,
+        "clips": CLIPS,
+    },
 )
