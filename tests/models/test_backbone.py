@@ -84,6 +84,8 @@ def test_only_the_levels_that_are_read_are_returned_and_trained() -> None:
     assert finest.state_dict().keys() == whole.state_dict().keys()
     still = {name for name, p in finest.named_parameters() if not p.requires_grad}
     assert still == {"smooth.1.weight", "smooth.1.bias"}
+    with pytest.raises(InputError, match="has 2 levels, of which 3"):
+        ImageBackbone(CONFIG, channels=12, levels=3)
 
 
 def vgg_state() -> dict[str, torch.Tensor]:

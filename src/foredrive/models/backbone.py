@@ -11,6 +11,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from foredrive.errors import InputError
+
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 IMAGE_STRIDE = {"stage1": 4, "stage2": 8, "stage3": 16, "stage4": 32}
@@ -41,6 +43,9 @@ class BackboneConfig:
     layer_type: Literal["basic", "bottleneck"]
     stages: tuple[str, ...]
     """Stages that feed the pyramid, e.g. ("stage2", "stage3")."""
+    levels: int | None = None
+    """Number of levels that the encoder reads, finest first; None: all. The pyramid hands the coarse stages
+    down to them."""
     weights: str | None = None
     """Hub name or local folder of a `transformers` ResNet. Its sizes then replace the ones given here. None
     starts from random weights."""
@@ -60,6 +65,9 @@ class ImageBackbone(nn.Module):
         channels: D of every pyramid level.
         levels: number of levels to return, finest first; None returns all.
         fetch: load `config.weights`. Not needed when trained weights replace them later.
+
+    Raises:
+        InputError: there are fewer levels than are to be returned.
     """
 
     def __init__(
@@ -85,6 +93,8 @@ class ImageBackbone(nn.Module):
         self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])
         self.levels = len(widths) if levels is None else levels
+        if not 0 < self.levels <= len(widths):
+            raise InputError(f"the image backbone has {len(widths)} levels, of which {levels} cannot be read")
         self.smooth[self.levels :].requires_grad_(False)  # they stay so that stored weights fit
         for norm in self._frozen_norms():
             norm.requires_grad_(False)

@@ -129,7 +129,7 @@ class DriveWorld(nn.Module):
         self.spec, self.channels, self.past_frames, self.dt_s = spec, channels, past_frames, dt_s
         self.warp_statics = config.warp_statics
         finest_alone = isinstance(config.encoder, LiftSplatConfig)
-        levels = 1 if finest_alone else len(config.backbone.stages)
+        levels = 1 if finest_alone else config.backbone.levels or len(config.backbone.stages)
         self.backbone = ImageBackbone(config.backbone, channels=channels, levels=levels, fetch=fetch)
         self.encoder = ENCODERS[type(config.encoder)](
             config.encoder, spec, channels=channels, plane_channels=plane, levels=levels

@@ -77,7 +77,7 @@ class Nemo(nn.Module):
         super().__init__()
         channels = config.channels
         finest_alone = isinstance(config.encoder, AveragingConfig)
-        levels = 1 if finest_alone else len(config.backbone.stages)
+        levels = 1 if finest_alone else config.backbone.levels or len(config.backbone.stages)
         self.spec, self.channels, self.dt_s = spec, channels, dt_s
         self.past_frames, self.max_steps = past_frames, max_steps
         self.backbone = ImageBackbone(config.backbone, channels=channels, levels=levels, fetch=fetch)
