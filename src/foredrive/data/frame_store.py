@@ -139,7 +139,7 @@ class FrameStore:
 
 def _flat(data: FrameData) -> dict[str, Tensor]:
     """Return the tensors of a frame by name; those of nested records have a dotted one."""
-    flat = {}
+    flat: dict[str, Tensor] = {}
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)
         entries = (
