@@ -26,7 +26,7 @@ from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.runs.search.indexing import IndexWriter
 from foredrive.search.find import find
-from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, Making, Part
+from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, IndexSettings, Part
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.target import Target
@@ -157,7 +157,7 @@ def rows_of(number: int, vectors: np.ndarray) -> tuple[Part, pa.Table]:
 
 def with_lancedb(seed: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
-        index = FrameIndex.make(f"{folder}/index", Making("made", f"made-{seed}", DIM, 0.5))
+        index = FrameIndex.make(f"{folder}/index", IndexSettings("made", f"made-{seed}", DIM, 0.5))
         held = []
         made, started = drives(seed), time.perf_counter()
         with IndexWriter(index) as writer:

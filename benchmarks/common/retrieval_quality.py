@@ -12,7 +12,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.setting import Place
 from foredrive.metrics.retrieval import Ranking, draw_sequences, mean_and_interval, precision_at
-from foredrive.runs.search.sector_views import LogViews, Row
+from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.search.facts import MANY, NOUNS
 from foredrive.search.find import collapse
 from foredrive.search.phrases import SETTINGS
@@ -55,7 +55,7 @@ class Question(NamedTuple):
 class Judged(NamedTuple):
     """Views with their known facts and their unit vectors."""
 
-    rows: list[Row]
+    rows: list[ViewRow]
     t_us: Int[np.ndarray, "n"]
     vectors: Mapping[str, Float[np.ndarray, "n D"]]
     """Unit vectors by modality: image, lidar, joint."""
@@ -132,7 +132,7 @@ def judge_naming(judged: Judged, towers: Towers) -> dict[str, dict[str, float]]:
     return out
 
 
-def weather_of(row: Row) -> str:
+def weather_of(row: ViewRow) -> str:
     """Return the weather of a row, a key of `WEATHERS`."""
     if row.facts.weather in ("rain", "fog"):
         return row.facts.weather

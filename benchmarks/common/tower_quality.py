@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.runs.search.sector_views import LogViews, Row
+from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.scene import LidarSweep
 from foredrive.search.embedding import mean_direction
 from foredrive.search.facts import EMPTY, NOUNS
@@ -63,7 +63,7 @@ def average_precision(scores: Float[np.ndarray, "n"], true: Bool[np.ndarray, "n"
     return float((np.cumsum(ranked) / np.arange(1, len(ranked) + 1))[ranked].mean())
 
 
-def _named(rows: Sequence[Row], found: Float[np.ndarray, "n D"], towers: Towers) -> Mapping[str, float]:
+def _named(rows: Sequence[ViewRow], found: Float[np.ndarray, "n D"], towers: Towers) -> Mapping[str, float]:
     """Return the mean over classes of the share that is classified correctly."""
     out = {}
     for kind in KINDS:

@@ -16,7 +16,7 @@ from benchmarks.common.retrieval_quality import (
     questions,
     weather_of,
 )
-from foredrive.runs.search.sector_views import Row
+from foredrive.runs.search.sector_views import ViewRow
 from foredrive.search.crops import Crop
 from foredrive.search.facts import Thing, ViewFacts
 from foredrive.search.phrases import SETTINGS
@@ -48,7 +48,7 @@ class AllKnowing:
         return torch.tensor([float(fact in longest | named) for fact in FACTS])
 
 
-def drives() -> list[Row]:
+def drives() -> list[ViewRow]:
     """Two drives of ten moments in each weather: a car in every other view, one truck among them."""
     told = {"clear": ("midday", "clear"), "night": ("night", "clear"), "rain": ("midday", "rain")}
     rows = []
@@ -58,7 +58,7 @@ def drives() -> list[Row]:
                 nouns = ["car"] * (frame % 2 == 0) + ["truck"] * (frame == 4)
                 things = tuple(Thing(noun, ("near",)) for noun in nouns)
                 facts = ViewFacts(time, air, "street", things)
-                rows.append(Row(f"town/{weather}{number}", frame, "ahead", facts))
+                rows.append(ViewRow(f"town/{weather}{number}", frame, "ahead", facts))
     return rows
 
 

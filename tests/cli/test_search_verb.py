@@ -89,7 +89,7 @@ def test_an_index_that_may_only_be_read_is_one_line(
         ("--like nowhere@1s", "no log of this name"),
         ("--like flat@0.5s/roof", "no view roof; there are ahead, left"),
         ("--like flat@0.5s/left:0,0,500,500", "outside the image of 96 x 48 px"),
-        ("--saved unknown", "no query is kept as unknown"),
+        ("--saved unknown", "no saved query unknown"),
         ("rain --view roof", "no view roof; there are any, sectors, ahead, all, left"),
         ("rain --out hits.jpg", "a contact sheet ends on .png or .html"),
         ("rain --index nowhere", "nowhere: no index here"),

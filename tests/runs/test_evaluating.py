@@ -8,7 +8,7 @@ from small_towers import PlainTowers
 
 from foredrive.errors import InputError
 from foredrive.runs.search.evaluating import Share, evaluate_index
-from foredrive.search.index import FrameIndex, Making, Part
+from foredrive.search.index import FrameIndex, IndexSettings, Part
 from foredrive.search.rows import EMBEDDINGS, WHOLE, row_schema
 
 RAIN, SUN, NIGHT = (1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0)
@@ -44,7 +44,7 @@ def rows_of(log: str, moments: list[tuple[str, str, tuple[float, ...], tuple[flo
 
 @pytest.fixture
 def index(tmp_path: Path) -> FrameIndex:
-    made = FrameIndex.make(str(tmp_path / "index"), Making("weather", "weather-1", 4, 0.5))
+    made = FrameIndex.make(str(tmp_path / "index"), IndexSettings("weather", "weather-1", 4, 0.5))
     wet = [("rain", "midday", RAIN, RAIN), ("rain", "midday", RAIN, SUN)]
     dry = [("clear", "midday", SUN, SUN), ("clear", "night", NIGHT, NIGHT)]
     parts = [(Part(log, 0, 1, "0"), rows_of(log, moments)) for log, moments in (("wet", wet), ("dry", dry))]
@@ -75,6 +75,6 @@ def test_shares_by_hand(index: FrameIndex) -> None:
 def test_an_index_without_sweeps_or_of_other_towers_is_refused(index: FrameIndex, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be compared"):
         evaluate_index(index, PlainTowers(), 0)
-    empty = FrameIndex.make(str(tmp_path / "empty"), Making("weather", "weather-1", 4, 0.5))
+    empty = FrameIndex.make(str(tmp_path / "empty"), IndexSettings("weather", "weather-1", 4, 0.5))
     with pytest.raises(InputError, match="both an image and a sweep"):
         evaluate_index(empty, WeatherTowers(), 0)

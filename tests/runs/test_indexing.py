@@ -19,7 +19,7 @@ from foredrive.runs.search.indexing import Job, index_logs
 from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.crops import Crop
-from foredrive.search.index import FrameIndex, Making
+from foredrive.search.index import FrameIndex, IndexSettings
 from foredrive.search.query import Query
 
 FRAMES = 21
@@ -113,7 +113,7 @@ def test_broken_logs_are_skipped_and_named(logs: list[LogPath], towers: str, tmp
     assert set(done.failed) == {"flat_train/broken", "flat_train/unreadable"}
     assert "ego_state" in done.failed["flat_train/broken"]
     assert "frames 0 to 20" in done.failed["flat_train/unreadable"]
-    with pytest.raises(InputError, match="0 s: moments lie apart"):
+    with pytest.raises(InputError, match="the stride must be above 0 s"):
         index_logs(logs, str(tmp_path / "index"), towers, 0.0, 1)
 
 
@@ -138,7 +138,8 @@ def test_an_index_of_sweeps_that_were_not_cut_is_refused(
     uri = str(tmp_path / "index")
     clip = find_towers(towers)
     assert clip.crop is Crop.MIDDLE_SQUARE
-    FrameIndex.make(uri, Making(clip.name, clip.fingerprint.replace("-middle-square", ""), clip.dim, 1.0))
+    before = clip.fingerprint.replace("-middle-square", "")
+    FrameIndex.make(uri, IndexSettings(clip.name, before, clip.dim, 1.0))
     with pytest.raises(InputError, match="index the logs again in another place"):
         index_logs(logs[:1], uri, towers, 1.0, 1)
 

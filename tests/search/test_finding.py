@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.search.find import collapse, find
-from foredrive.search.index import FrameIndex, Making, Part
-from foredrive.search.kept import add_tag, remove_tag, save_query, saved_queries, tagged
+from foredrive.search.index import FrameIndex, IndexSettings, Part
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
+from foredrive.search.saved import add_tag, remove_tag, save_query, saved_queries, tagged
 from foredrive.search.target import Target
 
 DIM = 16
-MAKING = Making("plain", "plain-1", DIM, 0.5)
+MAKING = IndexSettings("plain", "plain-1", DIM, 0.5)
 LOGS, FRAMES = ("city_train/a", "city_train/b", "rural_val/it's"), 40
 
 
@@ -206,9 +206,9 @@ def test_parts_are_put_in_once(index: FrameIndex) -> None:
 
 def test_an_index_is_its_towers_own(index: FrameIndex, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"made by the towers plain \(plain-1\), not by other \(clip-2\)"):
-        FrameIndex.make(index.uri, Making("other", "clip-2", DIM, 0.5))
+        FrameIndex.make(index.uri, IndexSettings("other", "clip-2", DIM, 0.5))
     with pytest.raises(InputError, match=r"a moment every 0\.5 s"):
-        FrameIndex.make(index.uri, Making("plain", "plain-1", DIM, 1.0))
+        FrameIndex.make(index.uri, IndexSettings("plain", "plain-1", DIM, 1.0))
     with pytest.raises(InputError, match="no index here"):
         FrameIndex(str(tmp_path / "nowhere"))
     assert not (tmp_path / "nowhere").exists()

@@ -84,7 +84,7 @@ def test_what_is_no_tower_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be loaded"):
         PretrainedTowers(str(tmp_path))
     BertConfig().save_pretrained(tmp_path)
-    with pytest.raises(InputError, match="a bert model; towers are CLIP or SigLIP"):
+    with pytest.raises(InputError, match="a bert model; only CLIP and SigLIP"):
         PretrainedTowers(str(tmp_path))
 
 

@@ -5,7 +5,16 @@ from typing import TYPE_CHECKING
 import tyro
 
 from foredrive.cli.arguments import check_number
-from foredrive.cli.search_options import Among, Choose, LookFor, Name, Place, Then, as_query, check_index
+from foredrive.cli.search_options import (
+    ConditionOptions,
+    HitOptions,
+    Name,
+    Place,
+    QueryOptions,
+    RankingOptions,
+    as_query,
+    check_index,
+)
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -18,10 +27,10 @@ INDEX = "runs/search"
 
 
 def search(
-    query: tyro.conf.OmitArgPrefixes[LookFor],
-    condition: tyro.conf.OmitArgPrefixes[Among],
-    ranking: tyro.conf.OmitArgPrefixes[Choose],
-    hits: tyro.conf.OmitArgPrefixes[Then],
+    query: tyro.conf.OmitArgPrefixes[QueryOptions],
+    condition: tyro.conf.OmitArgPrefixes[ConditionOptions],
+    ranking: tyro.conf.OmitArgPrefixes[RankingOptions],
+    hits: tyro.conf.OmitArgPrefixes[HitOptions],
     index: Place = INDEX,
     towers: Name = None,
     saved: Name = None,
@@ -44,18 +53,18 @@ def search(
     with importing():
         from foredrive.runs.search.searching import ask
         from foredrive.search.index import FrameIndex
-        from foredrive.search.kept import remove_tag
+        from foredrive.search.saved import remove_tag
 
     opened = FrameIndex(index)
     if untag is not None:
         remove_tag(index, untag)
-        print(f"nothing is tagged {untag} any more")
+        print(f"removed the tag {untag}")
         return
     if saved is not None:
         asked = _saved(index, saved)
     assert asked is not None
     found = ask(opened, asked, towers, ensemble=not query.plain)
-    _tell(opened, found)
+    _print_found(opened, found)
     hits.do(index, asked, found)
 
 
@@ -76,7 +85,7 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
         from foredrive.view.search_page import SearchPage
 
     page = SearchPage(FrameIndex(index), towers, host, port)
-    print(f"{index} is asked at {page.url} until you press Ctrl-C", flush=True)
+    print(f"serving the search page of {index} at {page.url}; press Ctrl-C to stop", flush=True)
     try:
         page.serve()
     finally:
@@ -84,16 +93,16 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
 
 
 def _saved(index: str, name: str) -> "Query":
-    from foredrive.search.kept import saved_queries
     from foredrive.search.query import Query
+    from foredrive.search.saved import saved_queries
 
-    kept = saved_queries(index)
-    if name not in kept:
-        raise InputError(f"{index}: no query is kept as {name}; there are: {', '.join(kept) or 'none'}")
-    return Query.from_json(kept[name])
+    saved = saved_queries(index)
+    if name not in saved:
+        raise InputError(f"{index}: no saved query {name}; there are: {', '.join(saved) or 'none'}")
+    return Query.from_json(saved[name])
 
 
-def _tell(index: "FrameIndex", found: "Found") -> None:
+def _print_found(index: "FrameIndex", found: "Found") -> None:
     from rich.console import Console
 
     from foredrive.view.search_sheet import hits_table
@@ -104,5 +113,5 @@ def _tell(index: "FrameIndex", found: "Found") -> None:
         print(f"nothing found among {rows} rows of {index.uri}")
         return
     print_table(hits_table(found.hits), Console())
-    how = "all compared" if found.exact else f"{found.compared} compared, the others lie farther off"
+    how = "all compared" if found.exact else f"{found.compared} compared, the others are less similar"
     print(f"{len(found.hits)} hits among {rows} rows of {index.uri}; {how}")

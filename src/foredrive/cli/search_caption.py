@@ -40,7 +40,7 @@ def search_caption(
 
     like = parse_like(moment)
     opened = FrameIndex(index) if towers is None else None
-    chosen = find_towers(towers if opened is None else opened.making.towers)
+    chosen = find_towers(towers if opened is None else opened.settings.towers)
     decoder = load_captions(Path(chosen.name) / CAPTIONS, chosen)
     views, _ = example_views(opened, like, chosen)
     said = caption_views(views, chosen, decoder)

@@ -35,7 +35,7 @@ def search_evaluate(
         from foredrive.search.index import FrameIndex
 
     opened = FrameIndex(index)
-    shares = evaluate_index(opened, find_towers(towers or opened.making.towers), moments)
+    shares = evaluate_index(opened, find_towers(towers or opened.settings.towers), moments)
     for arms in (("image", "lidar", "joint", "chance"), ("lidar_to_image", "image_to_lidar", "chance")):
         _print_shares(shares, arms)
     if out is not None:

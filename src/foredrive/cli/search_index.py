@@ -58,7 +58,7 @@ def search_index(
     with _progress() as tick:
         cores = len(os.sched_getaffinity(0))
         done = index_logs(found, index, towers, stride, workers or cores, on_ray=ray, scores=told, tick=tick)
-    _tell_indexed(done, index)
+    _print_indexed(done, index)
 
 
 def search_train(
@@ -105,10 +105,10 @@ def search_train(
     print(f"next: foredrive search index LOGS --towers {towers}")
 
 
-def _tell_indexed(done: "Indexed", index: str) -> None:
-    print(f"{done.logs} logs are in {index}: {done.rows} new rows, {done.there_before} parts were in already")
+def _print_indexed(done: "Indexed", index: str) -> None:
+    print(f"{done.logs} logs are in {index}: {done.rows} new rows, {done.there_before} parts were there")
     if done.scored:
-        print(f"gave {done.scored} rows their scores")
+        print(f"set the scores of {done.scored} rows")
     if done.failed:
         told = [f"{name} ({why})" for name, why in done.failed.items()]
         more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""

@@ -26,7 +26,7 @@ def check_index(place: str) -> None:
 
 
 @dataclass(frozen=True)
-class LookFor:
+class QueryOptions:
     """What to look for.
 
     Args:
@@ -52,7 +52,7 @@ class LookFor:
 
 
 @dataclass(frozen=True)
-class Among:
+class ConditionOptions:
     """Which moments to search.
 
     Args:
@@ -68,7 +68,7 @@ class Among:
 
 
 @dataclass(frozen=True)
-class Choose:
+class RankingOptions:
     """Which hits to return, and in what order.
 
     Args:
@@ -88,7 +88,7 @@ class Choose:
 
 
 @dataclass(frozen=True)
-class Then:
+class HitOptions:
     """What to do with the hits.
 
     Args:
@@ -121,7 +121,7 @@ class Then:
         """Save the query, tag the hits, and write the files."""
         from foredrive.data.clip_list import write_clip_list
         from foredrive.runs.search.searching import listed_clips
-        from foredrive.search.kept import add_tag, save_query
+        from foredrive.search.saved import add_tag, save_query
         from foredrive.view.search_sheet import write_search_sheet
 
         if self.save is not None:
@@ -135,26 +135,26 @@ class Then:
             print(f"wrote {self.clips}: foredrive train RECIPE --logs {self.clips}")
         if self.out is not None:
             write_search_sheet(self.out, query, found.hits)
-            print(f"look: {self.out}")
+            print(f"wrote {self.out}")
 
 
-def as_query(look_for: LookFor, among: Among, choose: Choose) -> "Query":
+def as_query(query: QueryOptions, condition: ConditionOptions, ranking: RankingOptions) -> "Query":
     """Return the query of the options. Raise `InputError` as `Query` does."""
     from foredrive.search.query import Query
 
     return Query(
-        text=look_for.text,
-        image_text=look_for.image_text,
-        lidar_text=look_for.lidar_text,
-        like=look_for.like,
-        modality=look_for.modality,
-        rule=look_for.rule,
-        where=among.where,
-        tag=among.tagged,
-        view=among.view,
-        top=choose.top,
-        gap_s=choose.gap,
-        diverse=None if choose.diverse == "no" else choose.diverse,
-        by=choose.by,
-        mix=choose.mix,
+        text=query.text,
+        image_text=query.image_text,
+        lidar_text=query.lidar_text,
+        like=query.like,
+        modality=query.modality,
+        rule=query.rule,
+        where=condition.where,
+        tag=condition.tagged,
+        view=condition.view,
+        top=ranking.top,
+        gap_s=ranking.gap,
+        diverse=None if ranking.diverse == "no" else ranking.diverse,
+        by=ranking.by,
+        mix=ranking.mix,
     )

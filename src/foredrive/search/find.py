@@ -12,9 +12,9 @@ from foredrive.errors import InputError
 from foredrive.search.diversity import facility_location, k_centre
 from foredrive.search.embedding import mean_direction
 from foredrive.search.index import EXACT_UP_TO, FrameIndex
-from foredrive.search.kept import where_tagged
 from foredrive.search.query import ANY_SECTOR, ANY_VIEW, Query
 from foredrive.search.rows import FACTS, IndexRow
+from foredrive.search.saved import where_tagged
 from foredrive.search.tables import quoted
 from foredrive.search.target import Target
 
@@ -76,7 +76,7 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
             break
         limit *= MORE
     if not order and query.modality == "lidar" and not index.count("lidar IS NOT NULL"):
-        raise InputError(f"{index.uri}: no lidar embeddings; the towers {index.making.towers} made none")
+        raise InputError(f"{index.uri}: no lidar embeddings; the towers {index.settings.towers} made none")
     if query.diverse is not None:
         order = [order[n] for n in _diverse(rows, order, score, query)]
     kept = rows.take(pa.array(order, pa.int64()))
@@ -102,7 +102,7 @@ def collapse(
 
 def _check(query: Query, target: Target | None) -> None:
     if query.compares and target is None:
-        raise InputError("the query compares, but there is nothing to compare with")
+        raise InputError("the query has no text or example to compare with")
     if target is None:
         return
     needs = {"image": ("image",), "lidar": ("lidar",), "joint": ("image", "lidar")}[query.modality]

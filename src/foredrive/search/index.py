@@ -36,7 +36,7 @@ SCORED_AT_ONCE = 2000
 
 
 @dataclass(frozen=True)
-class Making:
+class IndexSettings:
     """Settings with which all rows of an index were made."""
 
     towers: str
@@ -65,7 +65,7 @@ class FrameIndex:
         InputError: there is no index, or it is not one of Foredrive.
     """
 
-    making: Making
+    settings: IndexSettings
 
     def __init__(self, uri: str) -> None:
         self.uri = uri
@@ -75,25 +75,25 @@ class FrameIndex:
         self._frames = table
         told = (table.schema.metadata or {}).get(_REMEMBERED)
         if told is None:
-            raise InputError(f"{uri}: its table {FRAMES} is none of Foredrive's")
-        self.making = Making(**json.loads(told))
+            raise InputError(f"{uri}: the table {FRAMES} was not made by Foredrive")
+        self.settings = IndexSettings(**json.loads(told))
 
     @classmethod
-    def make(cls, uri: str, making: Making) -> "FrameIndex":
+    def make(cls, uri: str, settings: IndexSettings) -> "FrameIndex":
         """Open an index for adding rows, or create it.
 
         Raises:
             InputError: an index exists that was made with other towers or another stride.
         """
         if find_table(uri, FRAMES) is None:
-            schema = row_schema(making.dim).with_metadata({_REMEMBERED: json.dumps(asdict(making))})
+            schema = row_schema(settings.dim).with_metadata({_REMEMBERED: json.dumps(asdict(settings))})
             make_table(uri, FRAMES, schema)
         index = cls(uri)
-        index.check_towers(making.towers, making.fingerprint)
-        if index.making.stride_s != making.stride_s:
+        index.check_towers(settings.towers, settings.fingerprint)
+        if index.settings.stride_s != settings.stride_s:
             raise InputError(
-                f"{uri}: has a moment every {index.making.stride_s:g} s of its logs, "
-                f"not {making.stride_s:g} s"
+                f"{uri}: has a moment every {index.settings.stride_s:g} s of its logs, "
+                f"not {settings.stride_s:g} s"
             )
         return index
 
@@ -103,7 +103,7 @@ class FrameIndex:
         Raises:
             InputError: the index was made by other towers.
         """
-        ours = self.making
+        ours = self.settings
         if ours.fingerprint != fingerprint:
             raise InputError(
                 f"{self.uri}: made by the towers {ours.towers} ({ours.fingerprint}), not by {name} "
@@ -204,7 +204,7 @@ class FrameIndex:
         keys = list(scores)
         for start in range(0, len(keys), SCORED_AT_ONCE):
             where = f"key IN ({quoted_list(keys[start : start + SCORED_AT_ONCE])})"
-            rows = self.select(where, row_schema(self.making.dim).names)
+            rows = self.select(where, row_schema(self.settings.dim).names)
             if not len(rows):
                 continue
             for name in SCORES:

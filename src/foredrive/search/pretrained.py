@@ -131,7 +131,7 @@ def _from_files(model: str, *, local_files_only: bool) -> tuple[Any, Any]:
 
     config = AutoConfig.from_pretrained(model, local_files_only=local_files_only)
     if config.model_type not in KINDS:
-        raise InputError(f"{model}: a {config.model_type} model; towers are CLIP or SigLIP")
+        raise InputError(f"{model}: a {config.model_type} model; only CLIP and SigLIP models can be towers")
     tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=local_files_only)
     if Path(model).is_dir() and not any(Path(model).glob("*.safetensors")):
         warnings.warn(f"towers start from RANDOM weights: {model} has none", stacklevel=3)

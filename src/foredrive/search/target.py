@@ -116,7 +116,7 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
         raise InputError(
             f"{name}: no log of this name in the index, and no folder of one"
             if not logs
-            else f"{name}: may be {', '.join(sorted(logs))}; name the split too"
+            else f"{name}: several logs have this name: {', '.join(sorted(logs))}; add the split"
         )
     return next(iter(logs.values()))
 

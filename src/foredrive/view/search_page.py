@@ -17,10 +17,10 @@ from foredrive.errors import InputError
 from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
-from foredrive.search.kept import add_tag, save_query, saved_queries
 from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import FACTS, IndexRow
+from foredrive.search.saved import add_tag, save_query, saved_queries
 from foredrive.search.tables import quoted_list
 from foredrive.view.hit_picture import content_text, hit_name, hit_picture, score_text
 from foredrive.view.html import render_page

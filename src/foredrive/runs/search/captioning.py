@@ -67,7 +67,7 @@ def train_captions(
     told = [whole_caption(row.facts) for row in rows]
     known = [n for n, caption in enumerate(told) if caption is not None]
     if not known:
-        raise InputError("no view of these logs has a caption or annotated boxes to tell of")
+        raise InputError("no view of these logs has annotated boxes or a recorded setting")
     captions = {n: str(told[n]) for n in known}
     words = sorted({word for caption in captions.values() for word in caption.split()})
     longest = 1 + max(len(caption.split()) for caption in captions.values())

@@ -51,7 +51,7 @@ class Share(NamedTuple):
     high: float | None = None
 
 
-class _Pairs(NamedTuple):
+class _SensorPairs(NamedTuple):
     """Pairs of an image and a sweep, with their unit vectors."""
 
     image: Float[np.ndarray, "n D"]
@@ -92,11 +92,11 @@ def evaluate_index(index: FrameIndex, towers: Towers, moments: int) -> dict[str,
     return shares
 
 
-def _pairs_of(rows: pa.Table) -> _Pairs:
-    return _Pairs(vectors_of(rows, "image"), vectors_of(rows, "lidar"), rows["log"].to_pylist())
+def _pairs_of(rows: pa.Table) -> _SensorPairs:
+    return _SensorPairs(vectors_of(rows, "image"), vectors_of(rows, "lidar"), rows["log"].to_pylist())
 
 
-def _retrieval(task: str, pairs: _Pairs) -> dict[str, Share]:
+def _retrieval(task: str, pairs: _SensorPairs) -> dict[str, Share]:
     """Return the recall of each pair's other half among all, and that of random ranks."""
     ranks = {
         "lidar_to_image": match_rank(pairs.lidar, pairs.image),
@@ -111,7 +111,7 @@ def _retrieval(task: str, pairs: _Pairs) -> dict[str, Share]:
 
 
 def _classification(
-    task: str, pairs: _Pairs, truth: Sequence[str | None], templates: Sequence[str], *, towers: Towers
+    task: str, pairs: _SensorPairs, truth: Sequence[str | None], templates: Sequence[str], *, towers: Towers
 ) -> dict[str, Share]:
     """Return the accuracies of a task. Pairs without truth are left out; nothing if all are of one class."""
     classes = CLASSES[task]
@@ -146,7 +146,7 @@ def _share(values: Float[np.ndarray, "n"], logs: Sequence[str], group: np.ndarra
     return Share(value, low, high) if len(names) > 1 else Share(value)
 
 
-def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_Pairs, list[str | None]]:
+def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_SensorPairs, list[str | None]]:
     """Embed the objects of evenly chosen moments; return them with the words of their classes."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(moments, len(frames))).round().astype(int))
     vectors, logs, nouns = [], [], []
@@ -162,7 +162,7 @@ def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_Pairs, li
             logs += [row["log"]] * len(objects)
             nouns += [OBJECTS[found.category] for found in objects]
     pairs = np.concatenate(vectors) if vectors else np.zeros((0, 2, towers.dim), np.float32)
-    return _Pairs(pairs[:, 0], pairs[:, 1], logs), list(nouns)
+    return _SensorPairs(pairs[:, 0], pairs[:, 1], logs), list(nouns)
 
 
 @functools.lru_cache(maxsize=1)

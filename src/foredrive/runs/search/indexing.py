@@ -20,7 +20,7 @@ from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import held
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedding import embed_frames
-from foredrive.search.index import FrameIndex, Making, Part, Scores
+from foredrive.search.index import FrameIndex, IndexSettings, Part, Scores
 
 PART_FRAMES = 64
 """Frames that one worker embeds at a time. The limit keeps the memory independent of the length of a log."""
@@ -82,14 +82,14 @@ def index_logs(
         OSError: the disk is full or cannot be written.
     """
     if stride_s <= 0:
-        raise InputError(f"a stride of {stride_s:g} s: moments lie apart by more than 0 s")
+        raise InputError(f"the stride must be above 0 s, not {stride_s:g} s")
     tower = find_towers(towers)
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(embed_part, towers=towers, threads=threads)
     here = workers == 1 and not on_ray  # a separate process would have to load the towers first
     embed = _one_by_one if here else functools.partial(fan_out, workers=workers, on_ray=on_ray)
     with contextlib.nullcontext() if "://" in uri else held(Path(uri)):
-        index = FrameIndex.make(uri, Making(tower.name, tower.fingerprint, tower.dim, stride_s))
+        index = FrameIndex.make(uri, IndexSettings(tower.name, tower.fingerprint, tower.dim, stride_s))
         failed: dict[str, str] = {}
         jobs = _plan(logs, index, failed)
         there = index.parts()
@@ -189,7 +189,7 @@ def _plan(logs: Sequence[LogPath], index: FrameIndex, failed: dict[str, str]) ->
             failed[path.name] = f"{path.folder} has the name of {folder_of[path.name]}"
             continue
         try:
-            frames, digest = moments(Log(path), index.making.stride_s), log_digest(path)
+            frames, digest = moments(Log(path), index.settings.stride_s), log_digest(path)
         except InputError as error:
             failed[path.name] = str(error)
             continue

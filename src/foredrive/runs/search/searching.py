@@ -26,7 +26,7 @@ def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble:
 def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool) -> Target | None:
     if not query.compares:
         return None
-    chosen = find_towers(towers or index.making.towers)
+    chosen = find_towers(towers or index.settings.towers)
     index.check_towers(chosen.name, chosen.fingerprint)
     if query.example is not None:
         return example_target(index, query.example, chosen)

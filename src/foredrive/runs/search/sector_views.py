@@ -28,7 +28,7 @@ VIEWS_VERSION = 2
 """Part of the hash in each folder's name: raise it when the views change."""
 
 
-class Row(NamedTuple):
+class ViewRow(NamedTuple):
     """One view of one moment."""
 
     log: str
@@ -109,7 +109,7 @@ def _write_views(log: Log, stride_s: float, side_px: int, crop: Crop, folder: Pa
             if view.image is None:
                 continue
             mine, cloud = images.setdefault(name, []), _points(view)
-            row = Row(log.path.name, frame, name, facts[name])
+            row = ViewRow(log.path.name, frame, name, facts[name])
             rows.append({"row": row, "at": len(mine), "points": (count, count + len(cloud))})
             mine.append(view.image)
             points.append(cloud)
@@ -129,8 +129,8 @@ def _points(view: View) -> Float[Tensor, "P 4"]:
     return PointCloud.from_sweeps(stack_records([view.sweep])).points
 
 
-def _row_of(log: str, frame: int, view: str, facts: Sequence[Any]) -> Row:
+def _row_of(log: str, frame: int, view: str, facts: Sequence[Any]) -> ViewRow:
     """Return a row from its JSON form."""
     time_of_day, weather, place, things = facts
     seen = None if things is None else tuple(Thing(noun, tuple(manners)) for noun, manners in things)
-    return Row(log, frame, view, ViewFacts(time_of_day, weather, place, seen))
+    return ViewRow(log, frame, view, ViewFacts(time_of_day, weather, place, seen))

@@ -19,7 +19,7 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.lidar_clip import PointCloud
 from foredrive.models.text_encoder import TextEncoder
-from foredrive.runs.search.sector_views import LogViews, Row
+from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.search.phrases import Phrase, phrases
 from foredrive.search.towers import Towers
 from foredrive.training.alignment import CaptionedImages, ImagedSweeps
@@ -27,7 +27,7 @@ from foredrive.training.alignment import CaptionedImages, ImagedSweeps
 TEXTS_AT_ONCE = 4096
 
 
-class _Rows:
+class _ViewsOfLogs:
     """The rows of several logs under one running index."""
 
     def __init__(self, views: Sequence[LogViews]) -> None:
@@ -42,7 +42,7 @@ class _Rows:
         log = bisect.bisect_right(self._ends, index)
         return self.views[log], index - (self._ends[log - 1] if log else 0)
 
-    def all(self) -> list[Row]:
+    def all(self) -> list[ViewRow]:
         """Return all rows."""
         return [row for log in self.views for row in log.rows]
 
@@ -64,14 +64,14 @@ class CaptionedViews(Dataset[CaptionedImages]):
     def __init__(
         self, views: Sequence[LogViews], embed: Callable[[list[str]], Float[Tensor, "N D"]], texts: int
     ) -> None:
-        self._rows = _Rows(views)
+        self._rows = _ViewsOfLogs(views)
         told = [phrases(row.facts, seed, texts) for seed, row in enumerate(self._rows.all())]
         self._known = [index for index, those in enumerate(told) if those]
         if not self._known:
-            raise InputError("no view of these logs has a caption or annotated boxes to tell of")
+            raise InputError("no view of these logs has annotated boxes or a recorded setting")
         sizes = {tuple(images.shape[1:]) for log in views for _, images in log.images_by_view()}
         if len(sizes) > 1:
-            raise InputError(f"images of one shape are wanted, these logs have {sorted(sizes)}")
+            raise InputError(f"all images must have one size; these logs have {sorted(sizes)}")
         distinct = sorted({phrase.text for those in told for phrase in those})
         embedded = embed(distinct)
         number = {text: n for n, text in enumerate(distinct)}
@@ -111,7 +111,7 @@ class ImagedViews(Dataset[ImagedSweeps]):
     """Sweeps with the image towers' embeddings of the same views, for the image and for its mirror image."""
 
     def __init__(self, views: Sequence[LogViews], targets: Float[Tensor, "n 2 D"]) -> None:
-        self._rows, self._targets = _Rows(views), targets
+        self._rows, self._targets = _ViewsOfLogs(views), targets
 
     def __len__(self) -> int:
         return len(self._rows)

@@ -148,7 +148,7 @@ def _train_image(recipe: TowerRecipe, views: list[LogViews], folder: Path, fabri
             image=recipe.image,
             base_fingerprint="",
             lidar=None,
-            trained=_told(recipe, views),
+            trained=_described(recipe, views),
         )
         save_towers(stage / TOWERS, card, (tower, dataset.text_mean), None)
     return load_towers(stage / TOWERS)
@@ -176,14 +176,14 @@ def _train_lidar(
             image=None if sentences is None else sentences.size,
             base_fingerprint=base.fingerprint,
             lidar=recipe.lidar,
-            trained=_told(recipe, views),
+            trained=_described(recipe, views),
         )
         image = None if sentences is None else (sentences.tower, sentences.text_mean)
         save_towers(final, card, image, encoder)
     return final
 
 
-def _told(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
+def _described(recipe: TowerRecipe, views: Sequence[LogViews]) -> dict[str, object]:
     """Return the description of the training for the card: the recipe, the logs and the number of views."""
     logs = sorted({row.log for log in views for row in log.rows})
     return {"recipe": asdict(recipe), "logs": logs, "views": sum(map(len, views))}
