@@ -72,7 +72,7 @@ def test_a_data_set_of_listed_clips_has_no_others(log: LogPath) -> None:
 
     assert nows_s((0.25, 0.55)) == [0.0, 0.1, 0.2]
     assert len(nows_s((0.25, 0.55), (1.0, 1.05))) == 4
-    with pytest.raises(InputError, match="none of the parts"):
+    with pytest.raises(InputError, match="none of the selected parts"):
         nows_s((60.0, 70.0))
 
 
@@ -92,7 +92,7 @@ def test_folders_of_a_list_may_lie_beside_it(tmp_path: Path) -> None:
     (tmp_path / "clips.json").write_text(json.dumps({"format": "foredrive clips 1", "clips": [clip]}))
     (read,) = read_clip_list(tmp_path / "clips.json")
     assert (read.folder, read.end_s) == (tmp_path / "logs/s/a", 2.0)
-    with pytest.raises(InputError, match="is not there"):
+    with pytest.raises(InputError, match="does not exist"):
         find_logs(tmp_path / "clips.json")
 
 
