@@ -201,8 +201,8 @@ def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
     """Write results with variances, and the ground truth, as files."""
     rng = np.random.default_rng(seed)
     results, truth = folder / "results.json", folder / "truth.json"
-    with results.open("w") as said, truth.open("w") as true:
-        said.write('{"meta": {}, "results": {')
+    with results.open("w") as found, truth.open("w") as true:
+        found.write('{"meta": {}, "results": {')
         true.write('{"meta": {}, "results": {')
         for n in range(FRAMES):
             detected, objects = scene(DETECTIONS, int(rng.integers(5, 60)), 100.0, rng)
@@ -215,9 +215,9 @@ def write_validation(folder: Path, seed: int) -> tuple[Path, Path]:
                 {**box, "ego_translation": box["translation"], "scene_token": f"{n // 40}"} for box in there
             ]
             comma = ", " if n else ""
-            said.write(f'{comma}"{n}": {json.dumps(boxes)}')
+            found.write(f'{comma}"{n}": {json.dumps(boxes)}')
             true.write(f'{comma}"{n}": {json.dumps(there)}')
-        said.write("}}")
+        found.write("}}")
         true.write("}}")
     return results, truth
 

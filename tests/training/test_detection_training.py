@@ -79,9 +79,9 @@ def test_matching_takes_each_object_to_the_query_that_fits() -> None:
     logits = torch.zeros(4, 3)
     truth = LabelledBoxes(torch.tensor([1]), torch.tensor([[2.5, 0, 0, 0, 0, 0]]), torch.zeros(1))
     leaf = mean.clone().requires_grad_()
-    said = logits.clone().requires_grad_()
-    found = BoxSet(said, leaf, torch.zeros(4, 6), heading, torch.zeros(4))
-    by_mean, by_logits = torch.autograd.grad(matching_loss(found, truth), (leaf, said))
+    leaf_logits = logits.clone().requires_grad_()
+    found = BoxSet(leaf_logits, leaf, torch.zeros(4, 6), heading, torch.zeros(4))
+    by_mean, by_logits = torch.autograd.grad(matching_loss(found, truth), (leaf, leaf_logits))
     assert by_mean.abs().sum(-1).nonzero().tolist() == [[2]]
     assert by_mean[2, 0] < 0  # towards larger x
     assert by_logits[2, 1] < 0
