@@ -103,7 +103,7 @@ def test_drivers_that_see_nothing_carry_no_cameras() -> None:
     assert [sensor["id"] for sensor in agent.sensors()] == ["GPS", "IMU", "SPEED"]
     with pytest.raises(InputError, match="expert"):
         agent.setup("expert")
-    with pytest.raises(InputError, match="no such driver"):
+    with pytest.raises(InputError, match="unknown agent"):
         agent.setup("runs/there-is-none")
 
 

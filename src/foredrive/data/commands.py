@@ -6,6 +6,7 @@ from py123d.datatypes import ModalityType, RouteMetadata
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
+from foredrive.geometry.polylines import points_at
 from foredrive.scene import Command, Trajectory
 
 LATERAL_M = 2.0
@@ -65,7 +66,7 @@ def route_target(
         arc_m: arc length of each route point.
         progress_m: arc length of the ego's projection on the route.
     """
-    ahead = np.array([np.interp(progress_m + LOOKAHEAD_M, arc_m, axis) for axis in xy.T])
+    ahead = points_at(xy, arc_m, progress_m + LOOKAHEAD_M)
     forward = T_world_ego[:2, 0] / np.hypot(*T_world_ego[:2, 0])
     dx, dy = ahead - T_world_ego[:2, 3]
     return np.array([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]])
@@ -106,6 +107,6 @@ def route_offset_m(
     half_m = 0.5 * HEADING_OVER_M
     at_m = np.clip(progress_m, arc_m[0] + half_m, arc_m[-1] - half_m)
     along_m = [at_m - half_m, at_m + half_m, progress_m, progress_m + LOOKAHEAD_M]
-    behind, ahead, here, there = np.stack([np.interp(along_m, arc_m, axis) for axis in xy.T], axis=1)
+    behind, ahead, here, there = points_at(xy, arc_m, np.array(along_m))
     (dx, dy), (x, y) = ahead - behind, there - here
     return float((dx * y - dy * x) / max(np.hypot(dx, dy), 1e-9))

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from foredrive.data.commands import command_of, route_offset_m, route_target
 from foredrive.errors import InputError
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Command
 from foredrive.simulation.dynamics import EGO
 
@@ -57,10 +58,10 @@ class RouteLine:
     """
 
     def __init__(self, xyz: Float64[np.ndarray, "M 3"]) -> None:
-        arc_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+        arc_m = arc_lengths(xyz[:, :2])
         self.length_m = float(arc_m[-1])
         self._arc_m = np.linspace(0.0, self.length_m, max(2, int(np.ceil(self.length_m / SPACING_M)) + 1))
-        self._xy = np.stack([np.interp(self._arc_m, arc_m, xyz[:, axis]) for axis in (0, 1)], axis=1)
+        self._xy = points_at(xyz[:, :2], arc_m, self._arc_m)
 
     def advance(
         self, progress: RouteProgress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float

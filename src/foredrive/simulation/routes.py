@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from foredrive.errors import InputError
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.simulation.lane_search import Leg, find_way
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.towns.map.town_map import load_town_map
@@ -72,7 +73,7 @@ def snap_route(waypoints: RouteWaypoints) -> DriveRoute:
     except InputError as error:
         raise InputError(f"route {waypoints.id} in {waypoints.town}: {error}") from None
     xyz, option = route_line(graph, legs)
-    arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
+    arc_m = arc_lengths(xyz[:, :2])
     aside_m = max(place.aside_m for place in places)
     return DriveRoute(waypoints.id, waypoints.town, xyz, arc_m, option, tuple(legs), aside_m)
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Clip, Trajectory
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
@@ -22,7 +23,7 @@ from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
-from foredrive.towns.traffic.vehicles import Vehicles, path_starts
+from foredrive.towns.traffic.vehicles import path_starts
 
 EVERY, STEPS = 2, 15
 """A waypoint lies every `EVERY` decisions, `STEPS` in all: 3 s."""
@@ -99,7 +100,7 @@ class TownExpert:
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
         behind = v.track_id[leader == 0]  # vehicles behind take care themselves
         users = [road_users(traffic, then.traffic).without(behind) for then in self._imagined]
-        arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+        arc_m = arc_lengths(path)
         t_s = DECISION_S * np.arange(len(path))
         options = [arc_m]
         for brakes_mps2 in BRAKES_MPS2:
@@ -107,7 +108,7 @@ class TownExpert:
             options.append(np.minimum(here.speed_mps * till_s - 0.5 * brakes_mps2 * till_s**2, arc_m[-1]))
         free = (way_m for way_m in options if _is_free(path, arc_m, way_m, users, here))
         best_m = next(free, options[-1])
-        return np.stack([np.interp(best_m, arc_m, axis) for axis in path.T], axis=1)
+        return points_at(path, arc_m, best_m)
 
     def _edged_over(self, traffic: Traffic, here: EgoPose) -> Float64[np.ndarray, "T 2"]:
         """Return points that move slowly along the route, one per simulated step.
@@ -115,7 +116,7 @@ class TownExpert:
         The motion stops as soon as a road user comes near.
         """
         now, xyz = self._imagined[0], self._simulator.scenario.route_xyz
-        arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T)))
+        arc_m = arc_lengths(xyz[:, :2])
         max_m = traffic.to_light_m(now.traffic)
         way_m, speed, points = 0.0, here.speed_mps, [here.axle_xyz[:2]]
         for then in self._imagined[1:]:
@@ -150,7 +151,7 @@ class TownExpert:
         if abs(ahead_m) > LOST_AHEAD_M or abs(beside_m) > LOST_BESIDE_M:
             return state
         first = np.array([0])
-        wanted, real = _rows(meant.vehicles, first), _rows(state.vehicles, first)
+        wanted, real = meant.vehicles.rows(first), state.vehicles.rows(first)
         row = dataclasses.replace(
             wanted.moved(np.array([ahead_m])),
             speed_mps=real.speed_mps,
@@ -160,10 +161,6 @@ class TownExpert:
             has_stopped=real.has_stopped,
         )
         return dataclasses.replace(state, vehicles=state.vehicles.replace_rows(first, row))
-
-
-def _rows(vehicles: Vehicles, rows: np.ndarray) -> Vehicles:
-    return Vehicles(**{name: value[rows] for name, value in vars(vehicles).items()})
 
 
 def _is_free(
@@ -176,9 +173,7 @@ def _is_free(
     """Return whether the vehicle touches no road user on a path, given its distance along it at each step."""
     half, yaw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + NEAR_M, here.yaw_rad
     for at_m, others in zip(way_m.tolist(), users, strict=True):
-        axle, before = (
-            np.array([np.interp(m, arc_m, axis) for axis in path.T]) for m in (at_m, max(at_m - 1.0, 0.0))
-        )
+        axle, before = (points_at(path, arc_m, m) for m in (at_m, max(at_m - 1.0, 0.0)))
         if np.hypot(*(axle - before)) > 0.5:
             yaw = math.atan2(*(axle - before)[::-1])
         forward = np.array([math.cos(yaw), math.sin(yaw)])
@@ -196,7 +191,7 @@ def _is_too_late(traffic: Traffic, state: TrafficState) -> bool:
 
 def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "K 2"]:
     """Return a path that begins at the vehicle and gradually approaches the simulated one."""
-    way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    way_m = arc_lengths(path)
     return path + np.exp(-way_m / REJOINS_M)[:, None] * (here - path[0])
 
 

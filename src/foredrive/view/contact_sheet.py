@@ -15,6 +15,7 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import command_at
 from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, read_map_patch
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Command, MapKind, MapPatch
 from foredrive.view import palette
 from foredrive.view.bev import start_path_map
@@ -138,7 +139,7 @@ def draw_drive_path(ax: Axes, log: Log) -> None:
 
 def _frames_every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
     """Return the first frame, the last, and those that are `step_m` of driving apart."""
-    driven_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=-1))])
+    driven_m = arc_lengths(xy)
     at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
     return sorted({*at.tolist(), len(xy) - 1})
 

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from foredrive.data.commands import LOOKAHEAD_M
 from foredrive.errors import InputError
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Command
 from foredrive.simulation.carla.frames import xyz_of
 from foredrive.simulation.route_progress import RouteLine, RouteProgress
@@ -36,7 +37,7 @@ class GlobalPlan:
         self.xy: Float64[np.ndarray, "N 2"] = np.array(
             [xyz_of(transform.location)[:2] for transform, _ in plan], dtype=float
         ).reshape(-1, 2)
-        self._arc_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.xy, axis=0).T)))
+        self._arc_m = arc_lengths(self.xy)
         if len(plan) < 2 or not self._arc_m[-1] > 0:
             raise InputError(f"a route needs at least two different points, got {len(plan)} points")
         self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.geometry.polylines import points_at
 from foredrive.simulation.lane_search import Leg
 from foredrive.simulation.routes import DriveRoute
 from foredrive.towns.traffic.lane_graph import LaneGraph
@@ -54,9 +55,7 @@ def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> f
 
 def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]]:
     """Return a point of the route, m, and the unit vector of its heading there."""
-    at, before, after = (
-        np.array([np.interp(at_m + ds, route.arc_m, axis) for axis in route.xyz.T]) for ds in (0.0, -1.5, 1.5)
-    )
+    at, before, after = (points_at(route.xyz, route.arc_m, at_m + ds) for ds in (0.0, -1.5, 1.5))
     step = (after - before)[:2]
     return at, step / np.hypot(*step)
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.geometry.polylines import points_at
 from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.scenarios.context import ScenarioContext
 from foredrive.simulation.scenarios.road_context import RoadContext
@@ -52,9 +53,8 @@ def _is_far(road: RoadContext, ahead_m: Float64[np.ndarray, "n"], behind_m: Floa
 
     Two points cannot be seen from each other if they are further apart than `SPAWN_MIN_M`.
     """
-    xy, arc_m = road.route.xyz.T[:2], road.route.arc_m
-    there, here = (np.stack([np.interp(m, arc_m, axis) for axis in xy]) for m in (ahead_m, behind_m))
-    return bool((np.hypot(*(there - here)) > SPAWN_MIN_M).any())
+    there, here = (points_at(road.route.xyz[:, :2], road.route.arc_m, m) for m in (ahead_m, behind_m))
+    return bool((np.hypot(*(there - here).T) > SPAWN_MIN_M).any())
 
 
 def place_vehicles(context: ScenarioContext, at_start: bool) -> ScenarioContext:

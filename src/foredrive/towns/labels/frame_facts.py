@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 
 from foredrive.data.setting import Doing, LightColour, ObjectKind, Place, Setting, TimeOfDay, Weather
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Category, Command
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import Conditions
@@ -81,15 +82,11 @@ class FactCollector:
         conditions: Conditions,
         signal_xyz: dict[int, Float64[np.ndarray, "_ 3"]],
     ) -> None:
-        self._places, self._lanes, self._route, self._conditions = (
-            PlaceClassifier(town, lanes),
-            lanes,
-            route,
-            conditions,
-        )
+        self._places, self._lanes = PlaceClassifier(town, lanes), lanes
+        self._route, self._conditions = route, conditions
         self._signal_xyz = signal_xyz
         self._line = route.polyline(lanes)
-        self._arc_m = np.concatenate([[0.0], np.linalg.norm(np.diff(self._line, axis=0), axis=1).cumsum()])
+        self._arc_m = arc_lengths(self._line)
         length = lanes.length_m[route.lanes]
         self._begins_m = np.cumsum(length) - length - route.start_m
         self._passed = 0

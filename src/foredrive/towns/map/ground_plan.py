@@ -14,6 +14,7 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.towns.map.town_map import Points, Strip, StripKind, TownMap
 
 PIECE_SAMPLES = 8
@@ -168,7 +169,7 @@ def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N
     Samples on straight lines are left out.
     """
     middle = 0.5 * (strip.left_xyz + strip.right_xyz)
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
+    along = arc_lengths(middle)
     if np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1).max() < 0.05 or along[-1] < 0.05:
         return []
     changes = {mark.start_m for mark in strip.left_markings + strip.right_markings}

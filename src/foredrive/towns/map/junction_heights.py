@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from foredrive.geometry.polylines import arc_lengths
+
 Points = Float[np.ndarray, "N 3"]
 Line = Float[np.ndarray, "_ 3"]
 
@@ -42,7 +44,7 @@ def level_junction(roads: Sequence[tuple[Line, Line]]) -> list[tuple[Line, Line]
 
 def _blend(line: Points) -> Float[np.ndarray, "N"]:
     """Return 0 at the ends of a line and 1 further than BLEND_M from them."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    along = arc_lengths(line)
     t = np.clip(np.minimum(along, along[-1] - along) / BLEND_M, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

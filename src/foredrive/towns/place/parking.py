@@ -4,6 +4,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
 from foredrive.towns.map.town_map import StripKind, TownMap
@@ -29,7 +30,7 @@ def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[
     cars: list[ActorState] = []
     for strip in town.strips_of(StripKind.PARKING):
         middle = 0.5 * (strip.left_xyz + strip.right_xyz)
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
+        along = arc_lengths(middle)
         width = np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1)
         across = float(np.median(width)) >= CROSS_DEPTH_M
         bay = CROSS_BAY_M if across else KERB_BAY_M
@@ -86,9 +87,7 @@ def _pose_on(
     middle: Float[np.ndarray, "N 3"], along: Float[np.ndarray, "N"], s: float
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
     """Return the point, heading and pitch on a strip."""
-    at, before, after = (
-        np.array([np.interp(s + ds, along, middle[:, axis]) for axis in range(3)]) for ds in (0.0, -2.0, 2.0)
-    )
+    at, before, after = (points_at(middle, along, s + ds) for ds in (0.0, -2.0, 2.0))
     step = after - before
     return at, float(np.arctan2(step[1], step[0])), float(-np.arctan2(step[2], np.hypot(step[0], step[1])))
 

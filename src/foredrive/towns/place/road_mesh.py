@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.towns.map.ground_plan import GroundPlan, Piece
 from foredrive.towns.map.town_map import Marking, MarkingKind, StripKind, TownMap, marking_at
 from foredrive.towns.place.materials import (
@@ -201,9 +202,9 @@ def _stop_lines(town: TownMap, mats: RoadMaterials) -> list[Mesh]:
 
 def _before_end(line: Float[np.ndarray, "N 3"], gap_m: float) -> Float[np.ndarray, "2 3"]:
     """Return the points at STOP_LINE_M + gap and at gap before the end of a line."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    along = arc_lengths(line)
     at = along[-1] - gap_m - np.array([STOP_LINE_M, 0.0])
-    return np.column_stack([np.interp(at, along, line[:, axis]) for axis in range(3)])
+    return points_at(line, along, at)
 
 
 def _bridges(plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:

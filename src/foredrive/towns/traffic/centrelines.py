@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.towns.map.town_map import Lane
 
 SAMPLE_M = 0.5
@@ -41,7 +42,7 @@ def _bent_to(
         return line
     x = np.linspace(0.0, 1.0, 2 * len(line))[:, None]
     every = np.linspace(0.0, len(line) - 1.0, len(x))
-    fine = np.stack([np.interp(every, np.arange(len(line)), c) for c in line.T], axis=1)
+    fine = points_at(line, np.arange(len(line)), every)
     return fine + x**3 * (10 - 15 * x + 6 * x**2) * offset
 
 
@@ -49,10 +50,10 @@ def resample(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
     """Sample a line evenly, at most `SAMPLE_M` apart, and smooth it. Its ends do not move."""
     from scipy.signal import savgol_filter  # takes 0.3 s
 
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    along = arc_lengths(line)
     count = max(2, int(np.ceil(along[-1] / SAMPLE_M)) + 1)
     s = np.linspace(0.0, along[-1], count)
-    even = np.stack([np.interp(s, along, column) for column in line.T], axis=1)
+    even = points_at(line, along, s)
     if count < CUBIC_SAMPLES:
         return even
     smooth = savgol_filter(even, CUBIC_SAMPLES, 3, axis=0)  # the maps' polylines have corners, and one a kink

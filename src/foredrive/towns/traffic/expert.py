@@ -122,7 +122,7 @@ class ExpertDrive:
 
     @property
     def _ego(self) -> Vehicles:
-        return Vehicles(**{name: value[:1] for name, value in vars(self.state.vehicles).items()})
+        return self.state.vehicles.rows(slice(1))
 
     def _is_settled(self) -> bool:
         moving = self.state.vehicles.speed_mps[0] > MOVING_MPS

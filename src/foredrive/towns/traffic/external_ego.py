@@ -109,7 +109,7 @@ class PerceivedEgo:
 
         Vehicle 0 stays in its slot, wherever it is.
         """
-        return _with_ego(moved.first(self.count), active=True)
+        return _with_ego(moved.rows(slice(self.count)), active=True)
 
 
 def perceive_ego(

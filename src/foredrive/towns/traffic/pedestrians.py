@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int
 
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.traffic.leaders import LOOKAHEAD_M, motion_arrays
+from foredrive.towns.traffic.slots import Slots
 from foredrive.towns.traffic.vehicles import BEHIND, WINDOW, Vehicles
 from foredrive.towns.traffic.walkways import WalkGraph
 
@@ -43,12 +44,9 @@ DangerTest = Callable[[Float64[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 
 
 @dataclass(frozen=True)
-class Pedestrians:
-    """N pedestrian slots. The values of a slot that is not `active` have no meaning."""
+class Pedestrians(Slots):
+    """N pedestrian slots."""
 
-    active: Bool[np.ndarray, "N"]
-    track_id: Int[np.ndarray, "N"]
-    style: Int[np.ndarray, "N"]
     size_lwh: Float64[np.ndarray, "N 3"]
     walking_mps: Float64[np.ndarray, "N"]
     lateral: Float64[np.ndarray, "N"]
@@ -63,14 +61,6 @@ class Pedestrians:
     """Position of the feet, m."""
     velocity_mps: Float64[np.ndarray, "N 3"]
     yaw: Float64[np.ndarray, "N"]
-
-    def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Pedestrians") -> "Pedestrians":
-        """Return the people with the slots `rows` replaced by the k people of `other`."""
-        changed = {}
-        for field in dataclasses.fields(self):
-            changed[field.name] = getattr(self, field.name).copy()
-            changed[field.name][rows] = getattr(other, field.name)
-        return Pedestrians(**changed)
 
 
 def empty_pedestrians(count: int) -> Pedestrians:

@@ -44,7 +44,7 @@ def add_vehicle(
     no = np.zeros(CANDIDATES, dtype=np.bool_)
     drawn = draw_fleet(rng, np.full(CANDIDATES, state.next_track_id), no, no)
     car = int(np.argmax((drawn.category == Category.CAR) & (drawn.size_lwh[:, 0] < 5.0)))
-    one = dataclasses.replace(drawn, **{name: value[[car]] for name, value in vars(drawn).items()})
+    one = drawn.rows(np.array([car]))
     at, s_m = point_along(graph, lanes, along_m)
     one = place_vehicles(graph, one, np.array([lanes[at]]), np.array([s_m]))
     path = one.path.copy()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Category
 
 ACCELERATION_MPS2 = 4.0
@@ -33,7 +34,7 @@ class ScriptedActor:
     @property
     def arc_m(self) -> Float64[np.ndarray, "W"]:
         """Return the arc length of the path's points, m."""
-        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.path_xyz[:, :2], axis=0).T)))
+        return arc_lengths(self.path_xyz[:, :2])
 
     @property
     def length_m(self) -> float:
@@ -48,7 +49,7 @@ class ScriptedActor:
     @property
     def xyz(self) -> Float64[np.ndarray, "3"]:
         """Return the position of the feet, m."""
-        return np.array([np.interp(self.s_m, self.arc_m, axis) for axis in self.path_xyz.T])
+        return points_at(self.path_xyz, self.arc_m, self.s_m)
 
     @property
     def ahead(self) -> Float64[np.ndarray, "2"]:

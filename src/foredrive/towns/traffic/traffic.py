@@ -169,7 +169,8 @@ class Traffic:
         changed = self._begin_change(state, decision.context, perceived, orders)
         desired_mps2 = np.minimum(decision.desired_mps2, orders.max_mps2)
         moved = move_vehicles(state.vehicles if changed is None else changed, desired_mps2, dt_s)
-        vehicles = moved.first(self._slot_count) if perceived is None else perceived.without_shadows(moved)
+        own = slice(self._slot_count)
+        vehicles = moved.rows(own) if perceived is None else perceived.without_shadows(moved)
         state = dataclasses.replace(state, vehicles=vehicles)
         if changed is not None:
             state = self._extend_paths(state, rng)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64, Int
 from foredrive.towns.traffic.car_following import SLOWING_TIME_S
 from foredrive.towns.traffic.centrelines import SLOWING_MPS2
 from foredrive.towns.traffic.lane_graph import LaneGraph
+from foredrive.towns.traffic.slots import Slots
 
 BEHIND = 4
 AHEAD = 11
@@ -26,13 +27,10 @@ one, and some ahead."""
 
 
 @dataclass(frozen=True)
-class Vehicles:
-    """N vehicle slots. The values of a slot that is not `active` have no meaning."""
+class Vehicles(Slots):
+    """N vehicle slots."""
 
-    active: Bool[np.ndarray, "N"]
-    track_id: Int[np.ndarray, "N"]
     category: Int[np.ndarray, "N"]
-    style: Int[np.ndarray, "N"]
     size_lwh: Float64[np.ndarray, "N 3"]
     wheelbase_m: Float64[np.ndarray, "N"]
     axle_to_centre_m: Float64[np.ndarray, "N"]
@@ -117,24 +115,6 @@ class Vehicles:
     def moved(self, distance_m: Float64[np.ndarray, "N"]) -> "Vehicles":
         """Return the vehicles moved forward by a distance (m)."""
         return dataclasses.replace(self, s_m=self.s_m + distance_m, changed_m=self.changed_m + distance_m)
-
-    def first(self, count: int) -> "Vehicles":
-        """Return the first `count` vehicles."""
-        return Vehicles(**{name: value[:count] for name, value in vars(self).items()})
-
-    def appended(self, more: "Vehicles") -> "Vehicles":
-        """Return the vehicles with those of `more` appended."""
-        return Vehicles(
-            **{name: np.concatenate([value, getattr(more, name)]) for name, value in vars(self).items()}
-        )
-
-    def replace_rows(self, rows: Int[np.ndarray, "k"], other: "Vehicles") -> "Vehicles":
-        """Return the vehicles with the slots `rows` replaced by the k vehicles of `other`."""
-        changed = {}
-        for field in dataclasses.fields(self):
-            changed[field.name] = getattr(self, field.name).copy()
-            changed[field.name][rows] = getattr(other, field.name)
-        return Vehicles(**changed)
 
 
 @dataclass(frozen=True)

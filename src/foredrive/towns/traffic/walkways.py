@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.towns.map.ground_plan import WALKWAY_RAISE_M
 from foredrive.towns.map.town_map import StripKind, TownMap
 from foredrive.towns.traffic.lane_graph import LaneControl, LaneGraph
@@ -113,7 +114,7 @@ def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
     meeting = _crossed_lanes(every, is_crossing, lanes)
     return WalkGraph(
         xyz=np.concatenate(every) if every else np.zeros((0, 3)),
-        along_m=np.concatenate([_along(line) for line in every]) if every else np.zeros(0),
+        along_m=np.concatenate([arc_lengths(line) for line in every]) if every else np.zeros(0),
         first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         length_m=np.array([_length(line) for line in every]),
         ends=ends,
@@ -207,19 +208,12 @@ def _attach(
     line = walkways.geometries[index]
     if where.distance(line) > REACH_M:
         return None
-    return index, _at(walks[index], line.project(where) * _length(walks[index]) / line.length)
-
-
-def _along(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at_m = line.project(where) * _length(walks[index]) / line.length
+    return index, points_at(walks[index], arc_lengths(walks[index]), at_m)
 
 
 def _length(line: Float64[np.ndarray, "_ 3"]) -> float:
-    return float(_along(line)[-1])
-
-
-def _at(line: Float64[np.ndarray, "_ 3"], s_m: float) -> Float64[np.ndarray, "3"]:
-    return np.array([np.interp(s_m, _along(line), column) for column in line.T])
+    return float(arc_lengths(line)[-1])
 
 
 def _without_repeats(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_ 3"]:
@@ -228,13 +222,13 @@ def _without_repeats(line: Float64[np.ndarray, "_ 3"]) -> Float64[np.ndarray, "_
 
 def _cut(line: Float64[np.ndarray, "_ 3"], at_flat_m: list[float]) -> list[Float64[np.ndarray, "_ 3"]]:
     """Cut a walk at the points (arc length seen from above, m) where crossings join it."""
-    along = _along(line)
-    flat = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    along = arc_lengths(line)
+    flat = arc_lengths(line[:, :2])
     stops = np.unique(np.interp([0.0, *at_flat_m, flat[-1]], flat, along))
     pieces = []
     for a, b in itertools.pairwise(stops.tolist()):
         inner = line[(along > a + 1e-3) & (along < b - 1e-3)]
-        pieces.append(np.concatenate([_at(line, a)[None], inner, _at(line, b)[None]]))
+        pieces.append(np.vstack([points_at(line, along, a), inner, points_at(line, along, b)]))
     return [piece for piece in pieces if _length(piece) > 1e-2]
 
 
