@@ -77,24 +77,15 @@ def record(
         from foredrive.runs.drive.recording import record_drives, record_plan
         from foredrive.towns.campaign import Campaign, plan_drives
 
-    campaign = Campaign(
-        towns=town,
-        seeds=some_seeds,
-        conditions=weather,
-        vehicles=between[0],
-        people=between[1],
-        seconds=seconds,
-        rate_hz=rate,
-    )
-    plans = plan_drives(campaign)
+    plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
     if len(plans) == 1 and not ray:
         log = record_plan(plans[0], out, image_size)
         print(f"wrote {log.folder}")
         print(f"next: foredrive view {log.folder} --save {log.folder.name}.png")
         return
+    workers = workers or len(os.sched_getaffinity(0))
     with _progress(len(plans)) as tick:
-        cores = len(os.sched_getaffinity(0))
-        done = record_drives(plans, out, image_size, workers or cores, on_ray=ray, tick=tick)
+        done = record_drives(plans, out, image_size, workers, on_ray=ray, tick=tick)
     _tell(done, plans, out)
 
 

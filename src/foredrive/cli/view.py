@@ -1,5 +1,6 @@
 """`foredrive view`."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -77,13 +78,10 @@ def view(
         return
     from foredrive.view.viewer import Viewer
 
-    viewer = Viewer(frames, host, port)
-    try:
+    with closing(Viewer(frames, host, port)) as viewer:
         viewer.show(index)
         print(f"{frames.name} is at {viewer.url} until you press Ctrl-C")
         viewer.play()
-    finally:
-        viewer.close()
 
 
 def _opened(run: Path) -> "Run":
@@ -103,11 +101,8 @@ def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: st
         run.vehicle.check_time(t_s)
     known = [] if edits is None else load_edits(edits)
     edited_scene(run.scene, known)
-    viewer = RebuiltViewer(run, known, edits or folder / EDITS, host, port)
-    try:
+    with closing(RebuiltViewer(run, known, edits or folder / EDITS, host, port)) as viewer:
         if t_s is not None:
             viewer.show(t_s)
         print(f"{folder.name} is at {viewer.url} until you press Ctrl-C")
         viewer.play()
-    finally:
-        viewer.close()

@@ -112,16 +112,10 @@ def drive_route(
             nearest.append(_nearest_s(clip))
             on_frame()
         ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
-    progress = simulator.progress()
+    infractions = tuple(found for event in events if (found := infraction_of(event)) is not None)
+    duration_s, progress = (len(states) - 1) * STEP_S, vars(simulator.progress())
     score = RouteScore(
-        route=route,
-        repetition=repetition,
-        completion=progress.completion,
-        outside_lanes=progress.outside_lanes,
-        ending=ending,
-        infractions=tuple(found for event in events if (found := infraction_of(event)) is not None),
-        driven_m=progress.driven_m,
-        duration_s=(len(states) - 1) * STEP_S,
+        route, repetition, ending=ending, infractions=infractions, duration_s=duration_s, **progress
     )
     comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None
     return Drive(score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.scene import BicycleState, Event
+from foredrive.scene import BicycleState, DriveProgress, Event
 from foredrive.scene.traffic_light import LightState
 from foredrive.simulation.dynamics import EGO
 
@@ -64,6 +64,14 @@ class RuleState:
     def outside_share(self) -> float:
         """Return the share of the distance that was driven outside of the lanes."""
         return self.outside_m / max(self.driven_m, 1e-9)
+
+    def progress(self, completion: float) -> DriveProgress:
+        """Return the progress of a drive that has completed a share of its route."""
+        return DriveProgress(completion, min(1.0, self.outside_share), self.driven_m)
+
+    def final_events(self, t_s: float) -> list[Event]:
+        """Return the events to add at the end of a drive: one if it ends outside of the lanes."""
+        return [] if self.left_at is None else [left_lanes(self.left_at, self.left_m, t_s)]
 
 
 def lines_run(

@@ -16,7 +16,7 @@ from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
 from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, make_clip, no_images
+from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, no_images
 from foredrive.simulation.replayed import comes_from_behind, users_at
 from foredrive.simulation.route_progress import RouteLine, RouteProgress
 
@@ -132,9 +132,8 @@ class RebuiltSimulator:
     def progress(self) -> DriveProgress:
         """Return the progress of the drive. Without lanes the distance outside of them is 0."""
         state = self.state
-        completion = min(1.0, state.progress.done_m / self._route.length_m)
         outside = state.outside_m / state.driven_m if state.driven_m > 0 else 0.0
-        return DriveProgress(completion, outside, state.driven_m)
+        return DriveProgress(self._route.completion(state.progress), outside, state.driven_m)
 
     @property
     def scenario(self) -> RebuiltScenario:
@@ -163,8 +162,7 @@ class RebuiltSimulator:
         progress = self._route.advance(state.progress, xy, moved.speed_mps, t_s)
         ended = self._end_of(progress, t_s)
         if ended is not None:
-            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
-            events.append(Event(ended, t_s, (moved.x_m, moved.y_m), text))
+            events.append(self._route.end_event(ended, progress, moved, t_s))
         way_m = float(np.hypot(moved.x_m - state.ego.x_m, moved.y_m - state.ego.y_m))
         outside = self._lanes is not None and self._lanes.outside(box.foot_m[:2])
         return dataclasses.replace(
@@ -202,7 +200,5 @@ class RebuiltSimulator:
         return (*frames, frame)[-1 - self._scenario.past_frames :]
 
     def _make_clip(self) -> Clip:
-        state, route = self.state, self._route
         rig = self.renderer.rig if self._scenario.sensors else None
-        target_xy = route.target_xy(state.progress, state.frames[-1].T_world_ego)
-        return make_clip(state.frames, rig, route.command(state.progress), target_xy)
+        return self._route.observe(self.state.frames, self.state.progress, rig)

@@ -1,6 +1,7 @@
 """Progress of the ego vehicle along its route, and the conditions that end a drive."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +10,9 @@ from jaxtyping import Float64
 from foredrive.data.commands import command_of, route_offset_m, route_target
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.scene import Command
+from foredrive.scene import BicycleState, CameraRig, Clip, Command, Event
 from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.observation import KeyFrame, make_clip
 
 SPACING_M = 1.0
 AHEAD_M, BACK_M = 20.0, 5.0
@@ -89,6 +91,20 @@ class RouteLine:
         if t_s - progress.moved_s > BLOCKED_S:
             return "blocked"
         return "timeout" if t_s >= limit_s else None
+
+    def completion(self, progress: RouteProgress) -> float:
+        """Return the share of the route that has been driven, 0 to 1."""
+        return min(1.0, progress.done_m / self.length_m)
+
+    def end_event(self, ended: str, progress: RouteProgress, ego: BicycleState, t_s: float) -> Event:
+        """Return the event of the end of a drive, for a reason as `end_of` returns it."""
+        text = f"{progress.done_m:.0f} of {self.length_m:.0f} m"
+        return Event(ended, t_s, (ego.x_m, ego.y_m), text)
+
+    def observe(self, frames: Sequence[KeyFrame], progress: RouteProgress, rig: CameraRig | None) -> Clip:
+        """Return the clip of some key frames, with the command and the target point of the route."""
+        target_xy = self.target_xy(progress, frames[-1].T_world_ego)
+        return make_clip(frames, rig, self.command(progress), target_xy)
 
     def command(self, progress: RouteProgress) -> Command:
         """Return the next command of the route, computed as for recorded logs."""

@@ -14,8 +14,8 @@ from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.collisions import CollisionSense, Contacts
 from foredrive.simulation.dynamics import EGO, STEP_S, step, yaw_rate_radps
-from foredrive.simulation.lane_rules import RuleState, left_lanes
-from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
+from foredrive.simulation.lane_rules import RuleState
+from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, no_images
 from foredrive.simulation.road_users import RoadUsers, road_users
 from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
 from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
@@ -200,9 +200,7 @@ class TownSimulator:
 
     def progress(self) -> DriveProgress:
         """Return the progress of the drive."""
-        rules = self.state.rules
-        completion = min(1.0, self.state.progress.done_m / self._route.length_m)
-        return DriveProgress(completion, min(1.0, rules.outside_share), rules.driven_m)
+        return self.state.rules.progress(self._route.completion(self.state.progress))
 
     def save(self) -> SavedDrive:
         """Return the drive in its current state, as an immutable value that can be pickled."""
@@ -259,10 +257,7 @@ class TownSimulator:
         ended = self._route.end_of(progress, t_s, self._scenario.limit_s)
         events += more
         if ended is not None:
-            if rules.left_at is not None:
-                events.append(left_lanes(rules.left_at, rules.left_m, t_s))
-            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
-            events.append(Event(ended, t_s, (moved.x_m, moved.y_m), text))
+            events += [*rules.final_events(t_s), self._route.end_event(ended, progress, moved, t_s)]
         return dataclasses.replace(
             state,
             step_index=index,
@@ -310,10 +305,7 @@ class TownSimulator:
 
     def _make_clip(self, state: TownState) -> Clip:
         sensors = self._scenario.sensors
-        rig = None if sensors is None else sensors.rig
-        route, progress = self._route, state.progress
-        target_xy = route.target_xy(progress, state.frames[-1].T_world_ego)
-        return make_clip(state.frames, rig, route.command(progress), target_xy)
+        return self._route.observe(state.frames, state.progress, None if sensors is None else sensors.rig)
 
 
 @lru_cache(maxsize=1)  # consecutive drives are often in one town

@@ -36,7 +36,7 @@ def shown_voxels(
     """Return the voxels of frame k that are occupied with a probability of more than `above`.
 
     Args:
-        lowest_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
+        min_height_m: minimum height of voxel centres in the ego frame; the road would hide many other voxels.
     """
     z = spec.centres_m()[..., 2]
     return (prediction.occupancy_logit[k].sigmoid() > above) & (z >= min_height_m)

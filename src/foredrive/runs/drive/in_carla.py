@@ -23,7 +23,7 @@ PORT = 2000
 
 @dataclass(frozen=True)
 class CarlaRoutes(RouteSource):
-    """A `Source` of routes that are driven on a CARLA server, without scenarios."""
+    """A `DriveSource` of routes that are driven on a CARLA server, without scenarios."""
 
     server: str = dataclasses.field(kw_only=True)
     """Address: HOST or HOST:PORT."""

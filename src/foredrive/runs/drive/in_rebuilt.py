@@ -39,7 +39,7 @@ REPLAY = "log"
 
 @dataclass(frozen=True)
 class RebuiltRoutes:
-    """A `Source` of drives in a reconstructed log: one for each start time and threat."""
+    """A `DriveSource` of drives in a reconstructed log: one for each start time and threat."""
 
     run: str
     """Folder of the reconstruction run."""

@@ -22,7 +22,7 @@ from foredrive.towns.sensing.capture import SensorSuite
 
 @dataclass(frozen=True)
 class TownRoutes(RouteSource):
-    """A `Source` of routes that are driven in the embedded towns."""
+    """A `DriveSource` of routes that are driven in the embedded towns."""
 
     scenarios: bool = True
     """Whether scenarios are on the route, chosen by the seed: actors brake, cut in, run lights and step out.

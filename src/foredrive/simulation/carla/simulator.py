@@ -26,8 +26,8 @@ from foredrive.simulation.carla.road import CarlaLaneRules
 from foredrive.simulation.carla.session import TRAFFIC_PORT, CarlaSession, SensorQueue
 from foredrive.simulation.carla.weather import weather_of
 from foredrive.simulation.dynamics import EGO, STEP_S
-from foredrive.simulation.lane_rules import RuleState, left_lanes
-from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, make_clip, no_images
+from foredrive.simulation.lane_rules import RuleState
+from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, no_images
 from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
 from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
 
@@ -91,9 +91,7 @@ class CarlaSimulator:
 
     def progress(self) -> DriveProgress:
         """Return the progress of the drive."""
-        rules = self.state.rules
-        completion = min(1.0, self.state.progress.done_m / self._route.length_m)
-        return DriveProgress(completion, min(1.0, rules.outside_share), rules.driven_m)
+        return self.state.rules.progress(self._route.completion(self.state.progress))
 
     def reset(self, scenario: RouteScenario) -> Clip:
         """Load the town and start a drive. The vehicle stands until traffic has started to move.
@@ -214,10 +212,7 @@ class CarlaSimulator:
         ended = self._route.end_of(progress, t_s, self._scenario.limit_s)
         events += more
         if ended is not None:
-            if rules.left_at is not None:
-                events.append(left_lanes(rules.left_at, rules.left_m, t_s))
-            text = f"{progress.done_m:.0f} of {self._route.length_m:.0f} m"
-            events.append(Event(ended, t_s, (ego.x_m, ego.y_m), text))
+            events += [*rules.final_events(t_s), self._route.end_event(ended, progress, ego, t_s)]
         state = CarlaState(index, ego, T, state.frames, commanded, contact, rules, progress, ended)
         if index % FRAME_STEPS == 0:
             state = dataclasses.replace(state, frames=self._with_frame(session, state, frame))
@@ -258,13 +253,7 @@ class CarlaSimulator:
 
     def _make_clip(self, state: CarlaState) -> Clip:
         suite = self._scenario.sensors
-        rig = None if suite is None else suite.rig
-        clip = make_clip(
-            state.frames,
-            rig,
-            self._route.command(state.progress),
-            self._route.target_xy(state.progress, state.frames[-1].T_world_ego),
-        )
+        clip = self._route.observe(state.frames, state.progress, None if suite is None else suite.rig)
         return dataclasses.replace(clip, misses_known=torch.zeros_like(clip.misses_known))
 
 

@@ -102,10 +102,10 @@ class FactCollector:
         """Collect the facts of a moment. Calls must be in the order of time.
 
         Args:
-            moment: the moment of the drive.
+            snapshot: the moment of the drive.
             actors: the road users around the vehicle.
             visibility: the visible share of each of them.
-            sees: a function that returns whether the cameras see a point (ego frame).
+            is_visible: returns whether the cameras see a point (ego frame).
         """
         T_ego_world = np.linalg.inv(snapshot.T_world_ego)
         R, at = T_ego_world[:3, :3], snapshot.T_world_ego[:3, 3]

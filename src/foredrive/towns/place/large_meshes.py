@@ -21,7 +21,7 @@ def taper(
         z: heights of the two rectangles, m.
         half_width: half widths of the lower and the upper rectangle, m.
         inset: distances by which the upper rectangle is shorter at the rear and at the front, m.
-        materials: materials of the top, the ends and the sides.
+        mats: materials of the top, the ends and the sides.
     """
     (x0, x1), (z0, z1), (w0, w1) = x, z, half_width
     top, ends, sides = mats

@@ -102,7 +102,7 @@ def make_columns(
     Args:
         mesh: the triangles of the town.
         scene: the same mesh for ray casting.
-        surface_of_look: the `Surface` of each material.
+        material_surface: the `Surface` of each material.
         thin: points on objects that the columns would miss.
     """
     faces = faces_of(mesh, material_surface)

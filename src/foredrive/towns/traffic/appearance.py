@@ -20,7 +20,7 @@ def vehicle_actors(
     """Return the actors of the vehicles in `kept`.
 
     Args:
-        around: the result of `motion`.
+        motion: the result of `motion`.
     """
     before, after = motion
     velocity_mps = (after.centre_m - before.centre_m) / MOTION_S

@@ -283,7 +283,7 @@ def choose_change(
 
     Args:
         may: which vehicles may change to the left and to the right.
-        urge_mps2: the value of the change to them, in addition to acceleration.
+        bonus_mps2: the value of the change to them, in addition to acceleration.
     """
     if not may.any():
         return None

@@ -73,7 +73,7 @@ def claim_junctions(
 
     Args:
         green: lanes that no light forbids to enter.
-        may_ask: vehicles whose requests count. None: all.
+        may_request: vehicles whose requests count. None: all.
         runs: vehicles that ignore lights. None: none.
     """
     runs = np.zeros(len(vehicles.active), dtype=np.bool_) if runs is None else runs
