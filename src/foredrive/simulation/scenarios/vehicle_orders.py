@@ -214,10 +214,8 @@ def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:
     """
     scenario, progress, ego, slot = context.scenario, context.progress, context.ego, context.progress.slots[0]
     runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
-    line_m, room_m = (
-        context.way.line_m - lead_m - context.half_m(slot),
-        ego.front_gap_m(scenario.at_m - ROOM_M),
-    )
+    line_m = context.way.line_m - lead_m - context.half_m(slot)
+    room_m = ego.front_gap_m(scenario.at_m - ROOM_M)
     context.orders.ignores_ego[list(progress.slots)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
     comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
     if progress.since_s is not None:

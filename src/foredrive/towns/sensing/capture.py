@@ -331,10 +331,8 @@ def simulate_sweep(
             t = np.where(found.material == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
             odds = echoes.footprint_chance(odds, share)
-        material, echo = (
-            found.material,
-            lidar_returns(tracer.scene.materials, found, hits.t, far_m, odds, air),
-        )
+        material = found.material
+        echo = lidar_returns(tracer.scene.materials, found, hits.t, far_m, odds, air)
         if n > 1:
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
             hits, material = shading.Hits(*(column[picked] for column in hits)), material[picked]

@@ -112,12 +112,8 @@ def _openings(p, material, u, v, w, du, dv, out):
     Returns:
         The number of the window, 0 where there is none or where there are too many.
     """
-    storey, nominal_bay, wide_share, high_share = (
-        p[material, 0],
-        p[material, 1],
-        p[material, 2],
-        p[material, 3],
-    )
+    storey, nominal_bay = p[material, 0], p[material, 1]
+    wide_share, high_share = p[material, 2], p[material, 3]
     ground, kind = p[material, 4], int(p[material, 6])
     out[0] = out[1] = out[2] = 0.0
     out[3] = 1.0

@@ -42,7 +42,7 @@ def _bent_to(
         return line
     x = np.linspace(0.0, 1.0, 2 * len(line))[:, None]
     every = np.linspace(0.0, len(line) - 1.0, len(x))
-    fine = points_at(line, np.arange(len(line)), every)
+    fine = points_at(line, np.arange(len(line), dtype=np.float64), every)
     return fine + x**3 * (10 - 15 * x + 6 * x**2) * offset
 
 

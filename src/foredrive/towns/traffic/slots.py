@@ -2,10 +2,12 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Self
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int
+
+SlotsType = TypeVar("SlotsType", bound="Slots")
 
 
 @dataclass(frozen=True)
@@ -16,16 +18,16 @@ class Slots:
     track_id: Int[np.ndarray, "N"]
     style: Int[np.ndarray, "N"]
 
-    def rows(self, rows: slice | Int[np.ndarray, "k"]) -> Self:
+    def rows(self: SlotsType, rows: slice | Int[np.ndarray, "k"]) -> SlotsType:
         """Return some of the slots."""
         return dataclasses.replace(self, **{name: value[rows] for name, value in vars(self).items()})
 
-    def appended(self, more: Self) -> Self:
+    def appended(self: SlotsType, more: SlotsType) -> SlotsType:
         """Return the slots with those of `more` appended."""
         both = {name: np.concatenate([value, getattr(more, name)]) for name, value in vars(self).items()}
         return dataclasses.replace(self, **both)
 
-    def replace_rows(self, rows: Int[np.ndarray, "k"], other: Self) -> Self:
+    def replace_rows(self: SlotsType, rows: Int[np.ndarray, "k"], other: SlotsType) -> SlotsType:
         """Return the slots with `rows` replaced by the k slots of `other`."""
         changed = {name: value.copy() for name, value in vars(self).items()}
         for name, value in changed.items():
