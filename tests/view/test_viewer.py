@@ -91,7 +91,7 @@ def test_the_model_is_shown_where_it_has_seen_enough(viewer: Viewer) -> None:
     assert prediction is not None
     panel = viewer.model
     assert panel is not None
-    panel.lowest_m.value = panel.spec.lower_m[2]  # by default the road is left out
+    panel.min_height_m.value = panel.spec.lower_m[2]  # by default the road is left out
     for k in (0, 2):
         above = float(prediction.occupancy_logit[k].sigmoid().median())
         panel.frame.value, panel.above.value = k, above
