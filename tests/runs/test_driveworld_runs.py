@@ -130,7 +130,7 @@ def test_futures_are_drawn_alike_each_time_and_filmed(run: Run, log: LogPath, tm
     frames = write_imagination_video(tmp_path / "film.mp4", moments, 0.5)
     with av.open(str(tmp_path / "film.mp4")) as film:
         assert len(list(film.decode(video=0))) == frames == 2 * 5
-    with pytest.raises(InputError, match="at least one future"):
+    with pytest.raises(InputError, match="at least one moment"):
         next(imagine_run(run, log, seconds=0.1, samples=1, moments=1))
 
 

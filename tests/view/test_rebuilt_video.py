@@ -134,7 +134,7 @@ def test_captions_say_what_was_changed() -> None:
         (["--cameras", "behind"], "no camera 'behind'; there are: ahead"),
         (["--start", "7"], "7 s is not in the log, which lasts from 0 s to 0.4 s"),
         (["--start", "0.2", "--seconds", "1"], "1.2 s is not in the log"),
-        (["--rate-hz", "-5"], "--rate-hz is -5: a number above 0 is needed"),
+        (["--rate-hz", "-5"], "--rate-hz must be a number above 0, got -5"),
         (["--edits", "{tmp}/none.json"], "{tmp}/none.json: no such file"),
         (["--out", "/proc/none/film.webp"], "/proc/none: no folder can be made there"),
         (["--out", "{tmp}/film.avi"], "{tmp}/film.avi: videos end on .mp4"),

@@ -156,7 +156,7 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(
     expected = (
         "choose an actor",
         "no actor 99; there are",
-        "not the folder of",
+        "not a reconstruction folder",
         "cannot be read",
         "not a list",
     )
@@ -228,8 +228,8 @@ def test_a_move_is_read_off_two_poses(run: OpenedReconstruction) -> None:
         (["--edits", "{tmp}/none.json"], "none.json: no such file"),
         (["--edits", "{tmp}/other.json"], "no actor 99; there are"),
         (["--t", "7"], "7 s is not in the log"),
-        (["--save", "{tmp}/x.png"], "--run and --save are for logs"),
-        (["--port", "70000"], "--port is 70000: a number from 1 to 65535 is needed"),
+        (["--save", "{tmp}/x.png"], "--run and --save need a log"),
+        (["--port", "70000"], "--port must be a number from 1 to 65535, got 70000"),
     ],
 )
 def test_what_cannot_be_opened_is_one_line(

@@ -179,9 +179,9 @@ def test_a_camera_of_one_s_own_sees_as_wide_as_the_window() -> None:
     [
         (["--t", "9"], "no time 9 s in this log"),
         (["--run", "{tmp}"], "{tmp}: not a run folder"),
-        (["--run", "{tmp}", "--save", "{tmp}/x.png"], "--save draws the log alone"),
+        (["--run", "{tmp}", "--save", "{tmp}/x.png"], "--save draws only the log"),
         (["--host", "no-such-host.invalid"], "cannot serve a page at no-such-host.invalid"),
-        (["--port", "70000"], "--port is 70000: a number from 1 to 65535 is needed"),
+        (["--port", "70000"], "--port must be a number from 1 to 65535, got 70000"),
     ],
 )
 def test_what_cannot_be_shown_is_one_line(
