@@ -31,7 +31,7 @@ class Viewpoint:
 
     @classmethod
     def behind(cls, spec: VoxelSpec, size_hw: tuple[int, int]) -> "Viewpoint":
-        """Return an viewpoint above and behind the vehicle, so that the grid fills a picture of that size."""
+        """Return a viewpoint above and behind the vehicle, so that the grid fills a picture of that size."""
         reach = 0.5 * max(spec.shape_zyx[1:]) * spec.voxel_m
         low, high = np.array(spec.lower_m), np.array(spec.upper_m)
         middle = (low + high) / 2

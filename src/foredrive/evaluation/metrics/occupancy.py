@@ -81,7 +81,6 @@ class OccupancyMetric:
                         out[f"{scope}{kind}_{name}{suffix}"] = value
         for scope, (_, thresholds) in self._priors.items():
             names = self._context.frame_names(len(thresholds))
-            names = self._context.frame_names(len(thresholds))
             for name, value in zip(names, thresholds.tolist(), strict=True):
                 out[f"{scope}iou_{name}{PRIOR}_threshold"] = value
         return out
