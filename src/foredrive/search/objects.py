@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data.boxes import read_boxes
@@ -47,6 +47,7 @@ def read_objects(log: Log, frame: int, side_px: int) -> list[ObjectView]:
     boxes = boxes[boxes.valid]
     sweep = found[0][found[0].valid & found[0].returned]
     inside = points_in_boxes(sweep.points_ego, boxes.centre, boxes.size_lwh, boxes.yaw)
+    seen_enough = inside.sum(0) >= MIN_RETURNS
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
     objects = []
     for metadata in pinhole_cameras(log).values():
@@ -54,28 +55,23 @@ def read_objects(log: Log, frame: int, side_px: int) -> list[ObjectView]:
         camera = read_camera(log, frame, metadata, size_hw, with_image=True)
         if camera.image is None:
             continue
-        for number in range(len(boxes.valid)):
-            view = _object_view(camera, corners[number], sweep, inside[:, number], side_px)
+        corners_cam = transform_points(inverse_se3(camera.T_ego_cam), corners.flatten(0, 1))
+        uv, _, in_image = project(corners_cam, camera.K, camera.dist, size_hw)
+        uv, whole = uv.unflatten(0, (-1, 8)), in_image.unflatten(0, (-1, 8)).all(-1)
+        for number in (seen_enough & whole).nonzero()[:, 0].tolist():
+            view = _object_view(camera, uv[number], sweep[inside[:, number]], side_px)
             if view is not None:
                 objects.append(ObjectView(Category(int(boxes.category[number])), view))
     return objects
 
 
 def _object_view(
-    camera: CameraFrame,
-    corners_ego: Float[Tensor, "8 3"],
-    sweep: LidarSweep,
-    inside: Bool[Tensor, "N"],
-    side_px: int,
+    camera: CameraFrame, corners_px: Float[Tensor, "8 2"], returns: LidarSweep, side_px: int
 ) -> View | None:
-    """Return the view of a box. None if it is not whole in the image, too small or has too few returns."""
+    """Return the view of a box. None if it is too small in the image, or its returns lie beside the crop."""
     assert camera.image is not None
     height, width = camera.image.shape[-2:]
-    corners_cam = transform_points(inverse_se3(camera.T_ego_cam), corners_ego)
-    uv, _, seen = project(corners_cam, camera.K, camera.dist, (height, width))
-    if not bool(seen.all()):
-        return None
-    lower, upper = uv.amin(0), uv.amax(0)
+    lower, upper = corners_px.amin(0), corners_px.amax(0)
     side = min(int((upper - lower).max().ceil()), height, width)
     if side < MIN_SIDE_PX:
         return None
@@ -83,7 +79,7 @@ def _object_view(
         int((middle - side / 2).round().clamp(0, whole - side))
         for middle, whole in zip((lower + upper) / 2, (width, height), strict=True)
     )
-    view = View.of_camera(cut_camera(camera, (left, top, left + side, top + side)), sweep[inside])
+    view = View.of_camera(cut_camera(camera, (left, top, left + side, top + side)), returns)
     if view.sweep is None or len(view.sweep.valid) < MIN_RETURNS:
         return None
     assert view.image is not None
