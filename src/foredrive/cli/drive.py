@@ -8,14 +8,13 @@ import tyro
 
 from foredrive.cli.arguments import check_out_folder
 from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
+from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.suite import DriveJob, SuiteResult
     from foredrive.simulation.drive_record import DriveRecord
-
-FAILURES_SHOWN = 3
 
 
 def drive(
@@ -71,11 +70,10 @@ def _tell(driven: "SuiteResult") -> None:
     from foredrive.view.table import print_table
 
     if driven.broken:
-        told = [f"{job.name} ({reason})" for job, reason in driven.broken.items()]
-        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
-        whole = len(driven.drives) + len(told)
+        failures = listed_failures({job.name: reason for job, reason in driven.broken.items()})
+        whole = len(driven.drives) + len(driven.broken)
         raise InputError(
-            f"{len(told)} of {whole} drives failed: {', '.join(told[:FAILURES_SHOWN])}{more}; "
+            f"{len(driven.broken)} of {whole} drives failed: {failures}; "
             "the other drives are kept, and scores need all drives"
         )
     if driven.skipped:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder
+from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 from foredrive.towns.map.names import check_town
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from foredrive.towns.campaign import DrivePlan
 
 SHEET = "contact_sheet.png"
-FAILURES_SHOWN = 3
 NO_CONDITIONS = "none"
 Range = Annotated[str, tyro.conf.arg(metavar="N|FIRST..LAST")]
 
@@ -102,10 +102,8 @@ def _tell(done: "RecordingResult", plans: "list[DrivePlan]", out: Path) -> None:
         write_contact_sheet(out / SHEET, [(log, _caption(plan)) for plan, log in done.logs.items()])
         print(f"contact sheet: {out / SHEET}")
     if done.failed:
-        told = [f"{plan.log_name} ({reason})" for plan, reason in done.failed.items()]
-        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
-        shown = ", ".join(told[:FAILURES_SHOWN])
-        raise InputError(f"{len(told)} of {len(plans)} drives failed: {shown}{more}")
+        failures = listed_failures({plan.log_name: reason for plan, reason in done.failed.items()})
+        raise InputError(f"{len(done.failed)} of {len(plans)} drives failed: {failures}")
 
 
 def _caption(plan: "DrivePlan") -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from foredrive.cli.arguments import OptionalPath, SomePaths, check_file, check_number, check_out_folder
+from foredrive.cli.failures import listed_failures
 from foredrive.cli.search import INDEX
 from foredrive.cli.search_options import Place, Seconds
 from foredrive.data.log_paths import find_all_logs
@@ -110,9 +111,7 @@ def _print_indexed(done: "Indexed", index: str) -> None:
     if done.scored:
         print(f"set the scores of {done.scored} rows")
     if done.failed:
-        told = [f"{name} ({why})" for name, why in done.failed.items()]
-        more = f", and {len(told) - FAILURES_SHOWN} more" if len(told) > FAILURES_SHOWN else ""
-        skipped = f"skipped {len(told)} logs: {', '.join(told[:FAILURES_SHOWN])}{more}"
+        skipped = f"skipped {len(done.failed)} logs: {listed_failures(done.failed, FAILURES_SHOWN)}"
         if not done.logs:
             raise InputError(skipped)
         print(skipped)
