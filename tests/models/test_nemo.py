@@ -122,39 +122,6 @@ def test_driving_forward_moves_the_volume_back(agent: PlanningAgent, example: Ex
     torch.testing.assert_close(second.T_now_ego[0, :3, 3], torch.tensor([4.0, 0.0, 0.0]))
 
 
-def test_the_poses_of_a_curve_chain_in_the_order_of_driving(agent: PlanningAgent, example: Example) -> None:
-    """Two metres ahead and a quarter turn to the left, then three metres ahead: at (2, 3), facing left."""
-    with torch.no_grad():
-        xi = agent.world_model.motion.rigid[-1].bias.view(2, 6)
-        xi[0, 5] = 0.5 * math.pi / 0.1
-        xi[0, 0], xi[0, 1] = (
-            math.pi / 0.1 / 2,
-            -math.pi / 0.1 / 2,
-        )  # of a circle's quarter from (0, 0) to (2, 0)
-        xi[1, 0] = 3.0 / 0.1
-        belief = agent.world_model.observe(example.clip.observed())
-        first, second = agent.world_model.imagine(belief, 2)
-    assert first.T_now_ego is not None
-    assert second.T_now_ego is not None
-    torch.testing.assert_close(first.T_now_ego[0, :3, 3], torch.tensor([2.0, 0.0, 0.0]), atol=1e-5, rtol=0)
-    torch.testing.assert_close(second.T_now_ego[0, :3, 3], torch.tensor([2.0, 3.0, 0.0]), atol=1e-5, rtol=0)
-
-
-def test_each_step_has_its_own_flow(agent: PlanningAgent, example: Example) -> None:
-    """What is at x comes from x + 1 in the first step and from x + 2 in the second: from x + 3 in both."""
-    with torch.no_grad():
-        agent.world_model.motion.flow[-1].bias.view(2, 3)[:, 0] = torch.tensor([1.0, 2.0])
-        belief = agent.world_model.observe(example.clip.observed())
-        first, second = agent.world_model.imagine(belief, 2)
-    inner = slice(0, 12)
-    torch.testing.assert_close(first.volume[..., inner], belief.volume[..., 1:13], atol=1e-4, rtol=0)
-    torch.testing.assert_close(second.volume[..., inner], belief.volume[..., 3:15], atol=1e-4, rtol=0)
-    assert first.flow_mps is not None
-    assert second.flow_mps is not None
-    torch.testing.assert_close(first.flow_mps[:, 0], torch.full_like(first.flow_mps[:, 0], -2.0))
-    torch.testing.assert_close(second.flow_mps[:, 0], torch.full_like(second.flow_mps[:, 0], -4.0))
-
-
 def test_rays_stop_at_a_wall_and_pass_through_air() -> None:
     renderer = VolumeRenderer(RendererConfig(near_m=0.5, far_m=7.5, samples=28, hidden=8), SPEC, channels=2)
     logit = torch.full((1, *SPEC.shape_zyx), -30.0)
