@@ -127,6 +127,6 @@ def test_without_the_packages_it_is_one_line(
 def test_what_is_no_run_is_refused(trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path)]) == 2
     assert "not a run folder" in capsys.readouterr().err
-    with pytest.raises(InputError, match="at least one clip"):
+    with pytest.raises(InputError, match="must be at least 1"):
         export.export_run(trained, trained.logs, tmp_path, clips=0)
     assert list(tmp_path.iterdir()) == []

@@ -200,7 +200,7 @@ def test_plans_that_are_none_are_named() -> None:
     here, good = BicycleState(0.0, 0.0, 0.0, 5.0), trajectory(straight([1.0, 2.0]))
     with pytest.raises(InputError, match="finite waypoints"):
         fixed_in_world(trajectory(straight([1.0, math.nan])), here, 0.0)
-    with pytest.raises(InputError, match="one plan at a time"):
+    with pytest.raises(InputError, match="expected one plan"):
         fixed_in_world(good.map_tensors(lambda tensor: torch.cat([tensor, tensor])), here, 0.0)
 
 

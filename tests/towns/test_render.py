@@ -203,7 +203,7 @@ def test_a_part_of_the_grid_holds_what_the_whole_holds_there(world02: World, tow
 
 
 def test_voxels_too_fine_for_the_town_are_refused(world02: World, town02: TownMap) -> None:
-    with pytest.raises(InputError, match=r"0\.35 m or more, got 0\.2"):
+    with pytest.raises(InputError, match=r"at least 0\.35 m, got 0\.2"):
         world02.occupancy([], ego_pose(town02), VoxelSpec((0.0, 0.0, 0.0), 0.2, (2, 2, 2)))
 
 
