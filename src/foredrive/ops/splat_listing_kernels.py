@@ -53,8 +53,10 @@ class PointArrays(NamedTuple):
     """Int32[T 256], index of the point in each slot; -1 for none."""
     hit: np.ndarray
     """Float32[P], range of the hit of each point."""
-    by_centre: bool
-    """What counts as nearer than the hit, see `BeforeHit`."""
+    by_centre: bool | None
+    """True for `BeforeHit` "opacities", None for "weights". Kernels are compiled for each type, so that the
+    usual one does not branch.
+    """
     left_edge: np.ndarray
     lower_edge: np.ndarray
     first_tile: np.ndarray

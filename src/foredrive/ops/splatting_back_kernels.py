@@ -61,7 +61,7 @@ def _load_gradients(points, tile, out, grad_out, state, columns):
             state[base] = 1
             left = out[p, depth] * grad_out[p, depth]
             left += out[p, depth + 2] * grad_out[p, depth + 2]
-            if not points.by_centre:  # else nothing in front of a splat changes what it adds before the hit
+            if points.by_centre is None:  # else nothing in front of a splat changes what it adds before the hit
                 left += out[p, depth + 3] * grad_out[p, depth + 3]
             state[base + 2 * ROW] = grad_out[p, depth]
             state[base + 3 * ROW] = grad_out[p, depth + 2]
@@ -89,7 +89,7 @@ def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, by_centre,
     range_m = range_at(splat, dx, dy, t)
     grad_weight = load_row(state, base + 3 * ROW) + to_range * range_m
     to_before = load_row(state, base + 4 * ROW)
-    if not by_centre:
+    if by_centre is None:
         grad_weight = grad_weight + select_greater(hit, range_m, to_before, ZERO)
     at = base + 5 * ROW
     for d in range(feature.size):
@@ -103,7 +103,7 @@ def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, by_centre,
     store(state, base + ROW, behind)
     # d/d log α: the own contribution of the splat, minus what it hides behind it.
     slope = weight * grad_weight - alpha * behind / (broadcast(ONE) - alpha)
-    if by_centre:
+    if by_centre is not None:
         slope = slope + alpha * select_greater(hit, splat[RANGE], to_before, ZERO)
     slope = select_greater(opacity, MAX_ALPHA, ZERO, slope)
     return greater_mask(passed, MIN_TRANSMITTANCE) != 0, slope, weight * to_range

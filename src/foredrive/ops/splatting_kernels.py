@@ -170,7 +170,7 @@ def _accumulate(splat, feature, base, state, dx, dy, t, hit, by_centre):
     median = load_row(state, base + 2 * ROW)
     store(state, base + 2 * ROW, select_greater(crossed, ZERO, range_m, median))
     store(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
-    if by_centre:
+    if by_centre is not None:
         alpha = select_greater(passed, MIN_TRANSMITTANCE, alpha, ZERO)
         nearer = select_greater(hit, splat[RANGE], alpha, ZERO)
     else:

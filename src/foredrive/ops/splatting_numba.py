@@ -91,7 +91,7 @@ def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], by_centre: bool
         tile_bounds=tiled.tile_bounds.numpy(),
         point=tiled.index.int().numpy(),
         hit=hit_range_m.numpy(),
-        by_centre=by_centre,
+        by_centre=by_centre or None,
         left_edge=tiled.left_edge.numpy(),
         lower_edge=tiled.lower_edge.numpy(),
         first_tile=tiled.first_tile.numpy(),
