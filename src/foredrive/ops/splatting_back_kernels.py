@@ -61,7 +61,7 @@ def _load_gradients(points, tile, out, grad_out, state, columns):
             state[base] = 1
             left = out[p, depth] * grad_out[p, depth]
             left += out[p, depth + 2] * grad_out[p, depth + 2]
-            if points.by_centre is None:  # else nothing in front of a splat changes what it adds before the hit
+            if points.by_centre is None:  # else nothing in front changes what a splat adds before the hit
                 left += out[p, depth + 3] * grad_out[p, depth + 3]
             state[base + 2 * ROW] = grad_out[p, depth]
             state[base + 3 * ROW] = grad_out[p, depth + 2]
