@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from small_towers import PlainTowers
 from synthetic_log import EGO_SPEED_MPS
 
 from foredrive.data import LogPath
@@ -16,8 +17,10 @@ from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.search.crops import Crop
 from foredrive.search.embedding import embed_frames, mean_direction, read_views
+from foredrive.search.query import Like
 from foredrive.search.rows import FACTS, WHOLE, row_schema
 from foredrive.search.sectors import Sector, blind_sectors
+from foredrive.search.target import example_views
 from foredrive.search.towers import Towers
 
 
@@ -112,6 +115,21 @@ def test_a_return_beside_the_crop_of_the_image_is_left_out(log: LogPath) -> None
         torch.testing.assert_close(
             view.sweep.points_ego.norm(dim=-1), expected.norm(dim=-1), atol=1e-4, rtol=1e-5
         )
+
+
+def test_the_crop_of_towers_applies_to_a_part_of_an_image(log: LogPath) -> None:
+    class SquareTowers(PlainTowers):
+        crop = Crop.MIDDLE_SQUARE
+
+    like = Like(str(log.folder), 0.0, "ahead", (10, 4, 70, 44))
+    (part,) = example_views(None, like, SquareTowers()).views.values()
+    opened = Log(log)
+    camera = read_camera(opened, 0, pinhole_cameras(opened)["ahead"], (48, 96), with_image=True)
+    assert camera.image is not None
+    assert part.image is not None
+    assert torch.equal(part.image, camera.image[:, 4:44, 20:60])
+    assert part.sector.camera is not None
+    torch.testing.assert_close(part.sector.camera.K[:2, 2], camera.K[:2, 2] - torch.tensor([20.0, 4.0]))
 
 
 def test_sectors_without_cameras_share_every_return(log: LogPath) -> None:

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 
 from foredrive.data.log_paths import LogPath
-from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.metrics.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
+from foredrive.runs.search.indexing import opened_log
 from foredrive.search.embedding import embed_views, mean_direction
 from foredrive.search.find import vectors_of
 from foredrive.search.index import FrameIndex
@@ -151,7 +151,7 @@ def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_SensorPai
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(moments, len(frames))).round().astype(int))
     vectors, logs, nouns = [], [], []
     for row in frames.select(["log", "folder", "maps_dir", "frame"]).take(pa.array(chosen)).to_pylist():
-        log = _opened(LogPath(Path(row["folder"]), Path(row["maps_dir"])))
+        log = opened_log(LogPath(Path(row["folder"]), Path(row["maps_dir"])))
         objects = [
             found
             for found in read_objects(log, row["frame"], towers.image_side_px)
@@ -163,8 +163,3 @@ def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_SensorPai
             nouns += [OBJECTS[found.category] for found in objects]
     pairs = np.concatenate(vectors) if vectors else np.zeros((0, 2, towers.dim), np.float32)
     return _SensorPairs(pairs[:, 0], pairs[:, 1], logs), list(nouns)
-
-
-@functools.lru_cache(maxsize=1)
-def _opened(path: LogPath) -> Log:
-    return Log(path)

@@ -172,11 +172,12 @@ def embed_part(job: Job, towers: str, threads: int | None = None) -> pa.Table:
     """Embed the frames of a part; return its rows."""
     if threads is not None:
         torch.set_num_threads(threads)
-    return embed_frames(_opened(job.log), job.frames, find_towers(towers))
+    return embed_frames(opened_log(job.log), job.frames, find_towers(towers))
 
 
 @functools.lru_cache(maxsize=2)
-def _opened(path: LogPath) -> Log:
+def opened_log(path: LogPath) -> Log:
+    """Open a log, and keep it open for the next call."""
     return Log(path)
 
 
