@@ -39,7 +39,7 @@ def driveworld_tiny() -> DriveWorldRecipe:
         about="DriveWorld small enough for two CPU cores",
         clips=_in_time(nemo.clips),
         model=DriveWorldConfig(
-            backbone=nemo.model.backbone,
+            backbone=nemo_town().model.backbone,
             encoder=LiftSplatConfig(near_m=1.0, far_m=34.0, step_m=1.0),
             states=StateSpaceConfig(
                 observation=128, state=64, history=128, memory=8, heads=4, objects=8, hidden=128

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
+    from foredrive.training.augmentation import AugmentConfig
     from foredrive.training.checkpoints import load_weights, save_weights
     from foredrive.training.driveworld_objective import (
         DriveWorldObjective,
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONDITIONS",
+    "AugmentConfig",
     "DriveWorldObjective",
     "DriveWorldStage",
     "DriveWorldWeights",
@@ -46,6 +48,7 @@ __all__ = [
 __getattr__ = on_demand(
     __name__,
     {
+        "augmentation": ("AugmentConfig",),
         "checkpoints": ("load_weights", "save_weights"),
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
         "ego_mlp_fit": ("EgoMLPFit", "StatusDemonstrations", "fit_ego_mlp", "read_status"),
