@@ -85,7 +85,6 @@ def nemo_town() -> NemoRecipe:
     """
     tiny = nemo_tiny()
     assert tiny.pretrain is not None
-    whole = {"imagined_items": None, "past_gradient": True, "augment": AugmentConfig()}
     pretrain = rescheduled(tiny.pretrain, lr=2e-3, steps=500, warmup_steps=50)
     renderer = dataclasses.replace(tiny.model.renderer, far_m=48.0)
     along_m = (2.0, 5.0, 9.0, 13.0, 18.0, 24.0, 31.0, 39.0)
@@ -113,7 +112,9 @@ def nemo_town() -> NemoRecipe:
             path=PathCorrectionConfig(distances_m=along_m, width=64, hidden=32),
         ),
         path=PathFit(),
-        pretrain=dataclasses.replace(pretrain, **whole),
+        pretrain=dataclasses.replace(
+            pretrain, imagined_items=None, past_gradient=True, augment=AugmentConfig()
+        ),
         finetune=dataclasses.replace(
             rescheduled(tiny.finetune, steps=150, warmup_steps=20), past_gradient=True
         ),
