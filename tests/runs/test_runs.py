@@ -1,6 +1,7 @@
 """Runs as a whole, in miniature: what they leave on disk, how they go on, that they learn."""
 
 import dataclasses
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,20 @@ def test_a_finished_run_is_left_alone(trained: Run) -> None:
     before = files(trained.folder)
     assert train_run(trained.recipe, trained.logs, trained.folder) == trained
     assert files(trained.folder) == before
+
+
+def test_a_run_opens_from_any_working_directory(
+    log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its logs were named relative to the directory of training, which goes on from there too."""
+    whole = with_steps(miniature(), 1, 1)
+    recipe = dataclasses.replace(whole, pretrain=None)
+    monkeypatch.chdir(log.folder.parent)
+    relative = LogPath(Path(log.folder.name), Path(os.path.relpath(log.maps_dir)))
+    train_run(recipe, [relative], tmp_path / "run")
+    train_run(recipe, [relative], tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    assert open_run(Path("run")).logs[0].folder == log.folder
 
 
 def test_pretraining_leaves_the_planner_alone_and_finetuning_does_not(trained: Run) -> None:

@@ -24,6 +24,10 @@ class LogPath:
         """Return split/name, which is unique within a data root."""
         return f"{self.folder.parent.name}/{self.folder.name}"
 
+    def absolute(self) -> "LogPath":
+        """Return the same location, independent of the working directory."""
+        return LogPath(self.folder.absolute(), self.maps_dir.absolute(), self.parts_s)
+
 
 def find_logs(path: Path) -> list[LogPath]:
     """Find all 123D logs at `path`.

@@ -110,7 +110,8 @@ def train_run(
     from foredrive.training import make_fabric  # the import takes seconds; opening a run does without
 
     start = None if start is None else start.absolute()
-    run = Run(folder, recipe, tuple(logs), (cache_dir or folder / "cache").absolute(), start)
+    logs = tuple(log.absolute() for log in logs)  # a run opens from any working directory
+    run = Run(folder, recipe, logs, (cache_dir or folder / "cache").absolute(), start)
     claim = _folder_of(run)
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
@@ -224,7 +225,7 @@ def _write(run: Run) -> None:
 
 def _read_log(entry: dict[str, Any]) -> LogPath:
     parts = tuple((float(start), float(end)) for start, end in entry.get("parts_s", ()))
-    return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts)
+    return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts).absolute()
 
 
 def _folder_of(run: Run) -> RunFolder:
