@@ -206,6 +206,10 @@ def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None
     stage = dataclasses.replace(RECIPE.finetune, imagined_items=1)
     with pytest.raises(InputError, match="imagined frames of every item"):
         build_objective(RECIPE, stage, build_agent(RECIPE))
+    for count in (0, -1):
+        none = dataclasses.replace(RECIPE.pretrain, imagined_items=count)
+        with pytest.raises(InputError, match="set imagine to false"):
+            build_objective(RECIPE, none, build_agent(RECIPE))
 
 
 def test_examples_are_augmented_before_anything_is_read(example: Example) -> None:

@@ -37,7 +37,7 @@ class FrameData(Record):
     """A camera that the log lacks has identity matrices."""
     boxes: Boxes
     boxes_valid: Bool[Tensor, "*b"]
-    """Whether the frame is annotated."""
+    """True if the frame is annotated."""
 
 
 class FrameStore:
@@ -45,8 +45,8 @@ class FrameStore:
 
     The name of an entry is a hash of everything that it depends on: the log's files (name, size, modification
     time), the cameras, the frame, the image size and `FRAME_VERSION`. Entries are written atomically. Damaged
-    entries are replaced. One file holds a whole frame, and reading it opens no table of the log: a clip that
-    is drawn from hundreds of logs costs no more than one from the same log as before.
+    entries are replaced. One file holds a whole frame, and reading it opens no table of the log, so frames of
+    many logs in random order are read as fast as those of one.
 
     Args:
         cache_dir: folder of the cache. None disables it.

@@ -55,7 +55,7 @@ class Clip(Record):
     boxes: Boxes
     """Leading dimensions [b T]. Each box is in the ego frame of its own time step."""
     boxes_valid: Bool[Tensor, "*b T"]
-    """Whether the frame is annotated. An annotated frame may have no boxes."""
+    """True if the frame is annotated. An annotated frame may have no boxes."""
     ego_speed_mps: Float[Tensor, "*b T"]
     ego_speed_valid: Bool[Tensor, "*b T"]
     command: Int[Tensor, "*b"]

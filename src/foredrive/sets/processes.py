@@ -36,7 +36,7 @@ class MultiBernoulli(Record):
     """Log-probability of each class, given that the object exists."""
     boxes: BoxDensity
     normalised: bool = True
-    """Whether class probabilities add up to 1. If they do not, likelihoods are not those of a density."""
+    """True if class probabilities add up to 1. If they do not, likelihoods are not those of a density."""
 
     def __post_init__(self) -> None:
         require("existence", self.log_existence <= _ROUNDING)

@@ -60,7 +60,7 @@ class Schedule:
     steps: int | None = None
     epochs: int | None = None
     weight_decay: float = 1e-2
-    """Of weight matrices and filters, see `parameter_groups`."""
+    """Decay of weight matrices and filters, see `parameter_groups`."""
     warmup_steps: int = 0
     final_lr_fraction: float = 0.0
     clip_grad_norm: float = 35.0

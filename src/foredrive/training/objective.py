@@ -77,7 +77,7 @@ class NemoObjective(nn.Module):
         image_features: trained features for the perceptual loss, or None to disable it.
 
     Raises:
-        InputError: some items are not to be imagined, but the planner reads their imagined frames.
+        InputError: `imagined_items` is below 1, or the planner reads imagined frames of the other items.
     """
 
     def __init__(
@@ -96,6 +96,8 @@ class NemoObjective(nn.Module):
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
         set_planner_trainable(agent.planner, plans)
+        if stage.imagined_items is not None and stage.imagined_items < 1:
+            raise InputError(f"imagined_items is {stage.imagined_items}; without any, set imagine to false")
         if plans and agent.planner.imagined_frames > 0 and stage.imagined_items is not None:
             raise InputError("the planner reads imagined frames of every item: leave out imagined_items")
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)

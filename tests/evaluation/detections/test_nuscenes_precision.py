@@ -58,7 +58,7 @@ def test_objects_without_points_do_not_count(tmp_path: Path) -> None:
 
 
 def test_cycles_in_a_rack_do_not_count(tmp_path: Path) -> None:
-    """Of the rack of 4 m x 2 m: a bicycle 1.5 m along it is inside, one 1.5 m across it is not."""
+    """The rack is 4 m x 2 m: a bicycle 1.5 m along it is inside, one 1.5 m across it is not."""
     rack = at(10.0, 0.0, BICYCLE_RACK, yaw=np.pi / 2)
     truth = [at(10.0, 1.5, "bicycle"), at(11.5, 0.0, "bicycle"), at(10.0, 0.5), rack]
     found = [

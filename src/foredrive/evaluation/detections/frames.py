@@ -48,7 +48,7 @@ class DetectionFrame:
     stated: "StatedDetections | None" = None
     """Detections as the file states them. None: the likeliest class, and its probability."""
     object_counts: Bool[ndarray, "N"] | None = None
-    """Whether average precision counts the object. None: it counts all."""
+    """True if average precision counts the object. None: it counts all."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class StatedDetections:
     label: Int[ndarray, "M"]
     score: Float[ndarray, "M"]
     counts: Bool[ndarray, "M"]
-    """Whether average precision counts the detection."""
+    """True if average precision counts the detection."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class PrecisionScores:
     label: Int[ndarray, "m"]
     score: Float[ndarray, "m"]
     hit: Bool[ndarray, "T m"]
-    """Whether the detection hits an object at each threshold, by greedy matching among the counted ones."""
+    """True where the detection hits an object at a threshold, by greedy matching among the counted ones."""
     true_label: Int[ndarray, "n"]
 
 
