@@ -69,6 +69,7 @@ def test_what_is_not_there_is_named(
 ) -> None:
     if args == ["empty"]:
         (folder / "empty.py").write_text("")
-    filled = ["--folder", str(folder), *(a.format(folder=folder) for a in args)]
-    assert main(["bench", *filled]) == 2
+    filled = [each.format(folder=folder) for each in args]
+    where = [] if "--folder" in filled else ["--folder", str(folder)]
+    assert main(["bench", *filled, *where]) == 2
     assert said.format(folder=folder) in capsys.readouterr().err

@@ -17,6 +17,7 @@ from torch._utils import ExceptionWrapper
 import foredrive
 from foredrive.cli import main as program
 from foredrive.cli.main import main
+from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
@@ -150,6 +151,23 @@ def test_what_the_command_line_gets_wrong_ends_in_2(
         main(args)
     assert ended.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spelling", ["--set", "--image_size", "--rate=2"])
+def test_a_flag_given_twice_is_refused(spelling: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser alone would drop the first without a word."""
+    flag = spelling.partition("=")[0].replace("_", "-")
+    assert main(["record", spelling, "1", "--town", "Town01", flag, "2"]) == 2
+    assert capsys.readouterr().err.startswith(f"foredrive: {flag} is given twice; several values")
+
+
+def test_several_values_follow_one_flag(
+    log: LogPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["finetune.schedule.lr=1e-3", "finetune.schedule.stepz=4"]
+    out = ["--out", str(tmp_path / "run")]
+    assert main(["train", "nemo_tiny", "--logs", str(log.folder), *out, "--set", *settings]) == 2
+    assert "stepz" in capsys.readouterr().err
 
 
 def test_an_unknown_verb_is_told_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,6 +93,7 @@ def main(args: Sequence[str] | None = None) -> int:
         args = [" ".join(args[:2]), *args[2:]]
     interrupt = LastingInterrupt()
     try:
+        _check_flags(args)
         with interrupt:
             tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
@@ -110,6 +111,18 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         return _give_up(reason)
     return 0
+
+
+def _check_flags(args: Sequence[str]) -> None:
+    """Check that no flag is given twice. The parser would silently take the last one.
+
+    Raises:
+        InputError: a flag is given twice.
+    """
+    flags = [arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")]
+    for flag in flags:
+        if flags.count(flag) > 1:
+            raise InputError(f"{flag} is given twice; several values of a flag follow it: {flag} A B")
 
 
 def _end_interrupted() -> int:
