@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -126,6 +127,8 @@ def _check_flags(args: Sequence[str]) -> None:
 
 
 def _end_interrupted() -> int:
+    # An interrupt between the opening of a file and its `with` leaves it to the garbage collector.
+    warnings.simplefilter("ignore", ResourceWarning)
     _give_up("interrupted")
     return EXIT_INTERRUPTED
 
