@@ -1,0 +1,1 @@
+"""The published protocols of occupancy: semantic voxels, rays through them, instances seen from above."""

@@ -1,0 +1,197 @@
+"""RayIoU: what a lidar at several places would see in predicted and in true voxels.
+
+Liu et al., Fully Sparse 3D Occupancy Prediction (SparseOcc), section 4. Every number is rounded where the
+public code rounds it, so that rays end in the same voxels.
+"""
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.metrics.detection import mean_of_valid
+from foredrive.metrics.voxels.protocols import GRID, MAX_ORIGINS, ORIGIN_REACH_M, RayProtocol
+from foredrive.metrics.voxels.semantic import mean_iou
+from foredrive.ops.voxel_rays import RayEnds, first_hits
+from foredrive.scene import VoxelSpec
+
+MAX_ELEVATION_RAD = 0.21
+
+
+@lru_cache(maxsize=1)
+def lidar_rays() -> Float32[ndarray, "14040 3"]:
+    """Return unit vectors of the rays from one origin: 39 elevations, 360 azimuths each.
+
+    Ten elevations meet the ground at 1, 2 … 10 sensor heights; the last step between them is repeated
+    until the first elevation above 0.21 rad, about the upper end of nuScenes' lidar.
+    """
+    elevation = [np.arctan(k) - np.pi / 2 for k in range(1, 11)]
+    while elevation[-1] < MAX_ELEVATION_RAD:
+        elevation.append(elevation[-1] + (elevation[-1] - elevation[-2]))
+    up, around = np.meshgrid(np.array(elevation), np.deg2rad(np.arange(360)), indexing="ij")
+    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+    rays = rays.reshape(-1, 3).astype(np.float32)
+    rays.flags.writeable = False
+    return rays
+
+
+def ray_origins(
+    T_world_ego: Float64[ndarray, "F 4 4"], T_ego_lidar: Float64[ndarray, "F 4 4"], frame: int
+) -> Float64[ndarray, "O 3"]:
+    """Return the places from which one frame of a drive is looked at, in its ego frame, m.
+
+    They are the positions of the lidar in all key frames of the drive less than 39 m away, forward and
+    sideways. Of more than 8, 8 evenly spaced ones are taken.
+    """
+    T_world_lidar = T_world_ego @ T_ego_lidar
+    position = (np.linalg.inv(T_world_lidar[frame]) @ T_world_lidar)[:, :3, 3].astype(np.float32)
+    position[frame] = 0.0
+    in_ego = position.astype(np.float64) @ T_ego_lidar[frame, :3, :3].T + T_ego_lidar[frame, :3, 3]
+    near = in_ego[(np.abs(in_ego[:, :2]) < ORIGIN_REACH_M).all(axis=1)]
+    if len(near) > MAX_ORIGINS:
+        near = near[np.round(np.linspace(0, len(near) - 1, MAX_ORIGINS)).astype(np.int64)]
+    return near
+
+
+class Seen(NamedTuple):
+    """What the rays of a frame see in one grid."""
+
+    label: UInt8[ndarray, "N"]
+    range_m: Float32[ndarray, "N"]
+    velocity_mps: Float32[ndarray, "N 2"] | None
+
+
+def cast_rays(
+    origins_m: Float64[ndarray, "O 3"],
+    labels: UInt8[ndarray, "Z Y X"],
+    free: int,
+    velocity_mps: Float32[ndarray, "Z Y X 2"] | None = None,
+    *,
+    spec: VoxelSpec = GRID,
+) -> Seen:
+    """Return label, range and velocity at the end of each ray, origin by origin.
+
+    The range is that at which the ray leaves the voxel that it hits, or the grid if it hits none. A ray that
+    passes beside the grid has range -0.4 m and reads the grid's first voxel, as in the public code.
+
+    Raises:
+        InputError: an origin is not finite.
+    """
+    origin, direction = _in_voxels(origins_m, spec)
+    ends: RayEnds = first_hits(origin, direction, labels != free)
+    voxel = np.maximum(ends.voxel, 0)
+    return Seen(
+        labels.reshape(-1)[voxel],
+        ends.distance.astype(np.float32) * np.float32(spec.voxel_m),
+        None if velocity_mps is None else velocity_mps.reshape(-1, 2)[voxel],
+    )
+
+
+def _in_voxels(
+    origins_m: Float64[ndarray, "O 3"], spec: VoxelSpec
+) -> tuple[Float64[ndarray, "N 3"], Float64[ndarray, "N 3"]]:
+    """Return origin and unit direction of each ray in voxels; ends are rounded to single precision."""
+    if not np.isfinite(origins_m).all():
+        raise InputError(
+            f"origin {int(np.argwhere(~np.isfinite(origins_m))[0, 0])} of the rays is not finite"
+        )
+    lower_m, voxel_m = np.array(spec.lower_m), np.float64(np.float32(spec.voxel_m))
+    rays = lidar_rays()
+    end = ((rays + origins_m[:, None] - lower_m) / voxel_m).astype(np.float32).reshape(-1, 3)
+    origin = ((origins_m - lower_m) / voxel_m).astype(np.float32)
+    origin = np.repeat(origin, len(rays), axis=0).astype(np.float64)
+    step = end.astype(np.float64) - origin
+    x, y, z = step.T
+    return origin, step / np.sqrt(x * x + y * y + z * z)[:, None]
+
+
+@dataclass(frozen=True)
+class RayCounts:
+    """Numbers of rays whose truth is not free, and sums of velocity errors. Those of frames add up."""
+
+    true: Int64[ndarray, "C"]
+    predicted: Int64[ndarray, "C"]
+    hits: Int64[ndarray, "T C"]
+    """By threshold and class."""
+    velocity_error_mps: Float64[ndarray, "C"]
+    velocity_rays: Int64[ndarray, "C"]
+
+    def __add__(self, other: "RayCounts") -> "RayCounts":
+        return RayCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+
+def count_rays(predicted: Seen, true: Seen, protocol: RayProtocol) -> RayCounts:
+    """Count the rays of one frame under a protocol.
+
+    Without velocities in either, no velocity errors are summed.
+    """
+    classes = len(protocol.classes)
+    valid = true.label != classes - 1
+    label, true_label = predicted.label[valid], true.label[valid]
+    precision = np.float16 if protocol.stored == "half" else np.float32
+    ranges_m = (seen.range_m[valid].astype(precision).astype(np.float32) for seen in (predicted, true))
+    error_m = np.abs(np.subtract(*ranges_m))
+    same = label == true_label
+
+    def by_class(rays: ndarray) -> Int64[ndarray, "C"]:
+        return np.bincount(rays, minlength=classes).astype(np.int64)
+
+    error_mps, counted = np.zeros(classes), np.zeros(classes, np.int64)
+    if predicted.velocity_mps is not None and true.velocity_mps is not None:
+        hit = same & (error_m < protocol.velocity_threshold_m)
+        stored = (v[valid].astype(precision) for v in (predicted.velocity_mps, true.velocity_mps))
+        difference = np.subtract(*(v.astype(np.float32) for v in stored))
+        errors = np.linalg.norm(difference, axis=1).astype(np.float64)
+        error_mps, counted = _velocity_errors(errors, true_label, hit, protocol)
+    return RayCounts(
+        true=by_class(true_label),
+        predicted=by_class(label),
+        hits=np.stack([by_class(label[same & (error_m < limit)]) for limit in protocol.thresholds_m]),
+        velocity_error_mps=error_mps,
+        velocity_rays=counted,
+    )
+
+
+def _velocity_errors(
+    error_mps: Float64[ndarray, "n"], true_label: UInt8[ndarray, "n"], hit: ndarray, protocol: RayProtocol
+) -> tuple[Float64[ndarray, "C"], Int64[ndarray, "C"]]:
+    """Return sums of errors, and numbers of rays, of the classes that move."""
+    classes = len(protocol.classes)
+    number = np.bincount(true_label[hit], minlength=classes).astype(np.int64)
+    if protocol.velocity_rays == "hits":
+        total = np.bincount(true_label[hit], weights=error_mps[hit], minlength=classes)
+    else:
+        total = np.where(number > 0, error_mps.sum(), 0.0)
+        number = np.where(number > 0, len(error_mps), 0)
+    moving = np.array([name in protocol.moving for name in protocol.classes])
+    return np.where(moving, total, 0.0), np.where(moving, number, 0)
+
+
+@dataclass(frozen=True)
+class RayScores:
+    """The figures over a data set. NaN: nothing could be counted."""
+
+    iou: Float64[ndarray, "T C"]
+    """By threshold and class; NaN for a class that neither truth nor prediction has on the counted rays."""
+    ave_mps: Float64[ndarray, "C"]
+    """Mean velocity error; NaN for a class without hits."""
+    rayiou: float
+    mave_mps: float
+    occ_score: float
+    """NaN without velocities, as in the public code."""
+
+
+def score_rays(counts: RayCounts, protocol: RayProtocol) -> RayScores:
+    """Return RayIoU, velocity errors and OccScore of the summed counts."""
+    either = counts.true + counts.predicted - counts.hits
+    iou = np.divide(counts.hits, either, out=np.full(either.shape, np.nan), where=either > 0)
+    rays = counts.velocity_rays
+    ave = np.divide(counts.velocity_error_mps, rays, out=np.full(len(rays), np.nan), where=rays > 0)
+    rayiou, mave = mean_iou(iou), mean_of_valid(ave.tolist())
+    still = protocol.range_weight * rayiou
+    score = still + (1.0 - protocol.range_weight) * float(np.maximum(1.0 - mave, 0.0))
+    return RayScores(iou, ave, rayiou, mave, score)
