@@ -29,6 +29,7 @@ from foredrive.ops.volume import sample_volume_reference
 from foredrive.recipes import Recipe, find_recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
+from foredrive.scene.boxes import unlabelled
 from foredrive.training import make_fabric
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -89,7 +90,16 @@ def _no_sweeps(none: Tensor) -> LidarSweep:
 
 def _no_boxes(none: Tensor) -> Boxes:
     vectors = none[..., None].expand(*none.shape, 3)
-    return Boxes(vectors, vectors, none, vectors[..., :2], none.long(), none.long(), none.bool())
+    return Boxes(
+        vectors,
+        vectors,
+        none,
+        vectors[..., :2],
+        none.long(),
+        none.long(),
+        none.bool(),
+        **unlabelled(*none.shape),
+    )
 
 
 def _rig(frames: int, height: int, width: int) -> CameraRig:

@@ -31,6 +31,7 @@ from foredrive.scene import (  # noqa: E402
     VoxelGrid,
     VoxelSpec,
 )
+from foredrive.scene.boxes import unlabelled  # noqa: E402
 
 if TYPE_CHECKING:
     from foredrive.data import LogPath
@@ -117,6 +118,7 @@ def synthetic_example(
             track_id=torch.arange(boxes).expand(*shape, boxes),
             category=torch.zeros(*shape, boxes, dtype=torch.long),
             valid=torch.ones(*shape, boxes, dtype=torch.bool),
+            **unlabelled(*shape, boxes),
         ),
         boxes_valid=yes,
         ego_speed_mps=speed_mps,

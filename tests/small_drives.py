@@ -17,6 +17,7 @@ from foredrive.scene import (
     VoxelGrid,
     VoxelSpec,
 )
+from foredrive.scene.boxes import unlabelled
 
 SPEC = VoxelSpec(lower_m=(-2.0, -2.0, -0.5), voxel_m=0.5, shape_zyx=(4, 8, 8))
 PAST, FUTURE, DT_S = 2, 6, 0.5
@@ -71,6 +72,7 @@ def one_example(seed: int) -> Example:
             track_id=torch.ones(1, frames, 1, dtype=torch.long),
             category=torch.full((1, frames, 1), int(Category.CAR)),
             valid=torch.ones(1, frames, 1, dtype=torch.bool),
+            **unlabelled(1, frames, 1),
         ),
         boxes_valid=torch.ones(1, frames, dtype=torch.bool),
         ego_speed_mps=torch.full((1, frames), speed_mps),

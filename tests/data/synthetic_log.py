@@ -12,6 +12,7 @@ import torch
 
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
 from foredrive.scene import Boxes, Category, LidarSweep
+from foredrive.scene.boxes import unlabelled
 
 EGO_SPEED_MPS = 5.0
 PERIOD_US = 100_000
@@ -120,6 +121,7 @@ def boxes(t_s: float) -> Boxes:
         track_id=torch.tensor([7, 11]),
         category=torch.tensor([Category.CAR, Category.TRUCK]),
         valid=torch.ones(2, dtype=torch.bool),
+        **unlabelled(2),
     )
 
 

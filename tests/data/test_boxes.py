@@ -40,7 +40,7 @@ def test_boxes_are_in_the_ego_frame_of_their_frame(flat_log: Path) -> None:
 def test_a_log_without_a_single_box_has_no_boxes_at_any_frame(flat_log: Path, tmp_path: Path) -> None:
     path = copy_of(flat_log, tmp_path)
     file = path.folder / f"{BOXES}.arrow"
-    for column in ("bounding_box_se3", "track_token", "label", "velocity_3d"):
+    for column in ("bounding_box_se3", "track_token", "label", "velocity_3d", "num_lidar_points"):
         rewrite_column(file, f"{BOXES}.{column}", lambda rows: [[] for _ in rows])
     boxes = read_boxes(Log(path), 20)
     assert boxes is not None

@@ -13,6 +13,7 @@ from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import find_logs
 from foredrive.data.logs import Log
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
+from foredrive.scene.boxes import unlabelled
 
 SPEC = VoxelSpec((-20.0, -10.0, -0.75), 0.5, (8, 40, 80))
 
@@ -99,6 +100,7 @@ def box(velocity: tuple[float, float]) -> Boxes:
         track_id=torch.zeros(1, dtype=torch.int64),
         category=torch.zeros(1, dtype=torch.int64),
         valid=torch.ones(1, dtype=torch.bool),
+        **unlabelled(1),
     )
 
 

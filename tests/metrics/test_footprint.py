@@ -15,6 +15,7 @@ from shapely.geometry import box as shapely_box
 from foredrive.metrics.footprint import cells_in_quads, grid_hits, path_headings, polygon_hits, rectangle
 from foredrive.metrics.protocols import PROTOCOLS, ObstacleGrid, PlanningProtocol
 from foredrive.scene import Boxes, Category
+from foredrive.scene.boxes import unlabelled
 
 
 def some_boxes(rows: list[tuple[float, float, float, float, float]]) -> Boxes:
@@ -29,6 +30,7 @@ def some_boxes(rows: list[tuple[float, float, float, float, float]]) -> Boxes:
         track_id=torch.arange(m)[None, None],
         category=torch.full((1, 1, m), int(Category.CAR)),
         valid=torch.ones(1, 1, m, dtype=torch.bool),
+        **unlabelled(1, 1, m),
     )
 
 

@@ -11,6 +11,7 @@ from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, inverse_se3, matrix_from_yaw, transform_points
 from foredrive.metrics.obstacles import boxes_at_now, future_obstacles
 from foredrive.scene import Boxes, CameraRig, Clip, LidarSweep, Trajectory
+from foredrive.scene.boxes import unlabelled
 
 
 def drive(t_s: list[float], T_world_ego: torch.Tensor, centre: torch.Tensor, valid: torch.Tensor) -> Clip:
@@ -50,6 +51,7 @@ def drive(t_s: list[float], T_world_ego: torch.Tensor, centre: torch.Tensor, val
             track_id=torch.arange(m).expand(1, t, m),
             category=torch.zeros(1, t, m, dtype=torch.long),
             valid=valid[None],
+            **unlabelled(1, t, m),
         ),
         boxes_valid=torch.ones(1, t, dtype=torch.bool),
         ego_speed_mps=torch.zeros(1, t),

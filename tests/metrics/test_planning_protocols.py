@@ -13,6 +13,7 @@ from foredrive.metrics.obstacles import Obstacles
 from foredrive.metrics.planning import PlanScores, score_plan
 from foredrive.metrics.protocols import LIDAR_FORWARD_M, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Boxes, Category, Trajectory
+from foredrive.scene.boxes import unlabelled
 
 NAMES = sorted(PROTOCOLS)
 
@@ -64,6 +65,7 @@ def obstacles(*things: Thing, annotated_steps: int = STEPS) -> Obstacles:
             track_id=torch.arange(m).expand(1, STEPS, m),
             category=category,
             valid=valid,
+            **unlabelled(1, STEPS, m),
         ),
         annotated=(torch.arange(STEPS) < annotated_steps)[None],
         tracked_now=now,

@@ -14,6 +14,7 @@ from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.setting import Doing, Place, Setting, TimeOfDay, Weather
 from foredrive.scene import Boxes, Category
+from foredrive.scene.boxes import unlabelled
 from foredrive.search.crops import Crop
 from foredrive.search.embedding import read_views
 from foredrive.search.facts import NOUNS, Thing, ViewFacts, _things, view_facts
@@ -33,6 +34,7 @@ def boxes(*rows: tuple[Category, tuple[float, float], tuple[float, float], float
         track_id=torch.arange(count),
         category=torch.tensor([int(category) for category, *_ in rows]),
         valid=torch.ones(count, dtype=torch.bool),
+        **unlabelled(count),
     )
 
 

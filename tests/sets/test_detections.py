@@ -7,6 +7,7 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, Detections
+from foredrive.scene.boxes import unlabelled
 from foredrive.sets import LabelledBoxes, UniformPoisson, set_nll
 from foredrive.sets.detections import objects_from_boxes, pmb_from_detections
 
@@ -71,6 +72,7 @@ def test_from_boxes_to_a_likelihood() -> None:
         track_id=torch.arange(2),
         category=torch.tensor([0, 1]),
         valid=torch.tensor([True, False]),
+        **unlabelled(2),
     )
     pmb = pmb_from_detections(detections(background_rate=None))
     linear = -sum(math.log(s * math.sqrt(2 * math.pi)) for s in (0.5, 0.5, 0.2, 0.1, 0.1, 0.1))

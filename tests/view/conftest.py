@@ -24,6 +24,7 @@ from foredrive.scene import (
     VoxelGrid,
     VoxelSpec,
 )
+from foredrive.scene.boxes import unlabelled
 
 SIZE_HW = (54, 96)
 SPEC = VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=1.0, shape_zyx=(5, 32, 32))
@@ -101,6 +102,7 @@ def make_boxes(seconds: float) -> Boxes:
         torch.arange(count),
         rows[:, 8].long(),
         torch.ones(count).bool(),
+        **unlabelled(count),
     )
 
 

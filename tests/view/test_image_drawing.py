@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from foredrive.geometry.projection import pixels_to_rays
 from foredrive.scene import Boxes, Category
+from foredrive.scene.boxes import unlabelled
 from foredrive.view.image_drawing import (
     Camera,
     draw_boxes_on_image,
@@ -49,6 +50,7 @@ def one_box(x: float, y: float, z: float, lwh: tuple[float, float, float], yaw: 
         torch.zeros(1, dtype=torch.long),
         torch.tensor([int(Category.CAR)]),
         torch.ones(1, dtype=torch.bool),
+        **unlabelled(1),
     )
 
 

@@ -14,7 +14,7 @@ from foredrive.scene.record import Record
 
 R = TypeVar("R", bound=Record)
 
-_PADDING = {"kind": -1, "beam": -1}
+_PADDING = {"kind": -1, "beam": -1, "num_points": -1, "attribute": -1, "visibility": -1}
 """Padding values of fields. All other fields are padded with 0 (False)."""
 
 

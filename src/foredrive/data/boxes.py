@@ -1,23 +1,29 @@
 """Boxes of a 123D log in the ego frame, with Foredrive's categories and velocities from the tracks."""
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int, Int64
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.datatypes import ModalityType
 from py123d.datatypes.detections.box_detection_label import BoxDetectionLabel, DefaultBoxDetectionLabel
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.vehicle_state.ego_state import EGO_TRACK_TOKEN
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from foredrive.data.arrow_files import column_array, fixed_lists, reading
+from foredrive.data.beam_casting import box_of_points
 from foredrive.data.log_writer import DATASET
 from foredrive.data.logs import Log
+from foredrive.data.recorded import read_attributes, read_visibility
 from foredrive.errors import InputError
-from foredrive.scene import Boxes, Category
+from foredrive.scene import Boxes, Category, LidarSweep, Visibility
+from foredrive.scene.boxes import UNKNOWN, unlabelled
 
 _KEY = ModalityType.BOX_DETECTIONS_SE3.serialize()
 _MAX_DIFFERENCE_S = 1.5
@@ -26,6 +32,9 @@ _MAX_DIFFERENCE_S = 1.5
 
 _BACKWARDS = {"pandaset"}
 """Datasets whose boxes py123d 0.7 rotates by half a turn: all their moving cars seem to drive backwards."""
+
+LEVELS_FROM = (0.4, 0.6, 0.8)
+"""Visible shares at which nuScenes' second, third and fourth level begin."""
 
 _DEFAULT_CATEGORY = {
     DefaultBoxDetectionLabel.VEHICLE: Category.CAR,
@@ -64,9 +73,9 @@ def category_of(label: BoxDetectionLabel) -> Category:
     return named if named is not None else _DEFAULT_CATEGORY.get(label.to_default(), Category.OTHER)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tracks:
-    """All boxes of a log in the world frame, one row per box, in order of time."""
+    """All boxes of a log in the world frame, one row per box, in order of time. Hashed by identity."""
 
     first_row: Int64[np.ndarray, "R_1"]
     """Row r of 123D's box table has the boxes first_row[r] to first_row[r + 1] - 1."""
@@ -78,10 +87,18 @@ class Tracks:
     track_id: Int64[np.ndarray, "N"]
     category: Int64[np.ndarray, "N"]
     is_ego: Bool[np.ndarray, "N"]
+    num_points: Int64[np.ndarray, "N"]
+    """Number of lidar returns, `UNKNOWN` where the log has none."""
+    t_us: Int64[np.ndarray, "N"]
+    row_t_us: Int64[np.ndarray, "R"]
+    """Time of each row of the table."""
 
 
 def read_boxes(log: Log, frame: int) -> Boxes | None:
     """Read the boxes at a frame, unbatched, in its ego frame, without the ego vehicle.
+
+    `num_points` is as logged. It is not counted here (`with_counted_points`). The visibility is the level of
+    the logged share. Attributes are known where a recording or conversion has written them.
 
     Velocities are over ground, along the ego axes. They are the logged values if there are any. Otherwise
     they are the centred difference between the neighbouring observations of the track, or NaN.
@@ -92,18 +109,12 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
     Raises:
         InputError: the boxes cannot be read or are not finite.
     """
-    file = log.file(_KEY)
-    if not file.is_file():
+    tracks = read_tracks(log)
+    row = None if tracks is None else box_row(log, frame)
+    if tracks is None or row is None:
         return None
-    with reading(file, "the boxes"):
-        tracks = _tracks(log, file.stat().st_mtime_ns)
-        frames, table_rows = log.rows(_KEY)
-        at = np.searchsorted(frames, frame)
-    if at == len(frames) or frames[at] != frame:
-        return None
-    row = table_rows[at]
-    rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
-    rows = rows[~tracks.is_ego[rows]]
+    row_range = slice(tracks.first_row[row], tracks.first_row[row + 1])
+    rows = np.arange(row_range.start, row_range.stop)[~tracks.is_ego[row_range]]
     T_ego_world = np.linalg.inv(log.T_world_ego[frame])
     R_ego_box = T_ego_world[:3, :3] @ tracks.R_world_box[rows]
     centre = tracks.centre[rows] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -116,7 +127,70 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
         track_id=torch.from_numpy(tracks.track_id[rows]),
         category=torch.from_numpy(tracks.category[rows]),
         valid=torch.ones(len(rows), dtype=torch.bool),
+        num_points=torch.from_numpy(tracks.num_points[rows]),
+        **_recorded_labels(log, frame, ~tracks.is_ego[row_range]),
     )
+
+
+def read_tracks(log: Log) -> Tracks | None:
+    """Read all boxes of a log, the ego vehicle's included. Return None if it has none.
+
+    Raises:
+        InputError: the boxes cannot be read or are not finite.
+    """
+    file = log.file(_KEY)
+    if not file.is_file():
+        return None
+    with reading(file, "the boxes"):
+        return _tracks(log, file.stat().st_mtime_ns)
+
+
+def box_row(log: Log, frame: int) -> int | None:
+    """Return the row of a frame in the box table. Return None if the frame is not annotated."""
+    frames, rows = log.rows(_KEY)
+    at = int(np.searchsorted(frames, frame))
+    return int(rows[at]) if at < len(frames) and frames[at] == frame else None
+
+
+def _recorded_labels(log: Log, frame: int, kept: Bool[np.ndarray, "K"]) -> dict[str, Tensor]:
+    """Return attribute and visibility of the boxes in `kept` among all boxes of the frame.
+
+    Raises:
+        InputError: they are of another number of boxes.
+    """
+    out = {name: torch.full((int(kept.sum()),), UNKNOWN) for name in ("attribute", "visibility")}
+    attribute, share = read_attributes(log, frame), read_visibility(log, frame)
+    if attribute is not None:
+        out["attribute"] = _of_boxes(log, frame, "attributes", attribute, kept)
+    if share is not None:
+        level = torch.bucketize(share, torch.tensor(LEVELS_FROM), right=True) + Visibility.V0_40
+        out["visibility"] = _of_boxes(log, frame, "visibilities", level, kept)
+    return out
+
+
+def _of_boxes(
+    log: Log, frame: int, what: str, values: Int[Tensor, "K"], kept: Bool[np.ndarray, "M"]
+) -> Int[Tensor, "_"]:
+    if len(values) != len(kept):
+        raise InputError(f"{log.path.folder}: frame {frame} has {len(kept)} boxes and {len(values)} {what}")
+    return values[torch.from_numpy(kept)]
+
+
+def with_counted_points(boxes: Boxes, sweep: LidarSweep) -> Boxes:
+    """Return unbatched boxes with the lidar returns inside counted where their number is unknown.
+
+    A return in several boxes counts for the one with the nearest centre.
+    """
+    points = sweep.points_ego[sweep.valid & sweep.returned].double().numpy()
+    box = box_of_points(
+        points,
+        boxes.centre.double().numpy(),
+        0.5 * boxes.size_lwh.double().numpy(),
+        boxes.yaw.double().numpy(),
+    )
+    counted = torch.from_numpy(np.bincount(box[box >= 0], minlength=len(boxes.yaw)))
+    unknown = boxes.num_points == UNKNOWN
+    return dataclasses.replace(boxes, num_points=boxes.num_points.where(~unknown, counted))
 
 
 @functools.lru_cache(maxsize=4)
@@ -141,7 +215,8 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
         row = np.searchsorted(first_row, bad.argmax(), side="right") - 1
         raise InputError(f"{log.file(_KEY)}: a box in row {row} is not finite")
     track_id = _track_ids(tokens)
-    t_s = np.repeat(column["timestamp_us"].to_numpy() * 1e-6, np.diff(first_row))
+    t_us = np.repeat(column["timestamp_us"].to_numpy(), np.diff(first_row))
+    t_s = t_us * 1e-6
     logged = fixed_lists(column["velocity_3d"].flatten(), 3)
     if log.metadata.dataset != DATASET:
         logged[(logged == 0).all(-1)] = np.nan  # py123d's parsers write zeros for an unknown velocity
@@ -159,7 +234,19 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
         track_id=track_id,
         category=category[kind],
         is_ego=is_ego[kind] | (tokens == EGO_TRACK_TOKEN),
+        num_points=_num_points(column.get("num_lidar_points"), len(tokens)),
+        t_us=t_us.astype(np.int64),
+        row_t_us=column["timestamp_us"].to_numpy().astype(np.int64),
     )
+
+
+def _num_points(column: pa.Array | None, count: int) -> Int64[np.ndarray, "N"]:
+    """Return the logged numbers of lidar returns. A log of an earlier version may lack the column."""
+    if column is None:
+        return np.full(count, UNKNOWN, dtype=np.int64)
+    if len(column.flatten()) != count:
+        raise ValueError(f"{count} boxes, but {len(column.flatten())} numbers of lidar returns")
+    return column.flatten().fill_null(UNKNOWN).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _track_ids(tokens: np.ndarray) -> Int64[np.ndarray, "N"]:
@@ -200,4 +287,5 @@ def no_boxes() -> Boxes:
         track_id=torch.zeros(0, dtype=torch.int64),
         category=torch.zeros(0, dtype=torch.int64),
         valid=torch.zeros(0, dtype=torch.bool),
+        **unlabelled(0),
     )

@@ -16,7 +16,7 @@ from foredrive.data.av2_partial import Av2PartialParser
 from foredrive.data.kitti_object import KittiObjectParser
 from foredrive.data.log_paths import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
-from foredrive.data.pandaset import PandasetLogParser
+from foredrive.data.pandaset import PandasetParser
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
@@ -90,7 +90,7 @@ def _folders_with(source: Path, file: str) -> list[Path]:
 
 def _pandaset(source: Path) -> LogParsers:
     for folder in _folders_with(source, "annotations/cuboids"):
-        yield folder, PandasetLogParser(folder, folder.name, "pandaset_train"), None
+        yield folder, PandasetParser(folder, folder.name, "pandaset_train"), None
 
 
 def _av2(source: Path) -> LogParsers:

@@ -14,14 +14,16 @@ from py123d.datatypes import PinholeCameraMetadata
 from safetensors import SafetensorError
 from torch import Tensor
 
-from foredrive.data.boxes import no_boxes, read_boxes
+from foredrive.data.boxes import no_boxes, read_boxes, with_counted_points
 from foredrive.data.cameras import read_camera
+from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.files import atomic_path
 from foredrive.scene import Boxes, CameraRig
+from foredrive.scene.boxes import UNKNOWN
 from foredrive.scene.record import Record
 
-FRAME_VERSION = 1
+FRAME_VERSION = 2
 """Version in every cache key. Increase it when the images, rigs or boxes change."""
 
 _log = logging.getLogger(__name__)
@@ -101,7 +103,7 @@ class FrameStore:
             if camera.image is not None:
                 images[c], image_valid[c] = camera.image, True
         rig = CameraRig(K, T_ego_cam, dist, readout_s, self.names, self.image_hw, exposed_dt_s)
-        boxes = read_boxes(log, frame)
+        boxes = _counted_boxes(log, frame)
         annotated = torch.tensor(boxes is not None)
         return FrameData(images, image_valid, rig, no_boxes() if boxes is None else boxes, annotated)
 
@@ -135,6 +137,15 @@ class FrameStore:
             boxes=Boxes(**fields("boxes.")),
             boxes_valid=tensors["boxes_valid"],
         )
+
+
+def _counted_boxes(log: Log, frame: int) -> Boxes | None:
+    """Read the boxes, with their lidar returns counted if the log has a sweep but not the numbers."""
+    boxes = read_boxes(log, frame)
+    if boxes is None or not bool((boxes.num_points == UNKNOWN).any()):
+        return boxes
+    read = read_sweep(log, frame)
+    return boxes if read is None else with_counted_points(boxes, read[0])
 
 
 def _flat(data: FrameData) -> dict[str, Tensor]:

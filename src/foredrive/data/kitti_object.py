@@ -34,7 +34,9 @@ from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_S
 from py123d.parser.registry import NuScenesBoxDetectionLabel
 
 from foredrive.data.log_writer import LABEL_OF_CATEGORY
-from foredrive.scene import Category
+from foredrive.data.modalities import attributes_modality
+from foredrive.scene import Attribute, Category
+from foredrive.scene.boxes import UNKNOWN
 
 _NOW = Timestamp.from_us(0)
 _CAMERAS = {"image_2": ("P2", CameraID.PCAM_STEREO_L), "image_3": ("P3", CameraID.PCAM_STEREO_R)}
@@ -48,6 +50,12 @@ _CATEGORY = {
     "Tram": Category.OTHER,
     "Misc": Category.OTHER,
 }
+_ATTRIBUTE = {
+    "Cyclist": Attribute.CYCLE_WITH_RIDER,
+    "Person_sitting": Attribute.PEDESTRIAN_SITTING_LYING_DOWN,
+}
+"""nuScenes' attributes that a class of KITTI implies. KITTI's levels of occlusion are no shares, so the
+visibility stays unknown."""
 _NOT_LABELLED = "DontCare"
 
 
@@ -76,7 +84,7 @@ class KittiObjectParser(BaseLogParser):
             if self._file(kind, "png").is_file():
                 found.append(self._camera(kind, calibration))
         if self._file("label_2", "txt").is_file():
-            found.append(self._boxes(calibration))
+            found += self._boxes(calibration)
         yield ModalitiesSync(_NOW, found)
 
     def _lidar(self, calibration: "_Calibration") -> Lidar:
@@ -107,8 +115,9 @@ class KittiObjectParser(BaseLogParser):
         )
         return Camera(metadata, image, _pose(T_imu_cam), _NOW)
 
-    def _boxes(self, calibration: "_Calibration") -> BoxDetectionsSE3:
-        detections = []
+    def _boxes(self, calibration: "_Calibration") -> list[BaseModality]:
+        """Return the boxes and their attributes."""
+        detections, known = [], []
         for number, line in enumerate(self._file("label_2", "txt").read_text().splitlines()):
             kind, *words = line.split()
             if kind == _NOT_LABELLED:
@@ -122,7 +131,9 @@ class KittiObjectParser(BaseLogParser):
             pose = _pose(calibration.T_imu_rect @ T_rect_box)
             attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[_CATEGORY[kind]], str(number), None)
             detections.append(BoxDetectionSE3(attributes, BoundingBoxSE3(pose, length, width, height), None))
-        return BoxDetectionsSE3(detections, _NOW, BoxDetectionsSE3Metadata(NuScenesBoxDetectionLabel))
+            known.append(_ATTRIBUTE.get(kind, UNKNOWN))
+        boxes = BoxDetectionsSE3(detections, _NOW, BoxDetectionsSE3Metadata(NuScenesBoxDetectionLabel))
+        return [boxes, attributes_modality(known, _NOW)]
 
     def _file(self, kind: str, suffix: str) -> Path:
         return self._folder / kind / f"{self._frame}.{suffix}"

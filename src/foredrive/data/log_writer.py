@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, Int, UInt8, UInt16
+from jaxtyping import Float, Float64, UInt8, UInt16
 from py123d.api.scene.arrow.arrow_log_writer import ArrowLogWriter
 from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.api.scene.arrow.utils.route_utils import ROUTE_POSITION_KEY
@@ -66,6 +66,7 @@ from foredrive.data.modalities import (
     LIDAR_BEAMS,
     SETTING,
     FullOccupancy,
+    attributes_modality,
     occupancy_metadata,
     pack_beams,
     pack_occupancy,
@@ -77,6 +78,7 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import log_so3, matrix_from_yaw
 from foredrive.scene import Boxes, Category, LidarSweep, Trajectory, VoxelSpec
+from foredrive.scene.boxes import UNKNOWN
 
 DATASET = "foredrive"
 """123D dataset name of all logs written here. Maps are at maps/foredrive/foredrive_LOCATION.arrow."""
@@ -122,11 +124,9 @@ class Frame:
     sweep: LidarSweep | None
     """Unbatched, in the ego frame at `t_us`, with the misses."""
     boxes: Boxes
-    """Unbatched, in the ego frame at `t_us`."""
+    """Unbatched, in the ego frame at `t_us`. Their `visibility` is not written, but that of the frame is."""
     _: KW_ONLY
     occupancy: FullOccupancy | None = None
-    lidar_points: Int[np.ndarray, "M"] | None = None
-    """Number of returns from each of `boxes` (0 for a hidden one). None if not counted."""
     visibility: Float[np.ndarray, "M"] | None = None
     """For each of `boxes`, the visible area relative to the area without occlusion, 0 to 1."""
     setting: Setting | None = None
@@ -228,6 +228,9 @@ class LogWriter:
             modalities += self._sweep(frame, frame.sweep)
         if frame.occupancy is not None:
             modalities.append(self._occupancy(frame.t_us, frame.occupancy))
+        attribute = frame.boxes.attribute[frame.boxes.valid].tolist()
+        if any(known != UNKNOWN for known in attribute):
+            modalities.append(attributes_modality(attribute, Timestamp.from_us(frame.t_us)))
         if frame.visibility is not None:
             modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
         if frame.setting is not None:
@@ -331,10 +334,8 @@ class LogWriter:
 def _boxes(frame: Frame) -> BoxDetectionsSE3:
     metadata = BoxDetectionsSE3Metadata(Label)
     R_world_ego = frame.T_world_ego[:3, :3]
-    valid = frame.boxes.valid
-    boxes = frame.boxes[valid]
-    counted = frame.lidar_points
-    points = [None] * len(boxes.yaw) if counted is None else counted[valid.numpy()].tolist()
+    boxes = frame.boxes[frame.boxes.valid]
+    points = [None if count == UNKNOWN else count for count in boxes.num_points.tolist()]
     T_ego_box = matrix_from_yaw(boxes.yaw.double(), boxes.centre.double()).numpy()
     detections = []
     for T, size, velocity, track, category, hits in zip(

@@ -1,10 +1,11 @@
 """Foredrive's additions to 123D's modalities.
 
-They are beams that did not return, exact occupancy, visibility, settings, captions and the plans of the
-expert. All are stored as 123D custom modalities with one row per frame. Each array is compressed separately
-with zstd, so that a row can be read without its neighbours.
+They are beams that did not return, exact occupancy, visibility and attributes of boxes, settings, captions
+and the plans of the expert. All are stored as 123D custom modalities with one row per frame. Each array is
+compressed separately with zstd, so that a row can be read without its neighbours.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 import pyarrow as pa
 import torch
 from jaxtyping import Float, Int
-from py123d.datatypes.custom.custom_modality import CustomModalityMetadata
+from py123d.datatypes import Timestamp
+from py123d.datatypes.custom.custom_modality import CustomModality, CustomModalityMetadata
 
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep, Trajectory, VoxelSpec
@@ -20,6 +22,8 @@ from foredrive.scene import LidarSweep, Trajectory, VoxelSpec
 LIDAR_BEAMS = "lidar_beams"
 FULL_OCCUPANCY = "full_occupancy"
 BOX_VISIBILITY = "box_visibility"
+BOX_ATTRIBUTE = "box_attribute"
+"""An `Attribute` for each box."""
 SETTING = "setting"
 """The facts of `data.setting.Setting`: words and numbers by field name."""
 CAPTION = "caption"
@@ -132,6 +136,17 @@ def pack_visibility(visibility: Float[np.ndarray, "M"]) -> dict[str, Any]:
 def unpack_visibility(data: dict[str, Any]) -> Float[np.ndarray, "M"]:
     """Invert `pack_visibility`."""
     return expand_array(data["visibility"]).astype(np.float32)
+
+
+def attributes_modality(attribute: Sequence[int], timestamp: Timestamp) -> CustomModality:
+    """Return the `Attribute`s of boxes, in the order of the frame's boxes, as a modality."""
+    data = {"attribute": squeeze_array(np.array(attribute, dtype=np.int8))}
+    return CustomModality(data, CustomModalityMetadata(BOX_ATTRIBUTE), timestamp)
+
+
+def unpack_attributes(data: dict[str, Any]) -> Int[np.ndarray, "M"]:
+    """Return the attributes of a row of `attributes_modality`."""
+    return expand_array(data["attribute"]).astype(np.int64)
 
 
 def pack_plan(plan: Trajectory) -> dict[str, Any]:

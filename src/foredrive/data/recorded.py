@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from py123d.datatypes import ModalityType, TrafficLightStatus
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor, from_numpy
@@ -11,6 +11,7 @@ from torch import Tensor, from_numpy
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
 from foredrive.data.modalities import (
+    BOX_ATTRIBUTE,
     BOX_VISIBILITY,
     CAPTION,
     EXPERT_PLAN,
@@ -18,6 +19,7 @@ from foredrive.data.modalities import (
     OLD_NAMES,
     SETTING,
     FullOccupancy,
+    unpack_attributes,
     unpack_occupancy,
     unpack_plan,
     unpack_visibility,
@@ -35,6 +37,15 @@ def read_visibility(log: Log, frame: int) -> Float[Tensor, "M"] | None:
         InputError: the row cannot be read.
     """
     return _read(log, frame, BOX_VISIBILITY, lambda row: from_numpy(unpack_visibility(row.data)))
+
+
+def read_attributes(log: Log, frame: int) -> Int[Tensor, "M"] | None:
+    """Read the `Attribute` of each box of `read_boxes`, or `UNKNOWN`. Return None if it was not recorded.
+
+    Raises:
+        InputError: the row cannot be read.
+    """
+    return _read(log, frame, BOX_ATTRIBUTE, lambda row: from_numpy(unpack_attributes(row.data)))
 
 
 def read_setting(log: Log, frame: int) -> Setting | None:

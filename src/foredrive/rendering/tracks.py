@@ -18,6 +18,7 @@ from foredrive.geometry.se3 import (
     yaw_from_matrix,
 )
 from foredrive.scene import Boxes, Category, Clip
+from foredrive.scene.boxes import unlabelled
 from foredrive.scene.record import Record
 
 SYMMETRIC_CATEGORIES = (
@@ -146,6 +147,7 @@ def boxes_at(
         track_id=tracks.track_id[near],
         category=tracks.category[near],
         valid=torch.ones_like(tracks.track_id[near], dtype=torch.bool),
+        **unlabelled(int(near.sum()), device=near.device),
     )
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from foredrive.lazy import on_demand
 
 if TYPE_CHECKING:
-    from foredrive.scene.boxes import Boxes, Category
+    from foredrive.scene.boxes import Attribute, Boxes, Category, Visibility
     from foredrive.scene.clip import Clip, Command, Example
     from foredrive.scene.detections import Detections
     from foredrive.scene.frames import Frames, last_frames
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Agent",
+    "Attribute",
     "Belief",
     "BicycleState",
     "Boxes",
@@ -59,6 +60,7 @@ __all__ = [
     "Step",
     "Task",
     "Trajectory",
+    "Visibility",
     "VoxelGrid",
     "VoxelSpec",
     "WorldModel",
@@ -68,7 +70,7 @@ __all__ = [
 __getattr__ = on_demand(
     __name__,
     {
-        "boxes": ("Boxes", "Category"),
+        "boxes": ("Attribute", "Boxes", "Category", "Visibility"),
         "clip": ("Clip", "Command", "Example"),
         "detections": ("Detections",),
         "frames": ("Frames", "last_frames"),

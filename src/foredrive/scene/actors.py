@@ -7,10 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from foredrive.scene.boxes import Boxes, Category
+from foredrive.scene.boxes import UNKNOWN, VEHICLES, Attribute, Boxes, Category, unlabelled
 
 BOX_RANGE_M = 80.0
 """Recordings and observations have boxes up to this distance from the ego vehicle, m."""
+
+MOVING_MPS = 0.2
+"""Speed above which a road user has the attribute of a moving one, m/s."""
 
 
 @dataclass(frozen=True)
@@ -63,4 +66,19 @@ def boxes_in_ego_frame(actors: Sequence[ActorState], T_world_ego: Float64[np.nda
         track_id=torch.tensor([a.track_id for a in actors], dtype=torch.int64),
         category=torch.tensor([int(a.category) for a in actors], dtype=torch.int64),
         valid=torch.ones(len(actors), dtype=torch.bool),
+        **unlabelled(len(actors))
+        | {"attribute": torch.tensor([_attribute(actor) for actor in actors], dtype=torch.int64)},
     )
+
+
+def _attribute(actor: ActorState) -> int:
+    """Return the `Attribute` of an actor. Two-wheelers have riders unless they are parked."""
+    moves = float(np.linalg.norm(actor.velocity_mps)) > MOVING_MPS
+    if actor.category in (Category.BICYCLE, Category.MOTORCYCLE):
+        return Attribute.CYCLE_WITHOUT_RIDER if actor.parked else Attribute.CYCLE_WITH_RIDER
+    if actor.category is Category.PEDESTRIAN:
+        return Attribute.PEDESTRIAN_MOVING if moves else Attribute.PEDESTRIAN_STANDING
+    if actor.category in VEHICLES:
+        at_rest = Attribute.VEHICLE_PARKED if actor.parked else Attribute.VEHICLE_STOPPED
+        return Attribute.VEHICLE_MOVING if moves else at_rest
+    return UNKNOWN

@@ -1,16 +1,18 @@
 """Recording of a drive of the expert in a town as a 123D log with exact labels."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from rich.progress import track
+from torch import Tensor
 
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import CameraSpec, Frame, LogWriter
@@ -214,9 +216,11 @@ def _frame(
         acceleration_ego_mps2=snapshot.acceleration_ego_mps2,
         images=frame.images,
         sweep=frame.sweep,
-        boxes=boxes_in_ego_frame(near, snapshot.T_world_ego),
+        boxes=replace(
+            boxes_in_ego_frame(near, snapshot.T_world_ego),
+            num_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
+        ),
         occupancy=None if spec is None else world.occupancy(snapshot.actors, snapshot.T_world_ego, spec),
-        lidar_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
         visibility=visibility if labels.visibility else None,
         setting=setting,
         caption=text,
@@ -247,11 +251,11 @@ def _ray_labels(
     return out
 
 
-def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
+def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[Tensor, "M"]:
     """Return how often each track was hit."""
     hit, count = np.unique(hit_ids, return_counts=True)
     counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
-    return np.array([counts.get(i, 0) for i in track_ids.tolist()], dtype=np.int64)
+    return torch.tensor([counts.get(i, 0) for i in track_ids.tolist()], dtype=torch.int64)
 
 
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:
