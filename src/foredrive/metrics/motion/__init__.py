@@ -1,0 +1,1 @@
+"""Forecasts of agents' motion, judged by every published protocol."""
