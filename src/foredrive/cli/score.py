@@ -9,11 +9,14 @@ from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.errors import InputError
 
 Family = Literal["gaussian", "laplace"]
+Task = Literal["sets", "occupancy"]
 
 
 def score(
     results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS")],
     truth: Path,
+    task: Task = "sets",
+    poses: OptionalPath = None,
     against: OptionalPath = None,
     out: Path = Path("runs/score"),
     family: Family = "gaussian",
@@ -21,15 +24,20 @@ def score(
     k: int = 25,
     worst: int = 6,
 ) -> None:
-    """Score detections as a random finite set; write summary.json, report.html and frames.jsonl.
+    """Score files of results; write summary.json and report.html.
 
     Args:
-        results: nuScenes or COCO results (JSON), or a folder of KITTI's text files. docs/sets.md describes
-            how such files state their uncertainty.
+        results: For sets: nuScenes or COCO results (JSON), or a folder of KITTI's text files; docs/sets.md
+            describes how such files state their uncertainty. For occupancy: a folder of npz files as Occ3D or
+            OpenOcc define them.
         truth: The ground truth in the same format; for COCO its instances.
-        against: Other results on the same frames, to compare with.
-        out: Folder for summary.json, report.html and frames.jsonl, which has the scores of every frame for
-            `foredrive search index --scores`.
+        task: sets: detections as a random finite set. The others are scored under all published protocols of
+            the task, see docs/tasks.md.
+        poses: For occupancy: nuscenes_infos_val.pkl or Occ3D's annotations.json. They tell which frames are
+            scored, and where the lidar was; without it there is no RayIoU.
+        against: For sets: other results on the same frames, to compare with.
+        out: Folder for summary.json, report.html and, for sets, frames.jsonl, which has the scores of every
+            frame for `foredrive search index --scores`.
         family: Family of the box densities.
         background_rate: Expected number of objects a frame that no detection explains, spread evenly over the
             truth's classes and the region. With 0, as in the paper, frames with such an object have an
@@ -37,12 +45,19 @@ def score(
         k: Number of best associations to sum if there are too many to sum all.
         worst: Number of frames to draw in the report, beginning with the largest NLL.
     """
-    for path in (results, truth, *(() if against is None else (against,))):
-        if not path.exists():
+    for path in (results, truth, against, poses):
+        if path is not None and not path.exists():
             raise InputError(f"{path}: No such file or directory")
+    check_out_folder(out)
+    if task != "sets":
+        if against is not None:
+            raise InputError("--against compares sets; it does not go with --task " + task)
+        _score_task(task, results, truth, out, poses)
+        return
+    if poses is not None:
+        raise InputError("--poses does not go with --task sets")
     check_number("--background-rate", background_rate, low=0)
     check_number("--k", k, low=1)
-    check_out_folder(out)
     check_number("--worst", worst, low=0)
 
     from rich.console import Console
@@ -57,3 +72,18 @@ def score(
     write_score_report(out / REPORT, f"{results.name} and the truth, {truth.name}", scored, figures, worst)
     print_table(score_table(figures), Console())
     print(f"wrote {out / SUMMARY}, {out / REPORT} and {out / FRAMES}")
+
+
+def _score_task(task: Task, results: Path, truth: Path, out: Path, poses: Path | None) -> None:
+    from rich.console import Console
+
+    from foredrive.runs.score.run import SUMMARY
+    from foredrive.runs.score.tasks import score_task
+    from foredrive.view.score_report import REPORT
+    from foredrive.view.table import print_table
+    from foredrive.view.task_report import task_tables, write_task_report
+
+    figures = score_task(task, results, truth, out, poses)
+    write_task_report(out / REPORT, f"{results.name} and the truth, {truth.name}", figures)
+    print_table(task_tables(figures)[0], Console())
+    print(f"wrote {out / SUMMARY} and {out / REPORT}")

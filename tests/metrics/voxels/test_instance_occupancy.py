@@ -14,6 +14,7 @@ from foredrive.errors import InputError
 from foredrive.metrics.voxels.instances import InstanceCounts, count_instances, draw_instances
 from foredrive.metrics.voxels.protocols import UNIAD_INSTANCES, InstanceProtocol
 from foredrive.scene import Boxes, Category
+from foredrive.scene.boxes import unlabelled
 
 UNIAD = UNIAD_INSTANCES
 
@@ -176,6 +177,7 @@ def some_boxes(rows: list[tuple[float, float, float, float, float, int, Category
         track_id=torch.tensor([row[5] for row in rows]),
         category=torch.tensor([int(row[6]) for row in rows]),
         valid=torch.ones(m, dtype=torch.bool),
+        **unlabelled(m),
     )
     return boxes[None, None]
 

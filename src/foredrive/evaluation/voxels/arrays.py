@@ -1,0 +1,90 @@
+"""Arrays of npz files of semantic voxels: checked by their headers before anything is read.
+
+The files hold X Y Z; everything here returns Z Y X. Nothing is unpickled.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from numpy import ndarray
+from numpy.lib import format as npy
+
+from foredrive.errors import InputError
+from foredrive.metrics.voxels.protocols import GRID
+
+SHAPE_XYZ = GRID.shape_zyx[::-1]
+VOXELS = int(np.prod(SHAPE_XYZ))
+
+
+def array_names(file: Path) -> set[str]:
+    """Return the names of the arrays in a file.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    with _opened(file) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
+def read_labels(file: Path, name: str, classes: tuple[str, ...]) -> UInt8[ndarray, "Z Y X"]:
+    """Read the class of each voxel.
+
+    Raises:
+        InputError: the array has another shape or type, or a class that is not among `classes`.
+    """
+    labels = _read(file, name, "iu")
+    if labels.min() < 0 or labels.max() >= len(classes):
+        wrong = labels.min() if labels.min() < 0 else labels.max()
+        raise InputError(f"{file}: {name}: unknown class {wrong}; there are 0 to {len(classes) - 1}")
+    return np.ascontiguousarray(labels.reshape(SHAPE_XYZ).T.astype(np.uint8))
+
+
+def read_mask(file: Path, name: str) -> Bool[ndarray, "Z Y X"]:
+    """Read a mask of voxels: 0 is not seen."""
+    return np.ascontiguousarray(_read(file, name, "biu").reshape(SHAPE_XYZ).T != 0)
+
+
+def read_velocities(file: Path, name: str) -> Float32[ndarray, "Z Y X 2"]:
+    """Read the velocity of each voxel, m/s. It may hold NaN."""
+    flow = _read(file, name, "f", per_voxel=2).reshape(*SHAPE_XYZ, 2)
+    return np.ascontiguousarray(flow.transpose(2, 1, 0, 3).astype(np.float32))
+
+
+def _read(file: Path, name: str, kinds: str, per_voxel: int = 1) -> ndarray:
+    """Read one array of the grid's size, flat or of the grid's shape, with leading dimensions of 1."""
+    with _opened(file) as archive:
+        if f"{name}.npy" not in archive.namelist():
+            raise InputError(f"{file}: has no array {name!r}")
+        with archive.open(f"{name}.npy") as stream:
+            version = npy.read_magic(stream)
+            header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            shape, _, dtype = header(stream)
+        last = () if per_voxel == 1 else (per_voxel,)
+        trimmed = shape
+        while len(trimmed) > 1 and trimmed[0] == 1:
+            trimmed = trimmed[1:]
+        if trimmed not in ((*SHAPE_XYZ, *last), (VOXELS, *last), (VOXELS * per_voxel,)):
+            wanted = " x ".join(map(str, (*SHAPE_XYZ, *last)))
+            raise InputError(f"{file}: {name}: expected {wanted} values, got an array of shape {shape}")
+        if dtype.kind not in kinds:
+            raise InputError(f"{file}: {name}: values of type {dtype} cannot be used")
+        with archive.open(f"{name}.npy") as stream:
+            return np.asarray(npy.read_array(stream, allow_pickle=False))
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            yield archive
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror or error}") from error
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{file}: not an npz file that can be read") from error

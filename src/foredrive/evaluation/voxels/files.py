@@ -1,0 +1,164 @@
+"""Folders of semantic voxels in the formats of Occ3D and OpenOcc: which frames there are, and their arrays.
+
+Truth is `SCENE/TOKEN/labels.npz` with `semantics`, and beside it `mask_camera` and `mask_lidar` (Occ3D) or
+`flow` (OpenOcc). A prediction is `TOKEN.npz`, or has the truth's layout; its classes are `semantics`, `pred`
+or an array without a name, as the public scripts write them, and its velocities `flow`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.voxels.arrays import array_names, read_labels, read_mask, read_velocities
+from foredrive.evaluation.voxels.poses import FramePose, read_poses
+from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.metrics.voxels.rays import ray_origins
+
+PREDICTED_NAMES = ("semantics", "pred", "arr_0")
+MASKS = ("mask_camera", "mask_lidar")
+
+
+@dataclass(frozen=True)
+class VoxelFrame:
+    """The voxels of one frame, Z Y X."""
+
+    predicted: UInt8[ndarray, "Z Y X"]
+    true: UInt8[ndarray, "Z Y X"]
+    seen_by_camera: Bool[ndarray, "Z Y X"]
+    seen_by_lidar: Bool[ndarray, "Z Y X"]
+    """Both are True everywhere where the data set has no masks."""
+    predicted_mps: Float32[ndarray, "Z Y X 2"] | None
+    """0 where the prediction has no velocities, as in the public code; None where the data set has none."""
+    true_mps: Float32[ndarray, "Z Y X 2"] | None
+    states_velocity: bool
+    """Whether the prediction has velocities."""
+
+
+@dataclass(frozen=True)
+class VoxelFiles:
+    """The files of frames, by token, predictions and truth of the same frames."""
+
+    data_set: str
+    """occ3d or openocc."""
+    results: Mapping[str, Path]
+    truth: Mapping[str, Path]
+    origins_m: Mapping[str, Float64[ndarray, "O 3"]] | None
+    """The lidar's places of each frame; None without poses."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the data set's classes."""
+        return OCC3D_CLASSES if self.data_set == "occ3d" else OPENOCC_CLASSES
+
+
+def find_voxels(results: Path, truth: Path, poses: Path | None = None) -> VoxelFiles:
+    """Find the frames to be scored: those that `poses` lists, otherwise all of `truth`.
+
+    Raises:
+        InputError: a frame lacks its prediction or its truth, or the folders hold no such files.
+    """
+    places = None if poses is None else read_poses(poses)
+    true = _labels_by_token(truth)
+    if not true:
+        raise InputError(f"{truth}: holds no SCENE/TOKEN/labels.npz")
+    predicted = _results_by_token(results)
+    frames, listed = list(true if places is None else places), poses or truth
+    if places is not None:
+        absent = [token for token in frames if token not in true]
+        if absent:
+            raise InputError(
+                f"{truth}: has no labels of frame {absent[0]}, which {poses} lists{_more(absent)}"
+            )
+    if not set(predicted) & set(frames):
+        raise InputError(
+            f"{results}: holds none of the {len(frames)} frames of {listed}: is it another split?"
+        )
+    unknown = [token for token in predicted if token not in set(frames)]
+    if unknown:
+        raise InputError(f"{predicted[unknown[0]]}: {listed} has no frame {unknown[0]}{_more(unknown)}")
+    missing = [token for token in frames if token not in predicted]
+    if missing:
+        raise InputError(f"{results}: has no prediction of frame {missing[0]} of {listed}{_more(missing)}")
+    return VoxelFiles(
+        data_set=_data_set(true[frames[0]]),
+        results=predicted,
+        truth={token: true[token] for token in frames},
+        origins_m=None if places is None else _origins(places, true),
+    )
+
+
+def read_frame(files: VoxelFiles, token: str) -> VoxelFrame:
+    """Read one frame.
+
+    Raises:
+        InputError: an array is missing, has another shape or holds an unknown class or, in a prediction, a
+            velocity that is not finite. The message names the file and the array.
+    """
+    truth, result = files.truth[token], files.results[token]
+    true = read_labels(truth, "semantics", files.classes)
+    names = array_names(result)
+    name = next((name for name in PREDICTED_NAMES if name in names), None)
+    if name is None:
+        raise InputError(f"{result}: has no array named {', '.join(PREDICTED_NAMES[:-1])}")
+    predicted = read_labels(result, name, files.classes)
+    if files.data_set == "occ3d":
+        camera, lidar = (read_mask(truth, mask) for mask in MASKS)
+        return VoxelFrame(predicted, true, camera, lidar, None, None, states_velocity=False)
+    true_mps, seen = read_velocities(truth, "flow"), np.ones(true.shape, np.bool_)
+    stated = "flow" in names
+    predicted_mps = read_velocities(result, "flow") if stated else np.zeros_like(true_mps)
+    if not np.isfinite(predicted_mps).all():
+        raise InputError(f"{result}: flow: a velocity is not finite")
+    return VoxelFrame(predicted, true, seen, seen, predicted_mps, true_mps, states_velocity=stated)
+
+
+def _labels_by_token(folder: Path) -> dict[str, Path]:
+    """Return the files SCENE/TOKEN/labels.npz by token."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.glob("*/*/labels.npz")):
+        token = path.parent.name
+        if token in found:
+            raise InputError(f"{path}: frame {token} is also in {found[token].parent.parent}")
+        found[token] = path
+    return found
+
+
+def _results_by_token(folder: Path) -> dict[str, Path]:
+    flat = {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    found = flat or _labels_by_token(folder)
+    if not found:
+        raise InputError(f"{folder}: holds neither TOKEN.npz nor SCENE/TOKEN/labels.npz")
+    return found
+
+
+def _data_set(file: Path) -> str:
+    names = array_names(file)
+    if "flow" in names:
+        return "openocc"
+    if set(MASKS) <= names:
+        return "occ3d"
+    raise InputError(f"{file}: has neither {' and '.join(MASKS)} (Occ3D) nor flow (OpenOcc)")
+
+
+def _origins(poses: Mapping[str, FramePose], truth: Mapping[str, Path]) -> dict[str, Float64[ndarray, "O 3"]]:
+    """Return the lidar's places of each frame; frames of one scene folder are a drive."""
+    drives: dict[str, list[str]] = {}
+    for token in sorted(poses, key=lambda token: poses[token].time):
+        drives.setdefault(truth[token].parent.parent.name, []).append(token)
+    origins: dict[str, Float64[ndarray, "O 3"]] = {}
+    for tokens in drives.values():
+        T_world_ego, T_ego_lidar = (
+            np.stack([getattr(poses[token], name) for token in tokens])
+            for name in ("T_world_ego", "T_ego_lidar")
+        )
+        origins |= {token: ray_origins(T_world_ego, T_ego_lidar, n) for n, token in enumerate(tokens)}
+    return origins
+
+
+def _more(tokens: list[str]) -> str:
+    return f" (and {len(tokens) - 1} more)" if len(tokens) > 1 else ""

@@ -1,0 +1,47 @@
+"""Score results files under the published protocols of a task, into a folder of results."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.progress import Progress
+
+from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
+from foredrive.evaluation.summary import Figures, write_summary
+from foredrive.evaluation.voxels.files import find_voxels
+from foredrive.evaluation.voxels.score import score_voxels
+from foredrive.runs.score.run import SUMMARY
+
+
+def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
+    """Return the figures of folders of semantic voxels, see `evaluation.voxels`."""
+    files = find_voxels(results, truth, poses)
+    with Progress(transient=True) as progress:
+        bar = progress.add_task(results.name, total=len(files.truth))
+        return score_voxels(files, on_frame=lambda: progress.advance(bar))
+
+
+TASKS: dict[str, Callable[[Path, Path, Path | None], Figures]] = {"occupancy": score_occupancy}
+"""Functions of results, truth and poses, by the name of their task."""
+
+
+def score_task(task: str, results: Path, truth: Path, out: Path, poses: Path | None = None) -> Figures:
+    """Score results under all protocols of a task; write `out/summary.json`.
+
+    Args:
+        task: one of `TASKS`.
+        results, truth: files or folders as the task's data sets define them.
+        poses: where the sensors were, for tasks that need it.
+
+    Returns:
+        The written summary.
+
+    Raises:
+        InputError: a file cannot be read, or results and truth are not of the same frames.
+    """
+    started = time.perf_counter()
+    figures = TASKS[task](results, truth, poses)
+    figures |= {"task": task, "wall_s": time.perf_counter() - started}
+    figures |= {"peak_rss_gib": peak_rss_gib(), **collect_provenance()}
+    write_summary(out / SUMMARY, figures)
+    return figures
