@@ -56,10 +56,10 @@ $(ORACLE_STAMP): $(STAMP)
 
 # Our metrics beside the reference code itself; `make test` compares with its figures in golden.json.
 test-oracles: $(ORACLE_STAMP)
-	OMP_NUM_THREADS=1 .venv-oracles/bin/python -m pytest -m oracle tests/oracles
+	PYTHONPATH=src OMP_NUM_THREADS=1 .venv-oracles/bin/python -m pytest -m oracle tests/oracles
 
 golden: $(ORACLE_STAMP)
-	PYTHONPATH=tests .venv-oracles/bin/python tests/oracles/make_golden.py
+	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/make_golden.py
 
 clean:
 	rm -rf .venv .venv-oracles runs build dist
