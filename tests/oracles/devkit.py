@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-
 from oracles.synthetic import RACK, Drives, detection_boxes, tracking_boxes
 
 

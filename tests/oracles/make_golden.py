@@ -5,10 +5,11 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 from oracles import devkit
 from oracles.synthetic import make_drives
 from oracles.track_sequences import clear_by_motmetrics, hota_by_trackeval, make_sequence
+
+from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 
 GOLDEN = Path(__file__).with_name("golden.json")
 SEEDS = (0, 1)
