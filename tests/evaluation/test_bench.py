@@ -83,3 +83,52 @@ def test_wrong_names_and_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a benchmark's results"):
         run_benchmark("speed", recorder.benchmark(), tmp_path, say=recorder.said.append)
     assert recorder.measured == []
+
+
+def _study(decided_by: tuple[str, ...], size: int = 3) -> Benchmark:
+    return Benchmark(
+        "which is better?", {"ours": lambda seed: {"iou": 0.1 * seed}}, (0, 1), {"size": size}, decided_by
+    )
+
+
+def _module(folder: Path, code: str) -> tuple[str, ...]:
+    package = folder / "decisive"
+    package.mkdir(exist_ok=True)
+    (package / "__init__.py").write_text("")
+    (package / "model.py").write_text(code)
+    return ("decisive",)
+
+
+def test_a_study_outlives_commits_machines_and_comments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    decided_by = _module(tmp_path, "def half(x):\n    return x / 2\n")
+    first = {"commit": "aaa", "machine.cpu": "old", "machine.cores": 2}
+    monkeypatch.setattr("foredrive.evaluation.bench.collect_provenance", lambda: first)
+    study = dataclasses.replace(_study(decided_by), seeds=(0,))
+    run_benchmark("study", study, tmp_path, say=lambda line: None)
+
+    decided_by = _module(tmp_path, 'def half(x):\n    """Return half."""\n    return x / 2  # exact\n')
+    second = {"commit": "bbb", "machine.cpu": "new", "machine.cores": 4}
+    monkeypatch.setattr("foredrive.evaluation.bench.collect_provenance", lambda: second)
+    path = run_benchmark("study", _study(decided_by), tmp_path, say=lambda line: None)
+    runs = json.loads(path.read_text())["runs"]
+    assert [(run["seed"], run["commit"], run["machine.cpu"]) for run in runs] == [
+        (0, "aaa", "old"),
+        (1, "bbb", "new"),
+    ]
+
+
+@pytest.mark.parametrize("change", ["code", "config"])
+def test_a_study_starts_anew_where_what_decides_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    decided_by = _module(tmp_path, "def half(x):\n    return x / 2\n")
+    said: list[str] = []
+    run_benchmark("study", _study(decided_by), tmp_path, say=said.append)
+    if change == "code":
+        _module(tmp_path, "def half(x):\n    return x // 2\n")
+    run_benchmark("study", _study(decided_by, size=4 if change == "config" else 3), tmp_path, say=said.append)
+    assert any("starting anew" in line for line in said)

@@ -1,10 +1,14 @@
 """Benchmarks: arms side by side, over seeds, stored after each measurement.
 
-A benchmark runs seed by seed and arm by arm. An interrupted run goes on where it stopped. Figures are kept
-only while the code (commit and changes since), the benchmark's configuration and the machine are the same.
+A benchmark runs seed by seed and arm by arm. An interrupted run goes on where it stopped. Figures of speed
+are kept only while the code (commit and changes since), the benchmark's configuration and the machine are the
+same. Figures of quality, such as those of trained models, stand together as long as the configuration and the
+modules that decide them are the same, so a study may go on at another commit and on another machine.
 """
 
+import ast
 import hashlib
+import importlib.util
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +22,9 @@ from foredrive.errors import InputError
 from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 
+MADE_ON = ("commit", "machine.cpu", "machine.cores")
+"""Entries of the provenance that every run keeps for itself."""
+
 
 @dataclass(frozen=True)
 class Benchmark:
@@ -30,6 +37,9 @@ class Benchmark:
     seeds: tuple[int, ...] = (0, 1, 2)
     config: Mapping[str, Any] | None = None
     """Values that the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
+    decided_by: tuple[str, ...] | None = None
+    """Modules and packages whose code decides the figures of a study of quality, by full name. None: the
+    figures are speeds, which depend on commit and machine."""
 
 
 def run_benchmark(
@@ -57,7 +67,7 @@ def run_benchmark(
     path = folder / f"{name}.json"
     origin = collect_provenance()
     same = _identity(benchmark, origin)
-    runs = _kept_runs(path, same, benchmark, say)
+    runs = _kept_runs(path, same, benchmark, origin, say)
     chosen = [arm for arm in benchmark.arms if arms is None or arm in arms]
     for seed, arm in product(benchmark.seeds, chosen):  # what is interrupted has all arms beside each other
         if any(run["arm"] == arm and run["seed"] == seed for run in runs):
@@ -67,7 +77,8 @@ def run_benchmark(
         started = time.perf_counter()
         figures = {key: float(value) for key, value in benchmark.arms[arm](seed).items()}
         wall_s = time.perf_counter() - started
-        runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s})
+        made_on = {key: origin[key] for key in MADE_ON}
+        runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s, **made_on})
         write_json(path, _report(name, benchmark, origin, same, runs))
         say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
     if not path.is_file():
@@ -117,15 +128,61 @@ def _report(
 
 def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
     """Return a digest of all facts that make two measurements comparable."""
+    if benchmark.decided_by is not None:
+        return study_identity(benchmark.config or {}, benchmark.decided_by)
     parts = {key: value for key, value in origin.items() if key != "command"}
     parts["config"] = dict(benchmark.config or {})
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def study_identity(config: Mapping[str, Any], decided_by: Sequence[str]) -> str:
+    """Return a digest of a configuration and of the code of modules, without comments and docstrings.
+
+    Args:
+        config: JSON-able values.
+        decided_by: modules and packages by full name; a package stands for all modules in it.
+
+    Raises:
+        ImportError: there is no such module.
+    """
+    digest = hashlib.sha256(json.dumps(dict(config), sort_keys=True).encode())
+    for name in sorted(decided_by):
+        for path in _sources(name):
+            digest.update(f"{name}/{path.name}".encode() + _code_of(path).encode())
+    return digest.hexdigest()[:16]
+
+
+def _sources(name: str) -> list[Path]:
+    """Return the files of a module or package."""
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.origin is None:
+        raise ImportError(f"no module {name!r}")
+    path = Path(spec.origin)
+    return sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+
+
+def _code_of(path: Path) -> str:
+    """Return the syntax tree of a file without its docstrings."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [part for part in node.body if not _is_text(part)]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a string alone: a docstring."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
 def _kept_runs(
-    path: Path, same: str, benchmark: Benchmark, say: Callable[[str], None]
+    path: Path, same: str, benchmark: Benchmark, origin: Mapping[str, Any], say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Return the earlier runs that still hold."""
+    """Return the earlier runs that still hold, each with the commit and machine that it was made on."""
     if not path.is_file():
         return []
     try:
@@ -137,6 +194,7 @@ def _kept_runs(
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not a benchmark's results; move it away to start anew") from error
     if identity == same:
-        return runs
+        made_on = {key: earlier.get(key, origin[key]) for key in MADE_ON}  # files that have it once for all
+        return [made_on | run for run in runs]
     say(f"{path.name}: measured on other code, configuration or machine; starting anew")
     return []
