@@ -22,6 +22,7 @@ from foredrive.view.summary_tables import (
     planning_overview,
     planning_table,
     prior_comparison,
+    vehicle_table,
 )
 from foredrive.view.table import Value, number, words
 
@@ -80,7 +81,12 @@ def report_on_run(
 def write_run_report(path: Path, report: RunReport) -> None:
     """Write the page."""
     summary = report.summary
-    tables = (occupancy_table(summary), flow_table(summary), image_table(summary))
+    tables = (
+        occupancy_table(summary),
+        vehicle_table(summary),
+        flow_table(summary),
+        image_table(summary),
+    )
     write_page(
         path,
         "run_report.html.j2",

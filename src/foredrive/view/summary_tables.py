@@ -50,12 +50,13 @@ _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
 _FLOW = re.compile(r"flow\.epe_moving_(\w+)_mps")
+_VEHICLES = re.compile(r"vehicles\.car_recall_(\d+)m")
 _IMAGES = re.compile(r"(\w+(?:\.\w+)*)\.psnr_db")
 
 
 def print_summary(summary: Summary, console: Console, model: str) -> None:
     """Print the main metrics."""
-    for make in (occupancy_table, planning_table, flow_table, image_table):
+    for make in (occupancy_table, vehicle_table, planning_table, flow_table, image_table):
         if table := make(summary):
             print_table(table, console)
     console.print(
@@ -152,6 +153,17 @@ def flow_table(summary: Summary) -> Table | None:
         Column("error of predicting no motion, m/s", digits=2),
     )
     return simple_table(columns, rows, "Flow on moving voxels") if rows else None
+
+
+def vehicle_table(summary: Summary) -> Table | None:
+    """List the recall of the columns that hold a car, by range."""
+    rows = [
+        (f"within {found[1]} m", value, summary.get(f"vehicles.car_columns_{found[1]}m"))
+        for key, value in summary.items()
+        if (found := _VEHICLES.fullmatch(key))
+    ]
+    columns = (Column(align="left"), Column("recall"), Column("columns", digits=0))
+    return simple_table(columns, rows, "Columns of the grid that hold a car") if rows else None
 
 
 def image_table(summary: Summary) -> Table | None:

@@ -6,11 +6,13 @@ from foredrive.evaluation.metrics.futures import FuturesMetric
 from foredrive.evaluation.metrics.images import ImageMetric
 from foredrive.evaluation.metrics.occupancy import OccupancyMetric
 from foredrive.evaluation.metrics.planning import PlanningMetric
+from foredrive.evaluation.metrics.vehicles import VehicleMetric
 
 METRICS: tuple[MetricFactory, ...] = (
     OccupancyMetric,
     FuturesMetric,
     FlowMetric,
+    VehicleMetric,
     ImageMetric,
     PlanningMetric,
 )

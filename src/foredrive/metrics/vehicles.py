@@ -1,0 +1,58 @@
+"""Recall of vehicles in predicted occupancy: do the columns of the grid that hold a car look occupied?
+
+IoU hardly counts cars: they are few of the occupied voxels. A planner needs them most.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.metrics.occupancy import above_ground
+from foredrive.scene import Boxes, Category, VoxelGrid, VoxelSpec
+
+CARS = (Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER, Category.CONSTRUCTION_VEHICLE)
+
+
+def car_columns(boxes: Boxes, labels: VoxelGrid, range_m: float) -> Bool[Tensor, "b Y X"]:
+    """Return the columns that hold a car: observed as occupied above the ground, and inside a car's box.
+
+    A column is inside a box if the box, half a voxel wider on each side, contains its centre. The voxel of
+    a return from a car's side is then inside.
+
+    Args:
+        boxes: [b] of one frame.
+        labels: [b 1 Z Y X] of the same frame, on the same ego frame.
+        range_m: maximum distance of the column's centre from the ego frame's origin.
+    """
+    spec = labels.spec
+    observed = (labels.values[:, 0] > 0.5) & labels.known & above_ground(spec).to(labels.known.device)
+    centre = spec.centres_m()[0, ..., :2].to(boxes.centre)  # [Y, X, 2]
+    offset = centre[:, :, None] - boxes.centre[:, None, None, :, :2]  # [b, Y, X, M, 2]
+    cos, sin = boxes.yaw.cos()[:, None, None], boxes.yaw.sin()[:, None, None]
+    along = cos * offset[..., 0] + sin * offset[..., 1]
+    across = cos * offset[..., 1] - sin * offset[..., 0]
+    half = 0.5 * (boxes.size_lwh[:, None, None, :, :2] + spec.voxel_m)
+    is_car = boxes.valid & torch.isin(boxes.category, torch.tensor(CARS).to(boxes.category))
+    inside = (along.abs() <= half[..., 0]) & (across.abs() <= half[..., 1]) & is_car[:, None, None]
+    return observed.any(1) & inside.any(-1) & (centre.norm(dim=-1) <= range_m)
+
+
+def found_columns(predicted: Bool[Tensor, "b Z Y X"], spec: VoxelSpec) -> Bool[Tensor, "b Y X"]:
+    """Return the columns with any predicted voxel above the ground."""
+    return (predicted & above_ground(spec).to(predicted.device)).any(1)
+
+
+def count_car_columns(
+    predicted: Bool[Tensor, "b Z Y X"], boxes: Boxes, labels: VoxelGrid, range_m: Float[Tensor, "R"]
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """Return the numbers of found columns and of all columns that hold a car, within each range.
+
+    Args:
+        predicted: occupancy of one frame.
+        boxes, labels: ground truth of that frame, see `car_columns`.
+        range_m: maximum distances.
+    """
+    found = found_columns(predicted, labels.spec)
+    truth = [car_columns(boxes, labels, float(limit)) for limit in range_m]
+    hits = torch.stack([(found & columns).sum() for columns in truth])
+    return hits.cpu(), torch.stack([columns.sum() for columns in truth]).cpu()
