@@ -8,7 +8,8 @@ import synthetic_log as world
 import torch
 from arrow_surgery import rewrite_column
 
-from foredrive.data.labels import BOX_MARGIN_M, LabelStore, VoxelLabels, make_labels, voxel_labels
+from foredrive.data.label_store import LabelStore
+from foredrive.data.labels import BOX_MARGIN_M, VoxelLabels, make_labels, voxel_labels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import find_logs
 from foredrive.data.logs import Log

@@ -25,6 +25,12 @@ def test_levels_have_the_strides_of_their_stages() -> None:
     assert [tuple(level.shape) for level in levels] == [(2, 16, 24, 12), (2, 4, 6, 12)]
 
 
+def test_a_stem_without_pooling_halves_the_strides() -> None:
+    config = dataclasses.replace(CONFIG, stem_stride=2)
+    levels = ImageBackbone(config, channels=12)(torch.zeros(2, 3, 64, 96, dtype=torch.uint8))
+    assert [tuple(level.shape) for level in levels] == [(2, 32, 48, 12), (2, 8, 12, 12)]
+
+
 def test_white_is_normalised_as_imagenet_does() -> None:
     white = normalise_images(torch.full((1, 3, 1, 1), 255, dtype=torch.uint8)).flatten()
     torch.testing.assert_close(white, torch.tensor([2.2489, 2.4286, 2.6400]), atol=1e-3, rtol=0)

@@ -15,7 +15,7 @@ def train(
     logs: SomePaths,
     out: Path,
     cache: OptionalPath = None,
-    occupancy: Literal["lidar", "recorded"] = "lidar",
+    occupancy: Literal["lidar", "accumulated", "recorded"] = "lidar",
     start: OptionalPath = None,
     set: Settings = (),
 ) -> None:
@@ -26,8 +26,10 @@ def train(
         logs: 123D logs, splits or data roots to train on.
         out: Folder of the run. If it holds this run already, training continues from the last checkpoint.
         cache: Folder for voxel labels and shrunk images; by default "cache" in the run's folder.
-        occupancy: Source of the voxel labels: the voxels that lidar beams hit and passed through, or the
-            exact occupancy that towns record, visible or not. The run is evaluated with the same labels.
+        occupancy: Source of the voxel labels: "lidar", the voxels that beams of the frame's sweep hit and
+            passed through; "accumulated", those of sweeps within 3 s too; or "recorded", the exact occupancy
+            that towns record, visible or not. A run with recorded labels is evaluated with them, others with
+            those of the frame's sweep.
         start: Another run's folder: use its pre-trained weights and begin with fine-tuning.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
             prints all entries.

@@ -1,5 +1,6 @@
 """A torch dataset of clips from 123D logs, with voxel labels."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.commands import command_at, target_at
 from foredrive.data.frame_store import FrameStore
-from foredrive.data.labels import LabelStore, VoxelLabels
+from foredrive.data.label_store import LabelStore
+from foredrive.data.labels import VoxelLabels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
@@ -48,15 +50,23 @@ class ClipConfig:
     lidar: bool = False
     """Read lidar sweeps into the clip."""
     map: bool = False
-    occupancy_source: Literal["lidar", "recorded"] = "lidar"
-    """Source of the voxel labels: "lidar" for beams of the sweep, or "recorded" for the exact occupancy and
-    flow in recordings of towns, which includes voxels that no sensor has observed."""
+    occupancy_source: Literal["lidar", "accumulated", "recorded"] = "lidar"
+    """Source of the voxel labels: "lidar" for beams of the frame's own sweep, "accumulated" for those of the
+    frames within 3 s too, or "recorded" for the exact occupancy and flow in recordings of towns, which
+    includes voxels that no sensor has observed. Evaluations judge by "lidar" instead of "accumulated"."""
     future_source: Literal["driven", "expert"] = "driven"
     """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
     DAgger demonstrations. Clips without such a plan use the driven path."""
     part_s: tuple[float, float] | None = None
     """Part of each log, (start, end) in s since its start, end exclusive. Only clips with now and all later
     frames inside it are used. None is the whole log."""
+
+    @property
+    def judged(self) -> "ClipConfig":
+        """Return the clips of an evaluation: labels of neighbouring sweeps are for training alone."""
+        if self.occupancy_source != "accumulated":
+            return self
+        return dataclasses.replace(self, occupancy_source="lidar")
 
 
 class ClipDataset(Dataset[Example]):
@@ -86,7 +96,9 @@ class ClipDataset(Dataset[Example]):
         self._cameras = [pinhole_cameras(log) for log in self._logs]
         self.camera_names = self._choose_cameras()
         self._frames = FrameStore(cache_dir, config.image_hw, self.camera_names)
-        self._labels = LabelStore(cache_dir, config.voxels)
+        self._labels = LabelStore(
+            cache_dir, config.voxels, accumulated_labels if config.occupancy_source == "accumulated" else None
+        )
         self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}
         for number, log in enumerate(self._logs):

@@ -1,27 +1,18 @@
-"""Voxel labels from lidar beams (pseudo-occupancy) and from tracks (flow), with a disk cache."""
+"""Voxel labels from lidar beams (pseudo-occupancy) and from tracks (flow)."""
 
-import hashlib
-import logging
-import zlib
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
-from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack_encode_with_numpy
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
 from foredrive.data.beam_casting import FREE, OCCUPIED, UNKNOWN, box_of_points, cast_beams
 from foredrive.data.boxes import read_boxes
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
-from foredrive.data.modalities import expand_array, squeeze_array
-from foredrive.files import atomic_path
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
-LABEL_VERSION = 2
-"""Version in every cache key. Increase it when the labels change."""
 FREE_MARGIN_VOXELS = 0.5
 """Distance before a return within which a beam frees no voxel. Ranges are noisy, and a surface at the border
 of a voxel must not free the voxel in front of it, which it also occupies."""
@@ -29,8 +20,6 @@ EGO_MARGIN_M = 0.2
 """Margin around the ego vehicle's box. Returns inside (e.g. mirrors) are dropped."""
 BOX_MARGIN_M = 0.1
 """Margin around annotated boxes when points are assigned to them."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,26 +52,11 @@ def voxel_labels(
         boxes: unbatched, in the ego frame. None if the frame is not annotated; then the flow is unknown.
         ego_box: centre and size (length, width, height) of the ego vehicle in its frame, m.
     """
-    beams = sweep if bool(sweep.valid.all()) else sweep[sweep.valid]
-    origin = beams.origin_ego.numpy().astype(np.float64)
-    direction = beams.dir_ego.numpy().astype(np.float64)
-    range_m = beams.range_m.numpy().astype(np.float64)
-    returned = beams.returned.numpy()
-    ends = origin + direction * range_m[:, None]
-    if ego_box is not None:
-        on_ego = returned & _on_ego(ends, origin, *ego_box)
-        origin, range_m, returned, ends = (a[~on_ego] for a in (origin, range_m, returned, ends))
-
-    state = np.full(spec.shape_zyx, UNKNOWN, dtype=np.uint8)
-    points = ends[returned]
+    beams = beams_of(sweep, ego_box)
+    state = observed_state(beams, spec)
+    points = beams.ends[beams.returned]
     voxel = _voxels(points, spec)
     inside = voxel >= 0
-    state.reshape(-1)[voxel[inside]] = OCCUPIED
-    lower = np.asarray(spec.lower_m)
-    margin_m = np.where(returned, FREE_MARGIN_VOXELS * spec.voxel_m, 0.0)
-    free_until = np.where(range_m > 0, 1.0 - margin_m / np.maximum(range_m, 1e-6), 0.0)
-    cast_beams((origin - lower) / spec.voxel_m, (ends - lower) / spec.voxel_m, free_until, state)
-
     occupied = state == OCCUPIED
     flow_mps, flow_known = _flow(points[inside], voxel[inside], occupied, boxes)
     return VoxelLabels(
@@ -91,6 +65,48 @@ def voxel_labels(
         flow_mps=torch.from_numpy(flow_mps),
         flow_known=torch.from_numpy(flow_known),
     )
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Beams of a sweep, in m. The ego vehicle's own returns are left out."""
+
+    origin: Float64[np.ndarray, "N 3"]
+    ends: Float64[np.ndarray, "N 3"]
+    """Returns, or the points up to which misses are known to be free."""
+    range_m: Float64[np.ndarray, "N"]
+    returned: Bool[np.ndarray, "N"]
+
+
+def beams_of(
+    sweep: LidarSweep, ego_box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None
+) -> Beams:
+    """Return the valid beams of an unbatched sweep, in its ego frame, without those that hit the ego vehicle.
+
+    Args:
+        ego_box: centre and size (length, width, height) of the ego vehicle in its frame, m.
+    """
+    beams = sweep if bool(sweep.valid.all()) else sweep[sweep.valid]
+    origin = beams.origin_ego.numpy().astype(np.float64)
+    range_m = beams.range_m.numpy().astype(np.float64)
+    ends = origin + beams.dir_ego.numpy().astype(np.float64) * range_m[:, None]
+    returned = beams.returned.numpy()
+    if ego_box is None:
+        return Beams(origin, ends, range_m, returned)
+    kept = ~(returned & _on_ego(ends, origin, *ego_box))
+    return Beams(origin[kept], ends[kept], range_m[kept], returned[kept])
+
+
+def observed_state(beams: Beams, spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X"]:
+    """Return UNKNOWN, FREE or OCCUPIED for each voxel of a grid in the frame of the beams."""
+    state = np.full(spec.shape_zyx, UNKNOWN, dtype=np.uint8)
+    voxel = _voxels(beams.ends[beams.returned], spec)
+    state.reshape(-1)[voxel[voxel >= 0]] = OCCUPIED
+    lower = np.asarray(spec.lower_m)
+    margin_m = np.where(beams.returned, FREE_MARGIN_VOXELS * spec.voxel_m, 0.0)
+    free_until = np.where(beams.range_m > 0, 1.0 - margin_m / np.maximum(beams.range_m, 1e-6), 0.0)
+    cast_beams((beams.origin - lower) / spec.voxel_m, (beams.ends - lower) / spec.voxel_m, free_until, state)
+    return state
 
 
 def _on_ego(
@@ -142,41 +158,6 @@ def _flow(
     return flow, known
 
 
-class LabelStore:
-    """A disk cache of the labels of a log's frames.
-
-    The name of an entry is a hash of everything that the labels depend on: the log's files (name, size,
-    modification time), the frame's time, the grid and `LABEL_VERSION`. Entries are written atomically.
-    Damaged entries are replaced.
-    """
-
-    def __init__(self, cache_dir: Path | None, spec: VoxelSpec) -> None:
-        self._folder = None if cache_dir is None else Path(cache_dir) / "labels"
-        self._spec = spec
-
-    def labels(self, log: Log, frame: int) -> VoxelLabels:
-        """Return the labels of one frame. All voxels are unknown if the log has no sweep there."""
-        file = self._file(log, frame)
-        if file is not None:
-            kept = _read_entry(file, self._spec)
-            if kept is not None:
-                return kept
-        labels = make_labels(log, frame, self._spec)
-        if file is None:
-            return labels
-        entry = _encode(labels)
-        with atomic_path(file) as temporary:
-            temporary.write_bytes(entry)
-        return _decode(entry, self._spec)  # velocities are rounded here as in later reads
-
-    def _file(self, log: Log, frame: int) -> Path | None:
-        if self._folder is None:
-            return None
-        key = (LABEL_VERSION, log.fingerprint, int(log.t_us[frame]), self._spec)
-        name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
-        return self._folder / name[:2] / f"{name}.labels"
-
-
 def make_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
     """Read a frame's sweep and boxes and compute its labels.
 
@@ -185,52 +166,11 @@ def make_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
     """
     read = read_sweep(log, frame)
     if read is None:
-        nothing = torch.zeros(spec.shape_zyx, dtype=torch.bool)
-        return VoxelLabels(nothing, nothing, torch.zeros(3, *spec.shape_zyx), nothing)
+        return nothing_known(spec)
     return voxel_labels(read[0], spec, read_boxes(log, frame), log.ego_box)
 
 
-def _encode(labels: VoxelLabels) -> bytes:
-    """Encode bit masks of the grids and velocities of moving voxels, with a checksum in front."""
-    occupied = labels.occupied.numpy()
-    moving = np.flatnonzero(labels.flow_mps.numpy().any(0))
-    arrays: dict[str, np.ndarray] = {
-        "occupied": np.packbits(occupied),
-        "known": np.packbits(labels.known.numpy()),
-        "flow_known": np.packbits(labels.flow_known.numpy()[occupied]),
-        "moving": moving.astype(np.uint32),
-        "velocity_mps": labels.flow_mps.numpy().reshape(3, -1)[:, moving].astype(np.float16),
-    }
-    body: bytes = msgpack_encode_with_numpy({name: squeeze_array(array) for name, array in arrays.items()})
-    return zlib.crc32(body).to_bytes(4, "little") + body
-
-
-def _decode(data: bytes, spec: VoxelSpec) -> VoxelLabels:
-    if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
-        raise ValueError("checksum")
-    arrays = {name: expand_array(packed) for name, packed in msgpack_decode_with_numpy(data[4:]).items()}
-    count = int(np.prod(spec.shape_zyx))
-    occupied = np.unpackbits(arrays["occupied"], count=count).astype(bool)
-    flow_known = np.zeros(count, dtype=bool)
-    flow_known[occupied] = np.unpackbits(arrays["flow_known"], count=int(occupied.sum())).astype(bool)
-    flow = np.zeros((3, count), dtype=np.float32)
-    flow[:, arrays["moving"]] = arrays["velocity_mps"]
-    grid = spec.shape_zyx
-    return VoxelLabels(
-        occupied=torch.from_numpy(occupied.reshape(grid)),
-        known=torch.from_numpy(np.unpackbits(arrays["known"], count=count).astype(bool).reshape(grid)),
-        flow_mps=torch.from_numpy(flow.reshape(3, *grid)),
-        flow_known=torch.from_numpy(flow_known.reshape(grid)),
-    )
-
-
-def _read_entry(file: Path, spec: VoxelSpec) -> VoxelLabels | None:
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        return None
-    try:
-        return _decode(data, spec)
-    except Exception as error:  # any damaged entry can be computed again
-        _log.warning("%s is damaged (%s) and is made anew", file, error)
-        return None
+def nothing_known(spec: VoxelSpec) -> VoxelLabels:
+    """Return labels of which all voxels are unknown."""
+    nothing = torch.zeros(spec.shape_zyx, dtype=torch.bool)
+    return VoxelLabels(nothing, nothing, torch.zeros(3, *spec.shape_zyx), nothing)

@@ -15,7 +15,6 @@ from foredrive.errors import InputError
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-IMAGE_STRIDE = {"stage1": 4, "stage2": 8, "stage3": 16, "stage4": 32}
 
 
 def normalise_images(images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
@@ -43,6 +42,8 @@ class BackboneConfig:
     layer_type: Literal["basic", "bottleneck"]
     stages: tuple[str, ...]
     """Stages that feed the pyramid, e.g. ("stage2", "stage3")."""
+    stem_stride: Literal[2, 4] = 4
+    """Stride of the stem. 2 leaves its max pooling out, which halves the strides of all stages."""
     levels: int | None = None
     """Number of levels that the encoder reads, finest first; None: all. The pyramid hands the coarse stages
     down to them."""
@@ -89,6 +90,8 @@ class ImageBackbone(nn.Module):
         )
         if fetch and config.weights is not None:
             self._load(config.weights, config.stages)
+        if config.stem_stride == 2:
+            self.resnet.embedder.pooler = nn.Identity()
         widths = self.resnet.channels
         self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])

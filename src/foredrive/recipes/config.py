@@ -74,7 +74,7 @@ def named_after(full: R, rows: Mapping[str, tuple[R, str]]) -> dict[str, R]:
     return recipes
 
 
-def with_occupancy_source(recipe: R, occupancy_source: Literal["lidar", "recorded"]) -> R:
+def with_occupancy_source(recipe: R, occupancy_source: Literal["lidar", "accumulated", "recorded"]) -> R:
     """Return the recipe with voxel labels of another source, which is added to its name."""
     if occupancy_source == recipe.clips.occupancy_source:
         return recipe

@@ -55,7 +55,7 @@ def imagine_run(
     if world.max_steps is not None and steps > world.max_steps:
         max_s = world.max_steps * clips.frame_dt_s
         raise InputError(f"{run.folder}: the model imagines at most {max_s:g} s, not {seconds:g} s")
-    config = dataclasses.replace(clips, future_frames=steps, future_images=True)
+    config = dataclasses.replace(clips.judged, future_frames=steps, future_images=True)
     dataset = open_clips([log], config, run.cache_dir)
     generator = torch.Generator().manual_seed(SEED)
     count = min(moments, len(dataset))

@@ -61,7 +61,11 @@ def measure_gap(
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     config = dataclasses.replace(
-        clips, image_hw=recipe.image_hw, future_frames=frames, future_images=False, now_stride_s=_SAME_S
+        clips.judged,
+        image_hw=recipe.image_hw,
+        future_frames=frames,
+        future_images=False,
+        now_stride_s=_SAME_S,
     )
     dataset = open_clips([log], config, rebuilt / "cache")
     opened = Log(log)

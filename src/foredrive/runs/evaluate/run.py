@@ -53,7 +53,9 @@ def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = 
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     stride_s = stride_s or clips.now_stride_s
-    config = dataclasses.replace(clips, future_frames=frames, future_images=False, now_stride_s=stride_s)
+    config = dataclasses.replace(
+        clips.judged, future_frames=frames, future_images=False, now_stride_s=stride_s
+    )
     return open_clips(logs, config, run.cache_dir)
 
 
@@ -127,7 +129,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
     agent = load_agent(run)
     clips = run.recipe.clips
-    config = dataclasses.replace(clips, lidar=True, map=True)
+    config = dataclasses.replace(clips.judged, lidar=True, map=True)
     dataset = open_clips(logs, config, run.cache_dir)
     predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE)
     found = []

@@ -32,7 +32,7 @@ def fit_baselines(
     Raises:
         InputError: a log cannot be read.
     """
-    clips, target = recipe.clips, recipe.planner.target
+    clips, target = recipe.clips.judged, recipe.planner.target
     without_images = dataclasses.replace(clips, cameras=(), future_images=False)
     loader = DataLoader(ClipDataset(logs, without_images, cache_dir), batch_size=16, collate_fn=collate)
     prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
