@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3
+from foredrive.runs.drive.recording import log_of
 from foredrive.scene import CameraRig
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.towns.campaign import ANY_CONDITIONS, Campaign, DrivePlan, plan_drives
-from foredrive.towns.recorder import record, split_of
+from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite
 
 TRAIN_TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town06", "Town07", "Town10HD")
@@ -74,13 +76,10 @@ def _moved(
     return moved
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="123D data root")
-    out = parser.parse_args().out
-    plans = plan_learning()
+def record_missing(plans: Sequence[DrivePlan], out: Path) -> None:
+    """Record the drives that `out` lacks, one after another."""
     for number, plan in enumerate(plans):
-        if (out / "logs" / split_of(plan.town) / plan.log_name).is_dir():
+        if log_of(plan, out).folder.is_dir():
             continue
         start_s = time.process_time()
         record(
@@ -96,6 +95,12 @@ def main() -> None:
         )
         took_s = time.process_time() - start_s
         print(f"{number + 1}/{len(plans)} {plan.log_name}: {math.ceil(took_s)} s of CPU", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="123D data root")
+    record_missing(plan_learning(), parser.parse_args().out)
 
 
 if __name__ == "__main__":

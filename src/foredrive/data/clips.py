@@ -97,7 +97,7 @@ class ClipDataset(Dataset[Example]):
         self.camera_names = self._choose_cameras()
         self._frames = FrameStore(cache_dir, config.image_hw, self.camera_names)
         self._labels = LabelStore(
-            cache_dir, config.voxels, accumulated_labels if config.occupancy_source == "accumulated" else None
+            cache_dir, config.voxels, "accumulated" if config.occupancy_source == "accumulated" else "lidar"
         )
         self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}

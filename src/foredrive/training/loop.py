@@ -275,22 +275,26 @@ def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:
 
 
 class MetricsLog:
-    """The file metrics.jsonl, one line per step. Lines after the resumed step are dropped."""
+    """The file metrics.jsonl, one line per step. Lines after the resumed step are dropped.
+
+    `step_s` is the time since the step before, `cpu_s` this process's CPU time, without its data workers.
+    """
 
     def __init__(self, path: Path, done: int) -> None:
         kept = [line for line in read_metrics(path) if line["step"] <= done]
         with atomic_path(path) as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
         self.path = path
-        self.started = time.perf_counter()
+        self._wall_s, self._cpu_s = time.perf_counter(), time.process_time()
 
     def add(self, step: int, losses: dict[str, Tensor]) -> None:
         """Write the losses of one finished step."""
-        now = time.perf_counter()
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        took = {"step_s": round(wall_s - self._wall_s, 4), "cpu_s": round(cpu_s - self._cpu_s, 4)}
         line = {"step": step, **{name: value.item() for name, value in losses.items()}}
         with naming(self.path), self.path.open("a") as file:
-            file.write(json.dumps({**line, "step_s": round(now - self.started, 4)}) + "\n")
-        self.started = now
+            file.write(json.dumps({**line, **took}) + "\n")
+        self._wall_s, self._cpu_s = wall_s, cpu_s
 
 
 def read_metrics(path: Path) -> list[dict[str, float | int]]:

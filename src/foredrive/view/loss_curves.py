@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from foredrive.view.html import INK_MARK, inline_svg, style_axes
 
 COLOURS = ("#3f8efc", "#f2803c", "#2eb67d", "#d1559b", "#a78bfa", "#c9a227", "#e5484d")
-NOT_LOSSES = ("step", "step_s", "lr")
+NOT_LOSSES = ("step", "step_s", "cpu_s", "lr")
 SMOOTH_STEPS = 15
 LEGEND_COLUMNS = 5
 Losses = Mapping[str, Sequence[Mapping[str, float | int]]]
