@@ -45,7 +45,9 @@ def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def losses(folder: Path, stage: str) -> list[dict[str, float | int]]:
     lines = read_metrics(folder / stage / "metrics.jsonl")
-    return [{name: value for name, value in line.items() if name not in ("step_s", "cpu_s")} for line in lines]
+    return [
+        {name: value for name, value in line.items() if name not in ("step_s", "cpu_s")} for line in lines
+    ]
 
 
 def test_both_stages_are_trained(run: Run) -> None:

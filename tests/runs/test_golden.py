@@ -56,7 +56,8 @@ def first_losses(log: LogPath, folder: Path) -> dict[str, list[dict[str, float]]
         train(objective, dataset, collate, schedule, folder / name, fabric)
         lines = read_metrics(folder / name / "metrics.jsonl")
         found[name] = [
-            {key: value for key, value in line.items() if key not in ("step", "step_s", "cpu_s")} for line in lines
+            {key: value for key, value in line.items() if key not in ("step", "step_s", "cpu_s")}
+            for line in lines
         ]
     return found
 

@@ -36,7 +36,9 @@ def files(folder: Path) -> dict[str, bytes]:
 def losses(run: Path, stage: str) -> list[dict[str, float | int]]:
     """The lines of a stage's metrics, without how long a step took."""
     lines = read_metrics(run / stage / "metrics.jsonl")
-    return [{name: value for name, value in line.items() if name not in ("step_s", "cpu_s")} for line in lines]
+    return [
+        {name: value for name, value in line.items() if name not in ("step_s", "cpu_s")} for line in lines
+    ]
 
 
 def test_what_training_leaves_on_disk(trained: Run) -> None:
