@@ -9,6 +9,7 @@ camera rig: mounts, heights, directions and fields of view. The test drives keep
 
 import argparse
 import dataclasses
+import hashlib
 import math
 import time
 from collections.abc import Sequence
@@ -48,6 +49,12 @@ def plan_learning() -> list[DrivePlan]:
             Campaign(TRAIN_TOWNS, seeds, conditions, VEHICLES, PEOPLE, seconds=SECONDS, rate_hz=RATE_HZ)
         )
     return test + sorted(train, key=lambda plan: (plan.seed, TRAIN_TOWNS.index(plan.town)))
+
+
+def learning_digest() -> str:
+    """Return a digest of all drives and rigs, without the code that records them."""
+    rigs = (SHIFT_M, RAISE_M, TURN_DEG, TILT_DEG, ZOOM)
+    return hashlib.sha256(repr((plan_learning(), rigs, IMAGE_HW)).encode()).hexdigest()[:16]
 
 
 def rig_of(plan: DrivePlan) -> CameraRig:

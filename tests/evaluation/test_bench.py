@@ -132,3 +132,19 @@ def test_a_study_starts_anew_where_what_decides_it_changes(
         _module(tmp_path, "def half(x):\n    return x // 2\n")
     run_benchmark("study", _study(decided_by, size=4 if change == "config" else 3), tmp_path, say=said.append)
     assert any("starting anew" in line for line in said)
+
+
+def test_the_parts_of_an_arm_stand_together(tmp_path: Path) -> None:
+    arms = {
+        "ours@short": lambda seed: {"iou_short": 0.1 + seed},
+        "ours@long": lambda seed: {"iou_long": 0.2 + seed},
+        "peer@short": lambda seed: {"iou_short": 0.3 + seed},
+    }
+    path = run_benchmark("parts", Benchmark("?", arms, seeds=(0, 2)), tmp_path, say=lambda line: None)
+    report = json.loads(path.read_text())
+    assert {arm: set(found) for arm, found in report["figures"].items()} == {
+        "ours": {"iou_short", "iou_long"},
+        "peer": {"iou_short"},
+    }
+    assert report["figures"]["ours"]["iou_long"]["mean"] == pytest.approx(1.2)
+    assert {run["arm"] for run in report["runs"]} == set(arms)

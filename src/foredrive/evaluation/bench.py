@@ -33,7 +33,8 @@ class Benchmark:
     question: str
     """The question that the figures answer, in one line."""
     arms: Mapping[str, Callable[[int], Mapping[str, float]]]
-    """Functions by name: seed → figures by name, units in the names."""
+    """Functions by name: seed → figures by name, units in the names. ARM@PART is a part of ARM, measured and
+    stored by itself; its figures stand with those of ARM."""
     seeds: tuple[int, ...] = (0, 1, 2)
     config: Mapping[str, Any] | None = None
     """Values that the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
@@ -87,12 +88,15 @@ def run_benchmark(
 
 
 def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Return mean, standard deviation (of a sample), minimum, maximum and number per arm and figure."""
+    """Return mean, standard deviation (of a sample), minimum, maximum and number per arm and figure.
+
+    Figures of the parts of an arm, ARM@PART, are those of ARM.
+    """
     found: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         for key, value in run["figures"].items():
             if value is not None:
-                found.setdefault(run["arm"], {}).setdefault(key, []).append(value)
+                found.setdefault(run["arm"].partition("@")[0], {}).setdefault(key, []).append(value)
     return {
         arm: {
             key: {

@@ -1,0 +1,191 @@
+"""What NeMo learns per CPU second: `foredrive bench learning`, many hours on two cores.
+
+The recipe `nemo_town` and the one of commit 9544e57 are pre-trained for the same CPU time and judged on the
+test drives of `learning_towns.py`, which are recorded first. Drives, cache and run folders are kept in
+runs/learning, so that an interrupted study continues where it stopped.
+
+An arm ARM@BUDGET is one point of a curve: a whole training with its own learning rate schedule. Its length is
+a number of steps, chosen by `ARM@speed` on one machine: CPU time is that of one process with one thread which
+also loads the data.
+"""
+
+import dataclasses
+import statistics
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+
+from benchmarks.common.study import seeded
+from benchmarks.learning_towns import TEST_TOWNS, learning_digest, plan_learning, record_missing
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.evaluation.bench import Benchmark, study_identity
+from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, OccupancyMetric
+from foredrive.evaluation.metrics.vehicles import VehicleMetric
+from foredrive.evaluation.run import evaluate
+from foredrive.recipes import find_recipe
+from foredrive.recipes.config import Recipe, load_recipe, rescheduled
+from foredrive.runs.drive.recording import log_of
+from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.train.run import Run, load_agent, train_run
+from foredrive.training import read_metrics
+
+ROOT = Path("runs/learning")
+DRIVES = ROOT / "drives"
+RECIPES: Mapping[str, Recipe[Any, Any]] = {
+    "nemo_town": find_recipe("nemo_town"),
+    "nemo_town_9544e57": load_recipe(Path(__file__).with_name("nemo_town_9544e57.yaml")),
+}
+JUDGED_EVERY_S = 1.0
+PROBE_STEPS, PROBE_DRIVES = 40, 2
+DECIDED_BY = (
+    "foredrive.data.accumulated_labels",
+    "foredrive.data.clips",
+    "foredrive.data.labels",
+    "foredrive.geometry",
+    "foredrive.losses",
+    "foredrive.metrics.occupancy",
+    "foredrive.metrics.vehicles",
+    "foredrive.models.averaging",
+    "foredrive.models.backbone",
+    "foredrive.models.lifting",
+    "foredrive.models.nemo",
+    "foredrive.models.plane_context",
+    "foredrive.training.augmentation",
+    "foredrive.training.loop",
+    "foredrive.training.objective",
+    "foredrive.training.parameter_groups",
+    "foredrive.training.rays",
+)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """CPU seconds of a training, the steps that take them, and the number of drives it may see."""
+
+    cpu_s: float
+    drives: int
+    steps: Mapping[str, int]
+    """By recipe."""
+
+
+BUDGETS = {
+    "10min": Budget(1200.0, 56, {"nemo_town": 2000, "nemo_town_9544e57": 500}),
+    "1h": Budget(7200.0, 252, {"nemo_town": 12000, "nemo_town_9544e57": 3000}),
+    "best": Budget(28800.0, 252, {"nemo_town": 48000}),
+}
+"""Minutes and hours of two cores."""
+
+
+def pretraining_alone(recipe: Recipe[Any, Any], steps: int) -> Recipe[Any, Any]:
+    """Return the recipe with `steps` steps of pre-training and no fine-tuning; the process loads its data."""
+    assert recipe.pretrain is not None
+    warmup = max(1, round(0.08 * steps))
+    pretrain = rescheduled(recipe.pretrain, steps=steps, warmup_steps=warmup, workers=0)
+    return dataclasses.replace(
+        recipe,
+        planner=dataclasses.replace(recipe.planner, ego_mlp=None, path=None),
+        path=None,
+        pretrain=pretrain,
+        finetune=rescheduled(recipe.finetune, steps=0, workers=0),
+    )
+
+
+def logs_of(drives: int) -> tuple[tuple[LogPath, ...], tuple[LogPath, ...]]:
+    """Record the drives that are missing; return the first training drives and all test drives."""
+    plans = plan_learning()
+    test = [plan for plan in plans if plan.town in TEST_TOWNS]
+    train = [plan for plan in plans if plan.town not in TEST_TOWNS][:drives]
+    record_missing([*test, *train], DRIVES)
+    return tuple(log_of(plan, DRIVES) for plan in train), tuple(log_of(plan, DRIVES) for plan in test)
+
+
+def learned(name: str, budget_name: str) -> Callable[[int], dict[str, float]]:
+    """Return an arm that trains a recipe for a budget and judges it in the town of the test drives."""
+
+    def measure(seed: int) -> dict[str, float]:
+        torch.set_num_threads(1)
+        budget = BUDGETS[budget_name]
+        train_logs, test_logs = logs_of(budget.drives)
+        recipe = seeded(pretraining_alone(RECIPES[name], budget.steps[name]), seed)
+        folder = ROOT / IDENTITY / f"{name}_{budget_name}_seed{seed}"
+        run = train_run(recipe, train_logs, folder, ROOT / "cache")
+        lines = read_metrics(folder / "pretrain" / "metrics.jsonl")
+        cpu_s = sum(float(line["cpu_s"]) for line in lines)
+        samples = len(lines) * recipe.pretrain.schedule.batch_size
+        return judge(run, test_logs, budget_name) | {
+            f"cpu_s_{budget_name}": cpu_s,
+            f"samples_{budget_name}": float(samples),
+            f"samples_per_cpu_s_{budget_name}": samples / cpu_s,
+        }
+
+    return measure
+
+
+def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, float]:
+    """Return IoU above the ground now and later, ego-compensated persistence, and the recall of cars."""
+    clips = dataclasses.replace(run.recipe.clips.judged, future_images=False, now_stride_s=JUDGED_EVERY_S)
+    dataset = ClipDataset(logs, clips, run.cache_dir)
+    result = evaluate(
+        AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0),
+        DataLoader(dataset, batch_size=4, collate_fn=collate),
+        frame_dt_s=clips.frame_dt_s,
+        metrics=(OccupancyMetric, VehicleMetric),
+    )
+    found = result.summary
+    above = "occupancy.above_ground.iou"
+    figures = {"iou": f"{above}_now", "car_recall_20m": "vehicles.car_recall_20m"}
+    for when in ("future_500ms", "future_1s"):
+        figures |= {
+            f"iou_{when}": f"{above}_{when}",
+            f"iou_{when}_persistence": f"{above}_{when}{EGO_COMPENSATED}",
+        }
+    named = {f"{key}_{budget_name}": float(found[name]) for key, name in figures.items()}
+    return named | {
+        f"clips_{budget_name}": float(found["items"]),
+        f"failed_{budget_name}": float(found["failed"]),
+    }
+
+
+def speed(seed: int) -> dict[str, float]:
+    """Measure steps of both recipes in turns on one thread; return samples per CPU second and their ratio."""
+    torch.set_num_threads(1)
+    train_logs, _ = logs_of(PROBE_DRIVES)
+    rate = {}
+    for name in RECIPES:
+        recipe = seeded(pretraining_alone(RECIPES[name], PROBE_STEPS), seed)
+        with tempfile.TemporaryDirectory(prefix="learning_speed_") as folder:
+            train_run(recipe, train_logs, Path(folder), ROOT / "cache")
+            lines = read_metrics(Path(folder) / "pretrain" / "metrics.jsonl")
+        took_s = statistics.median(float(line["cpu_s"]) for line in lines[PROBE_STEPS // 4 :])
+        rate[name] = recipe.pretrain.schedule.batch_size / took_s
+    today, before = rate.values()
+    return {
+        "samples_per_cpu_s": today,
+        "samples_per_cpu_s_9544e57": before,
+        "samples_per_cpu_s_ratio": today / before,
+    }
+
+
+CONFIG = {
+    "recipes": {name: dataclasses.asdict(recipe) for name, recipe in RECIPES.items()},
+    "budgets": {name: dataclasses.asdict(budget) for name, budget in BUDGETS.items()},
+    "drives": learning_digest(),
+    "judged_every_s": JUDGED_EVERY_S,
+}
+IDENTITY = study_identity(CONFIG, DECIDED_BY)
+BENCHMARK = Benchmark(
+    question="How much does NeMo learn per CPU second, beside the recipe of commit 9544e57?",
+    arms={"nemo_town@speed": speed}
+    | {
+        f"{name}@{budget_name}": learned(name, budget_name)
+        for budget_name, budget in BUDGETS.items()
+        for name in budget.steps
+    },
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
