@@ -34,11 +34,11 @@ def scene_class_affinity(
     known voxels of the batch. A term with an empty denominator (no occupied voxel, no free one) is left out;
     the published code divides by zero there.
     """
-    p = logit.sigmoid()[known]
-    y = occupied[known]
-    hit = (p * y).sum()
-    terms = [(hit, p.sum()), (hit, y.sum()), (((1 - p) * (1 - y)).sum(), (1 - y).sum())]
-    has_occupied, has_free = y.sum() > 0, (1 - y).sum() > 0
+    p = logit.sigmoid()
+    y, free = occupied * known, (1 - occupied) * known
+    hit, count, count_free = (p * y).sum(), y.sum(), free.sum()
+    terms = [(hit, (p * known).sum()), (hit, count), (((1 - p) * free).sum(), count_free)]
+    has_occupied, has_free = count > 0, count_free > 0
     loss = logit.new_zeros(())
     for (numerator, denominator), present in zip(terms, (has_occupied, has_occupied, has_free), strict=True):
         ratio = (numerator + EPS) / (denominator + EPS)

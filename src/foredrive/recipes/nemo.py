@@ -95,7 +95,11 @@ def nemo_town() -> NemoRecipe:
             now_stride_s=0.5,
             voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
         ),
-        model=dataclasses.replace(tiny.model, renderer=dataclasses.replace(tiny.model.renderer, far_m=48.0)),
+        model=dataclasses.replace(
+            tiny.model,
+            motion=dataclasses.replace(tiny.model.motion, stride=2),
+            renderer=dataclasses.replace(tiny.model.renderer, far_m=48.0),
+        ),
         planner=dataclasses.replace(
             tiny.planner,
             history=1,
@@ -103,7 +107,9 @@ def nemo_town() -> NemoRecipe:
             path=PathCorrectionConfig(distances_m=along_m, width=64, hidden=32),
         ),
         path=PathFit(),
-        pretrain=rescheduled(tiny.pretrain, steps=2400, warmup_steps=190),
+        pretrain=rescheduled(
+            dataclasses.replace(tiny.pretrain, ray_stride=16, imagine_every=2), steps=2400, warmup_steps=190
+        ),
         finetune=rescheduled(tiny.finetune, steps=300, warmup_steps=20),
         precision="bf16-mixed",
     )

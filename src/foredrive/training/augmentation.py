@@ -73,7 +73,7 @@ def _mirrored_clip(clip: Clip, chosen: Bool[Tensor, "b"]) -> Clip:
     return dataclasses.replace(
         clip,
         T_world_ego=_mirrored_pose(clip.T_world_ego, chosen, axis=1),
-        images=_pick(chosen, clip.images.flip(-1), clip.images),
+        images=_flipped(clip.images, chosen, dim=-1),
         rig=_mirrored_rig(clip.rig, chosen),
         sweeps=_mirrored_sweep(clip.sweeps, chosen),
         boxes=_mirrored_boxes(clip.boxes, chosen),
@@ -125,8 +125,8 @@ def _mirrored_grid(
 ) -> VoxelGrid:
     return dataclasses.replace(
         grid,
-        values=_pick(chosen, values.flip(-2), values),
-        known=_pick(chosen, grid.known.flip(-2), grid.known),
+        values=_flipped(values, chosen, dim=-2),
+        known=_flipped(grid.known, chosen, dim=-2),
     )
 
 
@@ -142,6 +142,13 @@ def _negated(values: Tensor, chosen: Bool[Tensor, "b"], signs: tuple[float, ...]
     shape = [1] * values.dim()
     shape[dim] = len(signs)
     return _pick(chosen, values * values.new_tensor(signs).view(shape), values)
+
+
+def _flipped(values: Tensor, chosen: Bool[Tensor, "b"], dim: int) -> Tensor:
+    """Reverse a dimension of the chosen items. Only these are touched: flips of images are slow."""
+    out = values.clone()
+    out[chosen] = values[chosen].flip(dim)
+    return out
 
 
 def _pick(chosen: Bool[Tensor, "b"], one: Tensor, other: Tensor) -> Tensor:

@@ -121,7 +121,8 @@ def train(
     if items == 0:
         raise InputError("there is nothing to train on: the data set is empty")
     total = schedule.total_steps(items, fabric.world_size)
-    optimizer = torch.optim.AdamW(parameter_groups(objective, schedule.weight_decay), lr=schedule.lr)
+    groups = parameter_groups(objective, schedule.weight_decay)
+    optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
     model, fabric_optimizer = fabric.setup(objective, optimizer)
     found = latest_checkpoint(folder / CHECKPOINTS)
     done = load_checkpoint(found, objective, optimizer) if found is not None else 0

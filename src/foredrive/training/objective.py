@@ -60,6 +60,8 @@ class NemoStage:
     imagined_items: int | None = None
     """Number of items of each batch that are imagined, with their pasts and futures. The other items train
     the present alone, at a fraction of the cost. None: all items, as in the paper."""
+    imagine_every: int = 1
+    """Imagine in one step of so many, from the first step on. The steps between train the present alone."""
     past_gradient: bool = True
     """Train the encoder by past frames too. Only the motion reads them."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
@@ -77,8 +79,11 @@ class NemoObjective(nn.Module):
         image_features: trained features for the perceptual loss, or None to disable it.
 
     Raises:
-        InputError: `imagined_items` is below 1, or the planner reads imagined frames of the other items.
+        InputError: `imagined_items` or `imagine_every` is below 1, or the planner reads imagined frames of
+            items or in steps that have none.
     """
+
+    steps_done: Tensor
 
     def __init__(
         self,
@@ -98,9 +103,16 @@ class NemoObjective(nn.Module):
         set_planner_trainable(agent.planner, plans)
         if stage.imagined_items is not None and stage.imagined_items < 1:
             raise InputError(f"imagined_items is {stage.imagined_items}; without any, set imagine to false")
-        if plans and agent.planner.imagined_frames > 0 and stage.imagined_items is not None:
-            raise InputError("the planner reads imagined frames of every item: leave out imagined_items")
+        if stage.imagine_every < 1:
+            raise InputError(f"imagine_every is {stage.imagine_every}; without any, set imagine to false")
+        if plans and agent.planner.imagined_frames > 0:
+            if stage.imagined_items is not None:
+                raise InputError("the planner reads imagined frames of every item: leave out imagined_items")
+            if stage.imagine_every > 1:
+                raise InputError("the planner reads imagined frames in every step: leave out imagine_every")
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
+        if stage.imagine_every > 1:
+            self.register_buffer("steps_done", torch.zeros((), dtype=torch.long))
         world.motion.requires_grad_(imagines)
         if world.unseen is not None:
             world.unseen.requires_grad_(imagines)
@@ -114,9 +126,10 @@ class NemoObjective(nn.Module):
         now, weights = clip.now, self.weights
         observed = clip.observed()
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
-        beliefs = self._rollout(observed, max(self.steps, needed))
+        steps = self.steps if self._imagines_now() else 0
+        beliefs = self._rollout(observed, max(steps, needed))
         plan = self.agent.plan(observed, beliefs) if weights.wpts > 0 else None
-        decoded = [world.decode(belief) for belief in beliefs[: self.steps + 1]]
+        decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
@@ -149,10 +162,27 @@ class NemoObjective(nn.Module):
         losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
             losses["l1"] + weights.perc * losses["perc"]
         )
+        if len(beliefs) == 1 and self.steps > 0:
+            losses["loss"] = losses["loss"] + self._no_change()
         if plan is not None:
             losses["wpts"] = waypoint_loss(plan, clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
         return losses
+
+    def _imagines_now(self) -> bool:
+        """Return whether this step imagines, and count it in training."""
+        if self.stage.imagine_every == 1:
+            return True
+        now = int(self.steps_done) % self.stage.imagine_every == 0
+        if self.training:
+            self.steps_done += 1
+        return now
+
+    def _no_change(self) -> Float[Tensor, ""]:
+        """Return 0 with a gradient of 0 for the parameters of imagination: DDP needs one in every step."""
+        world = self.agent.world_model
+        unused = [*world.motion.parameters(), *(() if world.unseen is None else (world.unseen,))]
+        return 0.0 * torch.stack([parameter.sum() for parameter in unused]).sum()
 
     def _rollout(self, observed: Clip, steps: int) -> list[Belief]:
         """Return the beliefs about now, and about the next `steps` key frames for the imagined items."""

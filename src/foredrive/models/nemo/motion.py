@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -20,6 +21,9 @@ class MotionConfig:
     """Size of the plane that the SE(3) head flattens. It keeps coarse positions, which rotation needs."""
     xi_scale: float = 0.1
     """Factor from outputs of the rigid head to metres and radians. It keeps early warps small."""
+    stride: int = 1
+    """Stride along y and x of the grid from which flow and ego motion are predicted. From a coarser grid than
+    the volume's, the flow is interpolated. The paper has 1."""
 
 
 class Motion(NamedTuple):
@@ -47,7 +51,7 @@ class MotionFlow(nn.Module):
 
     def __init__(self, config: MotionConfig, *, channels: int, frames: int, steps: int) -> None:
         super().__init__()
-        self.steps, self.xi_scale = steps, config.xi_scale
+        self.steps, self.xi_scale, self.stride = steps, config.xi_scale, config.stride
         wide, hidden = channels * frames, config.hidden
         to_flow = nn.Conv3d(hidden, 3 * steps, 3, padding=1)
         to_xi = nn.Linear(4 * hidden, 6 * steps)
@@ -74,11 +78,21 @@ class MotionFlow(nn.Module):
 
     def forward(self, volumes: Float[Tensor, "b T D Z Y X"]) -> Motion:
         """Predict motion from the volumes of the past and of now (last), each in its own ego frame."""
-        stacked = volumes.flatten(1, 2).contiguous(memory_format=torch.channels_last_3d)
+        stacked = self._coarser(volumes.flatten(1, 2).contiguous(memory_format=torch.channels_last_3d))
         batch = len(stacked)
         if batch == 1 and stacked.device.type == "cpu" and not torch.compiler.is_compiling():
             # PyTorch uses a slow convolution for a batch of one. A batch of two takes a sixth of the time.
             stacked = stacked.expand(2, -1, -1, -1, -1)
-        flow = self.flow(stacked)[:batch].float().unflatten(1, (self.steps, 3))
+        flow = self.flow(stacked)[:batch].float()
+        if self.stride > 1:
+            flow = F.interpolate(flow, size=volumes.shape[-3:], mode="trilinear")
         xi = self.rigid(stacked)[:batch].float().unflatten(1, (self.steps, 6))
-        return Motion(flow=flow, T_prev_next=exp_se3(self.xi_scale * xi))
+        return Motion(flow=flow.unflatten(1, (self.steps, 3)), T_prev_next=exp_se3(self.xi_scale * xi))
+
+    def _coarser(self, stacked: Float[Tensor, "b W Z Y X"]) -> Float[Tensor, "b W Z _y _x"]:
+        """Average the columns of `stride` by `stride`. Layer by layer: pooling in 3-D is much slower."""
+        if self.stride == 1:
+            return stacked
+        layers = stacked.transpose(1, 2).flatten(0, 1)
+        pooled = F.avg_pool2d(layers, self.stride, ceil_mode=True, count_include_pad=False)
+        return pooled.unflatten(0, (len(stacked), -1)).transpose(1, 2)
