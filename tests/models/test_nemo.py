@@ -343,3 +343,19 @@ def test_what_moves_is_found_however_fast_the_ego_vehicle_drives() -> None:
     assert at_rest < 0.25
     assert mover_error(5) < 1.2 * at_rest
     assert mover_error(10) < 1.2 * at_rest
+
+
+@pytest.mark.parametrize("shape_yx", [(24, 32), (23, 31)])
+def test_flow_from_a_coarser_grid_is_that_of_columns_that_are_all_alike(shape_yx: tuple[int, int]) -> None:
+    """Away from the border, convolutions over equal columns do not depend on the size of a column."""
+    volumes = torch.randn(1, 2, 3, 4, 1, 1).expand(-1, -1, -1, -1, *shape_yx)
+    flows = []
+    for stride in (1, 2):
+        torch.manual_seed(0)
+        module = MotionFlow(MotionConfig(hidden=8, stride=stride), channels=3, frames=2, steps=2)
+        for parameter in module.parameters():
+            torch.nn.init.normal_(parameter, std=0.1)
+        flows.append(module(volumes).flow)
+    assert flows[1].shape == (1, 2, 3, 4, *shape_yx)
+    inner = (..., slice(8, -8), slice(8, -8))
+    torch.testing.assert_close(flows[0][inner], flows[1][inner], rtol=1e-4, atol=1e-5)

@@ -139,14 +139,14 @@ def test_recipes_of_towns_take_the_mean_and_base_recipes_the_sum() -> None:
 
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
 def test_a_file_of_vgg_weights_fits_the_recipes_of_towns(stage: str, tmp_path: Path) -> None:
-    """Fine-tuning renders 6 × 10 pixels: too few to be pooled three times."""
+    """Both stages render 6 × 10 pixels: too few to be pooled three times."""
     file = vgg_file(tmp_path / "vgg.safetensors")
     recipe = find_recipe("nemo_town", (f"{stage}.perceptual={file}",))
     chosen = getattr(recipe, stage)
     height, width = recipe.clips.image_hw
     features = Vgg16Features(chosen.perceptual)
     taps = features(torch.rand(1, 3, height // chosen.ray_stride, width // chosen.ray_stride))
-    assert [tap.shape[1] for tap in taps] == [64, 128, 256, 512][: 4 if stage == "pretrain" else 3]
+    assert [tap.shape[1] for tap in taps] == [64, 128, 256]
 
 
 def test_a_file_that_is_named_and_wrong_is_one_line(tmp_path: Path) -> None:
@@ -187,6 +187,31 @@ def test_some_items_of_a_batch_are_imagined_and_all_train_the_present(example: E
     torch.testing.assert_close(found, 0.5 * present + 0.5 * futures)
 
 
+def test_every_third_step_imagines_and_the_others_train_the_present(example: Example) -> None:
+    stage = RECIPE.pretrain
+    third = objective_of(dataclasses.replace(stage, imagine_every=3)).train()
+    always, never = (
+        objective_of(stage).train(),
+        objective_of(dataclasses.replace(stage, imagine=False)).train(),
+    )
+    for step in range(5):
+        found = losses_of(third, example)
+        torch.testing.assert_close(found, losses_of(always if step % 3 == 0 else never, example))
+        third.zero_grad()
+        found["loss"].backward()
+        motion = [parameter.grad for parameter in third.agent.world_model.motion.parameters()]
+        assert all(grad is not None for grad in motion)
+        assert any(grad.any() for grad in motion) == (step % 3 == 0)
+
+
+def test_an_interrupted_training_goes_on_with_the_step_that_is_due(example: Example) -> None:
+    stage = dataclasses.replace(RECIPE.pretrain, imagine_every=2)
+    first, second = objective_of(stage).train(), objective_of(stage).train()
+    losses_of(first, example)
+    second.load_state_dict(first.state_dict())
+    torch.testing.assert_close(losses_of(second, example), losses_of(first, example))
+
+
 def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     stage = RECIPE.pretrain
     whole, without = objective_of(stage), objective_of(dataclasses.replace(stage, past_gradient=False))
@@ -206,10 +231,13 @@ def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None
     stage = dataclasses.replace(RECIPE.finetune, imagined_items=1)
     with pytest.raises(InputError, match="imagined frames of every item"):
         build_objective(RECIPE, stage, build_agent(RECIPE))
+    with pytest.raises(InputError, match="imagined frames in every step"):
+        build_objective(RECIPE, dataclasses.replace(RECIPE.finetune, imagine_every=2), build_agent(RECIPE))
     for count in (0, -1):
-        none = dataclasses.replace(RECIPE.pretrain, imagined_items=count)
-        with pytest.raises(InputError, match="set imagine to false"):
-            build_objective(RECIPE, none, build_agent(RECIPE))
+        for field in ("imagined_items", "imagine_every"):
+            none = dataclasses.replace(RECIPE.pretrain, **{field: count})
+            with pytest.raises(InputError, match="set imagine to false"):
+                build_objective(RECIPE, none, build_agent(RECIPE))
 
 
 def test_examples_are_augmented_before_anything_is_read(example: Example) -> None:
