@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from shapely import LineString
 
-from foredrive.metrics.maps.elements import MapElements
+from foredrive.metrics.maps.lines import LineSet
 
 
 def points_of(line: np.ndarray, count: int) -> np.ndarray:
@@ -38,8 +38,8 @@ def area_under(score: list[float], hit: list[bool], objects: int) -> float:
 
 
 def precision(
-    predicted: MapElements,
-    true: MapElements,
+    predicted: LineSet,
+    true: LineSet,
     kind: int,
     limit_m: float,
     *,

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from metrics.maps_by_hand import chamfer, points_of, precision
 
 from foredrive.errors import InputError
-from foredrive.metrics.maps.elements import CLASSES, MapClass, MapElements, chamfer_distances, resample
+from foredrive.metrics.maps.lines import CLASSES, LineSet, chamfer_distances, resample
 from foredrive.metrics.maps.precision import (
     average_precision_area,
     mean_precision,
     score_maps,
 )
 from foredrive.metrics.maps.protocols import PROTOCOLS, Area
+from foredrive.scene.map_elements import ElementKind
 
 DIVIDER, CROSSING, BOUNDARY = CLASSES
 
@@ -28,9 +29,9 @@ def elements(
     frame: int | Sequence[int] = 0,
     score: float | Sequence[float] = 1.0,
     identity: Sequence[int] | None = None,
-) -> MapElements:
+) -> LineSet:
     n = len(lines)
-    return MapElements(
+    return LineSet(
         frame=np.broadcast_to(np.asarray(frame), n).copy(),
         kind=np.broadcast_to(np.asarray(kind), n).copy(),
         lines=[np.array(line, dtype=float) for line in lines],
@@ -43,11 +44,11 @@ def straight(y: float, start: float = -20.0, end: float = 20.0) -> list[tuple[fl
     return [(start, y), (end, y)]
 
 
-def ap_at(predicted: MapElements, true: MapElements, name: str, area: Area = "60x30") -> tuple[float, ...]:
+def ap_at(predicted: LineSet, true: LineSet, name: str, area: Area = "60x30") -> tuple[float, ...]:
     return score_maps(predicted, true, PROTOCOLS[name], area)[DIVIDER].ap_at
 
 
-def random_maps(rng: np.random.Generator, frames: int = 5) -> tuple[MapElements, MapElements]:
+def random_maps(rng: np.random.Generator, frames: int = 5) -> tuple[LineSet, LineSet]:
     """Curves with identities; predictions that follow most of them, lose their identity, or are clutter."""
     lines, kinds, frame, identity = [], [], [], []
     found, found_kind, found_frame, found_identity = [], [], [], []
@@ -162,7 +163,7 @@ def test_classes_without_truth() -> None:
     assert math.isnan(mean_precision(empty, PROTOCOLS["maptr"]))
 
 
-def consistent(predicted: MapElements, true: MapElements, *, corrected: bool, **more: object) -> float:
+def consistent(predicted: LineSet, true: LineSet, *, corrected: bool, **more: object) -> float:
     name = "maptracker_consistent" + "_corrected" * corrected
     return score_maps(predicted, true, PROTOCOLS[name], "60x30", **more)[DIVIDER].ap  # type: ignore[arg-type]
 
@@ -255,7 +256,7 @@ def test_perfect_maps(name: str) -> None:
 
 
 def test_centrelines_are_a_class_of_their_own() -> None:
-    line = elements([straight(0.0)], kind=MapClass.CENTRELINE)
-    scores = score_maps(line, line, PROTOCOLS["maptr"], "60x30", classes=[*CLASSES, MapClass.CENTRELINE])
-    assert scores[MapClass.CENTRELINE].ap == 1.0
+    line = elements([straight(0.0)], kind=ElementKind.CENTRELINE)
+    scores = score_maps(line, line, PROTOCOLS["maptr"], "60x30", classes=[*CLASSES, ElementKind.CENTRELINE])
+    assert scores[ElementKind.CENTRELINE].ap == 1.0
     assert mean_precision(scores, PROTOCOLS["maptr"]) == 1.0

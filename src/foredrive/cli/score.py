@@ -9,7 +9,7 @@ from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.errors import InputError
 
 Family = Literal["gaussian", "laplace"]
-Task = Literal["sets", "occupancy"]
+Task = Literal["sets", "map", "motion", "occupancy"]
 
 
 def score(
@@ -28,8 +28,9 @@ def score(
 
     Args:
         results: For sets: nuScenes or COCO results (JSON), or a folder of KITTI's text files; docs/sets.md
-            describes how such files state their uncertainty. For occupancy: a folder of npz files as Occ3D or
-            OpenOcc define them.
+            describes how such files state their uncertainty. For map: JSON of MapTR, or of StreamMapNet's
+            family. For motion: nuScenes results (JSON) with futures. For occupancy: a folder of npz files as
+            Occ3D or OpenOcc define them.
         truth: The ground truth in the same format; for COCO its instances.
         task: sets: detections as a random finite set. The others are scored under all published protocols of
             the task, see docs/tasks.md.

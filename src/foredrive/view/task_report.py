@@ -12,6 +12,8 @@ from foredrive.metrics.voxels.protocols import (
     VOXEL_PROTOCOLS,
 )
 from foredrive.view.html import write_page
+from foredrive.view.map_tables import map_tables
+from foredrive.view.motion_tables import motion_tables
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import Column, Table, simple_table, words
 
@@ -57,7 +59,11 @@ def occupancy_tables(figures: Summary) -> list[Table]:
     ]
 
 
-TABLES: dict[str, Callable[[Summary], Sequence[Table]]] = {"occupancy": occupancy_tables}
+TABLES: dict[str, Callable[[Summary], Sequence[Table]]] = {
+    "map": map_tables,
+    "motion": motion_tables,
+    "occupancy": occupancy_tables,
+}
 """Tables of a summary, the main one first, by task."""
 
 

@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.coco_results import read_coco
@@ -12,6 +11,7 @@ from foredrive.evaluation.detections.frames import DetectionSet
 from foredrive.evaluation.detections.kitti_labels import read_kitti
 from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
 from foredrive.evaluation.detections.score import FrameScore
+from foredrive.evaluation.json_files import read_json
 from foredrive.files import atomic_path
 from foredrive.sets import Family
 
@@ -27,7 +27,7 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
     else:
-        predicted, true = _read_json(results), _read_json(truth)
+        predicted, true = read_json(results), read_json(truth)
         if not isinstance(true, dict):
             raise InputError(f"{truth}: neither an object of boxes by sample (nuScenes) nor of images (COCO)")
         if isinstance(predicted, dict):
@@ -53,12 +53,3 @@ def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
             parts = {"nll": score.nll, **score.parts}
             values = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
             file.write(json.dumps({"frame": score.name, **values}) + "\n")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON that can be read") from error

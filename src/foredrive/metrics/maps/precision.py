@@ -11,8 +11,9 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.metrics.detection import descending, mean_of_valid, precision_recall
 from foredrive.metrics.frames import rows_by_frame
-from foredrive.metrics.maps.elements import CLASSES, MapClass, MapElements, chamfer_distances, resample
+from foredrive.metrics.maps.lines import CLASSES, LineSet, chamfer_distances, resample
 from foredrive.metrics.maps.protocols import Area, VectorProtocol
+from foredrive.scene.map_elements import ElementKind
 
 _UNTOUCHED_M = 100.0
 """Distance of a pair whose buffers do not touch, as MapTR has it: farther than any match."""
@@ -31,14 +32,14 @@ class MapPrecision:
 
 
 def score_maps(
-    predicted: MapElements,
-    true: MapElements,
+    predicted: LineSet,
+    true: LineSet,
     protocol: VectorProtocol,
     area: Area,
     *,
     drive: Int[ndarray, "F"] | None = None,
-    classes: Sequence[MapClass] = CLASSES,
-) -> dict[MapClass, MapPrecision]:
+    classes: Sequence[ElementKind] = CLASSES,
+) -> dict[ElementKind, MapPrecision]:
     """Return the average precision of each class over a whole data set.
 
     Args:
@@ -54,7 +55,7 @@ def score_maps(
     return {kind: _score_class(predicted, true, protocol, area, drive, kind) for kind in classes}
 
 
-def mean_precision(scores: dict[MapClass, MapPrecision], protocol: VectorProtocol) -> float:
+def mean_precision(scores: dict[ElementKind, MapPrecision], protocol: VectorProtocol) -> float:
     """Return the mean over classes as the protocol takes it; NaN if it has none to count."""
     left_out = protocol.absent_classes == "left_out"
     return mean_of_valid([score.ap for score in scores.values() if score.true or not left_out])
@@ -69,7 +70,7 @@ def average_precision_area(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], 
     return float((np.diff(recall, prepend=0.0) * envelope).sum())
 
 
-def check_identities(elements: MapElements, what: str) -> None:
+def check_identities(elements: LineSet, what: str) -> None:
     """Raise an InputError unless elements have identities, each of a class once a frame at most."""
     if elements.identity is None:
         raise InputError(f"{what} map elements have no identities, which C-mAP needs")
@@ -77,17 +78,17 @@ def check_identities(elements: MapElements, what: str) -> None:
     unique, count = np.unique(key, axis=0, return_counts=True)
     if (count > 1).any():
         frame, kind, identity = unique[count > 1][0].tolist()
-        name = MapClass(kind).name.lower()
+        name = ElementKind(kind).name.lower()
         raise InputError(f"frame {frame} has {what} {name} {identity} twice: identities are unique")
 
 
 def _score_class(
-    predicted: MapElements,
-    true: MapElements,
+    predicted: LineSet,
+    true: LineSet,
     protocol: VectorProtocol,
     area: Area,
     drive: Int[ndarray, "F"] | None,
-    kind: MapClass,
+    kind: ElementKind,
 ) -> MapPrecision:
     ours, theirs = (np.flatnonzero(elements.kind == kind) for elements in (predicted, true))
     predicted, true = predicted[ours], true[theirs]
@@ -103,7 +104,7 @@ def _score_class(
 
 
 def _match(
-    predicted: MapElements, true: MapElements, protocol: VectorProtocol, distances_m: Sequence[float]
+    predicted: LineSet, true: LineSet, protocol: VectorProtocol, distances_m: Sequence[float]
 ) -> Int[ndarray, "D M"]:
     """Return the true element that each prediction finds at each distance; -1: none."""
     found = np.full((len(distances_m), len(predicted.lines)), -1)
@@ -123,7 +124,7 @@ def _match(
     return found
 
 
-def _resampled_truth(true: MapElements, protocol: VectorProtocol) -> Float[ndarray, "N P 2"]:
+def _resampled_truth(true: LineSet, protocol: VectorProtocol) -> Float[ndarray, "N P 2"]:
     if protocol.true_points_first is None:
         return true.resampled(protocol.points)
     coarse = true.resampled(protocol.true_points_first)
@@ -151,8 +152,8 @@ def _distances(
 
 def _claimed(
     found: Int[ndarray, "M"],
-    predicted: MapElements,
-    true: MapElements,
+    predicted: LineSet,
+    true: LineSet,
     drive: Int[ndarray, "F"] | None,
 ) -> Int[ndarray, "M"]:
     """Leave each true element to the predicted identity that finds it first in its drive."""

@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.metrics.maps.elements import CLASSES, MapClass
+from foredrive.metrics.maps.lines import CLASSES
 from foredrive.metrics.maps.protocols import RasterProtocol
+from foredrive.scene.map_elements import ElementKind
 
 LAYERS = ("divider", "crossing", "boundary", "drivable")
 """Layers of the masks that are compared: the classes of lines in UniAD's order, and the drivable area."""
@@ -69,7 +70,7 @@ def _figure_masks(masks: Bool[ndarray, "F 4 H W"]) -> tuple[Bool[ndarray, "F H W
 
 
 def _of_kind(
-    lines: Sequence[Float[ndarray, "_ 2"]], kinds: Sequence[int], kind: MapClass
+    lines: Sequence[Float[ndarray, "_ 2"]], kinds: Sequence[int], kind: ElementKind
 ) -> list[Float[ndarray, "_ 2"]]:
     return [line for line, of in zip(lines, kinds, strict=True) if of == kind]
 

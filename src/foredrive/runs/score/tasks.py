@@ -6,6 +6,11 @@ from pathlib import Path
 
 from rich.progress import Progress
 
+from foredrive.errors import InputError
+from foredrive.evaluation.maps.files import read_maps
+from foredrive.evaluation.maps.score import score_map_files
+from foredrive.evaluation.motion.files import read_agents
+from foredrive.evaluation.motion.score import score_agent_files
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
 from foredrive.evaluation.voxels.files import find_voxels
@@ -21,7 +26,28 @@ def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
         return score_voxels(files, on_frame=lambda: progress.advance(bar))
 
 
-TASKS: dict[str, Callable[[Path, Path, Path | None], Figures]] = {"occupancy": score_occupancy}
+def score_map(results: Path, truth: Path, poses: Path | None) -> Figures:
+    """Return the figures of files of vector maps, see `evaluation.maps`."""
+    _check_no_poses("map", poses)
+    return score_map_files(read_maps(results, truth))
+
+
+def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:
+    """Return the figures of files of forecast agents, see `evaluation.motion`."""
+    _check_no_poses("motion", poses)
+    return score_agent_files(read_agents(results, truth))
+
+
+def _check_no_poses(task: str, poses: Path | None) -> None:
+    if poses is not None:
+        raise InputError(f"--poses does not go with --task {task}")
+
+
+TASKS: dict[str, Callable[[Path, Path, Path | None], Figures]] = {
+    "map": score_map,
+    "motion": score_motion,
+    "occupancy": score_occupancy,
+}
 """Functions of results, truth and poses, by the name of their task."""
 
 

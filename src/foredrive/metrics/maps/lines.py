@@ -1,7 +1,6 @@
 """Predicted and true map elements, as every vector protocol reads them, and distances between polylines."""
 
 import dataclasses
-import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import no_type_check
@@ -12,29 +11,20 @@ from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 
 from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.scene.map_elements import ElementKind
 
-
-class MapClass(enum.IntEnum):
-    """Classes of map elements, in MapTR's order, and centrelines, which some data sets have beside them."""
-
-    DIVIDER = 0
-    CROSSING = 1
-    BOUNDARY = 2
-    CENTRELINE = 3
-
-
-CLASSES = (MapClass.DIVIDER, MapClass.CROSSING, MapClass.BOUNDARY)
+CLASSES = (ElementKind.DIVIDER, ElementKind.CROSSING, ElementKind.BOUNDARY)
 """The classes that all protocols judge."""
 
 
 @dataclass(frozen=True)
-class MapElements:
+class LineSet:
     """M polylines of all frames of a data set."""
 
     frame: Int[ndarray, "M"]
     """Number of the frame."""
     kind: Int[ndarray, "M"]
-    """A `MapClass`."""
+    """An `ElementKind`."""
     lines: Sequence[Float[ndarray, "_ 2"]]
     """At least two vertices each, in the ego frame at the frame's time, m. An outline ends as it begins."""
     score: Float[ndarray, "M"]
@@ -42,7 +32,7 @@ class MapElements:
     identity: Int[ndarray, "M"] | None = None
     """Identity of the element within its drive. None: not tracked."""
 
-    def __getitem__(self, which: Int[ndarray, "n"]) -> "MapElements":
+    def __getitem__(self, which: Int[ndarray, "n"]) -> "LineSet":
         """Take elements by their indices."""
         return dataclasses.replace(
             self,

@@ -1,0 +1,1 @@
+"""Files of vector maps: read, and scored under every protocol."""

@@ -1,0 +1,1 @@
+"""Files of forecast agents: read, and scored under every protocol."""

@@ -1,0 +1,286 @@
+"""Forecast agents in nuScenes' results format with futures, as UniAD, SparseDrive and MFEval write them.
+
+A file has lists of boxes by sample token, under `results` or alone. A box has `translation` (m, global), a
+name (`detection_name`, `tracking_name` or `class_name`) and, if predicted, a score (`detection_score` or
+`tracking_score`), its futures [K, T, 2] at steps of 0.5 s (`predict_traj`, `trajs` or `traj`) and, if it has
+them, their probabilities (`predict_traj_score` or `traj_prob`).
+
+In the truth, `traj` [T, 2] is the future up to the first step without annotation, and `num_pts` the number
+of sensor points. Regions need the place of the ego vehicle: `ego_poses` by token (`translation`, `rotation`
+as w x y z) beside `results`, or `ego_translation` of the boxes, as the devkit writes it. The latter does not
+tell the heading, without which VAD's rectangle cannot be placed.
+
+Futures are in the global frame; or, as UniAD's, in the lidar's in both files. They can be compared then, but
+not with places, so that what needs both (moving vehicles) is left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import read_number_rows, read_numbers
+from foredrive.evaluation.json_files import read_json
+from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
+from foredrive.scene import Category
+
+STEPS = 12
+NAMES = ("detection_name", "tracking_name", "class_name")
+SCORES = ("detection_score", "tracking_score")
+FUTURES = ("predict_traj", "trajs", "traj")
+PROBABILITIES = ("predict_traj_score", "traj_prob")
+CATEGORIES = {
+    category.name.lower(): category
+    for category in Category
+    if category not in (Category.ANIMAL, Category.OTHER)
+}
+FAR_M = 100.0
+"""A future whose first step is farther from the place of its box is in another frame."""
+
+Box = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class AgentFiles:
+    """Predicted and true agents of the truth's frames."""
+
+    predicted: PredictedAgents
+    true: TrueAgents
+    frames: int
+    frames_without_results: int
+    heading_known: bool
+    """False if the truth tells where the ego vehicle was, but not its heading."""
+    futures_placed: bool
+    """False if futures are in another frame than boxes."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Boxes of one file in order of the truth's frames."""
+
+    records: Sequence[Box]
+    names: Sequence[str]
+    frame: Int[ndarray, "n"]
+    category: Int[ndarray, "n"]
+    xy: Float[ndarray, "n 2"]
+    """Global, m."""
+
+
+def read_agents(results: Path, truth: Path) -> AgentFiles:
+    """Read predicted and true agents.
+
+    Raises:
+        InputError: a file cannot be read, or an entry is wrong. The message names both.
+    """
+    true_content, content = _object(truth), _object(results)
+    true_boxes, boxes = _by_token(true_content, truth), _by_token(content, results)
+    unknown = [token for token in boxes if token not in true_boxes]
+    if unknown:
+        raise InputError(
+            f"{results}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth}: of another split?"
+        )
+    if not true_boxes:
+        raise InputError(f"{truth}: holds no frames")
+    tokens = list(true_boxes)
+    rows, true_rows = _rows(boxes, tokens, results), _rows(true_boxes, tokens, truth)
+    ego_xy, ego_yaw = _ego(true_content, true_rows, rows, tokens, truth)
+    futures = _predicted_futures(rows)
+    true_futures, valid = _true_futures(true_rows)
+    placed = _placed(rows, futures[:, :, 0], true_rows, true_futures[:, 0], valid[:, 0])
+
+    def to_ego(xy: Float[ndarray, "n *s 2"], frame: Int[ndarray, "n"]) -> Float[ndarray, "n *s 2"]:
+        extra = (None,) * (xy.ndim - 2)
+        offset = xy - ego_xy[(frame, *extra)]
+        yaw = np.nan_to_num(ego_yaw)[(frame, *extra)]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x, y = offset[..., 0], offset[..., 1]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+    if placed:
+        futures = to_ego(futures, rows.frame)
+        true_futures = to_ego(true_futures, true_rows.frame) * valid[..., None]
+    return AgentFiles(
+        predicted=PredictedAgents(
+            rows.frame,
+            rows.category,
+            _scores(rows),
+            to_ego(rows.xy, rows.frame),
+            futures,
+            _probabilities(rows, futures.shape[1]),
+        ),
+        true=TrueAgents(
+            true_rows.frame,
+            true_rows.category,
+            to_ego(true_rows.xy, true_rows.frame),
+            true_futures,
+            valid,
+            np.array([box.get("num_pts", -1) != 0 for box in true_rows.records], dtype=bool),
+        ),
+        frames=len(tokens),
+        frames_without_results=len(set(true_boxes) - set(boxes)),
+        heading_known=bool(np.isfinite(ego_yaw).all()),
+        futures_placed=placed,
+    )
+
+
+def _object(path: Path) -> Mapping[str, Any]:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: not an object of boxes by sample token")
+    return content
+
+
+def _by_token(content: Mapping[str, Any], path: Path) -> Mapping[str, Sequence[Box]]:
+    boxes = content.get("results", content)
+    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
+    for token, each in boxes.items():
+        for n, box in enumerate(each):
+            if not isinstance(box, dict):
+                raise InputError(f"{path}: frame {token}, box {n} is no object")
+    return boxes
+
+
+def _rows(boxes: Mapping[str, Sequence[Box]], tokens: Sequence[str], path: Path) -> _Rows:
+    records, names, frame, category = [], [], [], []
+    for number, token in enumerate(tokens):
+        for n, box in enumerate(boxes.get(token, ())):
+            where = f"{path}: frame {token}, box {n}"
+            name = _first(box, NAMES)
+            if name not in CATEGORIES:
+                raise InputError(f"{where}: the class {name!r} is none of {', '.join(CATEGORIES)}")
+            records.append(box)
+            names.append(where)
+            frame.append(number)
+            category.append(int(CATEGORIES[name]))
+    place = [{"translation": _planar(box["translation"])} if "translation" in box else {} for box in records]
+    xy = read_number_rows(place, "translation", 2, names)
+    return _Rows(records, names, np.array(frame, dtype=np.int64), np.array(category, dtype=np.int64), xy)
+
+
+def _first(box: Box, keys: Sequence[str]) -> Any:
+    return next((box[key] for key in keys if key in box), None)
+
+
+def _planar(value: Any) -> Any:
+    """Return x and y of a place, which may have a height."""
+    return value[:2] if isinstance(value, list) and len(value) in (2, 3) else value
+
+
+def _scores(rows: _Rows) -> Float[ndarray, "n"]:
+    found = [_first(box, SCORES) for box in rows.records]
+    stated = [{} if value is None else {"score": value} for value in found]
+    score = read_number_rows(stated, "score", 1, rows.names)[:, 0]
+    wrong = np.flatnonzero((score < 0) | (score > 1))
+    if len(wrong):
+        raise InputError(f"{rows.names[wrong[0]]}: the score {score[wrong[0]]:g} is not in [0, 1]")
+    return score
+
+
+def _predicted_futures(rows: _Rows) -> Float[ndarray, "n K T 2"]:
+    stated = [_first(box, FUTURES) for box in rows.records]
+    if not stated:
+        return np.zeros((0, 1, STEPS, 2))
+    shape: tuple[int, ...] = ()
+    futures: list[ndarray] = []
+    for where, value in zip(rows.names, stated, strict=True):
+        each = _numbers(value, where, "futures")
+        if each.ndim != 3 or each.shape[2] != 2 or not each.shape[0] or each.shape[1] < STEPS:
+            raise InputError(f"{where}: its futures are not [K, {STEPS}, 2] (x, y at steps of 0.5 s)")
+        shape = each.shape if not futures else shape
+        if each.shape != shape:
+            raise InputError(f"{where}: its futures are {list(each.shape)}, those before {list(shape)}")
+        futures.append(each[:, :STEPS])
+    return np.stack(futures)
+
+
+def _probabilities(rows: _Rows, futures: int) -> Float[ndarray, "n K"]:
+    found = np.full((len(rows.records), futures), 1.0 / futures)
+    for n, (where, box) in enumerate(zip(rows.names, rows.records, strict=True)):
+        stated = _first(box, PROBABILITIES)
+        if stated is not None:
+            each = _numbers(stated, where, "probabilities of its futures").reshape(-1)
+            if len(each) != futures:
+                raise InputError(f"{where} has {len(each)} probabilities for {futures} futures")
+            found[n] = each
+    return found
+
+
+def _true_futures(rows: _Rows) -> tuple[Float[ndarray, "n T 2"], Bool[ndarray, "n T"]]:
+    futures = np.zeros((len(rows.records), STEPS, 2))
+    valid = np.zeros((len(rows.records), STEPS), dtype=bool)
+    for n, (where, box) in enumerate(zip(rows.names, rows.records, strict=True)):
+        if "traj" not in box:
+            raise InputError(f"{where} has no traj: the truth states each agent's future, which may be empty")
+        each = _numbers(box["traj"], where, "traj")
+        if each.size and (each.ndim != 2 or each.shape[1] != 2):
+            raise InputError(f"{where}: its traj is not [T, 2]")
+        steps = min(len(each), STEPS)
+        futures[n, :steps] = each[:steps].reshape(-1, 2)
+        valid[n, :steps] = True
+    return futures, valid
+
+
+def _numbers(value: Any, where: str, what: str) -> ndarray:
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: its {what} are not numbers") from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{where}: its {what} are not finite")
+    return numbers
+
+
+def _placed(
+    rows: _Rows,
+    first_steps: Float[ndarray, "n K 2"],
+    true_rows: _Rows,
+    true_first: Float[ndarray, "m 2"],
+    known: Bool[ndarray, "m"],
+) -> bool:
+    """Return whether futures are in the frame of the boxes. Both files must agree on it."""
+    near = np.linalg.norm(first_steps - rows.xy[:, None], axis=-1).min(axis=1) < FAR_M
+    true_near = (np.linalg.norm(true_first - true_rows.xy, axis=-1) < FAR_M)[known]
+    placed = bool(true_near.all())
+    if not placed and true_near.any():
+        n = int(np.flatnonzero(known)[np.flatnonzero(~true_near)[0]])
+        raise InputError(f"{true_rows.names[n]}: its traj begins more than {FAR_M:g} m from its translation")
+    wrong = np.flatnonzero(near != placed) if known.any() else np.flatnonzero(~near)
+    if len(wrong):
+        raise InputError(
+            f"{rows.names[wrong[0]]}: its futures are not in the same frame as those of the truth"
+        )
+    return placed
+
+
+def _ego(
+    content: Mapping[str, Any], true: _Rows, predicted: _Rows, tokens: Sequence[str], path: Path
+) -> tuple[Float[ndarray, "F 2"], Float[ndarray, "F"]]:
+    """Return place and heading of the ego vehicle in each frame; NaN for a heading that is not told."""
+    xy, yaw = np.full((len(tokens), 2), np.nan), np.full(len(tokens), np.nan)
+    poses = content.get("ego_poses", {})
+    for number, token in enumerate(tokens):
+        pose = poses.get(token) if isinstance(poses, dict) else None
+        if isinstance(pose, dict):
+            where = f"{path}: frame {token}, its ego pose"
+            xy[number] = read_numbers(pose, "translation", 3, where)[:2]
+            w, x, y, z = read_numbers(pose, "rotation", 4, where)
+            yaw[number] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    for rows in (true, predicted):
+        for n, (frame, box) in enumerate(zip(rows.frame, rows.records, strict=True)):
+            if np.isnan(xy[frame, 0]) and "ego_translation" in box:
+                offset = read_numbers(box, "ego_translation", 3, rows.names[n])
+                if offset.any():  # the devkit writes zeros where it is unknown
+                    xy[frame] = rows.xy[n] - offset[:2]
+    missing = np.flatnonzero(np.isnan(xy[:, 0]))
+    if len(missing):
+        raise InputError(
+            f"{path}: frame {tokens[missing[0]]} does not tell where the ego vehicle is "
+            "(ego_poses, or ego_translation of a box)"
+        )
+    return xy, yaw

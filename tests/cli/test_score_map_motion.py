@@ -1,0 +1,44 @@
+"""`foredrive score --task map` and `--task motion`: summary, table, page, and one line for wrong files."""
+
+import json
+from pathlib import Path
+
+import pytest
+from evaluation.test_map_files import FOUND, TRUE, maptr, streammapnet, write
+from evaluation.test_motion_files import FOUND as AGENTS
+from evaluation.test_motion_files import TRUE as TRUE_AGENTS
+
+from foredrive.cli.main import main
+
+
+def test_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = write(tmp_path / "results.json", streammapnet(FOUND))
+    truth = write(tmp_path / "truth.json", maptr(TRUE, truth=True))
+    out = tmp_path / "out"
+    assert main(["score", str(results), "--truth", str(truth), "--task", "map", "--out", str(out)]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["task"] == "map"
+    assert summary["map.maptr.ap_divider"] == pytest.approx(1 / 3)
+    shown = capsys.readouterr().out
+    assert "MapTR" in shown
+    assert "C-mAP" not in shown  # the files have no identities
+    assert (out / "report.html").read_text().count("<table") == 2
+
+
+def test_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = write(tmp_path / "results.json", AGENTS)
+    truth = write(tmp_path / "truth.json", TRUE_AGENTS)
+    out = tmp_path / "out"
+    flags = ["score", str(results), "--truth", str(truth), "--task", "motion", "--out", str(out)]
+    assert main(flags) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["motion.uniad.car.min_ade_m"] == pytest.approx(0.3)
+    assert "SparseDrive" in capsys.readouterr().out
+    assert (out / "report.html").read_text().count("<table") == 3
+    assert main([*flags, "--poses", str(results)]) == 2
+    assert "--poses does not go with --task motion" in capsys.readouterr().err
+    write(results, {"elsewhere": []})
+    assert main(flags) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"{results}: frame elsewhere (1 in all) is not in {truth}: of another split?" in error
