@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo test quick test-slow lint format clean
+.PHONY: install demo test quick test-slow test-oracles golden lint format clean
 
 install: $(STAMP)
 
@@ -42,6 +42,25 @@ quick: install
 test-slow: install
 	$(PYTEST) -m slow
 
+# Reference code of other people, in an environment of its own that sees the packages of .venv.
+# The devkit's own requirements are older than ours, so each package is installed without its dependencies.
+ORACLES := nuscenes-devkit==1.2.0 motmetrics==1.4.0 trackeval==1.3.0 xmltodict cachetools pyquaternion
+ORACLE_STAMP := .venv-oracles/.installed
+
+$(ORACLE_STAMP): $(STAMP)
+	$(BIN)/python -m venv .venv-oracles
+	.venv-oracles/bin/python -m pip install --quiet --disable-pip-version-check --no-deps $(ORACLES)
+	$(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+		> "$$(.venv-oracles/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/foredrive.pth"
+	@touch $(ORACLE_STAMP)
+
+# Our metrics beside the reference code itself; `make test` compares with its figures in golden.json.
+test-oracles: $(ORACLE_STAMP)
+	PYTHONPATH=src OMP_NUM_THREADS=1 .venv-oracles/bin/python -m pytest -m oracle tests/oracles
+
+golden: $(ORACLE_STAMP)
+	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/make_golden.py
+
 clean:
-	rm -rf .venv runs build dist
+	rm -rf .venv .venv-oracles runs build dist
 	find src tests benchmarks -name '*.nb[ic]' -delete

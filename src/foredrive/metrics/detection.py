@@ -61,6 +61,52 @@ def _match_greedily(order, closeness, min_closeness):
     return found
 
 
+def match_centres(
+    found_frame: Int[ndarray, "m"],
+    found_xy: Float[ndarray, "m 2"],
+    score: Float[ndarray, "m"],
+    true_frame: Int[ndarray, "n"],
+    true_xy: Float[ndarray, "n 2"],
+    distances_m: Sequence[float] = NUSCENES_DISTANCES_M,
+) -> Int[ndarray, "T m"]:
+    """Match detections of one class with the nearest object of their frame that is left, as nuScenes does.
+
+    Detections take their turns by score (`descending`, ties reversed). Rows may be in any order.
+
+    Returns:
+        The true row of each detection at each distance; -1: none is nearer than the distance.
+    """
+    turn = descending(score, ties_reversed=True)
+    turn = turn[np.argsort(found_frame[turn], kind="stable")]
+    place = np.argsort(true_frame, kind="stable")
+    frames, first = np.unique(found_frame[turn], return_index=True)
+    bounds = (np.searchsorted(true_frame[place], frames, side=side) for side in ("left", "right"))
+    nearness = np.nextafter(-np.array(distances_m), 0.0)
+    matched = _match_centres(np.append(first, len(turn)), *bounds, found_xy[turn], true_xy[place], nearness)
+    found = np.empty_like(matched)
+    found[:, turn] = np.append(place, -1)[matched]
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+@no_type_check
+def _match_centres(start, true_start, true_stop, found_xy, true_xy, nearness):
+    matched = np.full((len(nearness), len(found_xy)), -1)
+    for f in range(len(start) - 1):
+        rows, there = np.arange(start[f + 1] - start[f]), true_xy[true_start[f] : true_stop[f]]
+        closeness = np.empty((len(rows), len(there)))
+        for i in rows:
+            for j in range(len(there)):
+                dx, dy = found_xy[start[f] + i, 0] - there[j, 0], found_xy[start[f] + i, 1] - there[j, 1]
+                closeness[i, j] = -np.sqrt(dx * dx + dy * dy)
+        for t in range(len(nearness)):
+            taken = _match_greedily(rows, closeness, nearness[t])
+            for i in rows:
+                if taken[i] >= 0:
+                    matched[t, start[f] + i] = true_start[f] + taken[i]
+    return matched
+
+
 def precision_recall(
     hit: Bool[ndarray, "n"], objects: int
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:

@@ -3,9 +3,7 @@
 The devkit pins NumPy 1, but `pip install --no-deps nuscenes-devkit pyquaternion cachetools` is enough here.
 """
 
-import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +11,11 @@ import pytest
 from evaluation.detections.files_of_detections import box, write_nuscenes
 
 from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.nuscenes_results import BICYCLE_RACK, CLASS_RANGE_M
+from foredrive.evaluation.detections.nuscenes_results import BICYCLE_RACK
 from foredrive.evaluation.detections.score import score_frames
 from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.evaluation.summary import Figures
+from foredrive.metrics.detection_protocols import CLASSES
 
 Boxes = list[dict[str, Any]]
 
@@ -82,7 +81,7 @@ def test_a_match_is_closer_than_the_threshold(tmp_path: Path) -> None:
 def random_drive(rng: np.random.Generator) -> tuple[dict[str, Boxes], dict[str, Boxes]]:
     """Frames of objects up to 60 m away, racks, near detections and false ones, many with equal scores."""
     truth, found = {}, {}
-    names = sorted(CLASS_RANGE_M)
+    names = sorted(CLASSES)
     for n in range(12):
         places = [(*rng.uniform(-45, 45, 2), str(rng.choice(names))) for _ in range(25)]
         truth[f"f{n}"] = [at(x, y, name, num_pts=int(rng.integers(0, 6))) for x, y, name in places]
@@ -93,44 +92,3 @@ def random_drive(rng: np.random.Generator) -> tuple[dict[str, Boxes], dict[str, 
             at(x, y, name, detection_score=round(float(rng.random()), 1)) for x, y, name in moved
         ]
     return truth, found
-
-
-def test_parity_with_the_devkit(tmp_path: Path) -> None:
-    """Its filter, matching and average precision, on the boxes as it serialises them itself."""
-    loaders = pytest.importorskip("nuscenes.eval.common.loaders", exc_type=ImportError)
-    from nuscenes.eval.common.data_classes import EvalBoxes
-    from nuscenes.eval.common.utils import center_distance
-    from nuscenes.eval.detection.algo import accumulate, calc_ap
-    from nuscenes.eval.detection.data_classes import DetectionBox
-
-    for seed in range(3):
-        truth, found = random_drive(np.random.default_rng(seed))
-        racks = {f: [b for b in boxes if b["detection_name"] == BICYCLE_RACK] for f, boxes in truth.items()}
-        true_boxes, boxes = EvalBoxes(), EvalBoxes()
-        for target, source in ((true_boxes, truth), (boxes, found)):
-            for frame, members in source.items():
-                kept = [b for b in members if b["detection_name"] != BICYCLE_RACK]
-                fields = {"sample_token": frame, "velocity": [0.0, 0.0], "attribute_name": ""}
-                target.add_boxes(frame, [DetectionBox.deserialize({**b, **fields}) for b in kept])
-        files = {"found": boxes.serialize(), "gt": true_boxes.serialize()}
-        for frame in racks:
-            files["gt"][frame] += racks[frame]
-        for name, content in files.items():
-            (tmp_path / f"{name}.json").write_text(json.dumps(content))
-
-        def get(table: str, token: Any, racks: dict[str, Boxes] = racks) -> dict[str, Any]:
-            """Annotations are the racks themselves: what the filter asks the data set for."""
-            if table == "sample":
-                return {"anns": racks[token]}
-            return {"category_name": BICYCLE_RACK, **token}
-
-        for each in (true_boxes, boxes):
-            loaders.filter_eval_boxes(SimpleNamespace(get=get), each, CLASS_RANGE_M)
-        read = read_detections(tmp_path / "found.json", tmp_path / "gt.json")
-        figures = summarise_scores(read, score_frames(read)).figures
-        for name in CLASS_RANGE_M:
-            expected = [
-                calc_ap(accumulate(true_boxes, boxes, name, center_distance, distance), 0.1, 0.1)
-                for distance in (0.5, 1.0, 2.0, 4.0)
-            ]
-            assert figures[f"ap.{name}"] == pytest.approx(np.mean(expected), abs=1e-12)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
@@ -38,21 +37,15 @@ from foredrive.evaluation.detections.frames import (
     read_numbers,
     read_relevance,
 )
-from foredrive.geometry.boxes import points_in_boxes
+from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS
+from foredrive.metrics.object_rows import UNKNOWN_POINTS, ObjectRows, counted, make_rows
 from foredrive.sets import Family, MultiBernoulli
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])
 """Region of objects: around the ego vehicle, or the middle of the frame's boxes, in m and log m."""
 DEFAULT_COVARIANCE = np.diag(np.square([*STD_M, *[STD_LOG_SIZE] * 3]))
-CLASS_RANGE_M = {
-    **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), 50.0),
-    **dict.fromkeys(("pedestrian", "motorcycle", "bicycle"), 40.0),
-    **dict.fromkeys(("traffic_cone", "barrier"), 30.0),
-}
-"""Range over ground within which the devkit (detection_cvpr_2019) counts a class."""
 BICYCLE_RACK = "static_object.bicycle_rack"
-_IN_RACKS = ("bicycle", "motorcycle")
 
 Box = Mapping[str, Any]
 
@@ -103,7 +96,8 @@ class _Boxes:
     @classmethod
     def of(cls, records: Sequence[Box], where: str) -> "_Boxes":
         names = [f"{where}, box {n}" for n in range(len(records))]
-        state, yaw = _states(records, names)
+        centre, size_lwh, yaw = read_geometry(records, names)
+        state = np.concatenate([centre, np.log(size_lwh)], axis=1)
         return cls(records, names, state, yaw, _ego(records, state, names))
 
     def __getitem__(self, which: Bool[ndarray, "n"]) -> "_Boxes":
@@ -114,16 +108,27 @@ class _Boxes:
         return [classes.index(box["detection_name"]) for box in self.records]
 
     def count_in_precision(self, ego: Float[ndarray, "3"] | None, racks: "_Boxes") -> Bool[ndarray, "n"]:
-        """Return whether the devkit counts each box: in range, with points, not in a bicycle rack."""
-        kinds = [box["detection_name"] for box in self.records]
-        points = [box.get("num_pts", -1) for box in self.records]
-        counts = np.array([number != 0 for number in points], bool)
-        if ego is not None:
-            limit = np.array([CLASS_RANGE_M.get(kind, np.inf) for kind in kinds])
-            counts &= np.linalg.norm(self.state[:, :2] - ego[:2], axis=1) < limit
-        centre, rack = torch.as_tensor(self.state[:, :3]), torch.as_tensor(racks.state)
-        inside = points_in_boxes(centre, rack[:, :3], rack[:, 3:].exp(), torch.as_tensor(racks.yaw)).any(1)
-        return counts & ~(inside.numpy() & np.isin(kinds, _IN_RACKS))
+        """Return whether nuScenes' protocol counts each box. Where the ego vehicle is unknown, ranges are."""
+        protocol = DETECTION_PROTOCOLS["nuscenes"]
+        return counted(
+            self.rows(protocol.classes, ego), racks.rows((), ego), protocol.region, protocol.classes
+        )
+
+    def rows(self, classes: Sequence[str], ego: Float[ndarray, "3"] | None) -> ObjectRows:
+        """Return the boxes as rows of one frame; the label of a class that is not among `classes` is -1."""
+        number = {name: n for n, name in enumerate(classes)}
+        label = np.array([number.get(box["detection_name"], -1) for box in self.records], dtype=np.int64)
+        points = np.array([box.get("num_pts", UNKNOWN_POINTS) for box in self.records], dtype=np.int64)
+        place = np.full(3, np.nan) if ego is None else ego
+        return make_rows(
+            np.zeros(len(label), np.int64),
+            label,
+            self.state[:, :3],
+            np.exp(self.state[:, 3:]),
+            self.yaw,
+            num_points=points,
+            from_ego=self.state[:, :2] - place[:2],
+        )
 
 
 def _frame(
@@ -191,8 +196,14 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
     return boxes
 
 
-def _states(boxes: Sequence[Box], names: Sequence[str]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
-    """Return centre and log length, width, height; and heading."""
+def read_geometry(
+    boxes: Sequence[Box], names: Sequence[str]
+) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Float[ndarray, "n"]]:
+    """Return centre (m, global), length, width, height (m), and heading (rad).
+
+    Raises:
+        InputError: a box has no size or no rotation, or a number that is not finite.
+    """
     centre, size, rotation = (
         read_number_rows(boxes, key, count, names)
         for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
@@ -205,7 +216,7 @@ def _states(boxes: Sequence[Box], names: Sequence[str]) -> tuple[Float[ndarray, 
         raise InputError(f"{names[wrong[0]]} has the rotation {rotation[wrong[0]].tolist()}")
     w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-    return np.concatenate([centre, np.log(size[:, [1, 0, 2]])], axis=1), yaw
+    return centre, size[:, [1, 0, 2]], yaw
 
 
 def _ego(

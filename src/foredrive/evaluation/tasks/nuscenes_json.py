@@ -1,0 +1,245 @@
+"""Detection and tracking results of nuScenes, and ground truth in the same format.
+
+A file has lists of boxes by sample token, under `results` or alone (as the devkit's `EvalBoxes.serialize`
+returns them). A box has `translation` (m, global), `size` (w, l, h in m), `rotation` (quaternion w x y z),
+`velocity` (m/s, NaN where unknown), and either `detection_name`, `detection_score` and `attribute_name`, or
+`tracking_name`, `tracking_score` and `tracking_id`.
+
+Truth may have either name, and `num_pts`, `ego_translation` and `tracking_id`. Boxes with the name of a
+bicycle rack are no objects. Tracking needs the scene and the time of each sample: `scene_token` and
+`timestamp` (µs), in its boxes or under `samples`, an object by sample token. There `ego_translation` is the
+place of the ego vehicle; in a box it is the box's offset from it.
+"""
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import read_numbers
+from foredrive.evaluation.detections.nuscenes_results import read_geometry
+from foredrive.evaluation.tasks.nuscenes_columns import (
+    Box,
+    read_attributes,
+    read_labels,
+    read_points,
+    read_scores,
+    read_texts,
+    read_velocities,
+)
+from foredrive.evaluation.tasks.objects import (
+    RACK,
+    BoxNames,
+    FoundObjects,
+    ObjectTruth,
+    check_known_frames,
+    check_tracks,
+    lacking,
+    number_names,
+)
+from foredrive.metrics.detection_protocols import CLASSES
+from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
+
+ObjectTask = Literal["detection", "tracking"]
+_TRUE_NAMES = ("tracking_name", "detection_name")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the ground truth says of a frame."""
+
+    scene: str | None
+    time_us: int | None
+    ego: Float[ndarray, "2"] | None
+    """Place of the ego vehicle over ground, m, global."""
+
+
+def read_results(
+    path: Path, truth: ObjectTruth, truth_path: Path, task: ObjectTask, classes: Sequence[str], max_boxes: int
+) -> FoundObjects:
+    """Read the detections or tracks of a results file.
+
+    Args:
+        truth, truth_path: the frames that the results are of.
+        classes: of the task; labels are their indices.
+        max_boxes: largest number of boxes that a frame may have.
+
+    Raises:
+        InputError: a box is wrong, or a frame has no ground truth. The message names the first.
+    """
+    found = boxes_by_frame(path, read_json(path))
+    check_known_frames(path, found, truth_path, truth.names)
+    for name, each in found.items():
+        if len(each) > max_boxes:
+            raise InputError(f"{path}: frame {name} has {len(each)} boxes, and {max_boxes} are allowed")
+    names, boxes = BoxNames(path, found), [box for each in found.values() for box in each]
+    number = {name: n for n, name in enumerate(truth.names)}
+    frame = np.array([number[name] for name, each in found.items() for _ in each], dtype=np.int64)
+    label = read_labels(boxes, (f"{task}_name",), classes, (), names)
+    centre, size_lwh, yaw = read_geometry(boxes, names)
+    columns: dict[str, ndarray] = {
+        "score": read_scores(boxes, f"{task}_score", names),
+        "velocity": read_velocities(boxes, names),
+        "from_ego": centre[:, :2] - truth.ego[frame],
+    }
+    missing = len(number) - len(found)
+    if task == "detection":
+        columns["attribute"] = read_attributes(boxes, names)
+        return FoundObjects(make_rows(frame, label, centre, size_lwh, yaw, **columns), missing)
+    identities = read_texts(boxes, "tracking_id", names)
+    columns["track"] = number_names(identities)
+    rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
+    check_tracks(rows, identities, names)
+    return FoundObjects(rows, missing)
+
+
+def read_json_truth(path: Path, task: ObjectTask, classes: Sequence[str]) -> ObjectTruth:
+    """Read ground truth in the format of results.
+
+    Raises:
+        InputError: a box is wrong, or tracking lacks a scene, a time or an identity.
+    """
+    whole = read_json(path)
+    content, stated = boxes_by_frame(path, whole), whole.get("samples", {})
+    if not isinstance(stated, dict) or not all(isinstance(each, dict) for each in stated.values()):
+        raise InputError(f"{path}: its `samples` must be objects by sample token")
+    samples = {
+        name: _sample(stated.get(name, {}), boxes, f"{path}: frame {name}") for name, boxes in content.items()
+    }
+    return make_truth(content, samples, path, task, classes)
+
+
+def make_truth(
+    content: Mapping[str, Sequence[Box]],
+    samples: Mapping[str, Sample],
+    path: Path,
+    task: ObjectTask,
+    classes: Sequence[str],
+) -> ObjectTruth:
+    """Return the ground truth of boxes by frame; for tracking, frames are ordered by scene and time.
+
+    Classes that the task leaves out have the label -1.
+
+    Raises:
+        InputError: a box is wrong, or tracking lacks a scene, a time or an identity.
+    """
+    if task == "tracking":
+        content = {name: content[name] for name in _in_time(samples, path)}
+    racks, objects = (
+        {name: [box for box in boxes if (_name(box) == RACK) is rack] for name, boxes in content.items()}
+        for rack in (True, False)
+    )
+    ego = np.array([(np.nan, np.nan) if (at := samples[name].ego) is None else at for name in content])
+    ego = ego.reshape(-1, 2).astype(np.float64)
+    boxes = _true_rows(objects, ego, path, task, classes)
+    times = np.array([samples[name].time_us or 0 for name in content], dtype=np.int64)
+    frames = Frames(number_names(samples[name].scene or name for name in content), times)
+    return ObjectTruth(
+        list(content), boxes, _true_rows(racks, ego, path, "detection", ()), frames, ego, lacking(boxes)
+    )
+
+
+def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
+    """Return the boxes of a file by sample token.
+
+    Raises:
+        InputError: it has none.
+    """
+    boxes = content.get("results", content)
+    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
+    for name, each in boxes.items():
+        for n, box in enumerate(each):
+            if not isinstance(box, dict):
+                raise InputError(f"{path}: frame {name}, box {n} is no object")
+    return boxes
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: the file has none.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON that can be read") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: not an object of boxes by sample token")
+    return content
+
+
+def _true_rows(
+    content: Mapping[str, Sequence[Box]],
+    ego: Float[ndarray, "F 2"],
+    path: Path,
+    task: ObjectTask,
+    classes: Sequence[str],
+) -> ObjectRows:
+    names, boxes = BoxNames(path, content), [box for each in content.values() for box in each]
+    frame = np.repeat(np.arange(len(content)), [len(each) for each in content.values()])
+    centre, size_lwh, yaw = read_geometry(boxes, names)
+    columns: dict[str, ndarray] = {
+        "velocity": read_velocities(boxes, names),
+        "attribute": read_attributes(boxes, names),
+        "num_points": read_points(boxes, names),
+        "from_ego": centre[:, :2] - ego[frame],
+    }
+    identities = read_texts(boxes, "tracking_id", names) if task == "tracking" else []
+    if task == "tracking":
+        columns["track"] = number_names(identities)
+    label = read_labels(boxes, _TRUE_NAMES, classes, {*CLASSES, RACK}, names)
+    rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
+    if task == "tracking":
+        check_tracks(rows, identities, names)
+    return rows
+
+
+def _name(box: Box) -> object:
+    return next((box[key] for key in _TRUE_NAMES if key in box), None)
+
+
+def _sample(stated: Mapping[str, Any], boxes: Sequence[Box], where: str) -> Sample:
+    """Return what a sample, or else its first box, says of scene, time and ego vehicle."""
+    box = boxes[0] if boxes else {}
+    scene, time_us = (stated.get(key, box.get(key)) for key in ("scene_token", "timestamp"))
+    ego = None
+    if "ego_translation" in stated:
+        ego = read_numbers(stated, "ego_translation", 3, where)[:2]
+    elif "ego_translation" in box:
+        offset = read_numbers(box, "ego_translation", 3, f"{where}, box 0")
+        if offset.any():  # the devkit writes zeros where it does not know
+            ego = (read_numbers(box, "translation", 3, f"{where}, box 0") - offset)[:2]
+    if time_us is not None and not isinstance(time_us, int):
+        raise InputError(f"{where}: its timestamp is no whole number of microseconds")
+    return Sample(None if scene is None else str(scene), time_us, ego)
+
+
+def _in_time(samples: Mapping[str, Sample], path: Path) -> list[str]:
+    """Return the frames by scene, in the order in which scenes appear, and time.
+
+    Raises:
+        InputError: a scene or a time is missing, or two frames of a scene have the same time.
+    """
+    for name, sample in samples.items():
+        if sample.scene is None or sample.time_us is None:
+            raise InputError(
+                f"{path}: frame {name} has no scene_token and timestamp, in its boxes or under `samples`: "
+                "tracking needs them"
+            )
+    place = {scene: n for n, scene in enumerate(dict.fromkeys(sample.scene for sample in samples.values()))}
+    ordered = sorted(samples, key=lambda name: (place[samples[name].scene], samples[name].time_us))
+    for before, name in itertools.pairwise(ordered):
+        if (samples[before].scene, samples[before].time_us) == (samples[name].scene, samples[name].time_us):
+            raise InputError(f"{path}: frames {before} and {name} have the same scene and time")
+    return ordered

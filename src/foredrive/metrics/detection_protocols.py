@@ -1,0 +1,222 @@
+"""The detection protocols in use on nuScenes, as data, and their figures.
+
+Facts read in the public code:
+- nuScenes: nuscenes-devkit 1.2.0, eval/detection (algo.py, data_classes.py), eval/common/utils.py,
+  detection_cvpr_2019.json
+- VAD: hustvl/VAD, datasets/vad_custom_nuscenes_eval.py (filter_eval_boxes),
+  vad_nusc_detection_cvpr_2019.json. It counts boxes within ±30 m and ±15 m along two axes. The axes are those
+  of the world, as `ego_translation` is, while the code that writes VAD's results keeps boxes by the same
+  limits along the axes of the ego vehicle. Here the file is taken as it is.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from foredrive.metrics.detection import (
+    NUSCENES_DISTANCES_M,
+    average_precision_nuscenes,
+    descending,
+    match_centres,
+    mean_of_valid,
+    precision_recall,
+)
+from foredrive.metrics.object_rows import NO_ATTRIBUTE, ObjectRows, Region, counted
+
+ERRORS = ("ate_m", "ase", "aoe_rad", "ave_mps", "aae")
+"""Errors of translation, scale (1 - overlap of sizes), orientation, velocity, attribute (1 - accuracy)."""
+
+
+@dataclass(frozen=True)
+class DetectionProtocol:
+    """The choices that define a detection protocol."""
+
+    title: str
+    classes: tuple[str, ...]
+    region: Region
+    distances_m: tuple[float, ...]
+    """Distances of centres over ground below which a detection hits; average precision is their mean."""
+    error_distance_m: float
+    """The one of them at which errors are taken."""
+    min_recall: float
+    """Recalls up to this one do not count, neither in average precision nor in errors."""
+    half_turn: frozenset[str]
+    """Classes whose front and back look alike."""
+    without: Mapping[str, frozenset[str]]
+    """Errors that are not defined for a class."""
+    map_weight: float
+    """Weight of mAP in NDS; each error's score has weight 1."""
+    max_boxes: int
+    """Maximum number of detections in a frame of a results file."""
+
+
+CLASSES: Final = (
+    "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle",
+    "traffic_cone", "barrier",
+)  # fmt: skip
+ATTRIBUTES: Final = (
+    "pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing", "cycle.with_rider",
+    "cycle.without_rider", "vehicle.moving", "vehicle.parked", "vehicle.stopped",
+)  # fmt: skip
+
+_REACH_M: Final = {
+    **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), (50.0, 50.0)),
+    **dict.fromkeys(("pedestrian", "motorcycle", "bicycle"), (40.0, 40.0)),
+    **dict.fromkeys(("traffic_cone", "barrier"), (30.0, 30.0)),
+}
+
+
+def _nuscenes(title: str, region: Region) -> DetectionProtocol:
+    return DetectionProtocol(
+        title=title,
+        classes=CLASSES,
+        region=region,
+        distances_m=NUSCENES_DISTANCES_M,
+        error_distance_m=2.0,
+        min_recall=0.1,
+        half_turn=frozenset({"barrier"}),
+        without={
+            "traffic_cone": frozenset({"aoe_rad", "ave_mps", "aae"}),
+            "barrier": frozenset({"ave_mps", "aae"}),
+        },
+        map_weight=5.0,
+        max_boxes=500,
+    )
+
+
+DETECTION_PROTOCOLS: Mapping[str, DetectionProtocol] = {
+    "nuscenes": _nuscenes("nuScenes", Region("circle", _REACH_M)),
+    "vad": _nuscenes("VAD", Region("rectangle", dict.fromkeys(CLASSES, (30.0, 15.0)))),
+}
+
+
+@dataclass(frozen=True)
+class ClassFigures:
+    """Figures of one class."""
+
+    ap: Mapping[float, float]
+    """Average precision at each distance, m."""
+    errors: Mapping[str, float]
+    """`ERRORS` of hits; NaN where the class has none defined."""
+    true: int
+    """Number of true boxes that the protocol counts."""
+
+
+@dataclass(frozen=True)
+class DetectionFigures:
+    """Figures of one protocol."""
+
+    by_class: Mapping[str, ClassFigures]
+    mean_ap: float
+    """Mean over classes and distances. A class without true boxes has 0."""
+    errors: Mapping[str, float]
+    """Means over the classes for which each is defined. A class of which nothing is found has 1."""
+    nds: float
+    """nuScenes detection score: mean of mAP (weight 5) and of 1 - error, at least 0 (weight 1 each)."""
+
+
+def evaluate_detections(
+    found: ObjectRows, true: ObjectRows, racks: ObjectRows, protocol: DetectionProtocol
+) -> DetectionFigures:
+    """Return the figures of detections under one protocol.
+
+    Args:
+        found: in the order of the file: among equal scores the later detection comes first.
+        true, found: labels are indices into the protocol's classes; -1 is left out.
+        racks: bicycle racks; labels do not matter.
+    """
+    found, true = (
+        boxes[(boxes.label >= 0) & counted(boxes, racks, protocol.region, protocol.classes)]
+        for boxes in (found, true)
+    )
+    by_class = {
+        name: _class_figures(found[found.label == n], true[true.label == n], name, protocol)
+        for n, name in enumerate(protocol.classes)
+    }
+    mean_ap = float(np.mean([np.mean([*figures.ap.values()]) for figures in by_class.values()]))
+    errors = {key: mean_of_valid([figures.errors[key] for figures in by_class.values()]) for key in ERRORS}
+    score = protocol.map_weight * mean_ap + sum(max(0.0, 1.0 - error) for error in errors.values())
+    return DetectionFigures(by_class, mean_ap, errors, score / (protocol.map_weight + len(ERRORS)))
+
+
+def _class_figures(
+    found: ObjectRows, true: ObjectRows, name: str, protocol: DetectionProtocol
+) -> ClassFigures:
+    partners = match_centres(
+        found.frame,
+        found.centre[:, :2],
+        found.score,
+        true.frame,
+        true.centre[:, :2],
+        protocol.distances_m,
+    )
+    ap = {
+        # A class without true boxes has average precision 0 in the devkit.
+        distance: average_precision_nuscenes(found.score, partner >= 0, len(true)) if len(true) else 0.0
+        for distance, partner in zip(protocol.distances_m, partners, strict=True)
+    }
+    partner = partners[protocol.distances_m.index(protocol.error_distance_m)]
+    errors = _mean_errors(found, true, partner, name, protocol)
+    undefined = dict.fromkeys(protocol.without.get(name, ()), math.nan)
+    return ClassFigures(ap, errors | undefined, len(true))
+
+
+def _mean_errors(
+    found: ObjectRows, true: ObjectRows, partner: Int[ndarray, "m"], name: str, protocol: DetectionProtocol
+) -> dict[str, float]:
+    """Return each error as a mean over recalls, of its running mean over hits of falling score.
+
+    Recalls are those above the least one, up to the largest that is reached with a score above 0.
+    """
+    order = descending(found.score, ties_reversed=True)
+    found, partner = found[order], partner[order]
+    hit = partner >= 0
+    if not hit.any():
+        return dict.fromkeys(ERRORS, 1.0)
+    _, recall = precision_recall(hit, len(true))
+    score = np.interp(np.linspace(0, 1, 101), recall, found.score, right=0)
+    first, reached = round(100 * protocol.min_recall) + 1, np.flatnonzero(score)
+    last = reached[-1] if len(reached) else 0
+    if last < first:
+        return dict.fromkeys(ERRORS, 1.0)
+    hits = found[hit]
+    values = hit_errors(hits, true[partner[hit]], half_turn=name in protocol.half_turn)
+    means = {}
+    for key, each in values.items():
+        at = np.interp(score[::-1], hits.score[::-1], running_mean(each)[::-1])[::-1]
+        means[key] = float(at[first : last + 1].mean())
+    return means
+
+
+def hit_errors(
+    found: ObjectRows, true: ObjectRows, *, half_turn: bool = False
+) -> dict[str, Float[ndarray, "n"]]:
+    """Return `ERRORS` of pairs. NaN: the velocity is unknown, or the true box has no attribute."""
+    smaller, a, b = (
+        size.prod(axis=1)
+        for size in (np.minimum(found.size_lwh, true.size_lwh), found.size_lwh, true.size_lwh)
+    )
+    period = math.pi if half_turn else 2 * math.pi
+    turn = np.abs((true.yaw - found.yaw + period / 2) % period - period / 2)
+    wrong = np.where(found.attribute == true.attribute, 0.0, 1.0)
+    return {
+        "ate_m": np.linalg.norm(found.centre[:, :2] - true.centre[:, :2], axis=1),
+        "ase": 1.0 - smaller / (a + b - smaller),
+        "aoe_rad": turn,
+        "ave_mps": np.linalg.norm(found.velocity - true.velocity, axis=1),
+        "aae": np.where(true.attribute == NO_ATTRIBUTE, np.nan, wrong),
+    }
+
+
+def running_mean(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
+    """Return the mean of the known values so far: 0 before the first, 1 everywhere if none is known."""
+    known: Bool[ndarray, n] = ~np.isnan(values)
+    if not known.any():
+        return np.ones(len(values))
+    count = np.cumsum(known)
+    return np.divide(np.nancumsum(values), count, out=np.zeros(len(values)), where=count > 0)

@@ -1,0 +1,1 @@
+"""Tracks against true tracks: CLEAR MOT, HOTA, and nuScenes' averages over recalls."""
