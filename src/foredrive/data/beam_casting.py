@@ -9,7 +9,8 @@ import numba
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+UNKNOWN, FREE, OCCUPIED, SEEN = 0, 1, 2, 3
+"""States of a voxel. SEEN is OCCUPIED, and the first such voxel on a line of sight."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -19,6 +20,7 @@ def cast_beams(
     end: Float64[np.ndarray, "N 3"],
     free_until: Float64[np.ndarray, "N"],
     state_zyx: UInt8[np.ndarray, "Z Y X"],
+    opaque: bool = False,
 ) -> None:
     """Change the UNKNOWN voxels that a beam passes through to FREE.
 
@@ -31,6 +33,7 @@ def cast_beams(
         end: end of each beam, in the same coordinates.
         free_until: fraction of the way from origin to end up to which the beam is known to be free.
         state_zyx: contiguous state of the voxels, changed in place.
+        opaque: end at the first voxel that is OCCUPIED, and change it to SEEN.
     """
     nz, ny, nx = state_zyx.shape
     state = state_zyx.reshape(-1)
@@ -47,6 +50,9 @@ def cast_beams(
         z, step_z, next_z, delta_z = _start(oz, dz, nz, enter)
         at = np.uint64((z * ny + y) * nx + x)
         while True:
+            if opaque and state[at] >= OCCUPIED:
+                state[at] = SEEN
+                break
             # Step across the nearest voxel border.
             if state[at] == UNKNOWN:
                 state[at] = FREE

@@ -23,8 +23,10 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
+from foredrive.data.task_truth import TaskTruthConfig, TaskTruthStore
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
+from foredrive.scene.task_truth import TaskTruth
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class ClipConfig:
     future_source: Literal["driven", "expert"] = "driven"
     """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
     DAgger demonstrations. Clips without such a plan use the driven path."""
+    tasks: TaskTruthConfig | None = None
+    """Ground truth of detection, mapping, motion and occupancy heads to read for each now. None: nothing."""
     part_s: tuple[float, float] | None = None
     """Part of each log, (start, end) in s since its start, end exclusive. Only clips with now and all later
     frames inside it are used. None is the whole log."""
@@ -99,6 +103,7 @@ class ClipDataset(Dataset[Example]):
         self._labels = LabelStore(
             cache_dir, config.voxels, "accumulated" if config.occupancy_source == "accumulated" else "lidar"
         )
+        self._truth = None if config.tasks is None else TaskTruthStore(cache_dir, config.tasks, config.voxels)
         self._clips: list[tuple[int, list[int]]] = []
         self.command_source = {"route": 0, "driven_future": 0, "none": 0}
         for number, log in enumerate(self._logs):
@@ -141,7 +146,20 @@ class ClipDataset(Dataset[Example]):
                 known=torch.stack([label.flow_known for label in labels]),
             ),
             key=(f"{log.path.name}@{self.now_us(index)}",),
+            truth=self.truth(index),
         )
+
+    def truth(self, index: int) -> TaskTruth | None:
+        """Read the truth of a clip alone. Return None if none was asked for.
+
+        Raises:
+            InputError: data cannot be read.
+        """
+        if self._truth is None:
+            return None
+        number, frames = self._clips[index]
+        cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
+        return self._truth.read(self._logs[number], frames[self.config.past_frames], cameras)
 
     def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
         if self.config.occupancy_source == "recorded":

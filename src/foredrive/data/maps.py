@@ -87,6 +87,13 @@ def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "V 2"]] | None:
     return [np.concatenate([left, right[::-1]]) for left, right in sides]
 
 
+def map_file(log: Log) -> Path | None:
+    """Return the file of a log's own map, or of the map that it shares, if there is one."""
+    own, metadata = log.path.folder / "map.arrow", log.metadata
+    shared = log.path.maps_dir / metadata.dataset / f"{metadata.dataset}_{metadata.location}.arrow"
+    return next((file for file in (own, shared) if file.is_file()), None)
+
+
 def write_map(objects: Iterable[BaseMapObject], location: str, root: Path) -> Path:
     """Write a map with heights, unless it exists. All logs of `location` in the data root share it.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 
 from foredrive.data.labels import VoxelLabels
 from foredrive.data.logs import Log
@@ -49,8 +49,31 @@ def resampled_labels(recorded: FullOccupancy, spec: VoxelSpec) -> VoxelLabels:
     of its content. All voxels inside the recorded grid are known. Voxels under the ground are free, because
     the ground is a surface.
     """
-    fastest_last = np.argsort((recorded.velocity_mps**2).sum(axis=-1), kind="stable")
-    index, velocity = recorded.index_zyx[fastest_last], recorded.velocity_mps[fastest_last]
+    held, known = held_voxels(recorded, (recorded.velocity_mps**2).sum(axis=-1), spec)
+    occupied = known & (held != NOTHING)
+    flow_mps = np.zeros((3, *spec.shape_zyx), dtype=np.float32)
+    flow_mps[:, occupied] = recorded.velocity_mps[held[occupied]].T
+    return VoxelLabels(
+        occupied=torch.from_numpy(occupied),
+        known=torch.from_numpy(known),
+        flow_mps=torch.from_numpy(flow_mps),
+        flow_known=torch.from_numpy(occupied.copy()),
+    )
+
+
+def held_voxels(
+    recorded: FullOccupancy, priority: Shaped[np.ndarray, "K"], spec: VoxelSpec
+) -> tuple[Int[np.ndarray, "Z Y X"], Bool[np.ndarray, "Z Y X"]]:
+    """Return the recorded voxel that each voxel of another grid holds, and the voxels inside the recording.
+
+    A voxel holds the recorded voxels whose centres it contains, and the one in which its own centre lies. Of
+    several it takes the one with the highest priority.
+
+    Returns:
+        Index of a recorded voxel, or NOTHING; True for voxels that are completely inside the recorded grid.
+    """
+    order = np.argsort(priority, kind="stable")
+    index = recorded.index_zyx[order]
     which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)  # one more layer, for indices outside
     which[tuple(index.T)] = np.arange(len(index))
     held = which[np.ix_(*_voxels_at_middles(spec, recorded.spec))]
@@ -58,17 +81,7 @@ def resampled_labels(recorded: FullOccupancy, spec: VoxelSpec) -> VoxelLabels:
     z, y, x = (of_axis[index[:, axis]] for axis, of_axis in enumerate(middles))
     within = np.flatnonzero((z >= 0) & (y >= 0) & (x >= 0))
     np.maximum.at(held, (z[within], y[within], x[within]), within)
-
-    known = _within(spec, recorded.spec)
-    occupied = known & (held != NOTHING)
-    flow_mps = np.zeros((3, *spec.shape_zyx), dtype=np.float32)
-    flow_mps[:, occupied] = velocity[held[occupied]].T
-    return VoxelLabels(
-        occupied=torch.from_numpy(occupied),
-        known=torch.from_numpy(known),
-        flow_mps=torch.from_numpy(flow_mps),
-        flow_known=torch.from_numpy(occupied.copy()),
-    )
+    return np.append(order, NOTHING)[held], _within(spec, recorded.spec)
 
 
 def _voxels_at_middles(spec: VoxelSpec, grid: VoxelSpec) -> list[Int[np.ndarray, "_"]]:

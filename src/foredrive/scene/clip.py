@@ -14,6 +14,7 @@ from foredrive.scene.map_patch import MapPatch
 from foredrive.scene.record import Record
 from foredrive.scene.rig import CameraRig
 from foredrive.scene.sweep import LidarSweep
+from foredrive.scene.task_truth import TaskTruth
 from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelGrid
 
@@ -123,3 +124,5 @@ class Example(Record):
     where the log has tracks and the voxel is occupied."""
     key: tuple[str, ...]
     """Log name and time of now for each item of the batch. Errors and reports show it."""
+    truth: TaskTruth | None = None
+    """Ground truth of further tasks at now. None if it was not asked for."""

@@ -40,13 +40,13 @@ class MapElements(Record):
 
 
 class RasterLayer(enum.IntEnum):
-    """Layers of a `MapRaster`."""
+    """Layers of a `MapRaster`: lines in the order of UniAD's classes, and an area."""
 
-    DRIVABLE = 0
-    DIVIDER = 1
-    CROSSING = 2
-    BOUNDARY = 3
+    DIVIDER = 0
+    CROSSING = 1
+    BOUNDARY = 2
     """UniAD's "contour"."""
+    DRIVABLE = 3
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ class MapRaster(Record):
 
 @dataclass(frozen=True)
 class InstanceRaster(Record):
-    """Vehicles seen from above, now and later, on a grid in the ego frame at now.
+    """Vehicles seen from above, now and later, on a grid in the ego frame at now. Step 0 is now.
 
-    Step 0 is now. A cell belongs to a vehicle whose box contains the centre of the cell.
+    A vehicle's cells are those that UniAD draws, about a cell more in each direction than its box.
     """
 
     spec: PlaneSpec

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, Clip, Command, Example, LidarSweep, VoxelGrid
+from foredrive.training.mirrored_truth import mirrored_truth
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ def mirrored(example: Example, chosen: Bool[Tensor, "b"]) -> Example:
         clip=_mirrored_clip(example.clip, chosen),
         occupancy=_mirrored_grid(occupancy, occupancy.values, chosen),
         flow=_mirrored_grid(flow, _negated(flow.values, chosen, (1.0, -1.0, 1.0), dim=2), chosen),
+        truth=None if example.truth is None else mirrored_truth(example.truth, chosen),
     )
 
 
