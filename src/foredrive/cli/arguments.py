@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from foredrive.errors import InputError
+from foredrive.runs.shipped import run_folder
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 SomePaths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]")]
@@ -66,10 +67,12 @@ def check_out_folder(folder: Path | None) -> None:
         raise InputError(f"--out {folder}: this is a file; a folder is needed")
 
 
-def check_run(folder: Path) -> None:
-    """Check that a folder holds a run. Raise `InputError` if it does not."""
+def check_run(run: Path) -> Path:
+    """Return the folder of a run or of a copy of `embedded:NAME`. Raise `InputError` if it holds no run."""
+    folder = run_folder(run)
     if not (folder / RUN_CONFIG).is_file():
         raise InputError(f"{folder}: not a run folder (no {RUN_CONFIG})")
+    return folder
 
 
 def check_rebuilt(folder: Path) -> None:

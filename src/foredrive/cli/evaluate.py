@@ -39,7 +39,7 @@ def evaluate(
         batch_size: Number of clips in a batch.
         rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
     """
-    check_run(run)
+    run = check_run(run)
     check_number("--examples", examples, low=0)
     check_out_folder(out)
     if rebuilt is not None:

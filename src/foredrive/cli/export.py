@@ -25,7 +25,7 @@ def export(
         logs: 123D logs, splits or data roots for the comparison; by default the training logs.
         clips: Number of clips to compare.
     """
-    check_run(run)
+    run = check_run(run)
     check_number("--clips", clips, low=1)
     check_out_folder(out)
     named = find_all_logs(logs)

@@ -37,7 +37,7 @@ def imagine(
     check_number("--samples", samples, low=1)
     check_number("--moments", moments, low=1)
     found = find_one_log(log)
-    check_run(run)
+    run = check_run(run)
 
     with importing():
         from foredrive.runs import open_run

@@ -36,7 +36,7 @@ def train(
     """
     check_out_folder(out)
     if start is not None:
-        check_run(start)
+        start = check_run(start)
     found = find_all_logs(logs)
 
     with importing():

@@ -62,7 +62,7 @@ def view(
     if save is not None and run is not None:
         raise InputError("--save draws only the log and cannot be combined with --run")
     if run is not None:
-        check_run(run)
+        run = check_run(run)
 
     with importing():
         from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames

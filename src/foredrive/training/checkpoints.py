@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.training.small_weights import full_precision
 
 MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "progress.json"
 
@@ -68,7 +69,7 @@ def save_weights(model: nn.Module, path: Path) -> None:
 
 
 def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
-    """Load weights into a model of the same architecture.
+    """Load weights into a model of the same architecture, from `save_weights` or `save_small`.
 
     Args:
         part: prefix of the model in the file, such as "world_model"; "" is the whole file.
@@ -78,7 +79,7 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
     """
     prefix = f"{part}." if part else ""
     try:
-        saved = load_file(path)
+        saved = full_precision(load_file(path))
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: weights cannot be read: {error}") from error
     state = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}

@@ -12,7 +12,8 @@ from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
-from foredrive.runs.train.baselines import fit_baselines
+from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
@@ -110,7 +111,7 @@ def _expert(town: TownSimulator | None) -> TownExpert:
 
 def _run_folder(driver: str) -> Path:
     prefix = next((known for known in (EGO_MLP, STUDENT, OLD_STUDENT) if driver.startswith(known)), "")
-    folder = Path(driver.removeprefix(prefix))
+    folder = run_folder(Path(driver.removeprefix(prefix)))
     if not folder.is_dir():
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {STUDENT}RUN"
@@ -130,4 +131,4 @@ def _fitted(folder: Path) -> EgoMLP:
     run = open_run(folder)
     planner, clips = run.recipe.planner, run.recipe.clips
     past_frames = clips.past_frames if planner.ego_mlp is None else planner.history
-    return fit_baselines(run.logs, run.recipe, run.cache_dir, past_frames)[1]
+    return run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past_frames)[1]

@@ -19,7 +19,7 @@ from foredrive.evaluation.summary import write_summary
 from foredrive.metrics.protocols import STEP_S, STEPS
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.baselines import fit_baselines
+from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Example, Trajectory
 
@@ -99,7 +99,7 @@ def evaluate_run(
     agent = load_agent(run)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s)
-    prior, ego_mlp = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
+    prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
     agent.to(device)

@@ -1,20 +1,23 @@
 """Baselines of a trained model, fitted to the logs that the model was trained on."""
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from torch import nn
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.evaluation.metric import labels_from_now
+from foredrive.files import atomic_path
 from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.recipes.config import Recipe
 from foredrive.scene import Clip, Example
-from foredrive.training import StatusDemonstrations, fit_ego_mlp, read_status
+from foredrive.training import StatusDemonstrations, fit_ego_mlp, load_weights, read_status, save_weights
 
 
 @lru_cache(maxsize=1)  # training, evaluation and the next arm of a study use the same baselines
@@ -41,6 +44,54 @@ def fit_baselines(
         sizes, status, recipe.ego_mlp, past_frames=past_frames, dt_s=clips.horizon_dt_s, target=target
     )
     return prior, mlp
+
+
+def run_baselines(
+    folder: Path, logs: tuple[LogPath, ...], recipe: Recipe[Any, Any], cache_dir: Path, past_frames: int
+) -> tuple[OccupancyPrior, EgoMLP]:
+    """Return the baselines of a run: those that are kept in its folder, or fitted ones, which are then kept.
+
+    A run that was copied to another machine is so evaluated without its training logs.
+
+    Args:
+        folder: folder of the run.
+        logs, recipe, cache_dir, past_frames: as for `fit_baselines`.
+
+    Raises:
+        InputError: a log cannot be read, or the file is of other sizes.
+    """
+    clips = recipe.clips.judged
+    file = folder / baselines_file(past_frames)
+    if file.is_file():
+        prior = OccupancyPrior(clips.future_frames + 1, clips.voxels)
+        mlp = EgoMLP(
+            recipe.planner.ego_mlp or EgoMLPConfig(),
+            past_frames=past_frames,
+            horizon_steps=clips.horizon_steps,
+            dt_s=clips.horizon_dt_s,
+            target=recipe.planner.target,
+        )
+        load_weights(Baselines(prior, mlp), file)
+        return prior, mlp.eval()
+    prior, mlp = fit_baselines(logs, recipe, cache_dir, past_frames)
+    with contextlib.suppress(OSError), atomic_path(file) as temporary:  # the folder may be read-only
+        save_weights(Baselines(prior, mlp), temporary)
+    return prior, mlp
+
+
+def baselines_file(past_frames: int) -> str:
+    """Return the name of the file of a run that keeps its baselines."""
+    return f"baselines_of_{past_frames}_past_frames.safetensors"
+
+
+class Baselines(nn.Module):
+    """The baselines as one module, to be saved and loaded like weights."""
+
+    def __init__(self, prior: OccupancyPrior, mlp: EgoMLP) -> None:
+        super().__init__()
+        self.register_buffer("occupied", prior.occupied)
+        self.register_buffer("known", prior.known)
+        self.mlp = mlp
 
 
 def read_training_set(

@@ -1,0 +1,61 @@
+"""Trained models that come with the package: `embedded:NAME` in place of a run folder."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+
+EMBEDDED = "embedded:"
+CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
+"""As in `runs.folder`, which is slow to import; arguments are checked before."""
+MODELS = Path(__file__).parent / "models"
+"""A folder for each model: config.yaml, logs.json without logs, the baselines, weights of the last stage in
+8 bits (`save_small`), and card.md."""
+CARD = "card.md"
+COPIES = Path("runs")
+"""Folder of the copies, below the working directory."""
+
+
+def shipped_models() -> list[str]:
+    """Return the names of all models that come with the package."""
+    return sorted(folder.name for folder in MODELS.glob("*") if (folder / CONFIG).is_file())
+
+
+def run_folder(run: Path, copies: Path = COPIES) -> Path:
+    """Return the folder of a run.
+
+    A model that comes with the package is first copied to `copies`/embedded_NAME, where evaluations and
+    caches may then write. The copy of another version is replaced.
+
+    Args:
+        run: a run folder, or `embedded:NAME`.
+        copies: folder of the copies.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    if not str(run).startswith(EMBEDDED):
+        return run
+    name = str(run).removeprefix(EMBEDDED)
+    if name not in shipped_models():
+        raise InputError(f"{run}: no such model; there are {', '.join(shipped_models()) or 'none'}")
+    source, copy = MODELS / name, copies / f"embedded_{name}"
+    if _digest(source) != _digest(copy):
+        shutil.rmtree(copy, ignore_errors=True)
+        with atomic_path(copy) as temporary:
+            shutil.copytree(source, temporary)
+            logs = temporary / LOGS
+            entries = json.loads(logs.read_text()) | {"cache_dir": str((copy / "cache").absolute())}
+            logs.write_text(json.dumps(entries, indent=1))
+    return copy
+
+
+def _digest(folder: Path) -> str | None:
+    """Return a digest of recipe and weights; None if there is no run."""
+    files = [folder / CONFIG, *sorted(folder.glob(f"*/{WEIGHTS}"))]
+    if not files[0].is_file():
+        return None
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

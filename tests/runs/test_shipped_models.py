@@ -1,0 +1,102 @@
+"""Models that come with the package: written from a run, opened by name, evaluated without training logs."""
+
+import dataclasses
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.evaluation.summary import read_summary
+from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
+from foredrive.runs.ship import ship
+from foredrive.runs.shipped import run_folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: Run, log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("run") / "own"
+    shutil.copytree(trained.folder, folder)
+    own = dataclasses.replace(trained, folder=folder)
+    evaluate_run(own, [log], folder, views=False)
+    return own
+
+
+@pytest.fixture(scope="module")
+def models(evaluated: Run, log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("package")
+    ship(evaluated, "tiny", [log], "Five seconds of a flat road.", "It has seen nothing else.", folder)
+    return folder
+
+
+@pytest.fixture
+def package(models: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(shipped, "MODELS", models)
+    return models
+
+
+def test_a_shipped_model_is_evaluated_without_its_training_logs(
+    package: Path, evaluated: Run, log: LogPath, tmp_path: Path
+) -> None:
+    run = open_run(run_folder(Path("embedded:tiny"), tmp_path))
+    assert run.logs == ()
+    evaluate_run(run, [log], tmp_path / "out", views=False)
+    found, before = (
+        read_summary(tmp_path / "out" / "summary.json"),
+        read_summary(evaluated.folder / "summary.json"),
+    )
+    for key in ("occupancy.above_ground.iou_now.best_constant", "items"):
+        assert found[key] == before[key]
+    for key in ("planning.uniad.l2_avg_m", "planning.ego_mlp.uniad.l2_avg_m"):
+        assert found[key] == pytest.approx(before[key], rel=0.05, abs=1e-3)
+
+
+def test_weights_take_a_quarter_and_are_nearly_the_same(
+    package: Path, evaluated: Run, tmp_path: Path
+) -> None:
+    run = open_run(run_folder(Path("embedded:tiny"), tmp_path))
+    assert run.weights.stat().st_size < 0.45 * evaluated.weights.stat().st_size  # norms have 16 bits
+    pairs = zip(
+        load_agent(evaluated).state_dict().items(), load_agent(run).state_dict().values(), strict=True
+    )
+    for (name, exact), small in pairs:
+        if exact.is_floating_point() and exact.dim() > 1:
+            row = exact.flatten(1).abs().amax(1)
+            error = (exact - small).flatten(1).abs().amax(1)
+            assert (error <= row / 253).all(), name
+        else:
+            torch.testing.assert_close(small, exact, rtol=1e-3, atol=1e-4)
+
+
+def test_the_card_has_both_figures(package: Path) -> None:
+    card = (package / "tiny" / "card.md").read_text()
+    assert "Five seconds of a flat road." in card
+    assert "| IoU above the ground, now |" in card
+    assert "4 clips, 0 failed" in card
+
+
+def test_a_copy_is_kept_until_the_model_changes(package: Path, tmp_path: Path) -> None:
+    folder = run_folder(Path("embedded:tiny"), tmp_path)
+    (folder / "summary.json").write_text("{}")
+    assert run_folder(Path("embedded:tiny"), tmp_path) == folder
+    assert (folder / "summary.json").is_file()
+    config = folder / "config.yaml"
+    config.write_text(config.read_text() + "\n# of an earlier version\n")
+    run_folder(Path("embedded:tiny"), tmp_path)
+    assert not (folder / "summary.json").exists()
+    assert json.loads((folder / "logs.json").read_text())["cache_dir"] == os.path.abspath(folder / "cache")
+
+
+def test_unknown_models_and_unevaluated_runs_are_one_line(
+    package: Path, trained: Run, log: LogPath, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="embedded:huge: no such model; there are tiny"):
+        run_folder(Path("embedded:huge"), tmp_path)
+    assert run_folder(tmp_path) == tmp_path
+    bare = dataclasses.replace(trained, folder=tmp_path)
+    with pytest.raises(InputError, match="evaluate the run first"):
+        ship(bare, "other", [log], "", "", tmp_path / "models")
