@@ -1,4 +1,4 @@
-"""Make a trained and evaluated run part of the package: `python docs/ship_model.py RUN NAME --test LOGS ...`."""
+"""Make an evaluated run part of the package: `python docs/ship_model.py RUN NAME --test LOGS ...`."""
 
 from pathlib import Path
 
