@@ -20,9 +20,9 @@ from metrics.motion_scenes import (
 from foredrive.errors import InputError
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents, displacement_errors
 from foredrive.metrics.motion.matching import match_by_distance, match_by_score
-from foredrive.metrics.motion.over_recall import error_over_recall
 from foredrive.metrics.motion.protocols import PROTOCOLS
 from foredrive.metrics.motion.scores import MotionScores, motion_figures, score_motion
+from foredrive.metrics.over_recall import error_over_recall
 from foredrive.scene import Category
 
 KEYS = ("min_ade_m", "min_fde_m", "miss_rate", "epa")

@@ -10,7 +10,7 @@ import pytest
 from oracles.synthetic import Drives, detection_boxes, tracking_boxes, truth_file
 from oracles.track_sequences import LEAST_SIMILARITY, Sequence, as_rows
 
-from foredrive.evaluation.tasks.nuscenes_json import read_json_truth, read_results
+from foredrive.evaluation.objects.nuscenes_json import read_json_truth, read_results
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.metrics.tracking.clear import Candidates, clear_mot
 from foredrive.metrics.tracking.hota import hota

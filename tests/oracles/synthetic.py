@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from foredrive.metrics.detection_protocols import ATTRIBUTES, CLASSES
+from foredrive.metrics.detection_protocols import CLASSES
+from foredrive.scene.boxes import Attribute
 
 Box = dict[str, Any]
+ATTRIBUTES = sorted(each.label for each in Attribute)
 RACK = "static_object.bicycle_rack"
 
 

@@ -9,7 +9,7 @@ from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.errors import InputError
 
 Family = Literal["gaussian", "laplace"]
-Task = Literal["sets", "map", "motion", "occupancy"]
+Task = Literal["sets", "detection", "tracking", "map", "motion", "occupancy"]
 
 
 def score(
@@ -28,10 +28,11 @@ def score(
 
     Args:
         results: For sets: nuScenes or COCO results (JSON), or a folder of KITTI's text files; docs/sets.md
-            describes how such files state their uncertainty. For map: JSON of MapTR, or of StreamMapNet's
-            family. For motion: nuScenes results (JSON) with futures. For occupancy: a folder of npz files as
-            Occ3D or OpenOcc define them.
-        truth: The ground truth in the same format; for COCO its instances.
+            describes how such files state their uncertainty. For detection, tracking and motion: nuScenes
+            results (JSON), for motion with futures. For map: JSON of MapTR, or of StreamMapNet's family. For
+            occupancy: a folder of npz files as Occ3D or OpenOcc define them.
+        truth: The ground truth in the same format; for COCO its instances. For detection and tracking also a
+            folder of nuScenes' tables (v1.0-*), or of 123D logs.
         task: sets: detections as a random finite set. The others are scored under all published protocols of
             the task, see docs/tasks.md.
         poses: For occupancy: nuscenes_infos_val.pkl or Occ3D's annotations.json. They tell which frames are

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.metrics.detection import (
@@ -24,9 +24,10 @@ from foredrive.metrics.detection import (
     descending,
     match_centres,
     mean_of_valid,
-    precision_recall,
 )
-from foredrive.metrics.object_rows import NO_ATTRIBUTE, ObjectRows, Region, counted
+from foredrive.metrics.object_rows import ObjectRows, Region, counted
+from foredrive.metrics.over_recall import error_over_recall
+from foredrive.scene.boxes import UNKNOWN
 
 ERRORS = ("ate_m", "ase", "aoe_rad", "ave_mps", "aae")
 """Errors of translation, scale (1 - overlap of sizes), orientation, velocity, attribute (1 - accuracy)."""
@@ -43,8 +44,6 @@ class DetectionProtocol:
     """Distances of centres over ground below which a detection hits; average precision is their mean."""
     error_distance_m: float
     """The one of them at which errors are taken."""
-    min_recall: float
-    """Recalls up to this one do not count, neither in average precision nor in errors."""
     half_turn: frozenset[str]
     """Classes whose front and back look alike."""
     without: Mapping[str, frozenset[str]]
@@ -59,11 +58,6 @@ CLASSES: Final = (
     "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle",
     "traffic_cone", "barrier",
 )  # fmt: skip
-ATTRIBUTES: Final = (
-    "pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing", "cycle.with_rider",
-    "cycle.without_rider", "vehicle.moving", "vehicle.parked", "vehicle.stopped",
-)  # fmt: skip
-
 _REACH_M: Final = {
     **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), (50.0, 50.0)),
     **dict.fromkeys(("pedestrian", "motorcycle", "bicycle"), (40.0, 40.0)),
@@ -78,7 +72,6 @@ def _nuscenes(title: str, region: Region) -> DetectionProtocol:
         region=region,
         distances_m=NUSCENES_DISTANCES_M,
         error_distance_m=2.0,
-        min_recall=0.1,
         half_turn=frozenset({"barrier"}),
         without={
             "traffic_cone": frozenset({"aoe_rad", "ave_mps", "aae"}),
@@ -169,28 +162,12 @@ def _class_figures(
 def _mean_errors(
     found: ObjectRows, true: ObjectRows, partner: Int[ndarray, "m"], name: str, protocol: DetectionProtocol
 ) -> dict[str, float]:
-    """Return each error as a mean over recalls, of its running mean over hits of falling score.
-
-    Recalls are those above the least one, up to the largest that is reached with a score above 0.
-    """
+    """Return each error of the hits, averaged over recall."""
     order = descending(found.score, ties_reversed=True)
     found, partner = found[order], partner[order]
     hit = partner >= 0
-    if not hit.any():
-        return dict.fromkeys(ERRORS, 1.0)
-    _, recall = precision_recall(hit, len(true))
-    score = np.interp(np.linspace(0, 1, 101), recall, found.score, right=0)
-    first, reached = round(100 * protocol.min_recall) + 1, np.flatnonzero(score)
-    last = reached[-1] if len(reached) else 0
-    if last < first:
-        return dict.fromkeys(ERRORS, 1.0)
-    hits = found[hit]
-    values = hit_errors(hits, true[partner[hit]], half_turn=name in protocol.half_turn)
-    means = {}
-    for key, each in values.items():
-        at = np.interp(score[::-1], hits.score[::-1], running_mean(each)[::-1])[::-1]
-        means[key] = float(at[first : last + 1].mean())
-    return means
+    errors = hit_errors(found[hit], true[partner[hit]], half_turn=name in protocol.half_turn)
+    return {key: error_over_recall(found.score, hit, len(true), each) for key, each in errors.items()}
 
 
 def hit_errors(
@@ -209,14 +186,5 @@ def hit_errors(
         "ase": 1.0 - smaller / (a + b - smaller),
         "aoe_rad": turn,
         "ave_mps": np.linalg.norm(found.velocity - true.velocity, axis=1),
-        "aae": np.where(true.attribute == NO_ATTRIBUTE, np.nan, wrong),
+        "aae": np.where(true.attribute == UNKNOWN, np.nan, wrong),
     }
-
-
-def running_mean(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """Return the mean of the known values so far: 0 before the first, 1 everywhere if none is known."""
-    known: Bool[ndarray, n] = ~np.isnan(values)
-    if not known.any():
-        return np.ones(len(values))
-    count = np.cumsum(known)
-    return np.divide(np.nancumsum(values), count, out=np.zeros(len(values)), where=count > 0)

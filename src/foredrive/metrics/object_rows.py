@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy import ndarray
 
 from foredrive.geometry.boxes import points_in_boxes
+from foredrive.scene.boxes import UNKNOWN
 
-NO_ATTRIBUTE = -1
-UNKNOWN_POINTS = -1
 IN_RACKS = ("bicycle", "motorcycle")
 """Classes that are not counted inside a bicycle rack."""
 
@@ -35,11 +34,11 @@ class ObjectRows:
     velocity: Float[ndarray, "n 2"]
     """Velocity over ground, m/s, in the axes of `centre`. NaN: unknown."""
     attribute: Int[ndarray, "n"]
-    """Index of an attribute; `NO_ATTRIBUTE`: none."""
+    """A `scene.boxes.Attribute`; `UNKNOWN`: none."""
     score: Float[ndarray, "n"]
     """Confidence. NaN in the ground truth."""
     num_points: Int[ndarray, "n"]
-    """Lidar and radar points in the box; `UNKNOWN_POINTS`: not counted."""
+    """Lidar and radar points in the box; `UNKNOWN`: not counted."""
     from_ego: Float[ndarray, "n 2"]
     """Offset from the ego vehicle over ground, m, in the axes of `centre`. NaN: unknown."""
     track: Int[ndarray, "n"]
@@ -65,9 +64,9 @@ def make_rows(
     n = len(frame)
     columns = {
         "velocity": np.full((n, 2), np.nan),
-        "attribute": np.full(n, NO_ATTRIBUTE),
+        "attribute": np.full(n, UNKNOWN),
         "score": np.full(n, np.nan),
-        "num_points": np.full(n, UNKNOWN_POINTS),
+        "num_points": np.full(n, UNKNOWN),
         "from_ego": np.full((n, 2), np.nan),
         "track": np.full(n, -1),
         **known,

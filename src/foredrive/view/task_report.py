@@ -14,6 +14,7 @@ from foredrive.metrics.voxels.protocols import (
 from foredrive.view.html import write_page
 from foredrive.view.map_tables import map_tables
 from foredrive.view.motion_tables import motion_tables
+from foredrive.view.object_tables import detection_tables, tracking_tables
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import Column, Table, simple_table, words
 
@@ -60,9 +61,11 @@ def occupancy_tables(figures: Summary) -> list[Table]:
 
 
 TABLES: dict[str, Callable[[Summary], Sequence[Table]]] = {
+    "detection": detection_tables,
     "map": map_tables,
     "motion": motion_tables,
     "occupancy": occupancy_tables,
+    "tracking": tracking_tables,
 }
 """Tables of a summary, the main one first, by task."""
 

@@ -38,7 +38,8 @@ from foredrive.evaluation.detections.frames import (
     read_relevance,
 )
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS
-from foredrive.metrics.object_rows import UNKNOWN_POINTS, ObjectRows, counted, make_rows
+from foredrive.metrics.object_rows import ObjectRows, counted, make_rows
+from foredrive.scene.boxes import UNKNOWN
 from foredrive.sets import Family, MultiBernoulli
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
@@ -118,7 +119,7 @@ class _Boxes:
         """Return the boxes as rows of one frame; the label of a class that is not among `classes` is -1."""
         number = {name: n for n, name in enumerate(classes)}
         label = np.array([number.get(box["detection_name"], -1) for box in self.records], dtype=np.int64)
-        points = np.array([box.get("num_pts", UNKNOWN_POINTS) for box in self.records], dtype=np.int64)
+        points = np.array([box.get("num_pts", UNKNOWN) for box in self.records], dtype=np.int64)
         place = np.full(3, np.nan) if ego is None else ego
         return make_rows(
             np.zeros(len(label), np.int64),

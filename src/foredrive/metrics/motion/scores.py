@@ -15,7 +15,6 @@ from foredrive.metrics.motion.agents import (
     displacement_errors,
 )
 from foredrive.metrics.motion.matching import match_by_distance, match_by_score
-from foredrive.metrics.motion.over_recall import error_over_recall
 from foredrive.metrics.motion.protocols import (
     FALSE_POSITIVE_COST,
     MATCH_M,
@@ -24,6 +23,7 @@ from foredrive.metrics.motion.protocols import (
     MotionProtocol,
     Rectangle,
 )
+from foredrive.metrics.over_recall import error_over_recall
 from foredrive.scene import Category
 
 

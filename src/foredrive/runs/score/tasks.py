@@ -11,6 +11,7 @@ from foredrive.evaluation.maps.files import read_maps
 from foredrive.evaluation.maps.score import score_map_files
 from foredrive.evaluation.motion.files import read_agents
 from foredrive.evaluation.motion.score import score_agent_files
+from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
 from foredrive.evaluation.voxels.files import find_voxels
@@ -38,15 +39,29 @@ def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:
     return score_agent_files(read_agents(results, truth))
 
 
+def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
+    """Return the figures of detections, see `evaluation.objects`."""
+    _check_no_poses("detection", poses)
+    return score_detections(*read_objects(results, truth, "detection"))
+
+
+def score_tracking(results: Path, truth: Path, poses: Path | None) -> Figures:
+    """Return the figures of tracks, see `evaluation.objects`."""
+    _check_no_poses("tracking", poses)
+    return score_tracks(*read_objects(results, truth, "tracking"))
+
+
 def _check_no_poses(task: str, poses: Path | None) -> None:
     if poses is not None:
         raise InputError(f"--poses does not go with --task {task}")
 
 
 TASKS: dict[str, Callable[[Path, Path, Path | None], Figures]] = {
+    "detection": score_detection,
     "map": score_map,
     "motion": score_motion,
     "occupancy": score_occupancy,
+    "tracking": score_tracking,
 }
 """Functions of results, truth and poses, by the name of their task."""
 

@@ -18,14 +18,22 @@ def error_over_recall(
 
     Args:
         score, hit: of the predictions, in order of descending score.
-        error: of the hits, in the same order.
+        error: of the hits, in the same order. NaN where it is not known.
     """
     if not hit.any():
         return 1.0
     recall = np.cumsum(hit) / objects
     at_recall = np.interp(np.linspace(0, 1, 101), recall, score, right=0.0)
-    running = np.cumsum(error) / np.arange(1, len(error) + 1)
-    curve = np.interp(at_recall[::-1], score[hit][::-1], running[::-1])[::-1]
+    curve = np.interp(at_recall[::-1], score[hit][::-1], running_mean(error)[::-1])[::-1]
     reached = np.flatnonzero(at_recall)
     last = int(reached[-1]) if len(reached) else 0
     return float(curve[FIRST : last + 1].mean()) if last >= FIRST else 1.0
+
+
+def running_mean(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
+    """Return the mean of the known values so far: 0 before the first, 1 everywhere if none is known."""
+    known: Bool[ndarray, n] = ~np.isnan(values)
+    if not known.any():
+        return np.ones(len(values))
+    count = np.cumsum(known)
+    return np.divide(np.nancumsum(values), count, out=np.zeros(len(values)), where=count > 0)

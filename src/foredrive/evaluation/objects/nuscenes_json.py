@@ -25,7 +25,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_numbers
 from foredrive.evaluation.detections.nuscenes_results import read_geometry
-from foredrive.evaluation.tasks.nuscenes_columns import (
+from foredrive.evaluation.objects.nuscenes_columns import (
     Box,
     read_attributes,
     read_labels,
@@ -34,7 +34,7 @@ from foredrive.evaluation.tasks.nuscenes_columns import (
     read_texts,
     read_velocities,
 )
-from foredrive.evaluation.tasks.objects import (
+from foredrive.evaluation.objects.truth import (
     RACK,
     BoxNames,
     FoundObjects,

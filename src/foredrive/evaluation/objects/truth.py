@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.metrics.object_rows import NO_ATTRIBUTE, UNKNOWN_POINTS, Frames, ObjectRows
+from foredrive.metrics.object_rows import Frames, ObjectRows
+from foredrive.scene.boxes import UNKNOWN
 
 RACK = "static_object.bicycle_rack"
 """Name of the objects in which bicycles and motorcycles are not counted."""
@@ -50,10 +51,10 @@ class BoxNames(Sequence[str]):
         return int(self._start[-1])
 
     @overload
-    def __getitem__(self, index: int) -> str: ...
+    def __getitem__(self, index: int | np.integer) -> str: ...
     @overload
     def __getitem__(self, index: slice) -> list[str]: ...
-    def __getitem__(self, index: int | slice) -> str | list[str]:
+    def __getitem__(self, index: int | np.integer | slice) -> str | list[str]:
         if isinstance(index, slice):
             return [self[n] for n in range(*index.indices(len(self)))]
         if not 0 <= index < len(self):
@@ -85,8 +86,8 @@ def lacking(boxes: ObjectRows) -> frozenset[str]:
     """Return the names of the columns in which no box has a value."""
     known = {
         "velocity": np.isfinite(boxes.velocity).all(1),
-        "attribute": boxes.attribute != NO_ATTRIBUTE,
-        "num_points": boxes.num_points != UNKNOWN_POINTS,
+        "attribute": boxes.attribute != UNKNOWN,
+        "num_points": boxes.num_points != UNKNOWN,
         "range": np.isfinite(boxes.from_ego).all(1),
     }
     return frozenset(name for name, each in known.items() if len(boxes) and not each.any())

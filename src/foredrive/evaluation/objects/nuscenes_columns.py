@@ -9,8 +9,7 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_number_rows
-from foredrive.metrics.detection_protocols import ATTRIBUTES
-from foredrive.metrics.object_rows import NO_ATTRIBUTE, UNKNOWN_POINTS
+from foredrive.scene.boxes import UNKNOWN, Attribute
 
 Box = Mapping[str, Any]
 
@@ -69,8 +68,8 @@ def _states_velocity(value: object) -> bool:
 
 
 def read_attributes(boxes: Sequence[Box], names: Sequence[str]) -> Int[ndarray, "n"]:
-    """Return indices of attributes; `NO_ATTRIBUTE` for the empty name, or none."""
-    number = {"": NO_ATTRIBUTE, **{name: n for n, name in enumerate(ATTRIBUTES)}}
+    """Return indices of attributes; `UNKNOWN` for the empty name, or none."""
+    number = {"": int(UNKNOWN), **{each.label: int(each) for each in Attribute}}
     stated = [box.get("attribute_name", "") for box in boxes]
     for n, name in enumerate(stated):
         if name not in number:
@@ -80,7 +79,7 @@ def read_attributes(boxes: Sequence[Box], names: Sequence[str]) -> Int[ndarray, 
 
 def read_points(boxes: Sequence[Box], names: Sequence[str]) -> Int[ndarray, "n"]:
     """Return the numbers of points that boxes state."""
-    stated = [{"num_pts": box.get("num_pts", UNKNOWN_POINTS)} for box in boxes]
+    stated = [{"num_pts": box.get("num_pts", UNKNOWN)} for box in boxes]
     return read_number_rows(stated, "num_pts", 1, names)[:, 0].astype(np.int64)
 
 

@@ -1,0 +1,95 @@
+"""Tables of detections and tracks under every protocol."""
+
+import dataclasses
+
+from foredrive.evaluation.summary import Summary
+from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS
+from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
+from foredrive.view.table import Column, Table, simple_table, words
+
+_DETECTION = {
+    "map": Column("mAP"),
+    "nds": Column("NDS"),
+    "ate_m": Column("ATE, m"),
+    "ase": Column("ASE"),
+    "aoe_rad": Column("AOE, rad"),
+    "ave_mps": Column("AVE, m/s"),
+    "aae": Column("AAE"),
+}
+_DETECTION_CLASS = {
+    "ap": Column("AP"),
+    **{f"ap_{distance}m": Column(f"{distance} m", "AP") for distance in ("0.5", "1", "2", "4")},
+    **{key: column for key, column in _DETECTION.items() if key not in ("map", "nds")},
+}
+_TRACKING = {
+    "amota": Column("AMOTA"),
+    "amotp_m": Column("AMOTP, m"),
+    "recall": Column("recall"),
+    "mota": Column("MOTA"),
+    "motp_m": Column("MOTP, m"),
+    "ids": Column("IDS", digits=0),
+    "frag": Column("FRAG", digits=0),
+    "mt": Column("MT", digits=0),
+    "ml": Column("ML", digits=0),
+    "fp": Column("FP", digits=0),
+    "fn": Column("FN", digits=0),
+    "faf_per_100_frames": Column("FAF", digits=1),
+    "tid_s": Column("TID, s", digits=2),
+    "lgd_s": Column("LGD, s", digits=2),
+}
+
+
+def detection_tables(figures: Summary) -> list[Table]:
+    """Return the figures of each protocol, and those of each class under nuScenes' own."""
+    protocols = {name: protocol.title for name, protocol in DETECTION_PROTOCOLS.items()}
+    classes = DETECTION_PROTOCOLS["nuscenes"].classes
+    notes = _notes(figures)
+    return [
+        _table(figures, "detection", protocols, _DETECTION, "Detection", notes),
+        _class_table(figures, "detection", classes, _DETECTION_CLASS),
+    ]
+
+
+def tracking_tables(figures: Summary) -> list[Table]:
+    """Return the figures of each protocol, and those of each class under nuScenes' own."""
+    protocols = {name: protocol.title for name, protocol in TRACKING_PROTOCOLS.items()}
+    classes = TRACKING_PROTOCOLS["nuscenes"].classes
+    return [
+        _table(figures, "tracking", protocols, _TRACKING, "Tracking", _notes(figures)),
+        _class_table(figures, "tracking", classes, _TRACKING),
+    ]
+
+
+def _table(
+    figures: Summary,
+    task: str,
+    protocols: dict[str, str],
+    columns: dict[str, Column],
+    title: str,
+    notes: list[str],
+) -> Table:
+    rows = [
+        (name, *(figures.get(f"{task}.{key}.{figure}") for figure in columns))
+        for key, name in protocols.items()
+    ]
+    table = simple_table([Column(align="left"), *columns.values()], rows, title)
+    return dataclasses.replace(table, notes=notes)
+
+
+def _class_table(figures: Summary, task: str, classes: tuple[str, ...], columns: dict[str, Column]) -> Table:
+    prefix = f"{task}.nuscenes"
+    rows = [
+        (words(name), *(figures.get(f"{prefix}.{name}.{figure}") for figure in columns))
+        for name in classes
+        if any(key.startswith(f"{prefix}.{name}.") for key in figures)
+    ]
+    return simple_table([Column(align="left"), *columns.values()], rows, "Classes, nuScenes")
+
+
+def _notes(figures: Summary) -> list[str]:
+    notes = []
+    if missing := figures.get("frames_without_results"):
+        notes.append(f"{missing} of {figures['frames_counted']} frames are not in the results.")
+    if lacks := figures.get("truth_lacks"):
+        notes.append(f"The ground truth has no {lacks}: what needs it is left out, or not filtered.")
+    return notes
