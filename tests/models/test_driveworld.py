@@ -181,9 +181,9 @@ def test_imagining_on_and_on_keeps_nothing_of_what_was(model: DriveWorld, clip: 
 def test_a_task_has_features_of_its_own(model: DriveWorld, clip: Clip) -> None:
     now = model.observe(clip)
     torch.testing.assert_close(model.volume_for(now, "occupancy"), now.volume)
-    assert not torch.allclose(model.volume_for(now, "plan"), now.volume)
+    assert not torch.allclose(model.volume_for(now, "planning"), now.volume)
     (later,) = model.imagine(now, 1)
-    torch.testing.assert_close(model.volume_for(later, "forecast"), later.volume)
+    torch.testing.assert_close(model.volume_for(later, "occupancy"), later.volume)
 
 
 @torch.no_grad()
@@ -282,7 +282,7 @@ def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: C
     try:
         torch.testing.assert_close(model.observe(clip).volume, now.volume)
         standing, going = (model.imagine(now, 2, actions)[-1] for actions in (stand, go))
-        torch.testing.assert_close(model.volume_for(going, "forecast"), going.volume)
+        torch.testing.assert_close(model.volume_for(going, "occupancy"), going.volume)
         seen = model.lift_frames(last_frames(clip, PAST))
         first, *_, last = model.unroll(seen, 0, None).beliefs  # statics of now
         torch.testing.assert_close(last.volume, now.volume)
@@ -292,3 +292,14 @@ def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: C
     assert not torch.allclose(going.volume, as_it_is[1])
     assert going.statics is now.statics  # carried when looked at, not twice
     assert not torch.allclose(first.volume, model.unroll(seen, 0, None).beliefs[0].volume)
+
+
+@torch.no_grad()
+def test_a_model_of_three_prompts_reads_other_tasks_under_a_near_one(model: DriveWorld, clip: Clip) -> None:
+    """As models do that were trained before each task had its prompt."""
+    now = model.observe(clip)
+    assert model.prompt is not None
+    assert model.prompt.prompts == ("occupancy", "forecast", "planning")
+    for task in ("detection", "tracking", "map"):
+        torch.testing.assert_close(model.volume_for(now, task), now.volume)
+    assert not torch.allclose(model.volume_for(now, "motion"), now.volume)

@@ -60,7 +60,7 @@ class PlanningAgent(nn.Module, Generic[W]):
 
     def planner_volume(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
         """Return the volume that the planner reads."""
-        return self.world_model.volume_for(belief, "plan")
+        return self.world_model.volume_for(belief, "planning")
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:

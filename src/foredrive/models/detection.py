@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.models.tasks.plane import PlaneFeatures, cell_middles
 from foredrive.scene import Detections, VoxelSpec
 from foredrive.scene.record import Record
 from foredrive.sets import BoxDensity, Family, MultiBernoulli
@@ -96,25 +97,11 @@ class DetectionHead(nn.Module):
     ) -> None:
         super().__init__()
         self.family = family
-        depth, height, breadth = spec.shape_zyx
         self.classes = classes
-        convolutions: list[nn.Module] = [nn.Conv2d(depth * channels, width, 3, padding=1), nn.ReLU()]
-        for _ in range(shrink):
-            convolutions += [
-                nn.Conv2d(width, width, 3, stride=2, padding=1),
-                nn.GroupNorm(8, width),
-                nn.ReLU(),
-            ]
-            convolutions += [nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
-        self.plane = nn.Sequential(*convolutions)
-        rows, columns = -(-height // 2**shrink), -(-breadth // 2**shrink)
-        cell_m = spec.voxel_m * 2**shrink
-        y = spec.lower_m[1] + (torch.arange(rows) + 0.5) * cell_m
-        x = spec.lower_m[0] + (torch.arange(columns) + 0.5) * cell_m
-        middle = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
+        self.plane = PlaneFeatures(spec, channels=channels, width=width, shrink=shrink)
+        middle = cell_middles(self.plane.lower_m, self.plane.cell_m, self.plane.shape_yx)
         self.register_buffer("middle_m", middle, persistent=False)
-        self.cell_m = cell_m
-        self.place = nn.Parameter(0.02 * torch.randn(rows * columns, width))
+        self.place = nn.Parameter(0.02 * torch.randn(len(middle), width))
         layer = nn.TransformerEncoderLayer(
             width, heads, 2 * width, dropout=0.0, batch_first=True, norm_first=True
         )
@@ -127,12 +114,12 @@ class DetectionHead(nn.Module):
 
     def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> BoxSet:
         """Return the boxes of all queries."""
-        plane = self.plane(volume.flatten(1, 2))
-        queries = self.attention(plane.flatten(2).mT + self.place)
+        plane = self.plane(volume)
+        queries = self.attention(plane.cells + self.place)
         logits, shift, size, heading, log_std = self.out(queries).split(
             [self.classes + 1, 3, 3, 2, 7], dim=-1
         )
-        ground = self.middle_m + self.cell_m * shift[..., :2]
+        ground = self.middle_m + plane.cell_m * shift[..., :2]
         log_lwh = size + size.new_tensor(TYPICAL_LOG_LWH)
         log_std = log_std.clamp(*LOG_STD_RANGE)
         return BoxSet(

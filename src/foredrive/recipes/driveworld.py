@@ -12,7 +12,7 @@ from foredrive.models.driveworld.planes import (
     VectorToPlaneConfig,
 )
 from foredrive.models.driveworld.state_space import StateSpaceConfig
-from foredrive.models.driveworld.task_prompt import PromptConfig
+from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.models.lift_splat import LiftSplatConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
@@ -58,7 +58,10 @@ def driveworld_tiny() -> DriveWorldRecipe:
             to_volume=PlanesToVolumeConfig(hidden=8),
             statics=StaticSceneConfig(channels=32),
             prompt=PromptConfig(
-                expand=VectorToPlaneConfig(widths=(32, 16, 8)), encoding=384, text_encoder=PACKAGED_MODEL
+                prompts=tuple(PROMPTS),
+                expand=VectorToPlaneConfig(widths=(32, 16, 8)),
+                encoding=384,
+                text_encoder=PACKAGED_MODEL,
             ),
         ),
         planner=nemo.planner,
@@ -132,6 +135,7 @@ def driveworld_base() -> DriveWorldRecipe:
             to_volume=PlanesToVolumeConfig(hidden=16),
             statics=StaticSceneConfig(channels=256),
             prompt=PromptConfig(
+                prompts=tuple(PROMPTS),
                 expand=VectorToPlaneConfig(widths=(256, 128, 64, 64)),
                 encoding=384,
                 text_encoder=PACKAGED_MODEL,

@@ -16,8 +16,8 @@ from foredrive.scene.sweep import LidarSweep
 from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelSpec
 
-Task = Literal["occupancy", "forecast", "plan"]
-"""Purpose of the features: the scene now, the scene later, or a path."""
+Task = Literal["detection", "tracking", "map", "motion", "occupancy", "planning"]
+"""Purpose of the features: the six tasks that heads and planners serve."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class WorldModel(Protocol):
         ...
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """Return the volume of a belief as the head of a task reads it."""
+        """Return the volume of a belief, at now or imagined, as the head of a task reads it."""
         ...
 
 

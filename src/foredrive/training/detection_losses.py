@@ -52,8 +52,19 @@ def matching_loss(
     With `box_score` "likelihood", L1 trains the means. The likelihood of matched boxes with fixed means
     trains the standard deviations. With "energy", the energy score trains both, but not the heading.
     """
+    query, match = best_matching(found, truth, config)
+    return matched_loss(found, truth, query, match, config)
+
+
+def matched_loss(
+    found: BoxSet,
+    truth: LabelledBoxes,
+    query: Int[Tensor, "n"],
+    match: Int[Tensor, "n"],
+    config: MatchingLossConfig = MatchingLossConfig(),
+) -> Float[Tensor, ""]:
+    """Return `matching_loss` for a given matching of queries and objects."""
     assert truth.yaw is not None
-    query, match = _best_matching(found, truth, config)
     objects = max(len(truth.label), 1)
     classes = found.logits.shape[-1] - 1
     target = torch.full(found.logits.shape[:1], classes, device=found.logits.device)
@@ -112,8 +123,8 @@ def energy_score(
     return to_truth - 0.5 * between
 
 
-def _best_matching(
-    found: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig
+def best_matching(
+    found: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig = MatchingLossConfig()
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return matched queries and objects. Each object has one query, if there are enough."""
     with torch.no_grad():

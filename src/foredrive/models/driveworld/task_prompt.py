@@ -1,6 +1,7 @@
 """Task prompts: the text encoding of a task tells the features which task they serve (§3.3)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,12 +10,30 @@ from foredrive.errors import InputError
 from foredrive.models.driveworld.planes import VectorToPlane, VectorToPlaneConfig
 from foredrive.models.text_encoder import TextEncoder
 
-PROMPTS = {
+Prompt = Literal["occupancy", "forecast", "planning", "detection", "tracking", "map", "motion"]
+"""A task, or "forecast": the occupancy of an imagined key frame, which the dynamics are trained with."""
+
+PROMPTS: dict[Prompt, str] = {
     "occupancy": "The task is to predict the 3D occupancy of the current scene.",
     "forecast": "The task is to predict the 3D occupancy of the future scene.",
-    "plan": "The task is to plan the path that the ego vehicle will drive.",
+    "planning": "The task is to plan the path that the ego vehicle will drive.",
+    "detection": "The task is to detect the 3D bounding boxes of all objects around the ego vehicle.",
+    "tracking": "The task is to track the objects around the ego vehicle over time.",
+    "map": "The task is to map the lanes, crossings and road boundaries around the ego vehicle.",
+    "motion": "The task is to forecast the motion of the objects around the ego vehicle.",
 }
-"""Prompts by the names of the tasks. The first one is from the paper."""
+"""Sentences by the names of the prompts. The first one is from the paper."""
+
+FIRST_PROMPTS: tuple[Prompt, ...] = ("occupancy", "forecast", "planning")
+"""Prompts of models that were trained before the other tasks had a prompt."""
+
+_STAND_IN: dict[Prompt, Prompt] = {
+    "detection": "occupancy",
+    "tracking": "occupancy",
+    "map": "occupancy",
+    "motion": "forecast",
+}
+"""The prompt under which a model reads a task that it has no prompt for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,15 +45,18 @@ class PromptConfig:
     """Width of the output of the text encoder."""
     text_encoder: str
     """Name or folder of the text encoder. Needed only once, when training starts from scratch."""
+    prompts: tuple[Prompt, ...] = FIRST_PROMPTS
+    """Prompts that the model knows, in the order of their encodings. A task without a prompt is read under a
+    near one."""
 
 
 def encode_prompts(config: PromptConfig) -> Float[Tensor, "P E"]:
-    """Return the encoding of every prompt in `PROMPTS`, in order.
+    """Return the encoding of every prompt that the model knows, in order.
 
     Raises:
         InputError: the text encoder cannot be loaded, or its output has another width.
     """
-    encoded: Tensor = TextEncoder(config.text_encoder)(list(PROMPTS.values()))
+    encoded: Tensor = TextEncoder(config.text_encoder)([PROMPTS[name] for name in config.prompts])
     if encoded.shape[1] != config.encoding:
         raise InputError(
             f"the text encoder {config.text_encoder!r} returns {encoded.shape[1]} numbers per sentence, but "
@@ -61,11 +83,12 @@ class TaskPrompt(nn.Module):
         self, config: PromptConfig, encodings: Float[Tensor, "P E"], size_yx: tuple[int, int]
     ) -> None:
         super().__init__()
-        self.tasks = tuple(PROMPTS)
+        self.prompts = config.prompts
         self.register_buffer("encodings", encodings)
         self.expand = VectorToPlane(config.expand, vector=config.encoding, size_yx=size_yx)
 
-    def forward(self, task: str, batch: int) -> Float[Tensor, "b C Y X"]:
-        """Return the plane of one task."""
-        encoding = self.encodings[self.tasks.index(task)]
+    def forward(self, prompt: Prompt, batch: int) -> Float[Tensor, "b C Y X"]:
+        """Return the plane of one prompt, or of the near one that the model knows."""
+        known = prompt if prompt in self.prompts else _STAND_IN[prompt]
+        encoding = self.encodings[self.prompts.index(known)]
         return self.expand(encoding[None]).expand(batch, -1, -1, -1)

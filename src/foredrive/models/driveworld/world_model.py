@@ -28,7 +28,7 @@ from foredrive.models.driveworld.planes import (
     warp_plane,
 )
 from foredrive.models.driveworld.state_space import Latent, StateSpace, StateSpaceConfig
-from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig, TaskPrompt, encode_prompts
+from foredrive.models.driveworld.task_prompt import Prompt, PromptConfig, TaskPrompt, encode_prompts
 from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
 from foredrive.models.lifting import lift_frames
 from foredrive.models.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
@@ -146,7 +146,7 @@ class DriveWorld(nn.Module):
         self.statics = None if config.statics is None else StaticScene(config.statics, channels=plane)
         self.prompt: TaskPrompt | None = None
         if config.prompt is not None:
-            encodings = torch.zeros(len(PROMPTS), config.prompt.encoding)
+            encodings = torch.zeros(len(config.prompt.prompts), config.prompt.encoding)
             encodings = encode_prompts(config.prompt) if fetch else encodings
             self.prompt = TaskPrompt(config.prompt, encodings, size_yx)
         self.occupancy = nn.Linear(channels, 1)
@@ -225,13 +225,17 @@ class DriveWorld(nn.Module):
         return Decoded(occupancy_logit=logit, feature=belief.volume, flow=flow, action=action)
 
     def volume_for(self, belief: Belief, task: Task) -> Float[Tensor, "b D Z Y X"]:
-        """Return the volume under the prompt of another task. Without prompts it is that of the belief."""
+        """Return the volume under the prompt of a task. Without prompts it is that of the belief.
+
+        The prompt for the occupancy of an imagined belief is the one that it was imagined under.
+        """
         if self.prompt is None:
             return belief.volume
         if belief.state is None or belief.statics is None:
             raise InputError("DriveWorld reads only beliefs that it made itself")
         statics = self._warped_statics(belief.statics, belief.T_now_ego)
-        return self._volume(self._unpack(belief.state), statics, task)
+        imagined = task == "occupancy" and belief.T_now_ego is not None
+        return self._volume(self._unpack(belief.state), statics, "forecast" if imagined else task)
 
     def unroll(
         self,
@@ -329,20 +333,20 @@ class DriveWorld(nn.Module):
         self,
         latent: Latent,
         statics: Float[Tensor, "b _S Y X"],
-        task: Task,
+        prompt: Prompt,
         T_now_ego: Float[Tensor, "b 4 4"] | None,
     ) -> Belief:
-        volume = self._volume(latent, self._warped_statics(statics, T_now_ego), task)
+        volume = self._volume(latent, self._warped_statics(statics, T_now_ego), prompt)
         return Belief(volume=volume, state=_pack(latent), statics=statics, T_now_ego=T_now_ego)
 
     def _volume(
-        self, latent: Latent, statics: Float[Tensor, "b _S Y X"], task: Task
+        self, latent: Latent, statics: Float[Tensor, "b _S Y X"], prompt: Prompt
     ) -> Float[Tensor, "b D Z Y X"]:
         """Apply m_θ and l_θ: decode a state and the statics into a volume of features."""
         history = latent.history if self.states.recall is None else self.states.recall(latent)
         planes = [self.from_vector(torch.cat([history, latent.state], dim=-1)), statics]
         if self.prompt is not None:
-            planes.append(self.prompt(task, len(statics)))
+            planes.append(self.prompt(prompt, len(statics)))
         volume: Tensor = self.to_volume(torch.cat(planes, dim=1))
         return volume
 
