@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from foredrive.scene import Category
+from foredrive.scene.boxes import VEHICLES
 
 STEPS = 6
 STEP_S = 0.5
@@ -38,18 +39,6 @@ LIDAR_FORWARD_M = 0.985793
 """Distance of nuScenes' lidar ahead of the rear axle; most of the protocols follow its path."""
 EGO_CENTRE_FORWARD_M = 0.5
 """Distance of the vehicle's centre ahead of the followed point, in public code."""
-
-VEHICLES = frozenset(
-    {
-        Category.CAR,
-        Category.TRUCK,
-        Category.BUS,
-        Category.TRAILER,
-        Category.CONSTRUCTION_VEHICLE,
-        Category.MOTORCYCLE,
-        Category.BICYCLE,
-    }
-)
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,16 @@ class Category(enum.IntEnum):
     OTHER = 11
 
 
-VEHICLES = (
-    Category.CAR,
-    Category.TRUCK,
-    Category.BUS,
-    Category.TRAILER,
-    Category.CONSTRUCTION_VEHICLE,
-    Category.MOTORCYCLE,
-    Category.BICYCLE,
+VEHICLES = frozenset(
+    {
+        Category.CAR,
+        Category.TRUCK,
+        Category.BUS,
+        Category.TRAILER,
+        Category.CONSTRUCTION_VEHICLE,
+        Category.MOTORCYCLE,
+        Category.BICYCLE,
+    }
 )
 """The seven vehicle classes of nuScenes' detection task, on which UniAD judges motion and occupancy."""
 

@@ -21,51 +21,14 @@ from typing import Literal
 
 from foredrive.metrics.protocols import LIDAR_FORWARD_M, VEHICLES, ObstacleGrid
 from foredrive.scene import Category, VoxelSpec
+from foredrive.scene.semantics import VOXEL_CLASSES
 
 GRID = VoxelSpec(lower_m=(-40.0, -40.0, -1.0), voxel_m=0.4, shape_zyx=(16, 200, 200))
 """The grid of Occ3D and OpenOcc on nuScenes, in the ego frame."""
 
 FREE = "free"
 """The last class of both data sets. It enters no mean."""
-OCC3D_CLASSES = (
-    "others",
-    "barrier",
-    "bicycle",
-    "bus",
-    "car",
-    "construction_vehicle",
-    "motorcycle",
-    "pedestrian",
-    "traffic_cone",
-    "trailer",
-    "truck",
-    "driveable_surface",
-    "other_flat",
-    "sidewalk",
-    "terrain",
-    "manmade",
-    "vegetation",
-    FREE,
-)
-OPENOCC_CLASSES = (
-    "car",
-    "truck",
-    "trailer",
-    "bus",
-    "construction_vehicle",
-    "bicycle",
-    "motorcycle",
-    "pedestrian",
-    "traffic_cone",
-    "barrier",
-    "driveable_surface",
-    "other_flat",
-    "sidewalk",
-    "terrain",
-    "manmade",
-    "vegetation",
-    FREE,
-)
+OCC3D_CLASSES, OPENOCC_CLASSES = VOXEL_CLASSES["occ3d"], VOXEL_CLASSES["openocc"]
 
 Mask = Literal["camera", "lidar"]
 
