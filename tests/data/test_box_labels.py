@@ -1,7 +1,9 @@
 """Lidar points, attributes and visibility of boxes: written, read, counted, and unknown where nobody told."""
 
 import dataclasses
+import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -198,3 +200,33 @@ def test_real_logs_have_the_labels_that_they_tell(real_data: Path, tmp_path: Pat
     found = clip_boxes(kitti[1])
     assert found["attribute"].tolist() == [UNKNOWN, UNKNOWN, Attribute.CYCLE_WITH_RIDER]
     assert found["num_points"].min() >= 0
+
+
+@pytest.mark.real
+def test_a_table_of_annotations_tells_attributes_and_visibility(real_data: Path, tmp_path: Path) -> None:
+    """The key frame has no such table; this one is made at the places of three of its boxes."""
+    (plain,) = convert(real_data / "nuscenes", "nuscenes-keyframe", tmp_path / "plain")
+    log = Log(plain)
+    boxes = read_boxes(log, 0)
+    assert boxes is not None
+    T = log.T_world_ego[0]
+    world_xyz = boxes.centre.double().numpy() @ T[:3, :3].T + T[:3, 3]
+    copy = tmp_path / "raw" / "keyframe"
+    shutil.copytree(real_data / "nuscenes" / "keyframe", copy)
+    tables = next(copy.glob("v1.0-*"))
+    token = {row["name"]: row["token"] for row in json.loads((tables / "attribute.json").read_text())}
+    rows = [
+        {"translation": world_xyz[row].tolist(), "attribute_tokens": attributes, "visibility_token": level}
+        for row, attributes, level in (
+            (0, [token["pedestrian.standing"]], "1"),
+            (1, [], "4"),
+            (2, [token["vehicle.parked"]], "3"),
+        )
+    ]
+    (tables / "sample_annotation.json").write_text(json.dumps(rows))
+    told = read_boxes(Log(convert(tmp_path / "raw", "nuscenes-keyframe", tmp_path / "told")[0]), 0)
+    assert told is not None
+    assert told.attribute[:3].tolist() == [Attribute.PEDESTRIAN_STANDING, UNKNOWN, Attribute.VEHICLE_PARKED]
+    assert told.visibility[:3].tolist() == [Visibility.V0_40, Visibility.V80_100, Visibility.V60_80]
+    assert (told.attribute[3:] == UNKNOWN).all()
+    assert (told.visibility[3:] == UNKNOWN).all()

@@ -60,7 +60,6 @@ from foredrive.data.camera_streams import (
     semantic_metadata,
 )
 from foredrive.data.modalities import (
-    BOX_VISIBILITY,
     CAPTION,
     EXPERT_PLAN,
     LIDAR_BEAMS,
@@ -71,7 +70,7 @@ from foredrive.data.modalities import (
     pack_beams,
     pack_occupancy,
     pack_plan,
-    pack_visibility,
+    visibility_modality,
 )
 from foredrive.data.setting import Setting, pack_setting
 from foredrive.errors import InputError
@@ -232,7 +231,8 @@ class LogWriter:
         if any(known != UNKNOWN for known in attribute):
             modalities.append(attributes_modality(attribute, Timestamp.from_us(frame.t_us)))
         if frame.visibility is not None:
-            modalities.append(_custom(frame, BOX_VISIBILITY, pack_visibility(frame.visibility)))
+            shares = frame.visibility.tolist()
+            modalities.append(visibility_modality(shares, Timestamp.from_us(frame.t_us)))
         if frame.setting is not None:
             modalities.append(_custom(frame, SETTING, pack_setting(frame.setting)))
         if frame.caption is not None:

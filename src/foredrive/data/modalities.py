@@ -128,13 +128,17 @@ def unpack_occupancy(data: dict[str, Any], metadata: CustomModalityMetadata) -> 
     )
 
 
-def pack_visibility(visibility: Float[np.ndarray, "M"]) -> dict[str, Any]:
-    """Pack visibilities in the order of the frame's boxes, with a precision of 0.0005."""
-    return {"visibility": squeeze_array(visibility.astype(np.float16))}
+def visibility_modality(share: Sequence[float], timestamp: Timestamp) -> CustomModality:
+    """Return visible shares, in the order of the frame's boxes, as a modality; NaN where not known.
+
+    The precision is 0.0005.
+    """
+    data = {"visibility": squeeze_array(np.array(share, dtype=np.float16))}
+    return CustomModality(data, CustomModalityMetadata(BOX_VISIBILITY), timestamp)
 
 
 def unpack_visibility(data: dict[str, Any]) -> Float[np.ndarray, "M"]:
-    """Invert `pack_visibility`."""
+    """Return the shares of a row of `visibility_modality`."""
     return expand_array(data["visibility"]).astype(np.float32)
 
 

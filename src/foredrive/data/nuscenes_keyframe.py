@@ -2,7 +2,8 @@
 
 py123d's own parser needs all nuScenes tables and the devkit. This parser reads a folder with the sensor files
 of one key frame, its rows of the devkit's tables (v1.0-*/*.json), and its boxes in an info file of
-mmdetection3d (*.pkl).
+mmdetection3d (*.pkl). The info file has no attributes and visibilities. They are read from the table
+sample_annotation.json, if the folder has it.
 """
 
 import json
@@ -26,6 +27,7 @@ from py123d.datatypes import (
     Timestamp,
 )
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
+from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
 from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync, ParsedCamera, ParsedLidar
 from py123d.parser.nuscenes.utils.nuscenes_constants import (
@@ -34,10 +36,18 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
     NUSCENES_EGO_STATE_SE3_METADATA,
     NUSCENES_LIDAR_SWEEP_DURATION_US,
 )
+from scipy.spatial import KDTree
 
 from foredrive.data.log_writer import LABEL_OF_CATEGORY
+from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.safe_pickle import load_pickle
-from foredrive.scene import Category
+from foredrive.scene import Attribute, Category
+from foredrive.scene.boxes import UNKNOWN
+
+_SAME_PLACE_M = 0.1
+_MIDDLE_OF_LEVEL = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
+"""Visible share that stands for each level, by the level's token."""
+_ATTRIBUTE_OF_LABEL = {attribute.label: attribute for attribute in Attribute}
 
 
 class NuScenesKeyframeParser(BaseLogParser):
@@ -66,6 +76,7 @@ class NuScenesKeyframeParser(BaseLogParser):
         T_world_ego = self._ego_pose(lidar)
         ego = EgoStateSE3.from_imu(_pose(T_world_ego), NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
         T_ego_lidar = _matrix(self._calibration(lidar))
+        boxes = self._boxes(T_world_ego @ T_ego_lidar, timestamp)
         cameras = [
             self._camera(camera_id, by_channel[channel])
             for camera_id, channel in NUSCENES_CAMERA_IDS.items()
@@ -75,7 +86,8 @@ class NuScenesKeyframeParser(BaseLogParser):
             timestamp,
             [
                 ego,
-                self._boxes(T_world_ego @ T_ego_lidar, timestamp),
+                boxes,
+                *self._labels(boxes),
                 self._lidar(lidar, T_ego_lidar),
                 *cameras,
             ],
@@ -99,6 +111,26 @@ class NuScenesKeyframeParser(BaseLogParser):
             )
         metadata: BoxDetectionsSE3Metadata = NUSCENES_BOX_DETECTIONS_SE3_METADATA
         return BoxDetectionsSE3(detections, timestamp, metadata)
+
+    def _labels(self, boxes: BoxDetectionsSE3) -> list[BaseModality]:
+        """Return attributes and visibilities of the boxes from the annotations at the same places."""
+        rows, found = self._rows.get("sample_annotation", []), list(boxes.box_detections)
+        if not rows or not found:
+            return []
+        centres = np.array([box.bounding_box_se3.center_se3.point_3d.array for box in found])
+        apart_m, nearest = KDTree([row["translation"] for row in rows]).query(centres)
+        near_enough = (np.atleast_1d(apart_m) < _SAME_PLACE_M).tolist()
+        matched = [
+            rows[at] if near else None
+            for at, near in zip(np.atleast_1d(nearest).tolist(), near_enough, strict=True)
+        ]
+        names = {row["token"]: row["name"] for row in self._rows["attribute"]}
+        attributes = [_attribute(row, names) for row in matched]
+        shares = [_MIDDLE_OF_LEVEL[row["visibility_token"]] if row else np.nan for row in matched]
+        return [
+            attributes_modality(attributes, boxes.timestamp),
+            visibility_modality(shares, boxes.timestamp),
+        ]
 
     def _lidar(self, row: dict[str, Any], T_ego_lidar: np.ndarray) -> ParsedLidar:
         sensor = LidarMetadata("LIDAR_TOP", LidarID.LIDAR_TOP, _pose(T_ego_lidar))
@@ -140,6 +172,12 @@ class NuScenesKeyframeParser(BaseLogParser):
 
     def _ego_pose(self, row: dict[str, Any]) -> np.ndarray:
         return _matrix(_find(self._rows["ego_pose"], row["ego_pose_token"]))
+
+
+def _attribute(row: dict[str, Any] | None, names: dict[str, str]) -> int:
+    """Return the `Attribute` of an annotation, or UNKNOWN."""
+    tokens = row["attribute_tokens"] if row is not None else []
+    return _ATTRIBUTE_OF_LABEL[names[tokens[0]]] if tokens else UNKNOWN
 
 
 def _find(rows: list[dict[str, Any]], token: str) -> dict[str, Any]:

@@ -103,7 +103,7 @@ def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, Vi
     reach_m = IN_FOG_M if told is not None and told.weather is Weather.FOG else AHEAD_M
     seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
     if visibility is not None:
-        seen = seen & (visibility >= MIN_VISIBILITY)
+        seen = seen & ~(visibility < MIN_VISIBILITY)  # NaN: not known
     return {
         name: ViewFacts(*setting, tuple(_things(boxes[seen & sector.contains(boxes.centre)])))
         for name, sector in sectors.items()
