@@ -29,7 +29,7 @@ from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite
 
 OUT = Path(__file__).parent / "tasks_truth.jpg"
-TOWN, SECONDS, SEED, RATE_HZ, NOW_S = "Town03", 16.0, 3, 5.0, 8.0
+TOWN, SECONDS, SEED, RATE_HZ, NOW_S = "Town03", 15.0, 1, 2.0, 8.0
 IMAGE_HW = (216, 384)
 VOXELS = VoxelSpec((-40.0, -40.0, -1.0), 0.4, (16, 200, 200))
 CAMERAS = ("pcam_l0", "pcam_f0", "pcam_r0")
@@ -187,7 +187,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         sensors = SensorSuite(camera_rig(IMAGE_HW), roof_lidar())
-        traffic = BackgroundTraffic(vehicles=60, pedestrians=40)
+        traffic = BackgroundTraffic(vehicles=24, pedestrians=16)
         log = record(
             TOWN, SECONDS, SEED, Path(folder), RATE_HZ, sensors, traffic, conditions=CONDITIONS["clear"]
         )
