@@ -26,15 +26,17 @@ def random_truth(rng: np.random.Generator, frames: int = 12, agents: int = 25) -
     )
 
 
-def random_predictions(rng: np.random.Generator, true: TrueAgents) -> PredictedAgents:
+def random_predictions(
+    rng: np.random.Generator, true: TrueAgents, *, apart_m: float = 0.9, drift_m: float = 0.5
+) -> PredictedAgents:
     """Most agents detected within a metre or two, some with another class; clutter; scores with ties."""
     found = np.flatnonzero(rng.random(len(true.frame)) < 0.8)
     clutter = rng.integers(0, len(true.frame), len(true.frame) // 3)
     source = np.concatenate([found, clutter])
     n = len(source)
     is_clutter = np.arange(n) >= len(found)
-    shift = np.where(is_clutter[:, None], rng.normal(0, 8, (n, 2)), rng.normal(0, 0.9, (n, 2)))
-    drift = rng.normal(0, 0.5, (n, FUTURES, 1, 2)) * np.arange(1, STEPS + 1)[:, None]
+    shift = np.where(is_clutter[:, None], rng.normal(0, 8, (n, 2)), rng.normal(0, apart_m, (n, 2)))
+    drift = rng.normal(0, drift_m, (n, FUTURES, 1, 2)) * np.arange(1, STEPS + 1)[:, None]
     category = true.category[source].copy()
     other = rng.random(n) < 0.1
     category[other] = rng.integers(0, Category.PEDESTRIAN + 1, other.sum())

@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from metrics.map_scenes import elements, random_maps
 from metrics.maps_by_hand import chamfer, points_of, precision
 
 from foredrive.errors import InputError
@@ -23,59 +23,12 @@ from foredrive.scene.map_elements import ElementKind
 DIVIDER, CROSSING, BOUNDARY = CLASSES
 
 
-def elements(
-    lines: Sequence[Sequence[tuple[float, float]]],
-    kind: int | Sequence[int] = DIVIDER,
-    frame: int | Sequence[int] = 0,
-    score: float | Sequence[float] = 1.0,
-    identity: Sequence[int] | None = None,
-) -> LineSet:
-    n = len(lines)
-    return LineSet(
-        frame=np.broadcast_to(np.asarray(frame), n).copy(),
-        kind=np.broadcast_to(np.asarray(kind), n).copy(),
-        lines=[np.array(line, dtype=float) for line in lines],
-        score=np.broadcast_to(np.asarray(score, dtype=float), n).copy(),
-        identity=None if identity is None else np.array(identity),
-    )
-
-
 def straight(y: float, start: float = -20.0, end: float = 20.0) -> list[tuple[float, float]]:
     return [(start, y), (end, y)]
 
 
 def ap_at(predicted: LineSet, true: LineSet, name: str, area: Area = "60x30") -> tuple[float, ...]:
     return score_maps(predicted, true, PROTOCOLS[name], area)[DIVIDER].ap_at
-
-
-def random_maps(rng: np.random.Generator, frames: int = 5) -> tuple[LineSet, LineSet]:
-    """Curves with identities; predictions that follow most of them, lose their identity, or are clutter."""
-    lines, kinds, frame, identity = [], [], [], []
-    found, found_kind, found_frame, found_identity = [], [], [], []
-    for f in range(frames):
-        for n in range(int(rng.integers(0, 8))):
-            x = np.sort(rng.uniform(-30, 30, int(rng.integers(2, 9))))
-            line = np.column_stack([x, rng.uniform(-14, 14) + rng.normal(0, 0.4, len(x))])
-            kind = int(rng.integers(0, 3))
-            lines.append(line)
-            kinds.append(kind)
-            frame.append(f)
-            identity.append(n)
-            for copy in range(int(rng.integers(0, 3))):
-                found.append(line + rng.normal(0, 0.7, 2) + rng.normal(0, 0.3, line.shape))
-                found_kind.append(kind)
-                found_frame.append(f)
-                found_identity.append(100 * copy + n + 1000 * int(rng.random() < 0.3))
-        for n in range(2):
-            found.append(rng.uniform(-14, 14, (3, 2)))
-            found_kind.append(int(rng.integers(0, 3)))
-            found_frame.append(f)
-            found_identity.append(5000 + n)
-    score = rng.permutation(len(found)) / len(found)
-    return (
-        elements(found, found_kind, found_frame, score, found_identity),
-        elements(lines, kinds, frame, 1.0, identity),
-    )
 
 
 def test_points_at_equal_distances() -> None:
@@ -205,8 +158,6 @@ def test_identities_are_checked() -> None:
 @pytest.mark.parametrize("name", list(PROTOCOLS))
 def test_parity_with_a_literal_derivation(seed: int, name: str) -> None:
     predicted, true = random_maps(np.random.default_rng(seed))
-    keys = np.stack([predicted.frame, predicted.kind, predicted.identity])
-    predicted = predicted[np.unique(keys, axis=1, return_index=True)[1]]
     protocol = PROTOCOLS[name]
     drive = [0, 0, 1, 1, 1]
     scores = score_maps(predicted, true, protocol, "60x30", drive=np.array(drive))
@@ -232,8 +183,6 @@ def test_parity_with_a_literal_derivation(seed: int, name: str) -> None:
 def test_moving_and_shuffling_everything_changes_nothing(seed: int, angle: float, name: str) -> None:
     rng = np.random.default_rng(seed)
     predicted, true = random_maps(rng, frames=3)
-    keys = np.stack([predicted.frame, predicted.kind, predicted.identity])
-    predicted = predicted[np.unique(keys, axis=1, return_index=True)[1]]
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     moved = [
         dataclasses.replace(e, lines=[line @ turn + (3.0, -7.0) for line in e.lines])[
