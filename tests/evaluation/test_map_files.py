@@ -9,7 +9,7 @@ import pytest
 
 from foredrive.errors import InputError
 from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.maps.score import area_of, score_map_files
+from foredrive.evaluation.maps.score import score_map_files
 
 LINE = [[-20.0, 3.0], [0.0, 3.5], [20.0, 3.0]]
 OTHER = [[-20.0, -6.0], [20.0, -6.0]]
@@ -107,7 +107,7 @@ def test_the_area_is_that_of_the_truth(tmp_path: Path) -> None:
     files = read_maps(
         write(tmp_path / "r.json", maptr(found)), write(tmp_path / "t.json", maptr(far, truth=True))
     )
-    assert area_of(files) == "100x50"
+    assert files.area == "100x50"
     figures = score_map_files(files)
     assert figures["map.streammapnet.ap_divider"] == pytest.approx(1 / 3)
     assert figures["map.maptr.ap_divider"] == 0.0

@@ -8,7 +8,8 @@ divider, 2 boundary) and, if predicted, `scores`. MapTracker's C-mAP also needs 
 and `local_idx` where there is more than one drive. MapTracker stores these, and its truth, in pickles, which
 are never read here: the same content as JSON is.
 
-Coordinates are metres in the frame of the vehicle or its lidar, the same in both files.
+Coordinates are metres in the frame of the vehicle or its lidar, the same in both files. The truth may also be
+a folder of 123D logs: frames are named LOG@T_US then, and coordinates are in the ego frame.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,9 +21,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from foredrive.data.map_elements import read_map_elements
 from foredrive.errors import InputError
 from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.log_frames import log_frames
 from foredrive.metrics.maps.lines import LineSet
+from foredrive.metrics.maps.protocols import HALF_XY_M, Area
 from foredrive.scene.map_elements import ElementKind
 
 _KINDS = {
@@ -48,6 +52,8 @@ class MapFiles:
     """Tokens of the frames; they are in order of time within a drive if there are identities."""
     drive: Int[ndarray, "F"]
     """Number of the drive of each frame."""
+    area: Area
+    """The smaller area that holds the truth, or the predictions where the truth is of logs."""
     frames_without_results: int
     short: int
     """Number of predictions with fewer than two points, which all protocols leave out."""
@@ -70,13 +76,15 @@ class _Frame:
 
 
 def read_maps(results: Path, truth: Path) -> MapFiles:
-    """Read predicted and true vector maps; each file may be in either format.
+    """Read predicted and true vector maps; each file may be in either format, and the truth of logs.
 
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names both.
     """
-    true = _read(truth, predicted=False)
     predicted = _read(results, predicted=True)
+    if truth.is_dir():
+        return _against_logs(predicted, results, truth)
+    true = _read(truth, predicted=False)
     unknown = [token for token in predicted if token not in true]
     if unknown:
         raise InputError(
@@ -87,14 +95,43 @@ def read_maps(results: Path, truth: Path) -> MapFiles:
     tokens = _in_order(true)
     drives = {name: n for n, name in enumerate(dict.fromkeys(true[token].drive for token in tokens))}
     lines, short = _line_set([predicted.get(token) for token in tokens])
+    true_lines, _ = _line_set([true[token] for token in tokens])
     return MapFiles(
         predicted=lines,
-        true=_line_set([true[token] for token in tokens])[0],
+        true=true_lines,
         tokens=tokens,
         drive=np.array([drives[true[token].drive] for token in tokens]),
+        area=area_of(true_lines),
         frames_without_results=len(set(true) - set(predicted)),
         short=short,
     )
+
+
+def area_of(lines: LineSet) -> Area:
+    """Return the area whose sides lines keep to: 60 × 30 m, or else 100 × 50 m."""
+    reach_m = max((float(np.abs(line).max()) for line in lines.lines), default=0.0)
+    return "60x30" if reach_m <= max(HALF_XY_M["60x30"]) + 1.0 else "100x50"
+
+
+def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path) -> MapFiles:
+    """Return predictions and the maps of logs at their frames."""
+    frames = list(log_frames(truth, predicted, results))
+    lines, short = _line_set([predicted[each.name] for each in frames])
+    area = area_of(lines)
+    half_xy_m = HALF_XY_M[area]
+    kinds, found, number = [], [], []
+    for n, each in enumerate(frames):
+        elements = read_map_elements(each.log, each.frame, (2 * half_xy_m[0], 2 * half_xy_m[1]))
+        if not elements.known:
+            raise InputError(f"{each.log.path.folder} has no map to judge frame {each.name} by")
+        for vertices, valid, kind in zip(elements.vertices, elements.valid, elements.kind, strict=True):
+            found.append(vertices[valid].double().numpy())
+            kinds.append(int(kind))
+            number.append(n)
+    count = len(found)
+    true = LineSet(np.array(number, dtype=np.int64), np.array(kinds, dtype=np.int64), found, np.ones(count))
+    names = [each.name for each in frames]
+    return MapFiles(lines, true, names, np.array([each.drive for each in frames]), area, 0, short)
 
 
 def _in_order(frames: Mapping[str, _Frame]) -> list[str]:

@@ -1,13 +1,11 @@
 """Vector maps scored under every protocol."""
 
-import numpy as np
-
 from foredrive.evaluation.maps.files import MapFiles
 from foredrive.evaluation.summary import Figures
 from foredrive.metrics.detection import mean_of_valid
 from foredrive.metrics.maps.lines import CLASSES
 from foredrive.metrics.maps.precision import MapPrecision, mean_precision, score_maps
-from foredrive.metrics.maps.protocols import HALF_XY_M, PROTOCOLS, Area
+from foredrive.metrics.maps.protocols import PROTOCOLS
 from foredrive.scene.map_elements import ElementKind
 
 FIGURES = {
@@ -21,13 +19,13 @@ FIGURES = {
 
 
 def score_map_files(files: MapFiles) -> Figures:
-    """Return `map.maptr.map`, `map.maptr.ap_divider`, … The area is the smaller one that holds the truth.
+    """Return `map.maptr.map`, `map.maptr.ap_divider`, …
 
-    C-mAP has figures only if both files state identities.
+    Centrelines count where the results have any, and C-mAP if both files state identities.
     """
-    area = area_of(files)
+    area = files.area
     classes = [*CLASSES]
-    if (files.true.kind == ElementKind.CENTRELINE).any():
+    if (files.predicted.kind == ElementKind.CENTRELINE).any():
         classes.append(ElementKind.CENTRELINE)
     figures: Figures = {"area": area, "map.frames_counted": len(files.tokens)}
     figures |= {"frames_without_results": files.frames_without_results, "vectors_too_short": files.short}
@@ -44,12 +42,6 @@ def score_map_files(files: MapFiles) -> Figures:
     for kind in classes:
         figures[f"map.true_{kind.name.lower()}"] = int((files.true.kind == kind).sum())
     return figures
-
-
-def area_of(files: MapFiles) -> Area:
-    """Return the area whose sides the true elements keep to: 60 × 30 m, or else 100 × 50 m."""
-    reach_m = max((float(np.abs(line).max()) for line in files.true.lines), default=0.0)
-    return "60x30" if reach_m <= max(HALF_XY_M["60x30"]) + 1.0 else "100x50"
 
 
 def _of_classes(scores: dict[ElementKind, MapPrecision]) -> Figures:

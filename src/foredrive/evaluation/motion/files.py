@@ -12,8 +12,12 @@ tell the heading, without which VAD's rectangle cannot be placed.
 
 Futures are in the global frame; or, as UniAD's, in the lidar's in both files. They can be compared then, but
 not with places, so that what needs both (moving vehicles) is left out.
+
+The truth may also be a folder of 123D logs: frames are named LOG@T_US then, and places and futures are in the
+log's world frame.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +27,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from foredrive.data.agent_futures import read_futures
+from foredrive.data.boxes import read_boxes
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_number_rows, read_numbers
 from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.log_frames import log_frames
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.scene import Category
+from foredrive.metrics.motion.protocols import STEP_S
+from foredrive.scene import Boxes, Category
+from foredrive.scene.agent_futures import AgentFutures
 
 STEPS = 12
 NAMES = ("detection_name", "tracking_name", "class_name")
@@ -77,8 +86,11 @@ def read_agents(results: Path, truth: Path) -> AgentFiles:
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names both.
     """
-    true_content, content = _object(truth), _object(results)
-    true_boxes, boxes = _by_token(true_content, truth), _by_token(content, results)
+    boxes = _by_token(_object(results), results)
+    if truth.is_dir():
+        return _against_logs(boxes, results, truth)
+    true_content = _object(truth)
+    true_boxes = _by_token(true_content, truth)
     unknown = [token for token in boxes if token not in true_boxes]
     if unknown:
         raise InputError(
@@ -88,44 +100,99 @@ def read_agents(results: Path, truth: Path) -> AgentFiles:
         raise InputError(f"{truth}: holds no frames")
     tokens = list(true_boxes)
     rows, true_rows = _rows(boxes, tokens, results), _rows(true_boxes, tokens, truth)
-    ego_xy, ego_yaw = _ego(true_content, true_rows, rows, tokens, truth)
+    ego = _ego(true_content, true_rows, rows, tokens, truth)
+    future_xy, valid = _true_futures(true_rows)
+    seen = np.array([box.get("num_pts", -1) != 0 for box in true_rows.records], dtype=bool)
+    true = TrueAgents(true_rows.frame, true_rows.category, true_rows.xy, future_xy, valid, seen)
+    missing = len(set(true_boxes) - set(boxes))
+    return _in_ego_frame(rows, true, true_rows.names, ego, missing)
+
+
+def _in_ego_frame(
+    rows: _Rows, true: TrueAgents, true_names: Sequence[str], ego: "_Ego", frames_without_results: int
+) -> AgentFiles:
+    """Bring both sides, global so far, into the ego frames."""
     futures = _predicted_futures(rows)
-    true_futures, valid = _true_futures(true_rows)
-    placed = _placed(rows, futures[:, :, 0], true_rows, true_futures[:, 0], valid[:, 0])
-
-    def to_ego(xy: Float[ndarray, "n *s 2"], frame: Int[ndarray, "n"]) -> Float[ndarray, "n *s 2"]:
-        extra = (None,) * (xy.ndim - 2)
-        offset = xy - ego_xy[(frame, *extra)]
-        yaw = np.nan_to_num(ego_yaw)[(frame, *extra)]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x, y = offset[..., 0], offset[..., 1]
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-    if placed:
-        futures = to_ego(futures, rows.frame)
-        true_futures = to_ego(true_futures, true_rows.frame) * valid[..., None]
+    placed = _placed(rows, futures[:, :, 0], true, true_names)
+    future_xy = ego.frame_of(futures, rows.frame) if placed else futures
+    true_future_xy = ego.frame_of(true.future_xy, true.frame) if placed else true.future_xy
     return AgentFiles(
         predicted=PredictedAgents(
             rows.frame,
             rows.category,
             _scores(rows),
-            to_ego(rows.xy, rows.frame),
-            futures,
+            ego.frame_of(rows.xy, rows.frame),
+            future_xy,
             _probabilities(rows, futures.shape[1]),
         ),
-        true=TrueAgents(
-            true_rows.frame,
-            true_rows.category,
-            to_ego(true_rows.xy, true_rows.frame),
-            true_futures,
-            valid,
-            np.array([box.get("num_pts", -1) != 0 for box in true_rows.records], dtype=bool),
+        true=dataclasses.replace(
+            true,
+            xy=ego.frame_of(true.xy, true.frame),
+            future_xy=true_future_xy * true.future_valid[..., None],
         ),
-        frames=len(tokens),
-        frames_without_results=len(set(true_boxes) - set(boxes)),
-        heading_known=bool(np.isfinite(ego_yaw).all()),
+        frames=len(ego.xy),
+        frames_without_results=frames_without_results,
+        heading_known=bool(np.isfinite(ego.yaw).all()),
         futures_placed=placed,
     )
+
+
+def _against_logs(boxes: Mapping[str, Sequence[Box]], results: Path, truth: Path) -> AgentFiles:
+    """Return predictions and the agents of logs at their frames."""
+    frames = list(log_frames(truth, boxes, results))
+    agents, names, ego_xy, ego_yaw = [], [], [], []
+    for number, each in enumerate(frames):
+        found = read_boxes(each.log, each.frame)
+        if found is None:
+            raise InputError(f"{results}: frame {each.name} is not annotated in {each.log.path.folder}")
+        future = read_futures(each.log, each.frame, STEPS, STEP_S)
+        T_world_ego = each.log.T_world_ego[each.frame]
+        agents.append(_agents_of_log(found, future, T_world_ego, number))
+        names += [f"{truth}: frame {each.name}, box {n}" for n in range(len(agents[-1].frame))]
+        ego_xy.append(T_world_ego[:2, 3])
+        ego_yaw.append(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
+    rows = _rows(boxes, [each.name for each in frames], results)
+    if not agents:
+        raise InputError(f"{results}: holds no frames")
+    fields = [field.name for field in dataclasses.fields(TrueAgents)]
+    true = TrueAgents(**{key: np.concatenate([getattr(a, key) for a in agents]) for key in fields})
+    return _in_ego_frame(rows, true, names, _Ego(np.array(ego_xy), np.array(ego_yaw)), 0)
+
+
+def _agents_of_log(
+    boxes: Boxes, futures: AgentFutures, T_world_ego: Float[ndarray, "4 4"], frame: int
+) -> TrueAgents:
+    """Return the boxes of a frame with their futures, in the log's world frame."""
+    centre = boxes.centre.double().numpy()
+    future = np.concatenate(
+        [futures.xy.double().numpy(), np.repeat(centre[:, None, 2:], futures.xy.shape[1], axis=1)], axis=-1
+    )
+    R, t = T_world_ego[:3, :3], T_world_ego[:3, 3]
+    return TrueAgents(
+        np.full(len(centre), frame),
+        boxes.category.numpy().astype(np.int64),
+        (centre @ R.T + t)[:, :2],
+        (future @ R.T + t)[..., :2],
+        futures.valid.numpy(),
+        boxes.num_points.numpy() != 0,
+    )
+
+
+@dataclass(frozen=True)
+class _Ego:
+    """Place (global, m) and heading of the ego vehicle in each frame; NaN for a heading that is not told."""
+
+    xy: Float[ndarray, "F 2"]
+    yaw: Float[ndarray, "F"]
+
+    def frame_of(self, xy: Float[ndarray, "n *s 2"], frame: Int[ndarray, "n"]) -> Float[ndarray, "n *s 2"]:
+        """Return global places in the ego frames, or along global axes if there are no headings."""
+        extra = (slice(None), *[None] * (xy.ndim - 2))
+        offset = xy - self.xy[frame][extra]
+        yaw = np.nan_to_num(self.yaw)[frame][extra]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x, y = offset[..., 0], offset[..., 1]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def _object(path: Path) -> Mapping[str, Any]:
@@ -237,20 +304,17 @@ def _numbers(value: Any, where: str, what: str) -> ndarray:
 
 
 def _placed(
-    rows: _Rows,
-    first_steps: Float[ndarray, "n K 2"],
-    true_rows: _Rows,
-    true_first: Float[ndarray, "m 2"],
-    known: Bool[ndarray, "m"],
+    rows: _Rows, first_steps: Float[ndarray, "n K 2"], true: TrueAgents, true_names: Sequence[str]
 ) -> bool:
     """Return whether futures are in the frame of the boxes. Both files must agree on it."""
+    known = np.flatnonzero(true.future_valid[:, 0])
     near = np.linalg.norm(first_steps - rows.xy[:, None], axis=-1).min(axis=1) < FAR_M
-    true_near = (np.linalg.norm(true_first - true_rows.xy, axis=-1) < FAR_M)[known]
+    true_near = np.linalg.norm(true.future_xy[known, 0] - true.xy[known], axis=-1) < FAR_M
     placed = bool(true_near.all())
     if not placed and true_near.any():
-        n = int(np.flatnonzero(known)[np.flatnonzero(~true_near)[0]])
-        raise InputError(f"{true_rows.names[n]}: its traj begins more than {FAR_M:g} m from its translation")
-    wrong = np.flatnonzero(near != placed) if known.any() else np.flatnonzero(~near)
+        name = true_names[known[np.flatnonzero(~true_near)[0]]]
+        raise InputError(f"{name}: its traj begins more than {FAR_M:g} m from its translation")
+    wrong = np.flatnonzero(near != placed)
     if len(wrong):
         raise InputError(
             f"{rows.names[wrong[0]]}: its futures are not in the same frame as those of the truth"
@@ -260,8 +324,8 @@ def _placed(
 
 def _ego(
     content: Mapping[str, Any], true: _Rows, predicted: _Rows, tokens: Sequence[str], path: Path
-) -> tuple[Float[ndarray, "F 2"], Float[ndarray, "F"]]:
-    """Return place and heading of the ego vehicle in each frame; NaN for a heading that is not told."""
+) -> _Ego:
+    """Return place and heading of the ego vehicle as the files tell them."""
     xy, yaw = np.full((len(tokens), 2), np.nan), np.full(len(tokens), np.nan)
     poses = content.get("ego_poses", {})
     for number, token in enumerate(tokens):
@@ -283,4 +347,4 @@ def _ego(
             f"{path}: frame {tokens[missing[0]]} does not tell where the ego vehicle is "
             "(ego_poses, or ego_translation of a box)"
         )
-    return xy, yaw
+    return _Ego(xy, yaw)

@@ -16,7 +16,6 @@ Facts read in the public code:
   of other identities on it are false. As released, all predictions of a class are dropped in frames without
   truth of this class ("maptracker_consistent"), which its own mAP counts as false; with them counted it is
   "maptracker_consistent_corrected"
-- raster: OpenDriveLab/UniAD, datasets/data_utils/{vector_map,rasterize}.py, dense_heads/panseg_head.py
 """
 
 from collections.abc import Mapping
@@ -81,22 +80,3 @@ PROTOCOLS: dict[str, VectorProtocol] = {
         true_points_first=20,
     ),
 }
-
-
-@dataclass(frozen=True)
-class RasterProtocol:
-    """The choices that define masks of map elements."""
-
-    title: str
-    side_m: float
-    """Side of the square around the ego vehicle."""
-    cells: int
-    width_px: int
-    """Width of the drawn lines."""
-    step_m: float
-    """Lines are sampled at this distance from their start before they are drawn; a shorter rest is lost."""
-    clear_px: int
-    """Lines of a class are erased where those of a later class, drawn this wide, cover them."""
-
-
-UNIAD_RASTER = RasterProtocol("UniAD", side_m=102.4, cells=200, width_px=2, step_m=1.0, clear_px=6)
