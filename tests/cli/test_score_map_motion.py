@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from evaluation.test_av2_forecast_files import bus, submission, write_scenario, write_sensor_log
 from evaluation.test_map_files import FOUND, TRUE, maptr, streammapnet, write
 from evaluation.test_motion_files import FOUND as AGENTS
 from evaluation.test_motion_files import TRUE as TRUE_AGENTS
@@ -42,3 +43,19 @@ def test_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert f"{results}: frame elsewhere (1 in all) is not in {truth}: of another split?" in error
+
+
+def test_forecasts_of_argoverse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A submission of the challenge, and end-to-end forecasts of a sensor log."""
+    write_scenario(tmp_path / "val", "one", {"7": 110})
+    results = submission(tmp_path / "r.parquet", [("one", "7", 1.0, 3.0)])
+    flags = ["--task", "motion", "--out", str(tmp_path / "out")]
+    assert main(["score", str(results), "--truth", str(tmp_path / "val"), *flags]) == 0
+    assert "brier-minFDE" in capsys.readouterr().out
+    write_sensor_log(tmp_path / "sensor" / "log")
+    end_to_end = write(tmp_path / "r.json", {"log": {"0": [bus()]}})
+    assert main(["score", str(end_to_end), "--truth", str(tmp_path / "sensor"), *flags]) == 0
+    shown = capsys.readouterr().out
+    assert "mAP_F" in shown
+    assert "non linear" in shown
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["motion.argoverse.map_f"] == 1.0

@@ -9,8 +9,7 @@ from rich.progress import Progress
 from foredrive.errors import InputError
 from foredrive.evaluation.maps.files import read_maps
 from foredrive.evaluation.maps.score import score_map_files
-from foredrive.evaluation.motion.files import read_agents
-from foredrive.evaluation.motion.score import score_agent_files
+from foredrive.evaluation.motion.score import score_motion_results
 from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
@@ -36,7 +35,7 @@ def score_map(results: Path, truth: Path, poses: Path | None) -> Figures:
 def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:
     """Return the figures of files of forecast agents, see `evaluation.motion`."""
     _check_no_poses("motion", poses)
-    return score_agent_files(read_agents(results, truth))
+    return score_motion_results(results, truth)
 
 
 def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
