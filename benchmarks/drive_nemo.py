@@ -48,11 +48,11 @@ def _demonstrations() -> tuple[LogPath, ...]:
     return find_all_logs(folders)
 
 
-def _scores(driver: str, name: str, seed: int) -> dict[str, float]:
+def _scores(agent: str, name: str, seed: int) -> dict[str, float]:
     """Return the metrics of one repetition of each set of routes; the seed selects the repetition."""
     figures = {}
     for short, routes in JUDGED.items():
-        suite = DriveSuite(driver, TownRoutes(routes, seed=seed), sensors=False)
+        suite = DriveSuite(agent, TownRoutes(routes, seed=seed), sensors=False)
         summary = summarise(
             list(_driven(suite, WORK / "drives" / f"{name}_{short}_seed{seed}").drives.values())
         )

@@ -18,7 +18,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.agents import _run_folder, inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.records import read_drive, summarise
+from foredrive.runs.drive.records import read_drive, suite_title, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
@@ -174,7 +174,7 @@ def test_while_a_drive_is_broken_there_is_no_summary(
 def test_files_of_suites_and_drives_stay_what_they_were(driven: SuiteResult, out: Path) -> None:
     """Folders of before go on, and are read by who knows their keys."""
     suite = json.loads((out / "suite.json").read_text())
-    fields = "driver routes repetitions seed conditions sensors image_hw vehicles people scenarios"
+    fields = "agent routes repetitions seed conditions sensors image_hw vehicles people scenarios"
     assert set(suite) == {*fields.split(), "period_s", "latency_s"}
     assert suite["image_hw"] == [18, 32]
     drive = json.loads((out / "drives" / "routea_rep0.json").read_text())
@@ -206,11 +206,23 @@ def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: P
         drive_suite(changed(suite, seed=1), out, workers=1)
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
-    with pytest.raises(InputError, match="no readable suite"):
+    with pytest.raises(InputError, match=r"not the description of a suite .* drives beside it"):
         drive_suite(suite, tmp_path, workers=1)
     (out / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="not the record of a drive"):
         drive_suite(suite, out, workers=1)
+
+
+def test_a_suite_of_an_earlier_version_goes_on(driven: SuiteResult, suite: DriveSuite, out: Path) -> None:
+    """It calls the agent "driver"."""
+    title, file = suite_title(out), out / "suite.json"
+    noted = json.loads(file.read_text())
+    file.write_text(json.dumps({"driver" if key == "agent" else key: value for key, value in noted.items()}))
+    assert suite_title(out) == title == "constant-velocity on two"
+    with pytest.raises(InputError, match="another suite"):
+        drive_suite(dataclasses.replace(suite, agent="stop"), out, workers=1)
+    assert drive_suite(suite, out, workers=1).skipped == len(driven.drives)
+    assert json.loads(file.read_text()) == noted
 
 
 def claim(suite: DriveSuite, out: Path) -> None:
@@ -219,7 +231,7 @@ def claim(suite: DriveSuite, out: Path) -> None:
 
 
 def test_a_folder_is_claimed_by_what_can_be_driven(suite: DriveSuite, tmp_path: Path) -> None:
-    unknown = changed(suite, routes="nothing.xml"), dataclasses.replace(suite, driver="nobody")
+    unknown = changed(suite, routes="nothing.xml"), dataclasses.replace(suite, agent="nobody")
     for wrong, named in zip(unknown, (r"nothing\.xml", "unknown agent"), strict=True):
         with pytest.raises(InputError, match=named):
             drive_suite(wrong, tmp_path / "new")
@@ -241,14 +253,14 @@ def test_a_folder_that_cannot_be_made_is_one_line(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "foredrive: /proc/no/folder: no folder can be made there\n"
 
 
-@pytest.mark.parametrize("driver", ["nobody", "ego-mlp:nowhere"])
-def test_an_unknown_driver_is_named(driver: str) -> None:
-    with pytest.raises(InputError, match=f"unknown agent '{driver}'; the agents are expert"):
-        inputs_of(driver)
+@pytest.mark.parametrize("agent", ["nobody", "ego-mlp:nowhere"])
+def test_an_unknown_agent_is_named(agent: str) -> None:
+    with pytest.raises(InputError, match=f"unknown agent '{agent}'; the agents are expert"):
+        inputs_of(agent)
 
 
 def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path) -> None:
-    blind = dataclasses.replace(suite, driver="stop", sensors=False)
+    blind = dataclasses.replace(suite, agent="stop", sensors=False)
     drive_suite(blind, tmp_path, workers=1)
     page = write_drive_report(tmp_path).read_text()
     for job in ("routea_rep0", "routeb_rep0"):
@@ -263,5 +275,5 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
     assert "<svg onload" not in write_drive_report(tmp_path).read_text()
 
 
-def test_the_driver_of_demonstrations_has_two_spellings(tmp_path: Path) -> None:
+def test_the_agent_of_demonstrations_has_two_spellings(tmp_path: Path) -> None:
     assert _run_folder(f"student:{tmp_path}") == _run_folder(f"pupil:{tmp_path}") == tmp_path

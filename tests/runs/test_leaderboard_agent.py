@@ -15,7 +15,7 @@ import foredrive.runs.drive.leaderboard_agent as agent_file
 from foredrive.errors import InputError
 from foredrive.recipes.config import save_recipe
 from foredrive.runs.build import build_agent
-from foredrive.runs.drive.leaderboard_agent import driver_of
+from foredrive.runs.drive.leaderboard_agent import agent_of
 from foredrive.training import save_weights
 
 
@@ -90,13 +90,13 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
 
 
 def test_the_route_may_be_appended_to_the_run(tmp_path: Path) -> None:
-    assert driver_of("runs/a+r1+r2") == ("runs/a", "r2")
-    assert driver_of("runs/a") == ("runs/a", "")
+    assert agent_of("runs/a+r1+r2") == ("runs/a", "r2")
+    assert agent_of("runs/a") == ("runs/a", "")
     (tmp_path / "a+b").mkdir()
-    assert driver_of(str(tmp_path / "a+b")) == (str(tmp_path / "a+b"), "")
+    assert agent_of(str(tmp_path / "a+b")) == (str(tmp_path / "a+b"), "")
 
 
-def test_drivers_that_see_nothing_carry_no_cameras() -> None:
+def test_agents_that_see_nothing_carry_no_cameras() -> None:
     pytest.importorskip("carla")
     agent = agent_file.ForedriveAgent()
     agent.setup("constant-velocity")

@@ -96,7 +96,7 @@ def test_what_lies_there_is_not_driven_again(run: Path, out: Path) -> None:
     drive_suite(suite, out)
     assert file.stat().st_mtime_ns == before
     with pytest.raises(InputError, match="another suite"):
-        drive_suite(dataclasses.replace(suite, driver="stop"), out)
+        drive_suite(dataclasses.replace(suite, agent="stop"), out)
 
 
 def test_a_report_has_the_drive_and_its_film(out: Path) -> None:

@@ -49,14 +49,14 @@ def write_suite(folder: Path, name: str) -> Path:
     path = folder / "drives" / f"{name}.json"
     path.write_text(json.dumps(make_drive(name)))
     (folder / "videos" / f"{name}.webp").touch()
-    (folder / "suite.json").write_text(json.dumps({"driver": name, "routes": f"{name}.xml"}))
+    (folder / "suite.json").write_text(json.dumps({"agent": name, "routes": f"{name}.xml"}))
     write_summary(folder / "summary.json", summarise([read_drive(path)]) | {"command": name})
     return write_drive_report(folder)
 
 
 def test_names_from_outside_run_nothing(tmp_path: Path) -> None:
     html = write_suite(tmp_path, EVIL).read_text()
-    # title and heading (driver and routes), command, table, and of the drive: heading, error, what, scenario
+    # title and heading (agent and routes), command, table, and of the drive: heading, error, what, scenario
     assert_harmless(html, times=4 + 1 + 1 + 4)
     images = [attributes["src"] for tag, attributes in Page(html).tags if tag == "img"]
     assert images == [f"videos/{quote(EVIL)}.webp"]

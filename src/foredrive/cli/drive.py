@@ -44,9 +44,9 @@ def drive(
     with importing():
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
-    driver = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = rebuilt.source() or towns.source()
-    suite = DriveSuite(driver, source, planning.sensors, planning.period, planning.latency)
+    suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency)
     workers = towns.workers or len(os.sched_getaffinity(0))
     with _Progress(len(suite.jobs())) as progress:
         driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)

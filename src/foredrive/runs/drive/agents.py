@@ -57,50 +57,50 @@ class _ResizingAgent:
         return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
 
 
-def inputs_of(driver: str) -> AgentInputs:
-    """Return the inputs that a driver requires.
+def inputs_of(agent: str) -> AgentInputs:
+    """Return the inputs that an agent requires.
 
     Args:
-        driver: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
+        agent: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
             the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
             the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
 
     Raises:
-        InputError: there is no such driver, or it was trained on another frame interval.
+        InputError: there is no such agent, or it was trained on another frame interval.
     """
-    if driver in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
         return AgentInputs(cameras=False, lidar=False, past_frames=1)
-    clips = open_run(_run_folder(driver)).recipe.clips
+    clips = open_run(_run_folder(agent)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
-        raise InputError(f"{driver}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    seeing = not driver.startswith(EGO_MLP)
+        raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
+    seeing = not agent.startswith(EGO_MLP)
     return AgentInputs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
-def make_driver(
-    driver: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
+def make_agent(
+    agent: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
 ) -> Agent:
-    """Create a driver for one drive.
+    """Create the agent of one drive.
 
     Args:
-        driver: as for `inputs_of`.
+        agent: as for `inputs_of`.
         clock: returns the time of the drive, s.
-        town: the town that the expert drives in; the other drivers do not need it.
+        town: the town that the expert drives in; the other agents do not need it.
         seed: seed of the random disturbances and turns in a demonstration.
 
     Raises:
-        InputError: there is no such driver, or it needs the expert and there is no town.
+        InputError: there is no such agent, or it needs the expert and there is no town.
     """
-    if driver == EXPERT:
+    if agent == EXPERT:
         return _expert(town)
-    if driver == DISTURBED:
+    if agent == DISTURBED:
         return DisturbedExpert(_expert(town), clock, seed)
-    if driver in (STOP, CONSTANT_VELOCITY):
-        return StraightAgent(CRUISE_MPS if driver == CONSTANT_VELOCITY else 0.0)
-    folder = _run_folder(driver)
-    if driver.startswith((STUDENT, OLD_STUDENT)):
+    if agent in (STOP, CONSTANT_VELOCITY):
+        return StraightAgent(CRUISE_MPS if agent == CONSTANT_VELOCITY else 0.0)
+    folder = _run_folder(agent)
+    if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
-    return RestartingAgent(_fitted(folder) if driver.startswith(EGO_MLP) else _seeing(folder), clock)
+    return RestartingAgent(_fitted(folder) if agent.startswith(EGO_MLP) else _seeing(folder), clock)
 
 
 def _expert(town: TownSimulator | None) -> TownExpert:
@@ -109,14 +109,14 @@ def _expert(town: TownSimulator | None) -> TownExpert:
     return TownExpert(town)
 
 
-def _run_folder(driver: str) -> Path:
-    prefix = next((known for known in (EGO_MLP, STUDENT, OLD_STUDENT) if driver.startswith(known)), "")
-    folder = run_folder(Path(driver.removeprefix(prefix)))
+def _run_folder(agent: str) -> Path:
+    prefix = next((known for known in (EGO_MLP, STUDENT, OLD_STUDENT) if agent.startswith(known)), "")
+    folder = run_folder(Path(agent.removeprefix(prefix)))
     if not folder.is_dir():
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {STUDENT}RUN"
         )
-        raise InputError(f"unknown agent {driver!r}; the agents are {known}")
+        raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import inputs_of, make_driver
+from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic
@@ -51,7 +51,7 @@ class CarlaRoutes(RouteSource):
     @contextlib.contextmanager
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive on the server; restore the server's state afterwards."""
-        route, inputs = self.route_of(job), inputs_of(suite.driver)
+        route, inputs = self.route_of(job), inputs_of(suite.agent)
         seed = self.seed + job.repetition
         rig = camera_rig(self.image_hw) if inputs.lidar or suite.sensors else None
         scenario = RouteScenario(
@@ -65,7 +65,7 @@ class CarlaRoutes(RouteSource):
             limit_s=timeout_s(route.length_m),
         )
         with CarlaSimulator(connect(*self.address())) as simulator:
-            agent = make_driver(suite.driver, lambda: simulator.state.t_s)
+            agent = make_agent(suite.agent, lambda: simulator.state.t_s)
             with drive_log(out, job.name, route.xyz, rig, route.town) as log:
                 yield DriveSetup(
                     simulator,

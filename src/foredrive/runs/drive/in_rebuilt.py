@@ -12,7 +12,7 @@ from foredrive.data.maps import read_lane_outlines
 from foredrive.errors import InputError
 from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import inputs_of, make_driver
+from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenedReconstruction,
@@ -34,7 +34,7 @@ from foredrive.simulation.simple_agents import ReplayAgent
 from foredrive.simulation.threats import Threat, reference_mps, send_threat, threat_score
 
 REPLAY = "log"
-"""The driver that repeats the logged drive (log replay)."""
+"""The agent that repeats the logged drive (log replay)."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class RebuiltRoutes:
         """Return the fields, and the run as the routes."""
         return {**dataclasses.asdict(self), "routes": self.run}
 
-    def jobs(self, driver: str) -> Sequence[DriveJob]:
+    def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each start and threat."""
-        past_frames = _past_frames(driver)
+        past_frames = _past_frames(agent)
         _edits_of(self.edits)
         return [job for job, _, _ in self._plan(past_frames)]
 
@@ -75,7 +75,7 @@ class RebuiltRoutes:
     @contextlib.contextmanager
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in the reconstructed scene."""
-        opened, edits, past_frames = _opened(self.run), _edits_of(self.edits), _past_frames(suite.driver)
+        opened, edits, past_frames = _opened(self.run), _edits_of(self.edits), _past_frames(suite.agent)
         _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
         edited = edited_scene(opened.scene, edits)
         drive = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu())
@@ -86,8 +86,8 @@ class RebuiltRoutes:
         renderer = RebuiltRenderer(opened.scene, graph, opened.vehicle)
         lanes = _lanes(opened.folder)
         simulator = RebuiltSimulator(renderer, graph.tracks, drive, lanes)
-        sensors = suite.sensors or (suite.driver != REPLAY and inputs_of(suite.driver).lidar)
-        agent = _driver(suite.driver, simulator)
+        sensors = suite.sensors or (suite.agent != REPLAY and inputs_of(suite.agent).lidar)
+        agent = _agent(suite.agent, simulator)
         route_xyz = drive.route_from(start_s)
         rig = renderer.rig if sensors else None
         with drive_log(out, job.name, route_xyz, rig) as log:
@@ -117,8 +117,8 @@ def _edits_of(file: str | None) -> list[Edit]:
     return [] if file is None else load_edits(Path(file))
 
 
-def _past_frames(driver: str) -> int:
-    return 1 if driver == REPLAY else inputs_of(driver).past_frames
+def _past_frames(agent: str) -> int:
+    return 1 if agent == REPLAY else inputs_of(agent).past_frames
 
 
 def _lanes(folder: Path) -> LoggedLanes | None:
@@ -142,12 +142,12 @@ class _SelectedCameras:
         return self.agent.act(observation.through(self.cameras))
 
 
-def _driver(driver: str, simulator: RebuiltSimulator) -> Agent:
-    if driver == REPLAY:
+def _agent(name: str, simulator: RebuiltSimulator) -> Agent:
+    if name == REPLAY:
         return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
-    agent = make_driver(driver, lambda: simulator.state.t_s)
-    there = [name.lower() for name in simulator.renderer.rig.names]
-    wanted = [name.lower() for name in inputs_of(driver).camera_names or there]
+    agent = make_agent(name, lambda: simulator.state.t_s)
+    there = [camera.lower() for camera in simulator.renderer.rig.names]
+    wanted = [camera.lower() for camera in inputs_of(name).camera_names or there]
     return _SelectedCameras(agent, camera_indices(there, wanted)) if wanted != there else agent
 
 

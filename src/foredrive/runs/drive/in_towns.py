@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from foredrive.runs.drive.agents import inputs_of, make_driver
+from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource, drive_hash
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene import Trajectory
@@ -37,7 +37,7 @@ class TownRoutes(RouteSource):
         route = self.route_of(job)
         simulator, scenario = TownSimulator(), self.scenario_of(route, job.repetition, suite)
         disturbance_seed = drive_hash(scenario.seed, job.route)
-        agent = make_driver(suite.driver, lambda: simulator.state.t_s, simulator, disturbance_seed)
+        agent = make_agent(suite.agent, lambda: simulator.state.t_s, simulator, disturbance_seed)
 
         def expert_plan() -> Trajectory | None:
             if isinstance(agent, DisturbedExpert | AlternatingStudent):
@@ -59,7 +59,7 @@ class TownRoutes(RouteSource):
 
     def scenario_of(self, route: DriveRoute, repetition: int, suite: DriveSuite) -> TownScenario:
         """Return the set-up of one drive."""
-        inputs, seed = inputs_of(suite.driver), self.seed + repetition
+        inputs, seed = inputs_of(suite.agent), self.seed + repetition
         sensed = inputs.lidar or suite.sensors
         return TownScenario(
             town=route.town,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import inputs_of, make_driver
+from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.sensors.vehicle import camera_rig, roof_lidar
 from foredrive.simulation.carla.client import import_carla
@@ -40,7 +40,7 @@ _AutonomousAgent: Any = _base_class()
 
 
 class ForedriveAgent(_AutonomousAgent):
-    """An `AutonomousAgent` for each driver of `foredrive drive --agent`, mainly for run folders.
+    """An `AutonomousAgent` for each agent of `foredrive drive --agent`, mainly for run folders.
 
     It receives the same inputs as in a town: the same cameras, image size and number of key frames.
     Leaderboard 1.0 calls `setup` in the constructor and gives the route later; 2.x and Bench2Drive use the
@@ -48,14 +48,14 @@ class ForedriveAgent(_AutonomousAgent):
     """
 
     def setup(self, path_to_conf_file: str) -> None:
-        """Load the driver; the track stays SENSORS, as in the base class.
+        """Load the agent; the track stays SENSORS, as in the base class.
 
         Raises:
-            InputError: there is no such driver, or it drives only in towns.
+            InputError: there is no such agent, or it drives only in towns.
         """
-        driver, self._route_name = driver_of(path_to_conf_file)
-        inputs, self._t_s = inputs_of(driver), 0.0
-        agent = make_driver(driver, lambda: self._t_s)
+        name, self._route_name = agent_of(path_to_conf_file)
+        inputs, self._t_s = inputs_of(name), 0.0
+        agent = make_agent(name, lambda: self._t_s)
         rig = camera_rig(RouteSource.image_hw) if inputs.cameras else None
         self._driver = LeaderboardDriver(
             agent, rig, roof_lidar() if inputs.lidar else None, inputs.past_frames
@@ -65,7 +65,7 @@ class ForedriveAgent(_AutonomousAgent):
         self._metrics: dict[str, Any] = {}
 
     def sensors(self) -> list[dict[str, Any]]:
-        """Return the sensors: the cameras and lidar that the driver requires, GNSS, IMU and speedometer."""
+        """Return the sensors: the cameras and lidar that the agent requires, GNSS, IMU and speedometer."""
         return self._driver.sensors()
 
     def run_step(self, input_data: dict[str, tuple[int, Any]], timestamp: float) -> Any:
@@ -89,9 +89,9 @@ class ForedriveAgent(_AutonomousAgent):
                 temporary.write_text(json.dumps(metrics))
 
 
-def driver_of(path_to_conf_file: str) -> tuple[str, str]:
-    """Return the driver, and the route name that Bench2Drive appended to it, or ""."""
+def agent_of(path_to_conf_file: str) -> tuple[str, str]:
+    """Return the name of the agent, and the route name that Bench2Drive appended to it, or ""."""
     if SEPARATOR not in path_to_conf_file or Path(path_to_conf_file).is_dir():
         return path_to_conf_file, ""
-    driver, *names = path_to_conf_file.split(SEPARATOR)
-    return driver, names[-1]
+    agent, *names = path_to_conf_file.split(SEPARATOR)
+    return agent, names[-1]

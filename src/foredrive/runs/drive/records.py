@@ -46,23 +46,37 @@ def read_drive(path: Path) -> DriveRecord:
     raise InputError(f"{path}: not the record of a drive ({why}); delete it to repeat the drive")
 
 
-def suite_title(folder: Path) -> str:
-    """Return the title of a suite: the driver and the routes.
+def read_suite(folder: Path) -> dict[str, object]:
+    """Read the description of a suite. Earlier versions wrote the agent's name as "driver".
 
     Raises:
-        InputError: the folder has no suite file, or the file cannot be read.
+        InputError: the folder has no suite file, or the file describes no suite.
     """
     try:
-        suite = json.loads((folder / SUITE).read_text())
-        return f"{Path(suite['driver']).name} on {Path(suite['routes']).stem}"
-    except (OSError, ValueError, LookupError, TypeError) as error:
+        suite: dict[str, object] = json.loads((folder / SUITE).read_text())
+        if "driver" in suite:
+            suite["agent"] = suite.pop("driver")
+        if not isinstance(suite["agent"], str) or not isinstance(suite["routes"], str):
+            raise TypeError("agent and routes have to be texts")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{folder / SUITE}: not the description of a suite ({error})") from error
+    return suite
+
+
+def suite_title(folder: Path) -> str:
+    """Return the title of a suite: the agent and the routes.
+
+    Raises:
+        InputError: as `read_suite`.
+    """
+    suite = read_suite(folder)
+    return f"{Path(str(suite['agent'])).name} on {Path(str(suite['routes'])).stem}"
 
 
 def summarise(drives: Sequence[DriveRecord]) -> Figures:
     """Compute the metrics of a suite as a flat dict.
 
-    A drive that failed because of the driver is scored by the distance that it drove.
+    A drive that failed because of the agent is scored by the distance that it drove.
     """
     suite = score_suite([drive.score for drive in drives])
     out: Figures = {

@@ -47,9 +47,9 @@ class RouteSource:
         """Return the fields."""
         return dataclasses.asdict(self)
 
-    def jobs(self, driver: str) -> Sequence[DriveJob]:
+    def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each route and repetition."""
-        inputs_of(driver)
+        inputs_of(agent)
         routes = load_route_set(self.routes)
         return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
 

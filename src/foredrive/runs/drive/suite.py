@@ -1,4 +1,4 @@
-"""Drives of one driver over all jobs of a source; each drive is saved when it ends.
+"""Drives of one agent over all jobs of a source; each drive is saved when it ends.
 
 A suite is a folder: drives/NAME.json is the record of a drive, logs/ has its 123D log, summary.json has the
 scores. A drive with a record is not driven again.
@@ -23,7 +23,7 @@ from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import write_summary
 from foredrive.files import atomic_path
-from foredrive.runs.drive.records import read_drive, summarise, write_drive
+from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
@@ -81,8 +81,8 @@ class DriveSource(Protocol):
         """Return the fields for JSON; "routes" names the routes."""
         ...
 
-    def jobs(self, driver: str) -> Sequence[DriveJob]:
-        """Return the drives. Raise InputError if there are none, or there is no such driver."""
+    def jobs(self, agent: str) -> Sequence[DriveJob]:
+        """Return the drives. Raise InputError if there are none, or there is no such agent."""
         ...
 
     def set_up(self, job: DriveJob, suite: "DriveSuite", out: Path) -> AbstractContextManager[DriveSetup]:
@@ -92,13 +92,13 @@ class DriveSource(Protocol):
 
 @dataclass(frozen=True)
 class DriveSuite:
-    """A driver, the source of its drives, and its planning period and latency."""
+    """An agent, the source of its drives, and its planning period and latency."""
 
-    driver: str
-    """Name of the driver; see `agents.inputs_of`."""
+    agent: str
+    """Name of the agent; see `agents.inputs_of`."""
     source: DriveSource
     sensors: bool = True
-    """Whether cameras and lidar are logged even if the driver does not need them."""
+    """Whether cameras and lidar are logged even if the agent does not need them."""
     period_s: float = PlanningTiming.period_s
     latency_s: float = PlanningTiming.latency_s
 
@@ -109,9 +109,9 @@ class DriveSuite:
         """Return the drives.
 
         Raises:
-            InputError: there is no such driver, or there are no drives.
+            InputError: there is no such agent, or there are no drives.
         """
-        return self.source.jobs(self.driver)
+        return self.source.jobs(self.agent)
 
     def noted(self) -> dict[str, object]:
         """Return the contents of the suite's file."""
@@ -130,7 +130,7 @@ class SuiteResult:
     skipped: int
     """Number of drives that had a record before."""
     broken: dict[DriveJob, str]
-    """The reason for each drive that failed because of the simulator, not the driver. It has no score."""
+    """The reason for each drive that failed because of the simulator, not the agent. It has no score."""
 
 
 def drive_suite(
@@ -149,7 +149,7 @@ def drive_suite(
         tick: called after each drive with its record, or None if the drive broke.
 
     Raises:
-        InputError: there is no such driver or there are no drives; the folder holds another suite, or another
+        InputError: there is no such agent or there are no drives; the folder holds another suite, or another
             process drives into it; a drive of a source with `in_turn` cannot be set up.
         OSError: the disk is full.
     """
@@ -229,14 +229,9 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
         if not any((out / DRIVES).glob("*.json")):
             return None
         try:
-            there = json.loads(path.read_text())
-        except (OSError, ValueError):
-            there = None
-        if not isinstance(there, dict) or not there.keys() >= set(grows):
-            raise InputError(
-                f"{out}: has drives, but no readable {SUITE} that describes them; choose another folder"
-            )
-        return there
+            return read_suite(out)
+        except InputError as error:
+            raise InputError(f"{error}, but there are drives beside it; choose another folder") from error
 
     def read() -> dict[str, object] | None:
         there = noted_there()

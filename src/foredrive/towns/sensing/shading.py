@@ -246,6 +246,25 @@ def _lit_window(light, glass, chance):
 
 @_kernel
 @no_type_check
+def _direct_light(kind, facing, lit):
+    """Return the share of the sun's light that a surface scatters. `facing` is the cosine to the sun."""
+    if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
+        return 0.45 + 0.55 * facing if lit else 0.12
+    return facing if lit else 0.0
+
+
+@_kernel
+@no_type_check
+def _gloss(gloss, glass, cosine):
+    """Return the share of mirrored light; it rises at grazing angles (Schlick's approximation)."""
+    gloss = min(1.0, gloss + 0.35 * glass)
+    if gloss > 0.0:
+        gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
+    return gloss
+
+
+@_kernel
+@no_type_check
 def shade(materials, found, t, direction, lit, light, mirrored, known):
     """Return the radiance [N 3] along rays.
 
@@ -277,12 +296,8 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
         kind, glass, cosine = materials.texture[material], colour[3], found.cosine[i]
         nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
         facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
-        direct = facing if lit[i] else 0.0
-        if kind == _FOLIAGE:  # leaves scatter: softer than a flat surface
-            direct = (0.45 + 0.55 * facing) if lit[i] else 0.12
-        gloss = min(1.0, materials.gloss[material] + 0.35 * glass)
-        if gloss > 0.0:
-            gloss = gloss + (1.0 - gloss) * (1.0 - cosine) ** 5 * (0.25 + glass)
+        direct = _direct_light(kind, facing, lit[i])
+        gloss = _gloss(materials.gloss[material], glass, cosine)
         film = 0.0
         if wetness > 0.0 and nz > LEVEL_COS and is_paved(materials.surface[material]):
             film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)

@@ -1,0 +1,84 @@
+"""The commands, names and links that README and the pages of docs show are there."""
+
+import ast
+import functools
+import importlib
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from foredrive.cli import main as program
+
+ROOT = Path(__file__).parents[2]
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+
+
+def blocks(page: Path, languages: str) -> list[str]:
+    return re.findall(rf"^```(?:{languages})\n(.*?)^```", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def commands(page: Path) -> list[str]:
+    text = "\n".join(blocks(page, "|bash"))
+    return re.findall(r"^foredrive (.+?)(?:\s+#.*)?$", text, flags=re.MULTILINE)
+
+
+COMMANDS = sorted({command for page in PAGES for command in commands(page)})
+
+
+def test_there_are_commands() -> None:
+    assert {"convert", "view", "record", "train", "evaluate", "render"} <= {
+        line.split()[0] for line in COMMANDS
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_is_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    called = []
+
+    def only_called(name: str) -> Callable[..., None]:
+        @functools.wraps(program.VERBS[name])
+        def verb(*args: object, **kwargs: object) -> None:
+            called.append(name)
+
+        return verb
+
+    monkeypatch.setattr(program, "VERBS", {name: only_called(name) for name in program.VERBS})
+    assert program.main(shlex.split(command)) == 0
+    verb, then = shlex.split(command)[:2]
+    assert called == [f"{verb} {then}" if f"{verb} {then}" in program.VERBS else verb]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_names_in_examples_can_be_imported(page: Path) -> None:
+    for block in blocks(page, "python"):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom):
+                module = importlib.import_module(node.module or "")
+                for name in node.names:
+                    assert hasattr(module, name.name), f"{page.name}: {node.module} has no {name.name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_benchmarks_that_are_named_exist(page: Path) -> None:
+    named = re.findall(r"foredrive bench ([a-z][a-z0-9-]+)", page.read_text())
+    assert set(named) <= {path.stem.replace("_", "-") for path in (ROOT / "benchmarks").glob("*.py")}
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{page.name}: {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
