@@ -11,7 +11,7 @@ from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.setting import Place
-from foredrive.metrics.retrieval import Ranking, draw_sequences, mean_and_interval, precision_at
+from foredrive.metrics.retrieval import draw_sequences, mean_and_interval
 from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.search.facts import MANY, NOUNS
 from foredrive.search.find import collapse
@@ -39,6 +39,34 @@ MODALITIES = ("image", "lidar", "joint", "joint_logits", "chance")
 modality (LidarCLIP, 4.2).
 """
 ALL, EVERY = "all", "every"
+
+
+class Ranking(NamedTuple):
+    """Hits of S sequences for one query, without those close to a better one.
+
+    Rows are padded to the H hits of the longest with a score of -inf.
+    """
+
+    score: Float[np.ndarray, "S H"]
+    true: Bool[np.ndarray, "S H"]
+    """Whether the hit fits the query."""
+    could: Int[np.ndarray, "S"]
+    """Maximum number of true hits of a sequence."""
+
+
+def precision_at(
+    ranking: Ranking, drawn: Int[np.ndarray, "B S"], ranks: Sequence[int]
+) -> Float[np.ndarray, "B K"]:
+    """Return P@K = true hits among the best K / min(K, hits that could be true), of each draw of sequences.
+
+    A sequence drawn twice counts as two. NaN where no hit could be true.
+    """
+    score, true = (of[drawn].reshape(len(drawn), -1) for of in (ranking.score, ranking.true))
+    order = np.argsort(-score, axis=1, kind="stable")[:, : max(ranks)]
+    hits = np.take_along_axis(true, order, axis=1).cumsum(axis=1)
+    could = ranking.could[drawn].sum(axis=1)
+    found = [hits[:, min(rank, hits.shape[1]) - 1] / np.minimum(rank, could).clip(min=1) for rank in ranks]
+    return np.where((could > 0)[:, None], np.stack(found, axis=1), np.nan)
 
 
 class Question(NamedTuple):

@@ -11,8 +11,10 @@ from benchmarks.common.retrieval_quality import (
     MODALITIES,
     WEATHERS,
     Judged,
+    Ranking,
     judge_naming,
     judge_retrieval,
+    precision_at,
     questions,
     weather_of,
 )
@@ -102,3 +104,25 @@ def test_weather_of_a_drive() -> None:
     for weather, (time, air) in told.items():
         assert weather_of(row._replace(facts=ViewFacts(time, air, None, None))) == weather
     assert set(WEATHERS) <= set(SETTINGS)
+
+
+OUT = -np.inf
+RANKING = Ranking(
+    score=np.array([[0.9, 0.1, OUT], [0.8, 0.7, 0.2]]),
+    true=np.array([[True, True, False], [False, True, False]]),
+    could=np.array([2, 1]),
+)
+"""In order: true, false, true, false, true; three could be."""
+
+
+def test_precision_by_hand() -> None:
+    drawn = np.array([[0, 1], [0, 0], [1, 1]])
+    found = precision_at(RANKING, drawn, (1, 2, 10))
+    np.testing.assert_allclose(found[0], [1, 1 / 2, 3 / 3])
+    np.testing.assert_allclose(found[1], [1, 1, 4 / 4])  # the first drive twice: four hits, all true
+    np.testing.assert_allclose(found[2], [0, 0, 2 / 2])  # false and false, then both true ones
+
+
+def test_what_nothing_answers_has_no_precision() -> None:
+    nothing = Ranking(RANKING.score, np.zeros((2, 3), dtype=bool), np.zeros(2, dtype=int))
+    assert np.isnan(precision_at(nothing, np.array([[0, 1]]), (1, 10))).all()

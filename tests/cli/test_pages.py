@@ -67,6 +67,17 @@ def test_benchmarks_that_are_named_exist(page: Path) -> None:
     assert set(named) <= {path.stem.replace("_", "-") for path in (ROOT / "benchmarks").glob("*.py")}
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_source_files_that_are_named_exist(page: Path) -> None:
+    """Users write foredrive_agent.py themselves."""
+    folders = ("src", "tests", "benchmarks", "docs")
+    there = {path.as_posix() for folder in folders for path in (ROOT / folder).rglob("*.py")}
+    for name in set(re.findall(r"`([a-z0-9_/]+\.py)`", page.read_text())) - {"foredrive_agent.py"}:
+        assert any(path.endswith(f"/{name}") for path in there), f"{page.name}: {name}"
+    for name, target in re.findall(r"\[`([a-z0-9_/]+\.py)`\]\(([^)]+)\)", page.read_text()):
+        assert target.endswith(f"/{name}"), f"{page.name}: {name} is linked to {target}"
+
+
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)

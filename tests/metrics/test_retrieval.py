@@ -1,37 +1,9 @@
-"""P@K over sequences, by hand and drawn again."""
+"""Ranks and means over sequences, by hand and drawn again."""
 
 import numpy as np
 import pytest
 
-from foredrive.metrics.retrieval import (
-    Ranking,
-    draw_sequences,
-    match_rank,
-    mean_and_interval,
-    mean_of_groups,
-    precision_at,
-)
-
-OUT = -np.inf
-RANKING = Ranking(
-    score=np.array([[0.9, 0.1, OUT], [0.8, 0.7, 0.2]]),
-    true=np.array([[True, True, False], [False, True, False]]),
-    could=np.array([2, 1]),
-)
-"""In order: true, false, true, false, true; three could be."""
-
-
-def test_precision_by_hand() -> None:
-    drawn = np.array([[0, 1], [0, 0], [1, 1]])
-    found = precision_at(RANKING, drawn, (1, 2, 10))
-    np.testing.assert_allclose(found[0], [1, 1 / 2, 3 / 3])
-    np.testing.assert_allclose(found[1], [1, 1, 4 / 4])  # the first drive twice: four hits, all true
-    np.testing.assert_allclose(found[2], [0, 0, 2 / 2])  # false and false, then both true ones
-
-
-def test_what_nothing_answers_has_no_precision() -> None:
-    nothing = Ranking(RANKING.score, np.zeros((2, 3), dtype=bool), np.zeros(2, dtype=int))
-    assert np.isnan(precision_at(nothing, np.array([[0, 1]]), (1, 10))).all()
+from foredrive.metrics.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
 
 
 def test_draws_begin_with_all_sequences_and_bounds_hold_what_varies() -> None:

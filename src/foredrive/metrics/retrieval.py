@@ -1,42 +1,11 @@
-"""Precision and recall of retrieval, and their intervals over sequences."""
-
-from collections.abc import Sequence
-from typing import NamedTuple
+"""Ranks of retrieval, and intervals of figures over sequences."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 ROWS_AT_ONCE = 1024
 _TIE = 1e-6
 """Difference of cosines up to which two items are equally similar; it is above the error of a product."""
-
-
-class Ranking(NamedTuple):
-    """Hits of S sequences for one query, without those close to a better one.
-
-    Rows are padded to the H hits of the longest with a score of -inf.
-    """
-
-    score: Float[np.ndarray, "S H"]
-    true: Bool[np.ndarray, "S H"]
-    """Whether the hit fits the query."""
-    could: Int[np.ndarray, "S"]
-    """Maximum number of true hits of a sequence."""
-
-
-def precision_at(
-    ranking: Ranking, drawn: Int[np.ndarray, "B S"], ranks: Sequence[int]
-) -> Float[np.ndarray, "B K"]:
-    """Return P@K = true hits among the best K / min(K, hits that could be true), of each draw of sequences.
-
-    A sequence drawn twice counts as two. NaN where no hit could be true.
-    """
-    score, true = (of[drawn].reshape(len(drawn), -1) for of in (ranking.score, ranking.true))
-    order = np.argsort(-score, axis=1, kind="stable")[:, : max(ranks)]
-    hits = np.take_along_axis(true, order, axis=1).cumsum(axis=1)
-    could = ranking.could[drawn].sum(axis=1)
-    found = [hits[:, min(rank, hits.shape[1]) - 1] / np.minimum(rank, could).clip(min=1) for rank in ranks]
-    return np.where((could > 0)[:, None], np.stack(found, axis=1), np.nan)
 
 
 def match_rank(queries: Float[np.ndarray, "n D"], gallery: Float[np.ndarray, "n D"]) -> Int[np.ndarray, "n"]:

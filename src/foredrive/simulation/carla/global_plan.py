@@ -22,8 +22,8 @@ COMMAND_OF_OPTION = {
 """By the names of CARLA's `RoadOption`. All others (STRAIGHT, LANEFOLLOW, VOID) mean straight on."""
 
 
-class GlobalPlan:
-    """A route of N points.
+class GlobalPlan(RouteLine):
+    """A route of N points with straight lines between them.
 
     Args:
         plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` keeps them. An
@@ -37,17 +37,11 @@ class GlobalPlan:
         self.xy: Float64[np.ndarray, "N 2"] = np.array(
             [xyz_of(transform.location)[:2] for transform, _ in plan], dtype=float
         ).reshape(-1, 2)
-        self._arc_m = arc_lengths(self.xy)
-        if len(plan) < 2 or not self._arc_m[-1] > 0:
+        self._point_arc_m = arc_lengths(self.xy)
+        if len(plan) < 2 or not self._point_arc_m[-1] > 0:
             raise InputError(f"a route needs at least two different points, got {len(plan)} points")
         self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]
-        self._line = RouteLine(np.column_stack([self.xy, np.zeros(len(plan))]))
-
-    def advance(
-        self, progress: RouteProgress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
-    ) -> RouteProgress:
-        """Return the progress of a vehicle that is now at `xy`."""
-        return self._line.advance(progress, xy, speed_mps, t_s)
+        super().__init__(np.column_stack([self.xy, np.zeros(len(plan))]))
 
     def command(self, progress: RouteProgress) -> Command:
         """Return the first turn or lane change that is under way or begins within `LOOKAHEAD_M`.
@@ -55,16 +49,7 @@ class GlobalPlan:
         In training (`data.commands`) commands change at about the same place. The difference is bends outside
         of junctions, which the few points do not show.
         """
-        first = int(np.searchsorted(self._arc_m, progress.done_m, side="right")) - 1
-        last = int(np.searchsorted(self._arc_m, progress.done_m + LOOKAHEAD_M))
+        first = int(np.searchsorted(self._point_arc_m, progress.done_m, side="right")) - 1
+        last = int(np.searchsorted(self._point_arc_m, progress.done_m + LOOKAHEAD_M))
         soon = self._commands[max(first, 0) : max(last, 1)]
         return next((command for command in soon if command is not Command.STRAIGHT), Command.STRAIGHT)
-
-    def target_xy(
-        self, progress: RouteProgress, T_world_ego: Float64[np.ndarray, "4 4"]
-    ) -> Float64[np.ndarray, "2"]:
-        """Return the target point on the route in the ego frame, m.
-
-        The route is straight between its points.
-        """
-        return self._line.target_xy(progress, T_world_ego)

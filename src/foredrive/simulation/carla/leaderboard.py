@@ -32,7 +32,7 @@ from foredrive.simulation.carla.localization import (
 from foredrive.simulation.carla.sensors import camera_specs, image_of, lidar_spec, mounting, sweep_of
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip, no_images
+from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, no_images
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.route_progress import RouteProgress
 
@@ -150,9 +150,7 @@ class LeaderboardDriver:
 
     def _clip(self) -> Clip:
         assert self._plan is not None
-        plan, progress = self._plan, self._progress
-        target_xy = plan.target_xy(progress, self._frames[-1].T_world_ego)
-        clip = make_clip(self._frames, self._rig, plan.command(progress), target_xy)
+        clip = self._plan.observe(self._frames, self._progress, self._rig)
         unknown = torch.zeros_like(clip.boxes_valid)
         return dataclasses.replace(clip, boxes_valid=unknown, misses_known=unknown)
 
