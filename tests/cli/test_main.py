@@ -1,14 +1,12 @@
 """What a user sees when a verb cannot go on: one line and an exit code."""
 
-import dataclasses
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -174,30 +172,6 @@ def test_an_unknown_verb_is_told_the_known_ones(capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit):
         main(["vew"])
     assert "view" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("verb", list(program.VERBS))
-def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([*verb.split(), "--help"])
-    assert ended.value.code == 0
-    said = capsys.readouterr().out
-    function = program.VERBS[verb]
-    assert (function.__doc__ or "").split("\n")[0] in " ".join(said.split())
-    for explained, name in flags_of(function):
-        sentence = (explained.__doc__ or "").partition(f"        {name}: ")[2].split()[:3]
-        assert len(sentence) == 3, f"{verb}: no sentence about {name}"
-        assert " ".join(sentence) in " ".join(said.replace("│", " ").split())
-
-
-def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
-    """A verb's flags, those of its groups too, and whose docstring explains each."""
-    for name, kind in verb.__annotations__.items():
-        group = get_args(kind)[0] if get_args(kind) else kind
-        if dataclasses.is_dataclass(group):
-            yield from flags_of(group)
-        elif name != "return":
-            yield verb, name
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The program `foredrive`: its verbs, and the messages when a verb cannot continue."""
 
 import errno
+import inspect
 import os
 import re
 import sys
@@ -93,6 +94,8 @@ def main(args: Sequence[str] | None = None) -> int:
     if " ".join(args[:2]) in VERBS:  # such as `search index`
         args = [" ".join(args[:2]), *args[2:]]
     interrupt = LastingInterrupt()
+    for verb in VERBS.values():
+        verb.__doc__ = _reflowed(verb.__doc__ or "")
     try:
         _check_flags(args)
         with interrupt:
@@ -112,6 +115,14 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         return _give_up(reason)
     return 0
+
+
+def _reflowed(docstring: str) -> str:
+    """Return a docstring with each paragraph and each argument in one line.
+
+    The parser of the command line would keep most of the line breaks in its help.
+    """
+    return re.sub(r"(?<=\S)\n(?: {8}(?=\S)|(?=[^\s\w]))", " ", inspect.cleandoc(docstring))
 
 
 def _check_flags(args: Sequence[str]) -> None:

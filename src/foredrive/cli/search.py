@@ -38,7 +38,7 @@ def search(
 ) -> None:
     """Find moments of indexed logs by a text, an example, their facts or their scores.
 
-    `foredrive search index LOGS` makes the index; `foredrive search page` queries it in the browser.
+    Make the index with `foredrive search index LOGS`. `foredrive search page` queries it in the browser.
 
     Args:
         index: The index: a folder, or a location in object storage.
