@@ -25,7 +25,7 @@ def commands(page: Path) -> list[str]:
     return re.findall(r"^foredrive (.+?)(?:\s+#.*)?$", text, flags=re.MULTILINE)
 
 
-COMMANDS = sorted({command for page in PAGES for command in commands(page)})
+COMMANDS = sorted({command for page in PAGES for command in commands(page) if "--help" not in command})
 
 
 def test_there_are_commands() -> None:
