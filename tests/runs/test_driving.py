@@ -201,18 +201,6 @@ def test_a_carla_server_is_reached_by_the_verb(
         assert "a CARLA server is named HOST:PORT" in capsys.readouterr().err
 
 
-def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="another suite"):
-        drive_suite(changed(suite, seed=1), out, workers=1)
-    (tmp_path / "drives").mkdir()
-    (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
-    with pytest.raises(InputError, match=r"not the description of a suite .* drives beside it"):
-        drive_suite(suite, tmp_path, workers=1)
-    (out / "drives" / "routea_rep0.json").write_text("{}")
-    with pytest.raises(InputError, match="not the record of a drive"):
-        drive_suite(suite, out, workers=1)
-
-
 def test_a_suite_of_an_earlier_version_goes_on(driven: SuiteResult, suite: DriveSuite, out: Path) -> None:
     """It calls the agent "driver"."""
     title, file = suite_title(out), out / "suite.json"
@@ -223,6 +211,18 @@ def test_a_suite_of_an_earlier_version_goes_on(driven: SuiteResult, suite: Drive
         drive_suite(dataclasses.replace(suite, agent="stop"), out, workers=1)
     assert drive_suite(suite, out, workers=1).skipped == len(driven.drives)
     assert json.loads(file.read_text()) == noted
+
+
+def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="another suite"):
+        drive_suite(changed(suite, seed=1), out, workers=1)
+    (tmp_path / "drives").mkdir()
+    (tmp_path / "drives" / "routea_rep0.json").write_text("{}")
+    with pytest.raises(InputError, match=r"not the description of a suite .* drives beside it"):
+        drive_suite(suite, tmp_path, workers=1)
+    (out / "drives" / "routea_rep0.json").write_text("{}")
+    with pytest.raises(InputError, match="not the record of a drive"):
+        drive_suite(suite, out, workers=1)
 
 
 def claim(suite: DriveSuite, out: Path) -> None:

@@ -79,7 +79,7 @@ def test_the_terminal_shows_scores_infractions_and_failures(tmp_path: Path) -> N
     path.write_text(json.dumps(make_drive("one") | {"error": ""}))
     table = score_table(summarise([read_drive(path)]))
     rows = {str(row.cells[0]): row.cells[1] for section in table.sections for row in section.rows}
-    assert table.title == "1 routes, 1 repetitions"
+    assert table.title == "1 route, 1 repetition"
     assert rows["collision static"] == "1  (100.00 / km)"
     assert rows["Failed drives"] == 0
     assert rows["Planning time, median, ms"] == "10"

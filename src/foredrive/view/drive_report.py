@@ -86,7 +86,7 @@ def score_table(summary: Summary) -> Table:
         Row(["Failed drives", summary["failed"]]),
         Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
-    title = f"{number(summary['routes'])} routes, {number(summary['repetitions'])} repetitions"
+    title = f"{_counted(summary['routes'], 'route')}, {_counted(summary['repetitions'], 'repetition')}"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
 
@@ -142,6 +142,10 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         MetricTile("Near collision, % of time", near, note=f"time to collision below {NEAR_COLLISION_S:g} s"),
         MetricTile("Planning time", number(summary["plan_ms"], 0), "ms", "median"),
     ]
+
+
+def _counted(count: Value, name: str) -> str:
+    return f"{number(count)} {name}" + ("" if count == 1 else "s")
 
 
 def _repeated(summary: Summary) -> bool:

@@ -27,8 +27,9 @@ ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it.
 BASELINES_NOTE = (
     "Occupancy prior: the fixed grid that scores best on the training logs. Persistence: the predicted "
     "present in place of the future. Ego-compensated persistence: the same, moved along the driven path, "
-    "which the model is not told. Best and mean of K: sampled futures."
+    "which the model is not told."
 )
+FUTURES_NOTE = "Best and mean of K: sampled futures."
 BEST_NOTE = "Green: best of its column. The protocols differ: compare values of one column only."
 INVALID_NOTE = (
     "Invalid frames have no complete driven future. UniAD's protocol counts the steps that they have, the "
@@ -137,7 +138,10 @@ def occupancy_table(summary: Summary) -> Table | None:
             cells += [summary.get(f"{iou}.{name}") for name in others]
             rows.append(Row([time_title(when), *cells]))
         sections.append(Section(rows, title))
-    return Table(columns, sections, "Occupancy on known voxels", [ABOVE_NOTE, BASELINES_NOTE])
+    notes = [ABOVE_NOTE, BASELINES_NOTE]
+    if not set(others) <= BASELINE_TITLES.keys():
+        notes.append(FUTURES_NOTE)
+    return Table(columns, sections, "Occupancy on known voxels", notes)
 
 
 def flow_table(summary: Summary) -> Table | None:
