@@ -52,6 +52,7 @@ def test_what_cannot_be_had_is_named(tmp_path: Path) -> None:
         TextEncoder(str(tmp_path))(["rain"])
 
 
-def test_the_packaged_one_knows_what_sentences_mean() -> None:
+def test_the_packaged_one_knows_what_sentences_mean(capfd: pytest.CaptureFixture[str]) -> None:
     rain, wet, car = TextEncoder(PACKAGED_MODEL)(["It is raining.", "The weather is wet.", "A red car."])
     assert float(rain @ wet) > 0.5 > float(rain @ car)
+    assert capfd.readouterr().err == ""  # no progress bar of a library

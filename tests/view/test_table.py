@@ -46,6 +46,12 @@ def test_a_narrow_terminal_folds_words_and_never_cuts_numbers() -> None:
     assert "\n".join(lines).count("word") == 20
 
 
+def test_a_column_of_names_may_refuse_to_be_folded() -> None:
+    columns = [Column("n"), Column("name", align="left", wraps=False), Column("what", align="left")]
+    lines = printed(simple_table(columns, [[1, "a" * 60, "word " * 20]]), width=40)
+    assert "a" * 60 in "\n".join(lines)
+
+
 def test_square_brackets_are_no_markup() -> None:
     columns = [Column("[red]", align="left"), Column("b", align="left")]
     text = "\n".join(printed(simple_table(columns, [["[/nothing]", "[bold]x"]], "[title]")))

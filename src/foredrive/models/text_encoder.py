@@ -1,6 +1,7 @@
 """A frozen text encoder for sentences."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ class TextEncoder:
         source = str(_in_package()) if model == PACKAGED_MODEL else model
         try:
             self._tokenizer: Any = AutoTokenizer.from_pretrained(source)
-            self._encoder: Any = AutoModel.from_pretrained(source).eval()
+            with quiet_loading():
+                self._encoder: Any = AutoModel.from_pretrained(source).eval()
         except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"the text encoder {model!r} cannot be loaded: {reason}") from error
@@ -65,6 +67,20 @@ class TextEncoder:
             hidden, mask = self._encoder(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
             encoded = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
         return F.normalize(encoded.float(), dim=-1)
+
+
+@contextlib.contextmanager
+def quiet_loading() -> Iterator[None]:
+    """Hide transformers' progress bar, which counts tensors in memory for a moment."""
+    from transformers.utils import logging
+
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()
 
 
 def _in_package() -> Path:

@@ -86,7 +86,7 @@ def score_table(summary: Summary) -> Table:
         Row(["Failed drives", summary["failed"]]),
         Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
-    title = f"{_counted(summary['routes'], 'route')}, {_counted(summary['repetitions'], 'repetition')}"
+    title = f"{_number_of(summary['routes'], 'route')}, {_number_of(summary['repetitions'], 'repetition')}"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
 
@@ -144,7 +144,7 @@ def _tiles(summary: Summary) -> list[MetricTile]:
     ]
 
 
-def _counted(count: Value, name: str) -> str:
+def _number_of(count: Value, name: str) -> str:
     return f"{number(count)} {name}" + ("" if count == 1 else "s")
 
 

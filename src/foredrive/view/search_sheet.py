@@ -92,7 +92,9 @@ def hits_table(hits: Sequence[Hit]) -> Table:
     """Return the hits as a table."""
     columns = (
         Column(),
-        *(Column(name, align="left") for name in ("moment and view", "score", "content")),
+        Column("moment and view", align="left", wraps=False),  # to be copied into --like
+        Column("score", align="left", wraps=False),
+        Column("content", align="left"),
     )
     rows = [(n, hit_name(hit), score_text(hit), content_text(hit)) for n, hit in enumerate(hits, 1)]
     return simple_table(columns, rows)

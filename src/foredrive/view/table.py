@@ -30,12 +30,14 @@ class Column:
         group: a title shared with the neighbouring columns of the same group.
         digits: digits of a float after the decimal point.
         align: left for words, right for numbers.
+        wraps: whether the terminal may wrap long words. Titles of rows and numbers never wrap.
     """
 
     title: str = ""
     group: str = ""
     digits: int = 3
     align: Literal["left", "right"] = "right"
+    wraps: bool = True
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,8 @@ def _rich(table: Table) -> RichTable:
         for row in section.rows:
             shown.add_row(*map(_rich_cell, row.cells, table.columns), style="bold" if row.is_strong else None)
         shown.add_section()
-    for place, made in enumerate(shown.columns):
-        if place == 0 or made.justify == "right":  # these never wrap
+    for place, (made, column) in enumerate(zip(shown.columns, table.columns, strict=True)):
+        if place == 0 or column.align == "right" or not column.wraps:
             lines = [line for cell in (made.header, *made.cells) for line in str(cell).split("\n")]
             made.no_wrap, made.min_width = True, max(map(cell_len, lines))
     return shown
