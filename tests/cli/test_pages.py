@@ -69,11 +69,13 @@ def test_benchmarks_that_are_named_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_source_files_that_are_named_exist(page: Path) -> None:
-    """Users write foredrive_agent.py themselves."""
+    """A path that begins with another folder is that of a public repository."""
     folders = ("src", "tests", "benchmarks", "docs")
     there = {path.as_posix() for folder in folders for path in (ROOT / folder).rglob("*.py")}
-    for name in set(re.findall(r"`([a-z0-9_/]+\.py)`", page.read_text())) - {"foredrive_agent.py"}:
-        assert any(path.endswith(f"/{name}") for path in there), f"{page.name}: {name}"
+    ours = {*folders, *(path.name for path in (ROOT / "src" / "foredrive").iterdir())}
+    for name in re.findall(r"`([a-z0-9_]+/[a-z0-9_/]+\.py)`", page.read_text()):
+        known = any(path.endswith(f"/{name}") for path in there)
+        assert known or name.split("/")[0] not in ours, f"{page.name}: {name}"
     for name, target in re.findall(r"\[`([a-z0-9_/]+\.py)`\]\(([^)]+)\)", page.read_text()):
         assert target.endswith(f"/{name}"), f"{page.name}: {name} is linked to {target}"
 
